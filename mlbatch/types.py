@@ -1,0 +1,266 @@
+"""What flows through mlbatch: packets in batches, columns that wait, scans that leave."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+U8Array: TypeAlias = npt.NDArray[np.uint8]
+U16Array: TypeAlias = npt.NDArray[np.uint16]
+U32Array: TypeAlias = npt.NDArray[np.uint32]
+I32Array: TypeAlias = npt.NDArray[np.int32]
+I64Array: TypeAlias = npt.NDArray[np.int64]
+F32Array: TypeAlias = npt.NDArray[np.float32]
+F64Array: TypeAlias = npt.NDArray[np.float64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Where packets come from: a (source IP, destination port) of a capture, or a topic of a bag.
+
+    Source ports are left out on purpose: they are ephemeral.
+    """
+
+    source_ip: str = ""
+    port: int = 0
+    topic: str = ""
+
+    def __str__(self) -> str:
+        return self.topic or f"{self.source_ip} > port {self.port}"
+
+
+@dataclass(slots=True)
+class StreamTable:
+    """Numbers the streams of a session; all its readers share one table."""
+
+    streams: list[Stream] = field(default_factory=list)
+    _numbers: dict[Stream, int] = field(default_factory=dict)
+
+    def number(self, stream: Stream) -> int:
+        """Number of `stream`, given at its first packet."""
+        found = self._numbers.get(stream)
+        if found is None:
+            found = self._numbers[stream] = len(self.streams)
+            self.streams.append(stream)
+        return found
+
+
+@dataclass(slots=True)
+class PacketBatch:
+    """UDP payloads in arrival order; valid only until the next batch, since readers reuse `data`.
+
+    Payload i is `data[start[i] : start[i] + size[i]]`.
+    data: (bytes,) uint8; start, size: (n,) int64; stream: (n,) int64, numbers of a `StreamTable`;
+    host_ns: (n,) int64, time of arrival at the recorder (of the completing fragment).
+    """
+
+    data: U8Array
+    start: I64Array
+    size: I64Array
+    stream: I64Array
+    host_ns: I64Array
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def take(self, index: I64Array | slice) -> PacketBatch:
+        """The packets at `index`, over the same bytes."""
+        return PacketBatch(
+            self.data, self.start[index], self.size[index], self.stream[index], self.host_ns[index]
+        )
+
+
+@dataclass(slots=True)
+class CaptureCounts:
+    """The ledger of a reader: frames = datagrams + sum(skipped)."""
+
+    frames: int = 0
+    datagrams: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+
+    def skip(self, reason: str, count: int = 1) -> None:
+        """Count `count` frames that gave no datagram; reasons are CONTRACT's closed list."""
+        if count:
+            self.skipped[reason] = self.skipped.get(reason, 0) + count
+
+
+class Recording(Protocol):
+    """An opened recording, whatever its container."""
+
+    path: Path
+    container: str
+    counts: CaptureCounts
+
+    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+        """Yield all packets from the start, in file order; may be called again (counts restart).
+
+        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
+        """
+        ...
+
+
+@dataclass(slots=True)
+class Columns:
+    """Columns of one sensor: small fixed records; their pixels stay raw in the sensor's ring.
+
+    stamp_ns: (n,) int64, common clock; place: (n,) int64, row of the sensor's `RawRing`;
+    encoder: (n,) int64, rotor position (index into the sensor's angle table).
+    """
+
+    stamp_ns: I64Array
+    place: I64Array
+    encoder: I64Array
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, index: I64Array | BoolArray | slice) -> Columns:
+        """The columns at `index`."""
+        return Columns(self.stamp_ns[index], self.place[index], self.encoder[index])
+
+
+@dataclass(slots=True)
+class Heads:
+    """What the columns of P packets say of themselves, before any pixel is decoded.
+
+    stamp_ns: (P, C) int64, sensor clock, the column's earliest nominal firing;
+    encoder: (P, C) int64; valid: (P, C) bool, the sensor's own word that the column was measured.
+    """
+
+    stamp_ns: I64Array
+    encoder: I64Array
+    valid: BoolArray
+
+
+@dataclass(slots=True)
+class Pixels:
+    """Readings of n columns of one return: (n, channels) each.
+
+    range_m: float32, 0 where nothing came back; intensity: float32, sensor units;
+    reflectivity: uint16, or None where the sensor has none.
+    """
+
+    range_m: F32Array
+    intensity: F32Array
+    reflectivity: U16Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class SensorInfo:
+    """What outputs say of a sensor; `body_from_sensor` is (4, 4) float64, metres."""
+
+    name: str
+    model: str
+    channels: int
+    returns: int
+    ring_base: int
+    body_from_sensor: F64Array
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """What is the same for all scans of a run.
+
+    rate_hz: the exact rate as text ("10", "10/3"); timescale: utc, tai, uptime or unknown;
+    layout: dense or organized; sensors in the order of `lidar_id`.
+    """
+
+    sensors: tuple[SensorInfo, ...]
+    frame_id: str
+    rate_hz: str
+    timescale: str
+    slices: int = 1
+    layout: str = "dense"
+
+
+@dataclass(slots=True)
+class Scan:
+    """All columns of one window of the common clock, sorted by stamp; fields as in the npz.
+
+    Dense: p points, only valid returns, never NaN. Organized: (n, slots) each, NaN where empty.
+    xyz: (p, 3) float32, m, body frame; intensity, range_m: (p,) float32; reflectivity: (p,) uint16
+    or None; time_ns: (p,) uint32 after `start_ns`; ring: (p,) uint16; return_type, lidar_id:
+    (p,) uint8; column: (p,) uint32, or None when organized; column_stamp_ns: (n,) int64;
+    column_lidar_id: (n,) uint8. `ready_host_ns` is the arrival of the packet that closed the
+    window; `max_gap_ns[s]` the widest step between columns of sensor s (0: fewer than two).
+    """
+
+    info: RunInfo
+    index: int
+    slice: int
+    start_ns: int
+    end_ns: int
+    complete: bool
+    ready_host_ns: int
+    xyz: F32Array
+    intensity: F32Array
+    reflectivity: U16Array | None
+    range_m: F32Array
+    time_ns: U32Array
+    ring: U16Array
+    return_type: U8Array
+    lidar_id: U8Array
+    column: U32Array | None
+    column_stamp_ns: I64Array
+    column_lidar_id: U8Array
+    points: int
+    columns_per_sensor: tuple[int, ...]
+    max_gap_ns: tuple[int, ...]
+
+    @property
+    def slices(self) -> int:
+        """Slices a window is cut into."""
+        return self.info.slices
+
+
+@dataclass(slots=True)
+class ImuSamples:
+    """Samples of one sensor's IMU, in its IMU frame.
+
+    sensor: index in `RunInfo.sensors`; stamp_ns: (n,) int64, the lidar's clock;
+    acceleration: (n, 3) float64, m/s2; angular_velocity: (n, 3) float64, rad/s.
+    """
+
+    sensor: int
+    stamp_ns: I64Array
+    acceleration: F64Array
+    angular_velocity: F64Array
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a writer may add at the end of a run.
+
+    t_init_ns: None when the run never started; report_json: report.json without timings and paths;
+    scans_csv: text of scans.csv.
+    """
+
+    t_init_ns: int | None
+    report_json: str
+    scans_csv: str
+
+
+class Writer(Protocol):
+    """Writes one run; nothing stands under the final name before `finish`."""
+
+    def write(self, scan: Scan) -> None:
+        """Write one scan; its arrays are only valid during the call."""
+        ...
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Write IMU samples; formats without a place for them ignore the call."""
+        ...
+
+    def finish(self, summary: Summary) -> None:
+        """Complete the output and move it to its final name."""
+        ...
+
+    def abandon(self) -> None:
+        """Close files after an error; what was written stays under `.partial`."""
+        ...
