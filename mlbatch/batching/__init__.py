@@ -1,0 +1,1 @@
+"""Windows of the common clock, and how columns are sorted into them."""
