@@ -1,0 +1,303 @@
+"""The paper in plain loops: the oracle of the fast batcher, never optimised.
+
+Source: Faitli et al. (2025), section 2.1, as CONTRACT.md section 1 makes it exact. It takes packets
+in arrival order, one after the other, column by column, and shares no helper with the fast code.
+Where the contract leaves room, these rules decide (N, M: newest and oldest stamp delivered by a
+sensor, G: the largest N; slack: 10 ms):
+
+1. Intake: see `reference_intake.py`.
+2. Invalid columns are dropped `invalid` and are never stamps, but count as decoded.
+3. Clocks are compared when a sensor's first valid column is delivered, with the first sensor that
+   had one (not with the host clock).
+4. Sensor s is stalled after a delivery if G - N[s], or before its first column G minus the smallest
+   t0, exceeds max-wait.
+5. Eq. (1) is evaluated after the first delivery at which every sensor has a column or is stalled,
+   over those that have one and are not stalled; else at the end, over all that have one.
+6. Slices are windows q = k * slices + j with bounds ceil(q * 1e9 / (rate * slices)).
+7. After each delivery the watermark is the smallest N of the sensors not stalled, minus the slack,
+   if that is larger than before; windows that end at or before it are published. A held packet is
+   delivered at the arrival of the one that confirms it. A column is `late` if its window ends at or
+   before its sensor's newest stamp before it minus the slack, or the end of what was published
+   before its packet.
+8. `complete` is judged at publication: M <= start and N >= end for every sensor, and no stall
+   overlaps. A stall is a step of a sensor's running maximum from a to b > a + max-wait; it overlaps
+   if a < end and b > start.
+9. End of input publishes everything else, at the arrival of the feed's last packet.
+10. A column has one reason, the first of: invalid, late, before_start (k < k0 - 1), outside_time
+   (start of the whole window outside [start, end)), head (k = k0 - 1), tail (the slice of the final
+   G). Keep-partial writes head and tail. `empty` counts slices without a column from k0 to the last
+   that holds one, inside [start, end). In a window columns lie by (stamp, sensor, arrival).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from mlbatch.batching.reference_intake import FeedPacket, Intake
+from mlbatch.errors import ClockError
+
+__all__ = ["FeedPacket", "Outcome", "Settings", "Window", "reference_scans"]
+
+SECOND_NS = 10**9
+SLACK_NS = 10**7
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the user chose; max_wait_ns None waits for ever; rate in Hz."""
+
+    rate: Fraction
+    sensors: int
+    slices: int = 1
+    max_wait_ns: int | None = SECOND_NS
+    keep_partial: bool = False
+    start_ns: int | None = None
+    end_ns: int | None = None
+    host_clock: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A written window or slice; columns: (sensor, its accepted packet, column in the packet)."""
+
+    index: int
+    slice: int
+    start_ns: int
+    end_ns: int
+    complete: bool
+    ready_host_ns: int
+    columns: list[tuple[int, int, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that came of a feed; lists over the sensors count packets (rejected) or columns."""
+
+    t_init_ns: int | None
+    windows: list[Window]
+    rejected: list[dict[str, int]]
+    dropped: list[dict[str, int]]
+    decoded: list[int]
+    written: list[int]
+    empty: int
+    incomplete: int
+
+
+@dataclass(slots=True)
+class Sensor:
+    """What is known of one sensor after the deliveries so far."""
+
+    packets: int = 0
+    first: int | None = None
+    newest: int | None = None
+    oldest: int | None = None
+    offset: int = 0
+    stalls: list[tuple[int, int]] = field(default_factory=list)
+    dropped: dict[str, int] = field(default_factory=dict)
+    decoded: int = 0
+    written: int = 0
+
+    def drop(self, reason: str) -> None:
+        """Count one column that is not written."""
+        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+
+    def note(self, stamp: int, max_wait_ns: int | None) -> None:
+        """Move N and M, and remember a step of N that is a stall."""
+        before = stamp if self.newest is None else self.newest
+        if max_wait_ns is not None and stamp - before > max_wait_ns:
+            self.stalls.append((before, stamp))
+        self.newest = max(before, stamp)
+        self.oldest = stamp if self.oldest is None else min(self.oldest, stamp)
+
+
+class Session:
+    """The main loop of the paper and what it remembers between packets."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.slices_per_ns = settings.rate * settings.slices / SECOND_NS
+        self.intakes = [Intake(s, settings.host_clock) for s in range(settings.sensors)]
+        self.sensors = [Sensor() for _ in range(settings.sensors)]
+        self.reference_offset: tuple[int, int] | None = None
+        self.k0: int | None = None
+        self.watermark: int | None = None
+        self.published_end: int | None = None
+        self.waiting: dict[int, list[tuple[int, int, int, int]]] = {}
+        self.filled: set[int] = set()
+        self.windows: list[Window] = []
+
+    def bound(self, q: int) -> int:
+        """First nanosecond of slice q: rule 6."""
+        return math.ceil(q / self.slices_per_ns)
+
+    def slice_of(self, stamp: int) -> int:
+        """The q with bound(q) <= stamp < bound(q + 1)."""
+        return math.floor(stamp * self.slices_per_ns)
+
+    def deliver(self, packet: FeedPacket, host_ns: int) -> None:
+        """One accepted packet, at host time `host_ns`: load its columns, publish what it closes."""
+        sensor = self.sensors[packet.sensor]
+        number, sensor.packets = sensor.packets, sensor.packets + 1
+        for column, stamp in enumerate(packet.stamps):
+            sensor.decoded += 1
+            if not packet.valid[column]:
+                sensor.drop("invalid")
+                continue
+            if sensor.first is None:
+                sensor.first = stamp
+                self.compare_clocks(packet.sensor, stamp - packet.host_ns)
+            self.load(packet.sensor, stamp, number, column)
+        if self.k0 is None:
+            self.initialise()
+        if self.k0 is not None:
+            self.publish(host_ns)
+
+    def compare_clocks(self, number: int, offset: int) -> None:
+        """Rule 3."""
+        if self.reference_offset is None:
+            self.reference_offset = (number, offset)
+        first, reference = self.reference_offset
+        if not self.settings.host_clock and abs(offset - reference) > SECOND_NS:
+            raise ClockError(
+                f"sensors {first} and {number}: wanted comparable clocks, got stamp minus host "
+                f"{reference} ns and {offset} ns; use --clock host or clock.offset_s"
+            )
+
+    def load(self, number: int, stamp: int, packet: int, column: int) -> None:
+        """Put a column into its window, unless it is late: rule 7."""
+        sensor, q = self.sensors[number], self.slice_of(stamp)
+        end = self.bound(q + 1)
+        passed = [] if self.published_end is None else [self.published_end]
+        passed += [] if sensor.newest is None else [sensor.newest - SLACK_NS]
+        if any(end <= limit for limit in passed):
+            sensor.drop("late")
+        else:
+            self.waiting.setdefault(q, []).append((stamp, number, packet, column))
+        sensor.note(stamp, self.settings.max_wait_ns)
+
+    def stalled(self, sensor: Sensor) -> bool:
+        """Rule 4."""
+        wait = self.settings.max_wait_ns
+        newest = [other.newest for other in self.sensors if other.newest is not None]
+        if wait is None or not newest:
+            return False
+        own = sensor.newest
+        if own is None:
+            own = min(other.first for other in self.sensors if other.first is not None)
+        return max(newest) - own > wait
+
+    def initialise(self) -> None:
+        """Eq. (1), if it can be evaluated: rule 5."""
+        stalled = [self.stalled(sensor) for sensor in self.sensors]
+        begun = [sensor.first is not None for sensor in self.sensors]
+        if any(begun) and all(b or s for b, s in zip(begun, stalled, strict=True)):
+            self.begin([one for one, s in zip(self.sensors, stalled, strict=True) if not s])
+
+    def begin(self, live: list[Sensor]) -> None:
+        """The first window that begins after every first stamp."""
+        t0max = max(sensor.first for sensor in live if sensor.first is not None)
+        self.k0 = math.floor(t0max * self.settings.rate / SECOND_NS) + 1
+
+    def publish(self, host_ns: int) -> None:
+        """Raise the watermark and close the windows it has passed: rule 7."""
+        live = [sensor for sensor in self.sensors if not self.stalled(sensor)]
+        mark = min(sensor.newest for sensor in live if sensor.newest is not None) - SLACK_NS
+        self.watermark = mark if self.watermark is None else max(self.watermark, mark)
+        while self.waiting and self.bound(min(self.waiting) + 1) <= self.watermark:
+            self.close(min(self.waiting), host_ns, tail=None)
+        self.published_end = self.bound(self.slice_of(self.watermark))
+
+    def finish(self, host_ns: int) -> None:
+        """End of input: rule 9."""
+        for intake in self.intakes:
+            intake.finish()
+        newest = [sensor.newest for sensor in self.sensors if sensor.newest is not None]
+        if newest and self.k0 is None:
+            self.begin(self.sensors)
+        tail = self.slice_of(max(newest, default=0))
+        while self.waiting:
+            self.close(min(self.waiting), host_ns, tail)
+
+    def close(self, q: int, host_ns: int, tail: int | None) -> None:
+        """Write slice q, or drop its columns under one reason."""
+        columns = sorted(self.waiting.pop(q))
+        self.filled.add(q)
+        reason = self.unwanted(q, tail)
+        for _, number, _, _ in columns:
+            if reason:
+                self.sensors[number].drop(reason)
+            else:
+                self.sensors[number].written += 1
+        if reason or self.k0 is None:
+            return
+        start, end = self.bound(q), self.bound(q + 1)
+        k, part = divmod(q, self.settings.slices)
+        order = [(number, packet, column) for _, number, packet, column in columns]
+        complete = self.complete(start, end)
+        self.windows.append(Window(k - self.k0, part, start, end, complete, host_ns, order))
+
+    def unwanted(self, q: int, tail: int | None) -> str:
+        """Why slice q is not written, or nothing: rule 10."""
+        k, k0 = q // self.settings.slices, self.k0
+        if k0 is None or k < k0 - 1:
+            return "before_start"
+        if not self.inside(k):
+            return "outside_time"
+        if self.settings.keep_partial:
+            return ""
+        if k == k0 - 1:
+            return "head"
+        return "tail" if q == tail else ""
+
+    def inside(self, k: int) -> bool:
+        """Whether window k begins in [start, end)."""
+        low, high = self.settings.start_ns, self.settings.end_ns
+        begin = self.bound(k * self.settings.slices)
+        return (low is None or begin >= low) and (high is None or begin < high)
+
+    def complete(self, start: int, end: int) -> bool:
+        """Rule 8."""
+        for sensor in self.sensors:
+            if sensor.oldest is None or sensor.oldest > start:
+                return False
+            if sensor.newest is None or sensor.newest < end:
+                return False
+            if any(before < end and after > start for before, after in sensor.stalls):
+                return False
+        return True
+
+    def empty(self) -> int:
+        """Slices of rule 10 without a column, by subtraction: gaps may last for hours."""
+        if self.k0 is None or not self.filled:
+            return 0
+        low, high, slices = self.settings.start_ns, self.settings.end_ns, self.settings.slices
+        first, last = self.k0 * slices, max(self.filled)
+        # ceil(k * T) >= low is k * T > low - 1, and ceil(k * T) < high is k * T <= high - 1.
+        if low is not None:
+            first = max(first, (self.slice_of(low - 1) // slices + 1) * slices)
+        if high is not None:
+            last = min(last, (self.slice_of(high - 1) // slices + 1) * slices - 1)
+        return max(0, last - first + 1) - sum(first <= q <= last for q in self.filled)
+
+
+def reference_scans(feed: Iterable[FeedPacket], settings: Settings) -> Outcome:
+    """Take the packets of a feed one by one, as the paper does."""
+    session, host_ns = Session(settings), 0
+    for packet in feed:
+        host_ns = packet.host_ns
+        for accepted in session.intakes[packet.sensor].take(packet):
+            session.deliver(accepted, host_ns)
+    session.finish(host_ns)
+    return Outcome(
+        None if session.k0 is None else session.bound(session.k0 * settings.slices),
+        session.windows,
+        [intake.rejected for intake in session.intakes],
+        [sensor.dropped for sensor in session.sensors],
+        [sensor.decoded for sensor in session.sensors],
+        [sensor.written for sensor in session.sensors],
+        session.empty(),
+        sum(not window.complete for window in session.windows),
+    )
