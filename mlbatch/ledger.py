@@ -1,0 +1,107 @@
+"""Counters: everything read is written or counted with a reason (CONTRACT.md, section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mlbatch.types import CaptureCounts
+
+# Closed lists: a new reason needs a line in the documentation.
+CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment_lost", "no_stream")
+PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
+COLUMN_REASONS = ("before_start", "late", "tail", "head", "invalid", "outside_time")
+
+
+@dataclass(slots=True)
+class PacketCounts:
+    """Lidar packets of a sensor: read = accepted + sum(rejected).
+
+    lost: numbers missing in the sensor's own count; reordered: numbers that came after a later one.
+    """
+
+    read: int = 0
+    accepted: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    lost: int = 0
+    reordered: int = 0
+
+    def reject(self, reason: str, count: int = 1) -> None:
+        """Count packets that were not accepted."""
+        _add(self.rejected, reason, count)
+
+
+@dataclass(slots=True)
+class ColumnCounts:
+    """Columns of a sensor: decoded = written + sum(dropped)."""
+
+    decoded: int = 0
+    written: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Count columns that were not written."""
+        _add(self.dropped, reason, count)
+
+
+@dataclass(slots=True)
+class PointCounts:
+    """Slots of the written columns: slots = no_return + range + box + repeated + written."""
+
+    slots: int = 0
+    no_return: int = 0
+    range: int = 0
+    box: int = 0
+    repeated: int = 0
+    written: int = 0
+
+
+@dataclass(slots=True)
+class SensorLedger:
+    """All counters of one sensor."""
+
+    packets: PacketCounts = field(default_factory=PacketCounts)
+    columns: ColumnCounts = field(default_factory=ColumnCounts)
+    points: PointCounts = field(default_factory=PointCounts)
+    imu_packets: int = 0
+
+    def check(self) -> list[str]:
+        """What does not balance, a line each; empty when all is accounted for."""
+        packets, columns, points = self.packets, self.columns, self.points
+        fates = (points.no_return, points.range, points.box, points.repeated, points.written)
+        return [
+            *_balance("packets", packets.read, (packets.accepted, *packets.rejected.values())),
+            *_balance("columns", columns.decoded, (columns.written, *columns.dropped.values())),
+            *_balance("points", points.slots, fates),
+            *_unknown("packets", packets.rejected, PACKET_REASONS),
+            *_unknown("columns", columns.dropped, COLUMN_REASONS),
+        ]
+
+
+def check_capture(counts: CaptureCounts) -> list[str]:
+    """What does not balance in the ledger of a reader, a line each."""
+    fates = (counts.datagrams, *counts.skipped.values())
+    return [
+        *_balance("frames", counts.frames, fates),
+        *_unknown("frames", counts.skipped, CAPTURE_REASONS),
+    ]
+
+
+def ordered(counts: dict[str, int], reasons: tuple[str, ...]) -> dict[str, int]:
+    """The reasons that were counted, in the order of their closed list."""
+    known = {reason: counts[reason] for reason in reasons if counts.get(reason)}
+    return known | {reason: count for reason, count in sorted(counts.items()) if count}
+
+
+def _add(counts: dict[str, int], reason: str, count: int) -> None:
+    if count:
+        counts[reason] = counts.get(reason, 0) + count
+
+
+def _balance(what: str, total: int, fates: tuple[int, ...]) -> list[str]:
+    if total == sum(fates):
+        return []
+    return [f"{what}: wanted {total} accounted for, got {' + '.join(map(str, fates))}"]
+
+
+def _unknown(what: str, counts: dict[str, int], reasons: tuple[str, ...]) -> list[str]:
+    return [f"{what}: unknown reason {reason!r}" for reason in counts if reason not in reasons]

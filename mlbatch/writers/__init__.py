@@ -1,0 +1,118 @@
+"""Outputs: one module a format, found by name; rules of CONTRACT.md, section 2."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+from mlbatch.errors import UsageError
+from mlbatch.writers._atomic import (
+    REPORT_JSON,
+    SCANS_CSV,
+    check_free_space,
+    side_path,
+    write_text,
+)
+from mlbatch.writers._options import ScanWriter, WriterModule, WriterOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mlbatch.types import RunInfo
+
+__all__ = [
+    "ReportPaths",
+    "ScanWriter",
+    "WriterOptions",
+    "check_free_space",
+    "choose_format",
+    "formats",
+    "open_writer",
+    "plugin",
+    "report_paths",
+    "write_text",
+]
+
+DEFAULT_FORMAT = "npz"
+# Announced in the contract; named here so that asking for one gets a straight answer.
+LATER_FORMATS = ("rosbag2", "rosbag1", "pcd", "las", "kitti")
+LATER_SUFFIXES = {
+    ".bag": "rosbag1",
+    ".db3": "rosbag2",
+    ".pcd": "pcd",
+    ".las": "las",
+    ".laz": "las",
+    ".bin": "kitti",
+}
+
+
+def formats() -> tuple[str, ...]:
+    """Names of all formats, sorted; no plug-in is imported."""
+    found = pkgutil.iter_modules(__path__)
+    return tuple(sorted(module.name for module in found if not module.name.startswith("_")))
+
+
+def plugin(name: str) -> WriterModule:
+    """The module that writes the format called `name`."""
+    if name not in formats():
+        later = " (not in this version)" if name in LATER_FORMATS else ""
+        raise UsageError(
+            f"--format: wanted one of {', '.join(formats())}, got {name!r}{later}; choose one"
+        )
+    return cast(WriterModule, importlib.import_module(f"{__name__}.{name}"))
+
+
+def choose_format(target: Path, asked: str | None) -> str:
+    """Format of the output `target`; `asked` is the value of `--format`, None if not given."""
+    suffix = target.suffix.lower()
+    by_suffix = {plugin(name).SUFFIX: name for name in formats() if plugin(name).SUFFIX}
+    _refuse_file_name(target, suffix)
+    found = by_suffix.get(suffix)
+    if asked is None:
+        return found or DEFAULT_FORMAT
+    if found is not None and plugin(asked).SUFFIX is None:
+        raise UsageError(
+            f"-o {target}: wanted a folder for --format {asked}, got the name of a {found} file; "
+            f"leave out {suffix} or the option"
+        )
+    return plugin(asked).FORMAT
+
+
+def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start the output `target` in the format called `name`."""
+    return plugin(name).open_writer(target, info, options)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportPaths:
+    """Where the report and the table of scans of an output lie."""
+
+    report: Path
+    scans_csv: Path
+
+
+def report_paths(target: Path, name: str) -> ReportPaths:
+    """Inside an output folder, beside an output file.
+
+    A writer's `finish` writes scans.csv; the report follows by `write_text` once it has timings.
+    """
+    if plugin(name).SUFFIX is None:
+        return ReportPaths(target / REPORT_JSON, target / SCANS_CSV)
+    return ReportPaths(side_path(target, REPORT_JSON), side_path(target, SCANS_CSV))
+
+
+def _refuse_file_name(target: Path, suffix: str) -> None:
+    """Refuse names of single files for outputs that are not single files."""
+    name = suffix.removeprefix(".")
+    if name in formats() and plugin(name).SUFFIX is None:
+        raise UsageError(
+            f"-o {target}: wanted a folder, since {name} output is a file a scan, got a file "
+            f"name; give -o {target.with_suffix('')} --format {name}"
+        )
+    if suffix in LATER_SUFFIXES:
+        raise UsageError(
+            f"-o {target}: wanted a .mcap file or a folder, got {suffix} "
+            f"({LATER_SUFFIXES[suffix]}, not in this version); choose another output"
+        )

@@ -1,0 +1,285 @@
+"""Point records: which field lies where and how it is filled (facts/outputs.md, sections 2, 3, 5).
+
+A layout is a table; `Layout.pack` fills records of any layout block by block, so that the strided
+writes of a block stay in the processor's cache.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.types import (
+    F32Array,
+    F64Array,
+    I64Array,
+    Scan,
+    SensorInfo,
+    U8Array,
+    U16Array,
+    U32Array,
+)
+from mlbatch.units import MM_PER_M, NS_PER_S
+
+Values: TypeAlias = npt.NDArray[np.generic]
+Records: TypeAlias = npt.NDArray[np.void]
+
+BLOCK_POINTS = 8192
+# The lowest 29 of the 52 mantissa bits of a float64 are those a float32 has no room for.
+_FLOAT32_BITS = np.uint64(2**64 - 2**29)
+_MAX_U8 = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The point arrays of a scan in the order of the file: (p,), or (slots, n) when organized."""
+
+    sensors: tuple[SensorInfo, ...]
+    start_ns: int
+    xyz: F32Array
+    intensity: F32Array
+    reflectivity: U16Array | None
+    range_m: F32Array
+    time_ns: U32Array
+    ring: U16Array
+    return_type: U8Array
+    lidar_id: U8Array
+
+    def take(self, rows: slice) -> Points:
+        """The points in `rows` of the first axis."""
+        return Points(
+            self.sensors,
+            self.start_ns,
+            self.xyz[rows],
+            self.intensity[rows],
+            None if self.reflectivity is None else self.reflectivity[rows],
+            self.range_m[rows],
+            self.time_ns[rows],
+            self.ring[rows],
+            self.return_type[rows],
+            self.lidar_id[rows],
+        )
+
+
+def points_of(scan: Scan) -> Points:
+    """The points of a scan; organized ones are turned so that a column is a column of the image."""
+    turned = scan.info.layout == "organized"
+    reflectivity = scan.reflectivity
+    if turned and reflectivity is not None:
+        reflectivity = reflectivity.T
+    return Points(
+        scan.info.sensors,
+        scan.start_ns,
+        scan.xyz.transpose(1, 0, 2) if turned else scan.xyz,
+        scan.intensity.T,
+        reflectivity,
+        scan.range_m.T,
+        scan.time_ns.T,
+        scan.ring.T,
+        scan.return_type.T,
+        scan.lidar_id.T,
+    )
+
+
+def seconds(time_ns: U32Array) -> F64Array:
+    """Nanoseconds as the nearest float64 seconds."""
+    return np.divide(time_ns, NS_PER_S, dtype=np.float64)
+
+
+def seconds_toward_zero(time_ns: U32Array) -> F64Array:
+    """Seconds that a float32 holds exactly and that never exceed the true time.
+
+    Rounding up could put a point past its scan's end. The division cannot cross a float32 value:
+    ns/1e9 lies on it or further away than a float64 rounds.
+    """
+    value = seconds(time_ns)
+    bits = value.view(np.uint64)
+    bits &= _FLOAT32_BITS
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of a record; `dtype` little endian, `values` gives its values in any type."""
+
+    name: str
+    dtype: str
+    offset: int
+    values: Callable[[Points], Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Fields of a point record of `step` bytes; bytes between fields are zero."""
+
+    name: str
+    step: int
+    fields: tuple[Field, ...]
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The record as a numpy type."""
+        return np.dtype(
+            {
+                "names": [field.name for field in self.fields],
+                "formats": [field.dtype for field in self.fields],
+                "offsets": [field.offset for field in self.fields],
+                "itemsize": self.step,
+            }
+        )
+
+    def pack(self, points: Points, out: Records) -> None:
+        """Fill `out`, records of this layout in the shape of the point arrays."""
+        rows, *rest = points.time_ns.shape
+        step = max(1, BLOCK_POINTS // max(1, math.prod(rest)))
+        for start in range(0, rows, step):
+            block = points.take(slice(start, start + step))
+            target = out[start : start + step]
+            for field in self.fields:
+                target[field.name] = field.values(block)
+
+
+def _in_sensor(points: Points) -> list[F64Array]:
+    """x, y and z, m, of every point in the frame of its sensor; poses are rigid."""
+    poses = np.stack([sensor.body_from_sensor for sensor in points.sensors])
+    which = points.lidar_id
+    offset = [points.xyz[..., axis] - poses[:, axis, 3][which] for axis in range(3)]
+    # The inverse of a rotation is its transpose: columns of the matrix are the sensor's axes.
+    return [
+        poses[:, 0, axis][which] * offset[0]
+        + poses[:, 1, axis][which] * offset[1]
+        + poses[:, 2, axis][which] * offset[2]
+        for axis in range(3)
+    ]
+
+
+def _azimuth(points: Points) -> Values:
+    """rad, from x to y."""
+    x, y, _ = _in_sensor(points)
+    return np.arctan2(y, x)
+
+
+def _elevation(points: Points) -> Values:
+    """rad, upwards from the xy plane."""
+    x, y, z = _in_sensor(points)
+    return np.arctan2(z, np.sqrt(x * x + y * y))
+
+
+def _distance(points: Points) -> Values:
+    """m, from the sensor's origin."""
+    x, y, z = _in_sensor(points)
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _channel(points: Points) -> Values:
+    bases = np.array([sensor.ring_base for sensor in points.sensors], dtype=np.uint16)
+    base = bases[points.lidar_id]
+    # Empty slots of an organized scan have ring 0 whatever the sensor.
+    return np.where(points.ring < base, np.uint16(0), points.ring - base)
+
+
+def _reflectivity(points: Points) -> Values:
+    return np.zeros_like(points.ring) if points.reflectivity is None else points.reflectivity
+
+
+def _range_mm(points: Points) -> Values:
+    range_mm: F64Array = np.multiply(np.nan_to_num(points.range_m), MM_PER_M, dtype=np.float64)
+    np.rint(range_mm, out=range_mm)
+    return range_mm
+
+
+def _intensity_u8(points: Points) -> Values:
+    return np.clip(np.nan_to_num(points.intensity), 0, _MAX_U8)
+
+
+def _seconds_absolute(points: Points) -> Values:
+    # A float64 of seconds since 1970 only resolves 0.24 us: it is rounded once, in the last sum.
+    whole_s, rest_ns = divmod(points.start_ns, NS_PER_S)
+    stamp_ns: I64Array = np.add(points.time_ns, rest_ns, dtype=np.int64)
+    stamp_s: F64Array = np.divide(stamp_ns, NS_PER_S, dtype=np.float64)
+    return np.add(stamp_s, whole_s, out=stamp_s)
+
+
+_XYZ = (
+    Field("x", "<f4", 0, lambda points: points.xyz[..., 0]),
+    Field("y", "<f4", 4, lambda points: points.xyz[..., 1]),
+    Field("z", "<f4", 8, lambda points: points.xyz[..., 2]),
+)
+
+
+def _intensity(offset: int) -> Field:
+    return Field("intensity", "<f4", offset, lambda points: points.intensity)
+
+
+def _ring(offset: int, dtype: str = "<u2") -> Field:
+    return Field("ring", dtype, offset, lambda points: points.ring)
+
+
+def _time(offset: int) -> Field:
+    return Field("time", "<f4", offset, lambda points: seconds_toward_zero(points.time_ns))
+
+
+def _time_ns(name: str, offset: int) -> Field:
+    return Field(name, "<u4", offset, lambda points: points.time_ns)
+
+
+def _return_type(offset: int) -> Field:
+    return Field("return_type", "u1", offset, lambda points: points.return_type)
+
+
+def _lidar_id(offset: int) -> Field:
+    return Field("lidar_id", "u1", offset, lambda points: points.lidar_id)
+
+
+_STANDARD = (*_XYZ, _intensity(12), _time(16), _ring(20), _return_type(22), _lidar_id(23))
+_VELODYNE = (*_XYZ, _intensity(12), _ring(16), _time(18))
+_OUSTER = (
+    *_XYZ,
+    _intensity(16),
+    _time_ns("t", 20),
+    Field("reflectivity", "<u2", 24, _reflectivity),
+    _ring(26),
+    # Near infrared light is not part of a scan; the field must be there for PCL, at 0.
+    Field("ambient", "<u2", 28, lambda points: np.zeros_like(points.ring)),
+    Field("range", "<u4", 32, _range_mm),
+)
+_HESAI = (*_XYZ, _intensity(12), _ring(16), Field("timestamp", "<f8", 18, _seconds_absolute))
+_AUTOWARE = (
+    *_XYZ,
+    Field("intensity", "u1", 12, _intensity_u8),
+    _return_type(13),
+    Field("channel", "<u2", 14, _channel),
+    Field("azimuth", "<f4", 16, _azimuth),
+    Field("elevation", "<f4", 20, _elevation),
+    Field("distance", "<f4", 24, _distance),
+    _time_ns("time_stamp", 28),
+)
+_PLY = (
+    *_XYZ,
+    _intensity(12),
+    Field("time", "<f8", 16, lambda points: seconds(points.time_ns)),
+    _ring(24, "<i4"),
+    _return_type(28),
+    _lidar_id(29),
+)
+
+# Presets of `--point-layout`: facts/outputs.md, section 3.
+CLOUD_LAYOUTS = {
+    layout.name: layout
+    for layout in (
+        Layout("standard", 24, _STANDARD),
+        Layout("velodyne", 22, _VELODYNE),
+        Layout("ouster", 48, _OUSTER),
+        Layout("hesai", 26, _HESAI),
+        Layout("autoware", 32, _AUTOWARE),
+        Layout("kiss-icp", 16, (*_XYZ, _time(12))),
+        Layout("minimal", 12, _XYZ),
+    )
+}
+# Section 5 of the same page.
+PLY_LAYOUT = Layout("ply", 30, _PLY)

@@ -1,0 +1,63 @@
+"""What every writer plug-in is given, and the face it shows (CONTRACT.md, sections 2 and 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mlbatch.types import ImuSamples, RunInfo, Scan, Summary
+
+DEFAULT_POINT_LAYOUT = "standard"
+
+
+@dataclass(frozen=True, slots=True)
+class WriterOptions:
+    """Options of an output.
+
+    point_layout: preset of a PointCloud2; overwrite: replace an existing output at the end;
+    split: one output stream per sensor instead of merged scans.
+    """
+
+    point_layout: str = DEFAULT_POINT_LAYOUT
+    overwrite: bool = False
+    split: bool = False
+
+
+class ScanWriter(Protocol):
+    """A `types.Writer` that also takes scans of single sensors."""
+
+    def write(self, scan: Scan, sensor: int | None = None) -> None:
+        """Write one scan; its arrays are only valid during the call.
+
+        sensor: index of the only sensor in the scan with `--split`, None for a merged scan.
+        """
+        ...
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Write IMU samples; formats without a place for them ignore the call."""
+        ...
+
+    def finish(self, summary: Summary) -> None:
+        """Complete the output and move it to its final name."""
+        ...
+
+    def abandon(self) -> None:
+        """Close files after an error; what was written stays under `.partial`."""
+        ...
+
+
+class WriterModule(Protocol):
+    """A plug-in: a module of this package whose name has no leading underscore.
+
+    FORMAT equals the module's name; SUFFIX is that of an output file, None for a folder.
+    """
+
+    FORMAT: str
+    SUFFIX: str | None
+
+    def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+        """Start an output; nothing stands at `target` before the writer's `finish`."""
+        ...

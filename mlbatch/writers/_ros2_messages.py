@@ -1,0 +1,129 @@
+"""ROS 2 messages as CDR bytes: OMG DDSI-RTPS 2.2 section 10, plain little-endian encapsulation.
+
+Values are aligned to their size, counted from the first byte after the 4-byte head.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from mlbatch.types import F64Array, ImuSamples, RunInfo
+from mlbatch.units import NS_PER_S
+from mlbatch.writers._layouts import Layout, Points
+from mlbatch.writers._ros2_types import FIELD_CODES
+
+_HEAD = b"\x00\x01\x00\x00"
+# sensor_msgs/Imu: -1 says that there is no orientation; all 0 says that a covariance is unknown.
+_NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
+_UNKNOWN_COVARIANCE = (0.0,) * 9
+
+
+class Cdr:
+    """A message under construction."""
+
+    def __init__(self) -> None:
+        self.data = bytearray(_HEAD)
+
+    def put(self, code: str, *values: float) -> None:
+        """Append values of one type, `code` as in `struct`."""
+        size = struct.calcsize(code)
+        self.data += bytes((len(_HEAD) - len(self.data)) % size)
+        self.data += struct.pack(f"<{len(values)}{code}", *values)
+
+    def text(self, value: str) -> None:
+        """Append a string: length with the closing 0, bytes, 0."""
+        data = value.encode() + b"\x00"
+        self.put("I", len(data))
+        self.data += data
+
+    def header(self, stamp_ns: int, frame_id: str) -> None:
+        """Append a std_msgs/Header."""
+        self.put("i", stamp_ns // NS_PER_S)
+        self.put("I", stamp_ns % NS_PER_S)
+        self.text(frame_id)
+
+
+class CloudMessage:
+    """Assembles sensor_msgs/PointCloud2 in one buffer that is used for every scan."""
+
+    def __init__(self, layout: Layout, frame_id: str) -> None:
+        self._layout = layout
+        self._frame_id = frame_id
+        self._dtype = layout.dtype
+        self._buffer = np.empty(0, dtype=np.uint8)
+
+    def assemble(self, points: Points, stamp_ns: int, dense: bool) -> memoryview:
+        """The message; it is valid until the next call."""
+        head = self._head(points.time_ns.shape, stamp_ns)
+        start, size = len(head), points.time_ns.size * self._layout.step
+        total = start + size + 1
+        if len(self._buffer) < total:
+            # Zeros: bytes between fields are never written.
+            self._buffer = np.zeros(total * 5 // 4, dtype=np.uint8)
+        self._buffer[:start] = np.frombuffer(head, dtype=np.uint8)
+        records = self._buffer[start : start + size].view(self._dtype)
+        self._layout.pack(points, records.reshape(points.time_ns.shape))
+        self._buffer[start + size] = dense
+        return self._buffer[:total].data
+
+    def _head(self, shape: tuple[int, ...], stamp_ns: int) -> bytearray:
+        """All that precedes the points; `shape`: (width,) or (height, width)."""
+        step = self._layout.step
+        height, width = shape if len(shape) == 2 else (1, shape[0])
+        cdr = Cdr()
+        cdr.header(stamp_ns, self._frame_id)
+        cdr.put("I", height, width, len(self._layout.fields))
+        for field in self._layout.fields:
+            cdr.text(field.name)
+            cdr.put("I", field.offset)
+            cdr.put("B", FIELD_CODES[field.dtype])
+            cdr.put("I", 1)
+        cdr.put("B", 0)
+        cdr.put("I", step, step * width, step * width * height)
+        return cdr.data
+
+
+def imu_message(samples: ImuSamples, which: int, frame_id: str) -> bytes:
+    """sensor_msgs/Imu of one of the samples."""
+    cdr = Cdr()
+    cdr.header(int(samples.stamp_ns[which]), frame_id)
+    cdr.put("d", *_NO_ORIENTATION)
+    cdr.put("d", *samples.angular_velocity[which].tolist(), *_UNKNOWN_COVARIANCE)
+    cdr.put("d", *samples.acceleration[which].tolist(), *_UNKNOWN_COVARIANCE)
+    return bytes(cdr.data)
+
+
+def static_transforms(info: RunInfo, stamp_ns: int) -> bytes:
+    """tf2_msgs/TFMessage with the pose of every sensor in the body frame."""
+    cdr = Cdr()
+    cdr.put("I", len(info.sensors))
+    for sensor in info.sensors:
+        pose = sensor.body_from_sensor
+        cdr.header(stamp_ns, info.frame_id)
+        cdr.text(sensor.name)
+        cdr.put("d", *pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
+    return bytes(cdr.data)
+
+
+def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3).
+
+    K = 4 q q^T is linear in the rotation; its row with the largest diagonal is q up to a factor
+    and far from 0 (S. W. Shepperd, "Quaternion from rotation matrix", 1978).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    product = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )
+    row = product[int(np.argmax(np.diagonal(product)))]
+    x, y, z, w = (row / np.sqrt((row * row).sum())).tolist()
+    # Adding 0.0 turns -0.0 into 0.0, so that equal poses give equal bytes.
+    sign = -1.0 if w < 0 else 1.0
+    return sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0

@@ -1,0 +1,72 @@
+"""A folder of binary PLY files, properties of facts/outputs.md, section 5.
+
+The format: G. Turk, "The PLY Polygon File Format", 1994; one element `vertex`, scalars only.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+import mlbatch
+from mlbatch.errors import UsageError
+from mlbatch.types import RunInfo, Scan
+from mlbatch.writers._folder import FolderWriter
+from mlbatch.writers._layouts import PLY_LAYOUT, points_of
+from mlbatch.writers._options import ScanWriter, WriterOptions
+
+FORMAT = "ply"
+SUFFIX: str | None = None
+
+# Classic names of PLY types: some readers know no others.
+_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
+
+
+def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start a folder of PLY files."""
+    if info.layout == "organized":
+        raise UsageError("--layout organized: PLY has no organized form; use npz or mcap")
+    return FolderWriter(target, info, options, ".ply", PlySaver().save)
+
+
+class PlySaver:
+    """Saves scans; owns the buffer of vertices."""
+
+    def __init__(self) -> None:
+        self._vertices = np.zeros(0, dtype=PLY_LAYOUT.dtype)
+
+    def save(self, file: BinaryIO, scan: Scan) -> None:
+        """Write the header and all points as vertices."""
+        count = len(scan.time_ns)
+        if len(self._vertices) < count:
+            self._vertices = np.zeros(count * 5 // 4, dtype=PLY_LAYOUT.dtype)
+        vertices = self._vertices[:count]
+        PLY_LAYOUT.pack(points_of(scan), vertices)
+        file.write(header(scan, count).encode())
+        file.write(vertices.view(np.uint8).data)
+
+
+def header(scan: Scan, count: int) -> str:
+    """Header of a PLY file of `count` vertices."""
+    info = scan.info
+    names = " ".join(sensor.name for sensor in info.sensors)
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment mlbatch {mlbatch.__version__}",
+        f"comment start_ns {scan.start_ns}",
+        f"comment end_ns {scan.end_ns}",
+        f"comment index {scan.index} slice {scan.slice} of {scan.slices}",
+        f"comment complete {str(scan.complete).lower()}",
+        f"comment timescale {info.timescale}",
+        f"comment rate_hz {info.rate_hz}",
+        f"comment frame_id {info.frame_id}",
+        "comment units: x y z m; time s after start_ns; intensity as sent by the sensor",
+        f"comment lidar_id from 0: {names}",
+        f"element vertex {count}",
+        *(f"property {_TYPES[field.dtype]} {field.name}" for field in PLY_LAYOUT.fields),
+        "end_header",
+    ]
+    return "\n".join(lines) + "\n"
