@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from mlbatch.types import CaptureCounts
 
 # Closed lists: a new reason needs a line in the documentation.
-CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment_lost", "no_stream")
+# `fragment`: a frame that its datagram's last fragment completed; it is in that datagram.
+CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 COLUMN_REASONS = ("before_start", "late", "tail", "head", "invalid", "outside_time")
 

@@ -61,12 +61,16 @@ class Lidar(Protocol):
 
     A packet holds `columns_per_packet` columns as equal records of `record_size` bytes from byte
     `record_start` on. `sequence_modulus`: the sequence number wraps there (0: packets carry none).
-    `return_types`: numbering of facts/outputs.md section 3 per return. `extrinsics`: (4, 4)
+    `carries_serial`: the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown.
+    `return_types`: numbering of facts/outputs.md section 3 per return; `strongest_first`: of two
+    returns the first is the stronger. `extrinsics`: (4, 4)
     body_from_sensor if the calibration knows it. `timestamp_mode`: the maker's word or "".
     """
 
+    maker: str
     model: str
     serial: str
+    carries_serial: bool
     mode: str
     channels: int
     returns: int
@@ -76,7 +80,9 @@ class Lidar(Protocol):
     record_start: int
     record_size: int
     sequence_modulus: int
+    imu_port: int
     return_types: tuple[int, ...]
+    strongest_first: bool
     beams: BeamTable
     extrinsics: F64Array | None
     timestamp_mode: str

@@ -70,6 +70,12 @@ class ScanTable:
         self._close_row()
         self._open = row
 
+    @property
+    def rows(self) -> int:
+        """Windows or slices that were written."""
+        self._close_row()
+        return self._written
+
     def text(self) -> str:
         """The whole table."""
         self._close_row()

@@ -96,6 +96,8 @@ class Recording(Protocol):
     path: Path
     container: str
     counts: CaptureCounts
+    size_bytes: int
+    position_bytes: int
 
     def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
         """Yield all packets from the start, in file order; may be called again (counts restart).

@@ -1,0 +1,5 @@
+"""`python -m mlbatch`."""
+
+from mlbatch.cli import main
+
+main()

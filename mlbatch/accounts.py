@@ -1,0 +1,157 @@
+"""What a finished run has to say: the inputs of its report, and why there may be no scan."""
+
+from __future__ import annotations
+
+import resource
+from typing import TYPE_CHECKING
+
+from mlbatch import discover
+from mlbatch.ledger import PointCounts
+from mlbatch.rate import rate_text
+from mlbatch.report import (
+    ClockReport,
+    InputReport,
+    ReportInputs,
+    SensorReport,
+    Timing,
+    Unassigned,
+    Warned,
+)
+from mlbatch.scan_table import ScanStatistics, Spread
+from mlbatch.types import CaptureCounts
+from mlbatch.units import NS_PER_MS, NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline import Conversion
+
+__all__ = ["PointCounts", "report_inputs", "why_nothing"]
+
+_KB_PER_MB = 1024
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, Spread(), Spread())
+
+
+def report_inputs(run: Conversion) -> ReportInputs:
+    """All that report.json is made of."""
+    table = run.table
+    return ReportInputs(
+        inputs=tuple(
+            InputReport(str(r.path), r.size_bytes, r.container) for r in run.recordings
+        ),
+        timescale="unknown" if run.info is None else run.info.timescale,
+        rate_hz=rate_text(run.grid.rate),
+        t_init_ns=run.batcher.t_init_ns,
+        slices=run.job.slices,
+        capture=_capture(run),
+        sensors=tuple(_sensor(run, number) for number in range(len(run.feeds))),
+        scans=_NO_SCANS if table is None else table.statistics(run.batcher.empty),
+        unassigned=_unassigned(run),
+        timing=_timing(run),
+        warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
+    )
+
+
+def why_nothing(run: Conversion) -> str:
+    """Why no scan came out, with the stamps of each sensor and what to do."""
+    where = ", ".join(str(path) for path in run.job.recordings)
+    spans = []
+    for sensor, span in zip(run.setup.sensors, run.batcher.spans_ns, strict=True):
+        if span is None:
+            spans.append(f"{sensor.name} gave no valid column")
+        else:
+            spans.append(
+                f"{sensor.name} from {span[0] / NS_PER_S:.6f} to {span[1] / NS_PER_S:.6f} s"
+            )
+    heads = sum(
+        count
+        for dropped in run.batcher.dropped
+        for reason, count in dropped.items()
+        if reason in ("head", "tail")
+    )
+    if all(span is None for span in run.batcher.spans_ns):
+        return f"{where}: no scan: wanted valid columns, got none ({'; '.join(spans)})"
+    period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
+    advice = (
+        "write the partial ones with --keep-partial"
+        if heads
+        else "choose another --start/--end, or a recording where all sensors run together"
+    )
+    return (
+        f"{where}: no scan: wanted a whole window of {period_ms:g} ms seen by all sensors, got "
+        f"{'; '.join(spans)}; {advice}"
+    )
+
+
+def _capture(run: Conversion) -> CaptureCounts:
+    total = CaptureCounts()
+    for recording in run.recordings:
+        total.frames += recording.counts.frames
+        total.datagrams += recording.counts.datagrams
+        for reason, count in recording.counts.skipped.items():
+            total.skip(reason, count)
+    return total
+
+
+def _sensor(run: Conversion, number: int) -> SensorReport:
+    sensor, feed = run.setup.sensors[number], run.feeds[number]
+    lidar, sampler = feed.lidar, run.setup.sampler
+    streams = sorted({str(sampler.table.streams[stream]) for stream, _ in sensor.found.kinds})
+    return SensorReport(
+        name=sensor.name,
+        model=lidar.model,
+        lidar_id=number,
+        stream="; ".join(streams),
+        mode=lidar.mode,
+        ledger=feed.ledger,
+        clock=_clock(run, number),
+        extrinsics_source=sensor.extrinsics_source,
+        body_from_sensor=sensor.body_from_sensor,
+        calibration=lidar.calibration,
+    )
+
+
+def _clock(run: Conversion, number: int) -> ClockReport:
+    sensor, first = run.setup.sensors[number], run.batcher.firsts[number]
+    host = run.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
+    source = "host" if host else "sensor"
+    mode = sensor.found.lidar.timestamp_mode
+    notes = (f"timestamp mode {mode}",) if mode else ()
+    if first is None:
+        return ClockReport(source, "unknown", notes=notes)
+    return ClockReport(
+        source,
+        run.timescale_of(sensor, *first),
+        offset_to_host_ms=(first[0] - first[1]) / NS_PER_MS,
+        notes=notes,
+    )
+
+
+def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
+    setup, rows = run.setup, []
+    for kind, count in sorted(run.feeder.unassigned.items()):
+        stream = setup.sampler.table.streams[kind[0]]
+        what = "not seen in the first 10 s"
+        if kind in setup.sampler.samples:
+            what = discover.describe(setup.sampler, kind) or "unknown"
+        if kind in setup.ignored:
+            what = f"ignored: {what}"
+        elif kind in setup.not_in_rig:
+            what = f"not_in_rig: {what}"
+        rows.append(Unassigned(str(stream), count, f"{what} ({kind[1]} bytes)"))
+    return tuple(rows)
+
+
+def _timing(run: Conversion) -> Timing:
+    wall_s, cpu_s = run.elapsed_s
+    stages = run.stages
+    points = sum(feed.ledger.points.written for feed in run.feeds)
+    return Timing(
+        wall_s=wall_s,
+        cpu_s=cpu_s,
+        read_s=stages.read_s,
+        decode_s=stages.decode_s,
+        merge_s=stages.merge_s,
+        write_s=stages.write_s,
+        recorded_s=run.recorded_s,
+        points_per_s=points / wall_s if wall_s > 0 else 0.0,
+        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB,
+    )

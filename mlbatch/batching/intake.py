@@ -1,0 +1,203 @@
+"""What of a sensor's packets is let in: no duplicates, no wild stamps, clock resets named.
+
+CONTRACT.md section 1, `bad_stamp`; section 4, `duplicate`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.batching.loss import Loss
+from mlbatch.errors import ClockError
+from mlbatch.types import BoolArray, Heads, I64Array
+from mlbatch.units import NS_PER_S
+
+STEP_NS = NS_PER_S
+STAMP_LIMIT_NS = 2**31 * NS_PER_S
+# A packet is a duplicate of one that came at most this many packets of the sensor before: captures
+# of bridged ports repeat within milliseconds, while a 16-bit frame id comes back after hours.
+DUPLICATE_REACH = 1024
+NEVER = -(2**62)
+FOREVER = 2**62
+
+
+@dataclass(slots=True)
+class Arrival:
+    """Packets of one sensor in one batch, in order of arrival.
+
+    position: (P,) int64, place in the batch; host_ns: (P,) int64; key: (P,) int64, equal for
+    duplicates, negative for packets without identity; heads: their columns, sensor clock; place:
+    (P,) int64, where the packet's first column lies in the ring.
+    """
+
+    position: I64Array
+    host_ns: I64Array
+    key: I64Array
+    heads: Heads
+    place: I64Array
+
+    def take(self, index: BoolArray | I64Array) -> Arrival:
+        """The packets at `index`."""
+        heads = self.heads
+        return Arrival(
+            self.position[index],
+            self.host_ns[index],
+            self.key[index],
+            Heads(heads.stamp_ns[index], heads.encoder[index], heads.valid[index]),
+            self.place[index],
+        )
+
+
+def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
+    """Smallest and largest valid stamp of each packet; FOREVER and NEVER where none is valid."""
+    stamp, valid = heads.stamp_ns, heads.valid
+    if valid.all():
+        return stamp.min(axis=1, initial=FOREVER), stamp.max(axis=1, initial=NEVER)
+    low = np.where(valid, stamp, FOREVER).min(axis=1, initial=FOREVER)
+    high = np.where(valid, stamp, NEVER).max(axis=1, initial=NEVER)
+    return low, high
+
+
+class Intake:
+    """The door of one sensor; `rejected` counts what stays outside."""
+
+    def __init__(
+        self, name: str, *, host_clock: bool = False, offset_ns: int = 0, modulus: int = 0
+    ) -> None:
+        self.name = name
+        self.loss = Loss(modulus)
+        self.rejected: dict[str, int] = {}
+        self._host_clock = host_clock
+        self._offset_ns = offset_ns
+        self._newest = NEVER
+        self._held: Arrival | None = None
+        self._recent = np.empty(0, np.int64)
+
+    def accept(self, arrival: Arrival) -> Arrival:
+        """The accepted packets of a batch, stamps on the common clock, in order of delivery."""
+        arrival = arrival.take(self._distinct(arrival.key))
+        heads = arrival.heads
+        if self._offset_ns:
+            heads.stamp_ns = heads.stamp_ns + self._offset_ns
+        low, high = extremes(heads)
+        measured = high > NEVER
+        sane = (low >= 0) & (high < STAMP_LIMIT_NS) | ~measured
+        sane[sane] &= (high[sane] - low[sane] <= STEP_NS) | ~measured[sane]
+        self._reject("bad_stamp", len(sane) - int(np.count_nonzero(sane)))
+        if not sane.all():
+            arrival, low, high = arrival.take(sane), low[sane], high[sane]
+        if self._held is not None or self._steps(low, high).any():
+            arrival = self._judge(arrival)
+            low, high = extremes(arrival.heads)
+        self.loss.add(arrival.key)
+        self._newest = max(self._newest, int(high.max(initial=NEVER)))
+        if self._host_clock and len(high):
+            stamp = arrival.heads.stamp_ns
+            arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
+        return arrival
+
+    def finish(self) -> None:
+        """End of input: a packet that is still held was never confirmed."""
+        if self._held is not None:
+            self._reject("bad_stamp", 1)
+            self._held = None
+
+    def _reject(self, reason: str, count: int) -> None:
+        if count:
+            self.rejected[reason] = self.rejected.get(reason, 0) + count
+
+    def _distinct(self, key: I64Array) -> BoolArray:
+        """Which packets are not a repetition of one of the last DUPLICATE_REACH packets."""
+        known = len(self._recent)
+        keys = np.concatenate([self._recent, key])
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+        again = (ordered[1:] == ordered[:-1]) & (ordered[1:] >= 0)
+        again &= order[1:] - order[:-1] <= DUPLICATE_REACH
+        fresh = np.ones(len(keys), bool)
+        fresh[order[1:][again]] = False
+        self._recent = keys[-DUPLICATE_REACH:]
+        self._reject("duplicate", int(np.count_nonzero(~fresh[known:])))
+        return fresh[known:]
+
+    def _steps(self, low: I64Array, high: I64Array) -> BoolArray:
+        """Which packets step more than 1 s from the newest stamp before them, if none were held."""
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], high]))[:-1]
+        # The first packet of all has nothing to step from.
+        known, measured = newest > NEVER, high > NEVER
+        return known & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
+
+    def _judge(self, arrival: Arrival) -> Arrival:
+        """Hold packets that step, until the sensor's next one; packet by packet, since it is rare."""
+        rows = arrival if self._held is None else _joined(self._held, arrival)
+        low, high = extremes(rows.heads)
+        position = rows.position.copy()
+        held = None if self._held is None else 0
+        newest, accepted = self._newest, []
+        for row in range(0 if held is None else 1, len(high)):
+            lowest, highest = int(low[row]), int(high[row])
+            if highest > NEVER:
+                steps = newest > NEVER and (
+                    highest > newest + STEP_NS or lowest < newest - STEP_NS
+                )
+                if held is not None:
+                    first = self._first_stamp(rows, held)
+                    near = first - STEP_NS <= lowest and highest <= first + STEP_NS
+                    if steps and near:
+                        if first < newest:
+                            raise self._reset(newest, first)
+                        accepted.append(held)
+                        # It is let in together with the packet that confirms it.
+                        position[held] = position[row]
+                        newest, held = max(newest, int(high[held])), None
+                        steps = False
+                    else:
+                        self._reject("bad_stamp", 1)
+                        held = None
+                if steps:
+                    held = row
+                    continue
+                newest = max(newest, highest)
+            accepted.append(row)
+        self._held = None if held is None else _copied(rows, held)
+        rows.position = position
+        return rows.take(np.array(accepted, np.int64))
+
+    @staticmethod
+    def _first_stamp(rows: Arrival, row: int) -> int:
+        heads = rows.heads
+        return int(heads.stamp_ns[row][heads.valid[row]][0])
+
+    def _reset(self, newest: int, back: int) -> ClockError:
+        return ClockError(
+            f"sensor {self.name}: clock reset within the recording: stamps went back from "
+            f"{newest / NS_PER_S:.6f} s to {back / NS_PER_S:.6f} s; wanted one running clock; "
+            "cut the recording there, or use --clock host"
+        )
+
+    @property
+    def held_place(self) -> int | None:
+        """Ring place of the packet that is held, if any; its pixels must not be overwritten."""
+        return None if self._held is None else int(self._held.place[0])
+
+
+def _copied(rows: Arrival, row: int) -> Arrival:
+    return rows.take(np.array([row]))
+
+
+def _joined(first: Arrival, second: Arrival) -> Arrival:
+    one, two = first.heads, second.heads
+    heads = Heads(
+        np.concatenate([one.stamp_ns, two.stamp_ns]),
+        np.concatenate([one.encoder, two.encoder]),
+        np.concatenate([one.valid, two.valid]),
+    )
+    return Arrival(
+        np.concatenate([first.position, second.position]),
+        np.concatenate([first.host_ns, second.host_ns]),
+        np.concatenate([first.key, second.key]),
+        heads,
+        np.concatenate([first.place, second.place]),
+    )

@@ -1,0 +1,60 @@
+"""Packets lost and reordered on the way, from the sensor's own count."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.types import I64Array
+
+# A longer step is believed only if the next packet goes on from there: one flipped bit in a frame
+# number must not count as a million lost packets.
+BELIEVED_STEP = 1024
+
+
+class Loss:
+    """Counts gaps and backward steps in sequence numbers that wrap at `modulus` (0: none)."""
+
+    def __init__(self, modulus: int) -> None:
+        self.lost = 0
+        self.reordered = 0
+        self._modulus = modulus
+        self._newest: int | None = None
+        self._doubtful: int | None = None
+
+    def add(self, sequence: I64Array) -> None:
+        """Count accepted packets (n,), in order of arrival."""
+        if not self._modulus or not len(sequence):
+            return
+        if self._newest is None:
+            self._newest = int(sequence[0])
+            sequence = sequence[1:]
+        steps = np.diff(sequence, prepend=self._newest) % self._modulus
+        if self._doubtful is None and bool((steps == 1).all()):
+            if len(sequence):
+                self._newest = int(sequence[-1])
+            return
+        for number in sequence.tolist():
+            self._step(number)
+
+    def _step(self, number: int) -> None:
+        step = self._signed(number - (self._newest or 0))
+        if abs(step) > BELIEVED_STEP:
+            if self._doubtful is None or abs(self._signed(number - self._doubtful)) > BELIEVED_STEP:
+                self._doubtful = number
+                return
+            # A restart counts anew; a long gap is a gap.
+            if step > 0:
+                self.lost += step - 2
+            self._newest, self._doubtful = number, None
+            return
+        self._doubtful = None
+        if step > 0:
+            self.lost += step - 1
+            self._newest = number
+        elif step < 0:
+            self.reordered += 1
+            self.lost = max(0, self.lost - 1)
+
+    def _signed(self, step: int) -> int:
+        half = self._modulus // 2
+        return (step + half) % self._modulus - half

@@ -1,0 +1,44 @@
+"""The command line: options to calls, errors to exit codes; the only place that prints."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from mlbatch.errors import MlbatchError, UsageError
+
+EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+
+
+def main() -> None:
+    """Run the command line; exit codes are those of CONTRACT.md section 2."""
+    from mlbatch.cli.app import app
+
+    try:
+        app()
+    except UsageError as err:
+        _fail(str(err), EXIT_USAGE)
+    except MlbatchError as err:
+        _fail(str(err), EXIT_ERROR)
+    except KeyboardInterrupt:
+        _fail("interrupted; what was written stays under .partial", EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        # Whoever read our output closed it: nothing to say, and nowhere to say it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_ERROR)
+    except MemoryError:
+        _fail("out of memory; use a smaller --max-wait, or convert a part with --end", EXIT_ERROR)
+    except Exception as err:
+        if os.environ.get("MLBATCH_TRACEBACK"):
+            raise
+        _fail(
+            f"internal error, please report it: {type(err).__name__}: {err} "
+            "(MLBATCH_TRACEBACK=1 shows where)",
+            EXIT_ERROR,
+        )
+
+
+def _fail(message: str, code: int) -> None:
+    line = " ".join(message.split())
+    print(f"mlbatch: error: {line}", file=sys.stderr)
+    sys.exit(code)

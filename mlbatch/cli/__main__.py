@@ -1,0 +1,5 @@
+"""`python -m mlbatch.cli`."""
+
+from mlbatch.cli import main
+
+main()

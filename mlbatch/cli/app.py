@@ -1,0 +1,41 @@
+"""All commands; what they need is imported when they run, so that `--help` is quick."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import mlbatch
+from mlbatch.cli.convert import convert
+from mlbatch.cli.inspect import inspect
+from mlbatch.cli.sensors import sensors
+
+app = typer.Typer(
+    name="mlbatch",
+    help="Time-consistent merged scans from raw packets of many lidars, offline.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mlbatch {mlbatch.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Time-consistent merged scans from raw packets of many lidars, offline."""
+
+
+app.command()(convert)
+app.command()(inspect)
+app.command()(sensors)

@@ -1,0 +1,160 @@
+"""`mlbatch convert`: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from mlbatch.errors import UsageError
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline import Job
+
+_BYTES_PER_POINT = {"mcap": 24, "npz": 36, "ply": 30}
+
+
+def convert(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of one session: pcap or pcapng, .gz or .zst.")
+    ],
+    output: Annotated[
+        Optional[Path],
+        typer.Option("-o", "--output", help="A .mcap file, or a folder for one file a scan."),
+    ] = None,
+    rig: Annotated[Optional[Path], typer.Option(help="Rig file (YAML).")] = None,
+    rate: Annotated[
+        Optional[str], typer.Option(help="Scans a second, Hz: 10, 29.97, 10/3. [default: rig's, 10]")
+    ] = None,
+    format_: Annotated[
+        Optional[str],
+        typer.Option("--format", help="mcap, npz or ply. [default: by OUTPUT; a folder: npz]"),
+    ] = None,
+    layout: Annotated[
+        str, typer.Option(help="dense: valid points only; organized: slots x columns.")
+    ] = "dense",
+    point_layout: Annotated[
+        str, typer.Option(help="Fields of a PointCloud2 point (preset).")
+    ] = "standard",
+    slices: Annotated[int, typer.Option(min=1, max=10000, help="Partial scans a window.")] = 1,
+    split: Annotated[
+        bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
+    ] = False,
+    keep_partial: Annotated[
+        bool, typer.Option("--keep-partial", help="Also write the first and last, partial window.")
+    ] = False,
+    max_wait: Annotated[
+        str, typer.Option(help="Wait for a silent sensor so long, s of stamps, or inf.")
+    ] = "1.0",
+    start: Annotated[
+        Optional[str],
+        typer.Option(help="First window starts at or after: epoch s, ISO time (UTC), or +S."),
+    ] = None,
+    end: Annotated[Optional[str], typer.Option(help="Windows start before: as --start.")] = None,
+    clock: Annotated[
+        str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
+    ] = "sensor",
+    min_range: Annotated[float, typer.Option(min=0.0, help="Drop nearer points, m.")] = 0.0,
+    max_range: Annotated[
+        float, typer.Option(help="Drop farther points, m.", show_default="none")
+    ] = float("inf"),
+    exclude_box: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Drop points in x0,y0,z0,x1,y1,z1, m, body frame; repeatable."),
+    ] = None,
+    keep_repeated: Annotated[
+        bool, typer.Option("--keep-repeated", help="Keep the second of two equal returns.")
+    ] = False,
+    metadata: Annotated[
+        Optional[list[Path]],
+        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+    ] = None,
+    identity_extrinsics: Annotated[
+        bool, typer.Option("--identity-extrinsics", help="Sensors without extrinsics: at 0, 0, 0.")
+    ] = False,
+    decode: Annotated[
+        Optional[list[str]], typer.Option(help="KEY=VALUE for decoders: crc=check; repeatable.")
+    ] = None,
+    only: Annotated[
+        Optional[list[str]], typer.Option(help="Use this sensor (name or serial); repeatable.")
+    ] = None,
+    ignore: Annotated[
+        Optional[list[str]], typer.Option(help="Leave this sensor out; repeatable.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Do all but write; print the report.")
+    ] = False,
+    report: Annotated[Optional[Path], typer.Option(help="Where the report goes (JSON).")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; 1 in this version.")] = 1,
+    engine: Annotated[str, typer.Option(help="auto or numpy.")] = "auto",
+    strict: Annotated[
+        bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing output.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary, no progress.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Also say what was found and chosen.")
+    ] = False,
+) -> None:
+    """Turn raw lidar packets into merged scans at an exact rate."""
+    from mlbatch.cli import values
+    from mlbatch.cli.run import Wanted, run
+    from mlbatch.discover import Wishes
+    from mlbatch.pipeline import Job
+    from mlbatch.rate import parse_rate
+
+    values.choice("--layout", layout, ("dense", "organized"))
+    values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
+    values.choice("--clock", clock, ("sensor", "host"))
+    if jobs != 1:
+        raise UsageError(f"--jobs: wanted 1, got {jobs}; more than one is not in this version")
+    if output is None and not dry_run:
+        raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
+    if max_range <= min_range:
+        raise UsageError(
+            f"--max-range: wanted more than --min-range ({min_range} m), got {max_range} m; swap"
+        )
+    first, first_is_date = values.time_limit("--start", start)
+    last, last_is_date = values.time_limit("--end", end)
+    job = Job(
+        recordings=tuple(recordings),
+        wishes=Wishes(
+            rig=rig,
+            metadata=tuple(metadata or ()),
+            only=tuple(only or ()),
+            ignore=tuple(ignore or ()),
+            identity_extrinsics=identity_extrinsics,
+            decode=values.decode_options(decode or ()),
+        ),
+        rate=None if rate is None else parse_rate(rate),
+        slices=slices,
+        layout=layout,
+        split=split,
+        keep_partial=keep_partial,
+        keep_repeated=keep_repeated,
+        max_wait_ns=values.max_wait_ns(max_wait),
+        start=first,
+        end=last,
+        limits_are_dates=first_is_date or last_is_date,
+        host_clock=clock == "host",
+        min_range_m=min_range,
+        max_range_m=max_range,
+        boxes_m=tuple(values.box_m(text) for text in exclude_box or ()),
+        strict=strict,
+    )
+    run(
+        job,
+        Wanted(
+            output=output,
+            format=format_,
+            point_layout=point_layout,
+            dry_run=dry_run,
+            report=report,
+            overwrite=overwrite,
+            quiet=quiet,
+            verbose=verbose,
+        ),
+    )

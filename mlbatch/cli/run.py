@@ -1,0 +1,108 @@
+"""Running a conversion from the command line: progress, summary, report."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from mlbatch.pipeline import Conversion, Job, OpenWriter, Progress, convert
+from mlbatch.report import report_paths, report_text, summary_lines, write_text
+from mlbatch.types import RunInfo
+from mlbatch.writers import (
+    ScanWriter,
+    WriterOptions,
+    check_target,
+    choose_format,
+    open_writer,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Where the result goes and how much is said about it."""
+
+    output: Path | None
+    format: str | None
+    point_layout: str
+    dry_run: bool
+    report: Path | None
+    overwrite: bool
+    quiet: bool
+    verbose: bool
+
+
+def run(job: Job, wanted: Wanted) -> None:
+    """Convert, write the report, print the summary."""
+    opener, report_path = None, wanted.report
+    if wanted.output is not None and not wanted.dry_run:
+        name = choose_format(wanted.output, wanted.format)
+        options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
+        check_target(name, wanted.output, options, job.layout)
+        opener = _opener(name, wanted.output, options)
+        report_path = report_path or report_paths(wanted.output, name).report
+    with _progress(wanted.quiet) as progress:
+        conversion, inputs = convert(job, opener, progress)
+    for note in conversion.notes:
+        typer.echo(f"mlbatch: warning: {note.code}: {note.message}", err=True)
+    text = report_text(inputs)
+    if report_path is not None:
+        write_text(report_path, text)
+    elif wanted.dry_run:
+        typer.echo(text, nl=False)
+        return
+    if not wanted.quiet:
+        if wanted.verbose:
+            _tell(conversion)
+        for line in summary_lines(inputs):
+            if not line.startswith("warning "):
+                typer.echo(line)
+        if wanted.output is not None and not wanted.dry_run:
+            typer.echo(f"wrote {wanted.output}, report {report_path}")
+
+
+def _opener(name: str, target: Path, options: WriterOptions) -> OpenWriter:
+    def start(info: RunInfo) -> ScanWriter:
+        return open_writer(name, target, info, options)
+
+    return start
+
+
+def _tell(conversion: Conversion) -> None:
+    for sensor in conversion.setup.sensors:
+        lidar = sensor.found.lidar
+        typer.echo(
+            f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
+            f"extrinsics from {sensor.extrinsics_source}"
+        )
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Progress | None]:
+    """A progress bar with rate and remaining time, on a terminal only."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress as Bar,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    with Bar(
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("convert", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

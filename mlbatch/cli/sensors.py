@@ -1,0 +1,42 @@
+"""`mlbatch sensors`: the supported models."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+HEAD = ("model", "maker", "channels", "returns", "clock", "calibration", "verified")
+
+
+def sensors(
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """List the supported lidars, what they need, and how each was verified."""
+    from mlbatch.sensors import models
+
+    rows = [
+        {
+            "model": model.name,
+            "maker": model.maker,
+            "channels": model.channels,
+            "returns": list(model.returns),
+            "clock": model.clock,
+            "calibration": model.calibration,
+            "verified": model.verified,
+        }
+        for model in models()
+    ]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    from mlbatch.cli.tables import columns
+
+    cells = [[_cell(row[key]) for key in HEAD] for row in rows]
+    for line in columns([list(HEAD), *cells]):
+        typer.echo(line)
+
+
+def _cell(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,100 @@
+"""Option values from text, with errors that say what was wanted."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+
+from mlbatch.batching.batcher import Limit
+from mlbatch.errors import UsageError
+from mlbatch.units import NS_PER_S
+
+DECODE_KEYS = {
+    "firing_azimuth": ("on", "off"),
+    "vertical_offset": ("on", "off"),
+    "optical_centre": ("on", "off"),
+    "crc": ("check",),
+}
+
+
+def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
+    """A `--start`/`--end`: epoch seconds, ISO time, or +S; and whether it was a date."""
+    if text is None:
+        return None, False
+    relative = text.startswith("+")
+    try:
+        return Limit(int(Decimal(text) * NS_PER_S), from_t_init=relative), False
+    except (InvalidOperation, ValueError, OverflowError):
+        pass
+    try:
+        return Limit(_iso_ns(text)), True
+    except ValueError:
+        raise UsageError(
+            f"{option}: wanted epoch seconds, an ISO time or +SECONDS, got {text!r}; "
+            "write 1700000000.5, 2026-05-01T12:00:00 or +12.5"
+        ) from None
+
+
+def _iso_ns(text: str) -> int:
+    moment = datetime.datetime.fromisoformat(text.replace("Z", "+00:00"))
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.timezone.utc)
+    since = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+    return (since.days * 86400 + since.seconds) * NS_PER_S + since.microseconds * 1000
+
+
+def max_wait_ns(text: str) -> int | None:
+    """`--max-wait` in s; None for `inf`."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if math.isnan(seconds) or seconds <= 0:
+        raise UsageError(f"--max-wait: wanted seconds above 0, or inf, got {text!r}; write 1.0")
+    return None if math.isinf(seconds) else round(seconds * NS_PER_S)
+
+
+def box_m(text: str) -> tuple[float, ...]:
+    """`--exclude-box x0,y0,z0,x1,y1,z1`, metres in the body frame."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    ordered = len(values) == 6 and all(a < b for a, b in zip(values[:3], values[3:], strict=True))
+    if not ordered:
+        raise UsageError(
+            f"--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+            f"got {text!r}; write --exclude-box=-1,-1,0,1,1,2"
+        )
+    return values
+
+
+def decode_options(texts: Sequence[str]) -> dict[str, str]:
+    """`--decode KEY=VALUE`, repeatable."""
+    options = {}
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if key not in DECODE_KEYS:
+            raise UsageError(
+                f"--decode: wanted one of {', '.join(DECODE_KEYS)}, got {key!r}; "
+                "write --decode crc=check"
+            )
+        if not sign or value not in DECODE_KEYS[key]:
+            raise UsageError(
+                f"--decode {key}: wanted {' or '.join(DECODE_KEYS[key])}, got {value!r}; "
+                f"write --decode {key}={DECODE_KEYS[key][0]}"
+            )
+        options[key] = value
+    return options
+
+
+def choice(option: str, text: str, allowed: Sequence[str], later: Sequence[str] = ()) -> str:
+    """One of a few words; `later` are announced, but not in this version."""
+    if text in allowed:
+        return text
+    note = " (not in this version)" if text in later else ""
+    raise UsageError(
+        f"{option}: wanted {' or '.join(allowed)}, got {text!r}{note}; choose one of them"
+    )

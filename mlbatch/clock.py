@@ -1,0 +1,29 @@
+"""What a sensor's stamps count: decided by their value and by the recorder's clock.
+
+facts/ouster.md section 7: the mode a sensor was set to does not prove what it does; its values do.
+"""
+
+from __future__ import annotations
+
+from mlbatch.units import NS_PER_S
+
+# Stamps below 1e9 s (2001) cannot be today's time: the sensor counts from power-on.
+EPOCH_NS = 10**9 * NS_PER_S
+# TAI - UTC since 2017-01-01 (IERS Bulletin C 52).
+TAI_UTC_NS = 37 * NS_PER_S
+NEAR_NS = 2 * NS_PER_S
+
+
+def timescale(stamp_ns: int, host_ns: int) -> str:
+    """`utc`, `tai`, `uptime` or `unknown`, for a stamp and the arrival of its packet (UTC)."""
+    if stamp_ns < EPOCH_NS:
+        return "uptime"
+    for name, offset_ns in (("utc", 0), ("tai", TAI_UTC_NS)):
+        if abs(stamp_ns - host_ns - offset_ns) < NEAR_NS:
+            return name
+    return "unknown"
+
+
+def common_timescale(names: list[str]) -> str:
+    """The timescale of a scan made of several sensors: theirs if they agree, else unknown."""
+    return names[0] if len(set(names)) == 1 else "unknown"

@@ -1,0 +1,282 @@
+"""What a recording knows of itself: its sensors, their calibrations and extrinsics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch import sensors
+from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.lidar import Calibration
+from mlbatch.readers import merge
+from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig
+from mlbatch.types import F64Array, Recording, StreamTable
+from mlbatch.units import NS_PER_S
+
+LOOK_NS = 10 * NS_PER_S
+# Metadata is searched beside the recording under these suffixes, and told by content.
+SIDECAR_SUFFIXES = (".json",)
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What the user said of the sensors, besides the rig."""
+
+    rig: Path | None = None
+    metadata: tuple[Path, ...] = ()
+    only: tuple[str, ...] = ()
+    ignore: tuple[str, ...] = ()
+    identity_extrinsics: bool = False
+    decode: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A warning: a short code, the sensor it is about (or ""), one line for a person."""
+
+    code: str
+    sensor: str
+    message: str
+
+
+@dataclass(slots=True)
+class Mounted:
+    """A sensor with its place on the body and its wishes from the rig (or their defaults)."""
+
+    found: Found
+    body_from_sensor: F64Array
+    extrinsics_source: str
+    rig: RigSensor | None = None
+
+    @property
+    def name(self) -> str:
+        """Name in all outputs."""
+        return self.found.name
+
+
+@dataclass(slots=True)
+class Setup:
+    """All sensors of a session, ready to convert."""
+
+    sensors: list[Mounted]
+    frame_id: str
+    router: Router
+    sampler: Sampler
+    notes: list[Note]
+    rig: Rig | None = None
+    not_in_rig: set[Kind] = field(default_factory=set)
+    ignored: set[Kind] = field(default_factory=set)
+
+
+def look(recordings: Sequence[Recording], table: StreamTable) -> Sampler:
+    """Look at the first 10 s of a session."""
+    sampler = Sampler(table)
+    for batch in merge(list(recordings), until_ns=LOOK_NS):
+        sampler.add(batch)
+    return sampler
+
+
+def calibrations_for(
+    recordings: Sequence[Path], given: Sequence[Path]
+) -> tuple[list[Calibration], list[Path]]:
+    """Calibrations that were given, else those beside the recordings; and the files looked at."""
+    if given:
+        return [_read_given(path) for path in given], list(given)
+    looked: list[Path] = []
+    for folder in dict.fromkeys(recording.parent for recording in recordings):
+        looked += sorted(p for p in folder.iterdir() if p.suffix.lower() in SIDECAR_SUFFIXES)
+    found = []
+    for path in looked:
+        # A file beside the recording was never named by the user, so a foreign one is no error.
+        try:
+            calibration = sensors.read_calibration(path)
+        except RigError:
+            continue
+        if calibration is not None:
+            found.append(calibration)
+    return found, looked
+
+
+def _read_given(path: Path) -> Calibration:
+    calibration = sensors.read_calibration(path)
+    if calibration is None:
+        raise RigError(
+            f"{path}: wanted the metadata or calibration of a lidar, got another kind of file; "
+            "give the file that the sensor's driver or recorder saved"
+        )
+    return calibration
+
+
+def discover(
+    recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
+) -> Setup:
+    """Find the sensors of a session; errors name what is missing and the ways to give it."""
+    rig = None if wishes.rig is None else read_rig(wishes.rig)
+    sampler = look(recordings, table)
+    paths = [recording.path for recording in recordings]
+    calibrations, looked = calibrations_for(paths, wishes.metadata)
+    if rig is None or wishes.rig is None:
+        found, unknown = match(sampler, calibrations, wishes.decode)
+        rigged: list[RigSensor | None] = [None] * len(found)
+    else:
+        rigged = list(rig.sensors)
+        found, unknown = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
+    lidar_kinds = [kind for kind in unknown if _is_lidar(sampler, kind)]
+    if not any(sensor.kinds for sensor in found):
+        raise _nothing_found(sampler, paths, lidar_kinds, looked)
+    notes = [] if rig is not None else [_unmatched(sampler, kind, looked) for kind in lidar_kinds]
+    chosen = _choose(found, wishes)
+    ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
+    rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
+    router = Router(table, chosen, has_rig=rig is not None)
+    mounted = _mount(chosen, rigged, wishes)
+    setup = Setup(mounted, _frame(mounted, rig), router, sampler, notes, ignored=ignored)
+    if rig is not None:
+        setup.rig = rig
+        setup.not_in_rig = set(lidar_kinds)
+    for sensor in mounted:
+        notes += [Note("calibration", sensor.name, text) for text in sensor.found.lidar.notes]
+        if not sensor.found.kinds:
+            notes.append(
+                Note("not_seen_yet", sensor.name, "no packet of it in the first 10 seconds")
+            )
+    return setup
+
+
+def _find_rigged(
+    sampler: Sampler, rig: Rig, origin: Path, calibrations: Sequence[Calibration], wishes: Wishes
+) -> tuple[list[Found], list[Kind]]:
+    wanted = [
+        Wanted(
+            sensor.name,
+            sensor.stream or StreamSelector(),
+            calibrations if sensor.metadata is None else [_read_given(sensor.metadata)],
+            wishes.decode | sensor.decode,
+        )
+        for sensor in rig.sensors
+    ]
+    return match_rig(sampler, wanted, origin)
+
+
+def _is_lidar(sampler: Sampler, kind: Kind) -> bool:
+    """Whether a maker's module takes packets that no calibration fits for those of a lidar."""
+    what = describe(sampler, kind)
+    return what is not None and "lidar" in what
+
+
+def describe(sampler: Sampler, kind: Kind) -> str | None:
+    """What the packets of a kind look like, in words; None: like nothing we know."""
+    evidence = sampler.evidence(kind)
+    return sensors.describe(evidence.size, evidence.sample)
+
+
+def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[Path]) -> Note:
+    stream = sampler.table.streams[kind[0]]
+    return Note(
+        "no_metadata",
+        "",
+        f"{stream}: {describe(sampler, kind)}: no metadata fits among {_files(looked)}; "
+        "its packets are counted as unassigned; give --metadata FILE",
+    )
+
+
+def _nothing_found(
+    sampler: Sampler, paths: Sequence[Path], lidar_kinds: Sequence[Kind], looked: Sequence[Path]
+) -> RecordingError:
+    where = ", ".join(str(path) for path in paths)
+    if lidar_kinds:
+        kind = lidar_kinds[0]
+        stream = sampler.table.streams[kind[0]]
+        return RecordingError(
+            f"{where}: {stream} carries {describe(sampler, kind)}, but no metadata fits it; "
+            f"looked at {_files(looked)}; give the sensor's metadata with --metadata FILE"
+        )
+    seen = [
+        f"{sampler.table.streams[kind[0]]} ({kind[1]} bytes: {describe(sampler, kind) or 'unknown'})"
+        for kind in sampler.samples
+    ]
+    return RecordingError(
+        f"{where}: no lidar packets; wanted raw UDP packets of a supported lidar "
+        f"(see `mlbatch sensors`), got {_some(seen) or 'no UDP packet at all'}; "
+        "check that the recording holds the sensor's data port"
+    )
+
+
+def _files(paths: Sequence[Path]) -> str:
+    return _some([path.name for path in paths]) or "no file (none beside the recording)"
+
+
+def _some(words: Sequence[str], most: int = 4) -> str:
+    text = ", ".join(words[:most])
+    return text if len(words) <= most else f"{text} and {len(words) - most} more"
+
+
+def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
+    """Apply --only and --ignore; both take names and serial numbers."""
+    known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
+    for option, words in (("--only", wishes.only), ("--ignore", wishes.ignore)):
+        for word in words:
+            if word not in known:
+                raise UsageError(
+                    f"{option} {word}: wanted the name of a sensor, one of "
+                    f"{', '.join(sensor.name for sensor in found)}, got {word}"
+                )
+    chosen = [
+        sensor
+        for sensor in found
+        if (not wishes.only or {sensor.name, sensor.lidar.serial} & set(wishes.only))
+        and not {sensor.name, sensor.lidar.serial} & set(wishes.ignore)
+    ]
+    if not chosen:
+        raise UsageError("--only/--ignore: wanted at least one sensor to convert, none is left")
+    return chosen
+
+
+def _mount(
+    found: Sequence[Found], rigged: Sequence[RigSensor | None], wishes: Wishes
+) -> list[Mounted]:
+    """Give every sensor its extrinsics: rig, then metadata, else refuse (identity for one)."""
+    mounted, missing = [], []
+    for sensor, entry in zip(found, rigged, strict=True):
+        matrix, source = sensor.lidar.extrinsics, "metadata"
+        if entry is not None and isinstance(entry.extrinsics, str):
+            raise RigError(
+                f"sensor {sensor.name}: extrinsics by frame ({entry.extrinsics}) need a recording "
+                "with /tf_static, which captures do not have; give translation_m and a rotation"
+            )
+        if entry is not None and entry.extrinsics is not None:
+            matrix, source = np.asarray(entry.extrinsics, np.float64), "rig"
+        if matrix is None:
+            missing.append(sensor.name)
+            matrix, source = np.eye(4), "identity"
+        mounted.append(Mounted(sensor, matrix, source, entry))
+    if missing and len(found) > 1 and not wishes.identity_extrinsics:
+        raise RigError(
+            f"extrinsics unknown for {', '.join(missing)}; wanted for every sensor when there are "
+            "two or more; give them in a rig file (--rig) or in the metadata (ouster-sdk "
+            "extrinsic), or accept the body origin with --identity-extrinsics"
+        )
+    return mounted
+
+
+def _frame(mounted: Sequence[Mounted], rig: Rig | None) -> str:
+    """Body frame of the output; a single sensor without extrinsics keeps its own."""
+    if rig is not None:
+        return rig.body_frame
+    if len(mounted) == 1 and mounted[0].extrinsics_source == "identity":
+        return mounted[0].name
+    return DEFAULT_BODY_FRAME
+
+
+def absent(sensor: Mounted, rig: Path | None) -> RigError:
+    """The error about a sensor of the rig that sent nothing."""
+    selector = sensor.rig.stream if sensor.rig is not None else None
+    return RigError(
+        f"{rig}: sensor {sensor.name}: wanted its packets, got none from "
+        f"{selector or sensor.found.lidar.calibration}; correct its stream or serial, or set "
+        "`optional: true`"
+    )

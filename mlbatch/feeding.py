@@ -1,0 +1,119 @@
+"""From batches of packets to arrivals of sensors: routing, first checks, raw pixels into rings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mlbatch.batching.intake import Arrival
+from mlbatch.discover import Setup
+from mlbatch.ledger import SensorLedger
+from mlbatch.lidar import FAULTS, Lidar
+from mlbatch.ring import RawRing
+from mlbatch.streams import Kind, Role, split_by_kind
+from mlbatch.types import BoolArray, I64Array, ImuSamples, PacketBatch
+
+
+@dataclass(slots=True)
+class Feed:
+    """One sensor's way into the batching."""
+
+    lidar: Lidar
+    ring: RawRing
+    ledger: SensorLedger = field(default_factory=SensorLedger)
+
+
+@dataclass(slots=True)
+class Fed:
+    """What a batch brought: an arrival for each sensor (or None), and IMU samples."""
+
+    arrivals: list[Arrival | None]
+    imu: list[ImuSamples]
+
+
+class Feeder:
+    """Sorts packets to their sensors; what belongs to none is counted in `unassigned`."""
+
+    def __init__(self, setup: Setup, feeds: Sequence[Feed], *, host_clock: bool) -> None:
+        self.unassigned: dict[Kind, int] = {}
+        self._router = setup.router
+        self._feeds = list(feeds)
+        self._host_clock = host_clock
+
+    def feed(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Fed:
+        """Route a batch, copy lidar packets to their rings and read their heads."""
+        own: list[list[I64Array]] = [[] for _ in self._feeds]
+        fed = Fed([None] * len(self._feeds), [])
+        owned = np.zeros(len(batch), bool)
+        shared: list[tuple[Kind, I64Array]] = []
+        for kind, index in split_by_kind(batch):
+            begin = int(batch.start[index[0]])
+            route = self._router.route(kind, batch.data[begin : begin + kind[1]])
+            if route.role is Role.LIDAR:
+                shared.append((kind, index))
+                for number in route.sensors:
+                    own[number].append(index)
+            elif route.role is Role.IMU:
+                fed.imu += self._imu(batch, index, route.sensors[0])
+            elif route.role is Role.BAD_SIZE:
+                packets = self._feeds[route.sensors[0]].ledger.packets
+                packets.read += len(index)
+                packets.reject("bad_size", len(index))
+            else:
+                self._unassign(kind, len(index))
+        for number, parts in enumerate(own):
+            if parts:
+                index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
+                fed.arrivals[number] = self._arrive(
+                    number, batch, index, owned, oldest_places[number]
+                )
+        for kind, index in shared:
+            self._unassign(kind, len(index) - int(np.count_nonzero(owned[index])))
+        return fed
+
+    def _unassign(self, kind: Kind, count: int) -> None:
+        if count:
+            self.unassigned[kind] = self.unassigned.get(kind, 0) + count
+
+    def _arrive(
+        self,
+        number: int,
+        batch: PacketBatch,
+        index: I64Array,
+        owned: BoolArray,
+        oldest_place: int | None,
+    ) -> Arrival:
+        feed = self._feeds[number]
+        lidar, counts = feed.lidar, feed.ledger.packets
+        packets, place = feed.ring.store(batch.data, batch.start[index], oldest_place)
+        mine = lidar.owns(packets) & ~owned[index]
+        owned[index[mine]] = True
+        faults = lidar.faults(packets)
+        counts.read += int(np.count_nonzero(mine))
+        for fault, count in enumerate(np.bincount(faults[mine])):
+            if fault:
+                counts.reject(FAULTS[fault], int(count))
+        good = mine & (faults == 0)
+        if not good.all():
+            packets, place, index = packets[good], place[good], index[good]
+        return Arrival(
+            position=index,
+            host_ns=batch.host_ns[index],
+            key=lidar.sequence(packets),
+            heads=lidar.heads(packets),
+            place=place,
+        )
+
+    def _imu(self, batch: PacketBatch, index: I64Array, number: int) -> list[ImuSamples]:
+        feed = self._feeds[number]
+        feed.ledger.imu_packets += len(index)
+        samples = []
+        for at in index.tolist():
+            begin = int(batch.start[at])
+            sample = feed.lidar.imu(batch.data[begin : begin + int(batch.size[at])], number)
+            if self._host_clock and len(sample.stamp_ns):
+                sample.stamp_ns = sample.stamp_ns + (int(batch.host_ns[at]) - sample.stamp_ns[-1])
+            samples.append(sample)
+        return samples

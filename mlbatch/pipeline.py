@@ -1,0 +1,406 @@
+"""The main job: packets in, scans out; the only place that knows all stages."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch import accounts
+from mlbatch.batching.batcher import Batcher, Limit, Policy, Window
+from mlbatch.batching.grid import Grid
+from mlbatch.batching.intake import Intake
+from mlbatch.clock import common_timescale, timescale
+from mlbatch.decode import Decoder, Due, Label, Source
+from mlbatch.discover import Mounted, Note, Setup, Wishes, absent, discover
+from mlbatch.errors import PacketError, RecordingError, UsageError
+from mlbatch.feeding import Feed, Feeder
+from mlbatch.rate import rate_text
+from mlbatch.readers import merge, open_recording
+from mlbatch.report import ReportInputs, imbalances, report_text
+from mlbatch.ring import RawRing
+from mlbatch.scan_table import ScanTable
+from mlbatch.types import (
+    F64Array,
+    ImuSamples,
+    PacketBatch,
+    Recording,
+    RunInfo,
+    Scan,
+    SensorInfo,
+    StreamTable,
+    Summary,
+)
+from mlbatch.units import NS_PER_S
+from mlbatch.writers import ScanWriter
+
+DEFAULT_RATE = Fraction(10)
+DEFAULT_MAX_WAIT_NS = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
+
+    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6).
+    """
+
+    recordings: tuple[Path, ...]
+    wishes: Wishes = field(default_factory=Wishes)
+    rate: Fraction | None = None
+    slices: int = 1
+    layout: str = "dense"
+    split: bool = False
+    keep_partial: bool = False
+    keep_repeated: bool = False
+    max_wait_ns: int | None = DEFAULT_MAX_WAIT_NS
+    start: Limit | None = None
+    end: Limit | None = None
+    limits_are_dates: bool = False
+    host_clock: bool = False
+    min_range_m: float = 0.0
+    max_range_m: float = float("inf")
+    boxes_m: tuple[tuple[float, ...], ...] = ()
+    strict: bool = False
+
+
+@dataclass(slots=True)
+class Stages:
+    """Seconds spent in each stage."""
+
+    read_s: float = 0.0
+    decode_s: float = 0.0
+    merge_s: float = 0.0
+    write_s: float = 0.0
+
+
+OpenWriter = Callable[[RunInfo], ScanWriter]
+Progress = Callable[[int, int], None]
+
+
+class Conversion:
+    """One run; `scans` drives it, the rest tells what came of it."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.stages = Stages()
+        self.table: ScanTable | None = None
+        self.info: RunInfo | None = None
+        self.recordings: list[Recording] = []
+        self._started_s = (time.perf_counter(), time.process_time())
+        self._hosts_ns: tuple[int, int] | None = None
+        self._notes: list[Note] = []
+        streams = StreamTable()
+        self.recordings = [open_recording(path, streams) for path in job.recordings]
+        self.setup: Setup = discover(self.recordings, streams, job.wishes)
+        self._prepare()
+        for note in self.setup.notes:
+            self.warn(note)
+
+    def _prepare(self) -> None:
+        job, rig = self.job, self.setup.rig
+        rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
+        self.grid = Grid(rate, job.slices)
+        self.feeds = [_feed(sensor) for sensor in self.setup.sensors]
+        intakes = [
+            _intake(sensor, job.host_clock) for sensor in self.setup.sensors
+        ]
+        policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
+        self.batcher = Batcher(self.grid, intakes, policy)
+        self.feeder = Feeder(self.setup, self.feeds, host_clock=job.host_clock)
+        self._decoders: list[Decoder] = []
+        self._imu: list[ImuSamples] = []
+        if job.max_wait_ns is None:
+            self.warn(
+                Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent")
+            )
+
+    # -- the run ------------------------------------------------------------------------------
+
+    def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
+        """Yield every scan and, with split, the sensor it is of; arrays live until the next."""
+        size = sum(recording.size_bytes for recording in self.recordings)
+        batches = merge(self.recordings)
+        while (batch := self._read(batches)) is not None:
+            yield from self._windows(self._push(batch))
+            if progress is not None:
+                progress(sum(r.position_bytes for r in self.recordings), size)
+            if self.batcher.past_end:
+                break
+        last = self._hosts_ns[1] if self._hosts_ns is not None else 0
+        yield from self._windows(self.batcher.finish(last))
+        self._close()
+
+    def _read(self, batches: Iterator[PacketBatch]) -> PacketBatch | None:
+        with self._timed("read_s"):
+            batch = next(batches, None)
+        if batch is not None and len(batch):
+            first = int(batch.host_ns[0]) if self._hosts_ns is None else self._hosts_ns[0]
+            self._hosts_ns = first, int(batch.host_ns[-1])
+        return batch
+
+    def _push(self, batch: PacketBatch) -> Iterator[Window]:
+        with self._timed("merge_s"):
+            places = [self.batcher.oldest_place(number) for number in range(len(self.feeds))]
+            fed = self.feeder.feed(batch, places)
+            self._imu += fed.imu
+            if self.job.strict:
+                self._refuse_rejected()
+        return self.batcher.push(fed.arrivals, batch.host_ns)
+
+    def _windows(self, windows: Iterator[Window]) -> Iterator[tuple[Scan, int | None]]:
+        while True:
+            with self._timed("merge_s"):
+                window = next(windows, None)
+            if window is None:
+                return
+            if self.info is None:
+                self._begin()
+            yield from self._decode(window)
+
+    def _decode(self, window: Window) -> Iterator[tuple[Scan, int | None]]:
+        label = Label(
+            window.index,
+            window.slice,
+            window.start_ns,
+            window.end_ns,
+            window.complete,
+            window.ready_host_ns,
+        )
+        for number, decoder in enumerate(self._decoders):
+            only = number if self.job.split else None
+            due = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
+            if only is not None:
+                own = window.sensor == only
+                if not own.any():
+                    continue
+                due = Due(
+                    window.stamp_ns[own],
+                    np.zeros(int(np.count_nonzero(own)), np.int64),
+                    window.place[own],
+                    window.encoder[own],
+                )
+            with self._timed("decode_s"):
+                scan = decoder.scan(due, label)
+            self._account(scan)
+            yield scan, only
+
+    def _account(self, scan: Scan) -> None:
+        for feed, count in zip(self.feeds, scan.columns_per_sensor, strict=True):
+            feed.ledger.columns.written += count
+        if self.table is not None:
+            self.table.add(scan)
+
+    def _begin(self) -> None:
+        """What needs the clocks to be known: the timescale, and with it all labels of scans."""
+        names = []
+        for sensor, stamps in zip(self.setup.sensors, self.batcher.firsts, strict=True):
+            if stamps is not None:
+                names.append(self.timescale_of(sensor, *stamps))
+        shared = common_timescale(names)
+        if len(set(names)) > 1:
+            self.warn(
+                Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}")
+            )
+        if self.job.limits_are_dates and shared not in ("utc", "tai"):
+            raise UsageError(
+                f"--start/--end: wanted seconds, since the sensors' clock ({shared}) knows no "
+                "date, got a date; write +SECONDS after the first scan"
+            )
+        self.info = _run_info(self.setup, self.job, self.grid, shared)
+        self.table = ScanTable(self.info)
+        boxes_m = _boxes(self.setup, self.job)
+        sources = [
+            _source(sensor, feed, info.ring_base, self.job)
+            for sensor, feed, info in zip(
+                self.setup.sensors, self.feeds, self.info.sensors, strict=True
+            )
+        ]
+        if self.job.split:
+            for number, source in enumerate(sources):
+                source.ring_base = 0
+                self._decoders.append(Decoder(self.info, [source], boxes_m, only=number))
+        else:
+            self._decoders = [Decoder(self.info, sources, boxes_m)]
+
+    def timescale_of(self, sensor: Mounted, stamp_ns: int, host_ns: int) -> str:
+        """Timescale of a sensor's stamps as they are batched."""
+        if self.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host"):
+            return timescale(host_ns, host_ns)
+        return timescale(stamp_ns, host_ns)
+
+    def imu_until(self, end_ns: int | None) -> list[ImuSamples]:
+        """Take IMU samples before `end_ns` (None: all), by stamp, then sensor."""
+        ready, later = [], []
+        for samples in self._imu:
+            due = len(samples.stamp_ns) == 0 or end_ns is None or samples.stamp_ns[0] < end_ns
+            (ready if due else later).append(samples)
+        self._imu = later
+        ready = [samples for samples in ready if len(samples.stamp_ns)]
+        return sorted(ready, key=lambda samples: (int(samples.stamp_ns[0]), samples.sensor))
+
+    # -- the end ------------------------------------------------------------------------------
+
+    def _close(self) -> None:
+        """Bring the ledgers together, and refuse what the contract calls no result."""
+        for number, feed in enumerate(self.feeds):
+            ledger = feed.ledger
+            for reason, count in self.batcher.rejected[number].items():
+                ledger.packets.reject(reason, count)
+            ledger.packets.accepted = ledger.packets.read - sum(ledger.packets.rejected.values())
+            ledger.packets.lost, ledger.packets.reordered = self.batcher.loss(number)
+            ledger.columns.decoded = self.batcher.decoded[number]
+            for reason, count in self.batcher.dropped[number].items():
+                ledger.columns.drop(reason, count)
+            ledger.points = self._points(number)
+        if self.job.strict:
+            self._refuse_rejected()
+        for sensor, feed in zip(self.setup.sensors, self.feeds, strict=True):
+            if sensor.rig is not None and not sensor.rig.optional and not feed.ledger.packets.read:
+                raise absent(sensor, self.job.wishes.rig)
+        if self.table is None or not self.table.rows:
+            raise RecordingError(accounts.why_nothing(self))
+
+    def _points(self, number: int) -> accounts.PointCounts:
+        if not self._decoders:
+            return accounts.PointCounts()
+        if self.job.split:
+            return self._decoders[number].counts[0]
+        return self._decoders[0].counts[number]
+
+    def _refuse_rejected(self) -> None:
+        for number, sensor in enumerate(self.setup.sensors):
+            rejected = self.feeds[number].ledger.packets.rejected | self.batcher.rejected[number]
+            for reason, count in rejected.items():
+                raise PacketError(
+                    f"sensor {sensor.name}: {count} packet(s) rejected as {reason} while --strict "
+                    "was given; leave it out to count them and go on"
+                )
+
+    def warn(self, note: Note) -> None:
+        """Note a warning; with --strict it is an error."""
+        if self.job.strict:
+            raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
+        self._notes.append(note)
+
+    @property
+    def notes(self) -> Sequence[Note]:
+        """Warnings so far."""
+        return self._notes
+
+    @property
+    def elapsed_s(self) -> tuple[float, float]:
+        """Wall and CPU time since the start."""
+        wall_s, cpu_s = self._started_s
+        return time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+    @property
+    def recorded_s(self) -> float:
+        """Length of what was read, by the recorder's clock."""
+        if self._hosts_ns is None:
+            return 0.0
+        return (self._hosts_ns[1] - self._hosts_ns[0]) / NS_PER_S
+
+    @contextlib.contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent_s = time.perf_counter() - began_s
+            setattr(self.stages, stage, getattr(self.stages, stage) + spent_s)
+
+
+def convert(
+    job: Job,
+    open_writer: OpenWriter | None,
+    progress: Progress | None = None,
+) -> tuple[Conversion, ReportInputs]:
+    """Run a job; open_writer None is a dry run. Gives the run and what its report is made of."""
+    run = Conversion(job)
+    writer: ScanWriter | None = None
+    try:
+        for scan, only in run.scans(progress):
+            if open_writer is None:
+                run.imu_until(scan.end_ns)
+                continue
+            began_s = time.perf_counter()
+            if writer is None:
+                writer = open_writer(scan.info)
+            for samples in run.imu_until(scan.end_ns):
+                writer.write_imu(samples)
+            writer.write(scan, only)
+            run.stages.write_s += time.perf_counter() - began_s
+        began_s = time.perf_counter()
+        if writer is not None:
+            for samples in run.imu_until(None):
+                writer.write_imu(samples)
+        inputs = accounts.report_inputs(run)
+        broken = imbalances(inputs)
+        if broken:
+            raise RecordingError(f"the ledger does not balance, please report: {broken[0]}")
+        if writer is not None:
+            table = run.table.text() if run.table is not None else ""
+            report = report_text(inputs, machine=False)
+            writer.finish(Summary(run.batcher.t_init_ns, report, table))
+            writer = None
+            run.stages.write_s += time.perf_counter() - began_s
+            inputs = accounts.report_inputs(run)
+    finally:
+        if writer is not None:
+            writer.abandon()
+    return run, inputs
+
+
+def _feed(sensor: Mounted) -> Feed:
+    lidar = sensor.found.lidar
+    return Feed(lidar, RawRing(lidar.packet_size, lidar.record_start, lidar.record_size))
+
+
+def _intake(sensor: Mounted, host_clock: bool) -> Intake:
+    rig, lidar = sensor.rig, sensor.found.lidar
+    return Intake(
+        sensor.name,
+        host_clock=host_clock or (rig is not None and rig.clock == "host"),
+        offset_ns=0 if rig is None else rig.offset_ns,
+        modulus=lidar.sequence_modulus,
+    )
+
+
+def _source(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
+    rig = sensor.rig
+    low = [job.min_range_m, 0.0 if rig is None else rig.min_range_m or 0.0]
+    high = [job.max_range_m, float("inf") if rig is None else rig.max_range_m or float("inf")]
+    return Source(feed.lidar, feed.ring, sensor.body_from_sensor, ring_base, max(low), min(high))
+
+
+def _boxes(setup: Setup, job: Job) -> F64Array:
+    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
+    if setup.rig is None:
+        return boxes_m
+    return np.concatenate([setup.rig.exclude_boxes_m, boxes_m])
+
+
+def _run_info(setup: Setup, job: Job, grid: Grid, scale: str) -> RunInfo:
+    sensors, ring_base = [], 0
+    for sensor in setup.sensors:
+        lidar = sensor.found.lidar
+        sensors.append(
+            SensorInfo(
+                sensor.name,
+                lidar.model,
+                lidar.channels,
+                lidar.returns,
+                0 if job.split else ring_base,
+                sensor.body_from_sensor,
+            )
+        )
+        ring_base += lidar.channels
+    return RunInfo(
+        tuple(sensors), setup.frame_id, rate_text(grid.rate), scale, job.slices, job.layout
+    )
