@@ -1,0 +1,73 @@
+"""All makers' modules behind one door: models, calibration files, names of unknown streams.
+
+A module of this package without a leading underscore is a plug-in, found by its name. It offers
+what `Plugin` lists.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol, cast
+
+from mlbatch.errors import RigError
+from mlbatch.lidar import Calibration, SensorModel
+from mlbatch.types import U8Array
+
+# No calibration file comes near; what is larger is a recording or something else altogether.
+MAX_CALIBRATION_BYTES = 16_000_000
+
+
+class Plugin(Protocol):
+    """What a maker's module offers."""
+
+    MAKER: str
+    MODELS: tuple[SensorModel, ...]
+
+    def read_calibration(self, path: Path, content: bytes) -> Calibration | None:
+        """The calibration in a file; None if it is not this maker's, RigError if unusable."""
+        ...
+
+    def describe(self, size: int, sample: U8Array) -> str | None:
+        """What payloads (k, size) of an unknown stream are; None if not this maker's."""
+        ...
+
+
+@lru_cache(maxsize=1)
+def plugins() -> tuple[Plugin, ...]:
+    """The makers' modules, in the order of their names."""
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return tuple(
+        cast(Plugin, importlib.import_module(f"{__name__}.{name}"))
+        for name in names
+        if not name.startswith("_")
+    )
+
+
+def models() -> tuple[SensorModel, ...]:
+    """All supported models."""
+    return tuple(model for plugin in plugins() for model in plugin.MODELS)
+
+
+def read_calibration(path: Path) -> Calibration | None:
+    """The calibration in a file of any maker, or None if it is none; RigError if unreadable."""
+    try:
+        if not path.is_file():
+            kind = "a directory" if path.is_dir() else "no such file"
+            raise RigError(f"{path}: wanted a calibration file, got {kind}; check the path")
+        with path.open("rb") as file:
+            content = file.read(MAX_CALIBRATION_BYTES + 1)
+    except OSError as err:
+        raise RigError(f"{path}: cannot read the calibration file: {err.strerror}") from err
+    if len(content) > MAX_CALIBRATION_BYTES:
+        return None
+    found = (plugin.read_calibration(path, content) for plugin in plugins())
+    return next((calibration for calibration in found if calibration is not None), None)
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """What payloads (k, size) of an unknown stream are, or None if no maker knows them."""
+    found = (plugin.describe(size, sample) for plugin in plugins())
+    return next((text for text in found if text is not None), None)

@@ -1,0 +1,204 @@
+"""Every real Ouster recording against the maker's own decoder, field by field."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from mlbatch.lidar import Evidence
+from mlbatch.sensors import read_calibration
+from mlbatch.sensors._crc import crc64
+from mlbatch.sensors.ouster import OusterCalibration, OusterLidar
+from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array, U16Array
+from tests.unit.sensors.captures import CASES, OUSTER, Case, Reference, needs_recordings
+
+pytestmark = needs_recordings
+MAX_XYZ_ERROR_M = 1e-4
+MAX_TABLE_ERROR_M = 1e-9
+
+
+def calibration_of(case: Case) -> OusterCalibration:
+    found = read_calibration(case.metadata_path)
+    assert isinstance(found, OusterCalibration)
+    return found
+
+
+@lru_cache(maxsize=1)
+def loaded(case: Case) -> tuple[OusterCalibration, OusterLidar, U8Array, Reference]:
+    calibration = calibration_of(case)
+    lidar = calibration.lidar({"crc": "check"})
+    return calibration, lidar, case.payloads(lidar.packet_size), case.arrays()
+
+
+def records_of(lidar: OusterLidar, packets: U8Array) -> U8Array:
+    size = lidar.columns_per_packet * lidar.record_size
+    body = packets[:, lidar.record_start : lidar.record_start + size]
+    return np.ascontiguousarray(body.reshape(-1, lidar.record_size))
+
+
+def decoded(
+    lidar: OusterLidar, records: U8Array, which: int
+) -> tuple[F32Array, F32Array, U16Array]:
+    shape = (len(records), lidar.channels)
+    reflectivity = np.zeros(shape, np.uint16)
+    out = Pixels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), reflectivity)
+    lidar.read(records, which, out)
+    return out.range_m, out.intensity, reflectivity
+
+
+def frames_of(lidar: OusterLidar, packets: U8Array, reference: Reference) -> tuple[list[int], int]:
+    """Index of each packet's frame in the reference, and packets per frame."""
+    per_frame = lidar.sequence_modulus // 2 ** (32 if "FUSA" in lidar.mode else 16)
+    frame_ids = (lidar.sequence(packets) // per_frame).tolist()
+    return [reference["frame_id"].tolist().index(number) for number in frame_ids], per_frame
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
+class TestEveryRecording:
+    def test_stamps_ids_and_validity_of_every_column(self, case: Case) -> None:
+        _, lidar, packets, reference = loaded(case)
+        heads = lidar.heads(packets)
+        frames, _ = frames_of(lidar, packets, reference)
+        assert len(packets)
+        for frame, stamp_ns, mid, valid in zip(
+            frames, heads.stamp_ns, heads.encoder, heads.valid, strict=True
+        ):
+            # Columns outside the azimuth window are sent, but the reference leaves them out.
+            kept = reference["valid"][frame, mid]
+            assert (valid == kept).all()
+            assert (reference["measurement_id"][frame, mid[kept]] == mid[kept]).all()
+            told = reference["timestamp_ns"][frame, mid[kept]].astype(np.int64)
+            assert (told == stamp_ns[kept]).all()
+        assert heads.valid.sum() == reference["valid"].sum()
+
+    def test_ranges_signal_and_reflectivity_of_every_pixel(self, case: Case) -> None:
+        _, lidar, packets, reference = loaded(case)
+        heads = lidar.heads(packets)
+        frames, _ = frames_of(lidar, packets, reference)
+        frame = np.repeat(frames, lidar.columns_per_packet)[heads.valid.ravel()]
+        mid = heads.encoder[heads.valid]
+        records = records_of(lidar, packets)[heads.valid.ravel()]
+        for which in range(lidar.returns):
+            range_m, intensity, reflectivity = decoded(lidar, records, which)
+            wanted_mm = reference["range_mm"][frame, :, mid, which]
+            # float64 division rounded to float32: no double rounding occurs for 20-bit integers.
+            assert np.array_equal(range_m, (wanted_mm / 1000).astype(np.float32))
+            wanted = reference["reflectivity"][frame, :, mid, which]
+            assert np.array_equal(reflectivity, wanted)
+            if "signal" in reference:
+                wanted = reference["signal"][frame, :, mid, which]
+            assert np.array_equal(intensity, wanted.astype(np.float32))
+
+    def test_xyz_as_the_reference_has_it(self, case: Case) -> None:
+        _, lidar, _, reference = loaded(case)
+        table = lidar.beams
+        frame, which = 0, 0
+        range_m = reference["range_mm"][frame, :, :, which].T / 1000
+        hit = range_m > 0
+        xyz = projected(lidar, range_m)
+        wanted = np.moveaxis(reference["xyz_m"][frame, :, :, which], 1, 0)
+        assert hit.any()
+        assert np.abs(xyz - wanted)[hit].max() < MAX_XYZ_ERROR_M
+        assert len(table.angle_rad) == range_m.shape[0]
+
+    def test_the_table_equals_the_formula(self, case: Case) -> None:
+        _, lidar, _, reference = loaded(case)
+        range_m = np.full((len(lidar.beams.angle_rad), lidar.channels), 17.25)
+        wanted = formula_m(reference, range_m)
+        assert np.abs(projected(lidar, range_m) - wanted).max() < MAX_TABLE_ERROR_M
+
+    def test_calibration_as_the_reference_fills_it_in(self, case: Case) -> None:
+        calibration, lidar, _, reference = loaded(case)
+        described = calibration.metadata
+        degrees = np.degrees
+        for ours, theirs in (
+            (degrees(described.altitude_rad), reference["beam_altitude_angles_deg"]),
+            (degrees(described.azimuth_rad), reference["beam_azimuth_angles_deg"]),
+            (described.beam_offset_m[0] * 1e3, reference["lidar_origin_to_beam_origin_mm"]),
+            (in_mm(described.lidar_to_sensor), reference["lidar_to_sensor_transform"]),
+            (in_mm(lidar.sensor_from_imu()), reference["imu_to_sensor_transform"]),
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+
+    def test_no_packet_is_faulty_or_foreign(self, case: Case) -> None:
+        _, lidar, packets, _ = loaded(case)
+        assert not lidar.faults(packets).any()
+        assert lidar.owns(packets).all()
+
+    def test_sequence_counts_packets_without_a_gap(self, case: Case) -> None:
+        _, lidar, packets, _ = loaded(case)
+        assert (np.diff(lidar.sequence(packets)) % lidar.sequence_modulus == 1).all()
+        assert (lidar.sequence(packets) < lidar.sequence_modulus).all()
+
+    def test_the_metadata_fit_their_packets(self, case: Case) -> None:
+        calibration, lidar, packets, _ = loaded(case)
+        assert calibration.fit(Evidence(Stream("", 1), lidar.packet_size, packets[:4])) >= 1
+
+
+def in_mm(pose: F64Array) -> F64Array:
+    scaled: F64Array = pose.copy()
+    scaled[:3, 3] *= 1000
+    return scaled
+
+
+def projected(lidar: OusterLidar, range_m: F64Array) -> F64Array:
+    """Ranges (W, H) through the beam table in float64: (W, H, 3)."""
+    table = lidar.beams
+    cosine, sine = np.cos(table.angle_rad)[:, None, None], np.sin(table.angle_rad)[:, None, None]
+    direction = cosine * table.direction[0] + sine * table.direction[1] + table.direction[2]
+    origin = cosine * table.origin[0] + sine * table.origin[1] + table.origin[2]
+    xyz: F64Array = (range_m + table.reach_m)[:, :, None] * direction + origin
+    return xyz
+
+
+def formula_m(reference: Reference, range_m: F64Array) -> F64Array:
+    """Section 6 of the fact sheet as it is printed, column by column, in mm."""
+    columns, beams = range_m.shape
+    n = float(reference["lidar_origin_to_beam_origin_mm"])
+    transform = reference["lidar_to_sensor_transform"]
+    a = np.array([-math.radians(v) for v in reference["beam_azimuth_angles_deg"]])
+    p = np.array([math.radians(v) for v in reference["beam_altitude_angles_deg"]])
+    xyz = np.empty((columns, beams, 3))
+    for mid in range(columns):
+        theta = 2 * math.pi * (1 - mid / columns)
+        r = range_m[mid] * 1000
+        x = (r - n) * np.cos(theta + a) * np.cos(p) + n * math.cos(theta)
+        y = (r - n) * np.sin(theta + a) * np.cos(p) + n * math.sin(theta)
+        z = (r - n) * np.sin(p)
+        xyz[mid] = (np.stack([x, y, z], 1) @ transform[:3, :3].T + transform[:3, 3]) / 1000
+    return xyz
+
+
+@pytest.mark.parametrize(("folder", "count"), [(CASES[0].folder, 34), (CASES[-1].folder, 1)])
+def test_checksums_of_recent_firmware(folder: str, count: int) -> None:
+    case = next(case for case in reversed(CASES) if case.folder == folder)
+    packets = case.payloads(calibration_of(case).metadata.layout.packet_size)
+    told = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
+    assert len(packets) == count
+    assert (crc64(packets[:, :-8]) == told).all()
+
+
+def test_checksum_of_an_imu_and_a_zone_packet() -> None:
+    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    for size, count in ((452, 8), (680, 1)):
+        packets = case.payloads(size)
+        told = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
+        assert len(packets) == count
+        assert (crc64(packets[:, :-8]) == told).all()
+
+
+def test_a_changed_packet_is_told_by_its_checksum_only_if_asked() -> None:
+    calibration = calibration_of(CASES[0])
+    packets = CASES[0].payloads(calibration.metadata.layout.packet_size)
+    packets[3, 777] ^= 4
+    assert calibration.lidar({"crc": "check"}).faults(packets).tolist() == [0] * 3 + [3] + [0] * 30
+    assert not calibration.lidar({}).faults(packets).any()
+
+
+def test_foreign_json_beside_the_recordings_is_no_calibration() -> None:
+    paths = [*OUSTER.glob("*/*digest.json"), *OUSTER.glob("*/extrinsic_parameters.json")]
+    assert len(paths) == 4
+    assert [read_calibration(path) for path in paths] == [None] * 4
