@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mlbatch._yaml import Node, short
+from mlbatch._yaml import Node
 from mlbatch.errors import RigError, UsageError
 from mlbatch.rate import parse_rate
 from mlbatch.transforms import from_quaternion, from_rpy_deg, rigid
@@ -38,7 +38,8 @@ EXCLUDES = {
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _FRAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _TEXT = re.compile(r"\S(.*\S)?")
-_WORD = re.compile(r"[^\s\x00-\x1f]+")
+# Neither blanks nor control characters, nor halves of characters, which no output could hold.
+_WORD = re.compile(r"[^\s\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -102,7 +103,7 @@ def existing_file(node: Node) -> Path:
     path = node.file.parent / node.word("a file name", _TEXT)
     if not os.path.isfile(path):
         remedy = "give its path relative to the rig file"
-        raise node.error("an existing file", short(str(path)), remedy)
+        raise node.error("an existing file", f"none at {str(path)!r}", remedy)
     return path
 
 

@@ -114,11 +114,10 @@ class Node:
 
     def number(self) -> float:
         """A number in float64."""
-        exact = self.exact()
-        # float() rounds once and correctly; a Fraction of 1e999 would raise OverflowError.
+        self.exact()
         value = float(self.text)
-        if not math.isfinite(value) or (value == 0.0 and exact != 0):
-            raise self.error("a finite number", self.shown, "write a smaller number of digits")
+        if not math.isfinite(value):
+            raise self.error("a finite number", self.shown, "give one that float64 can hold")
         return value
 
     def whole(self, low: int, high: int) -> int:
