@@ -1,0 +1,115 @@
+"""Several recordings as one session: packets in the order of their arrival at the recorder.
+
+The order depends on host times alone, then on the order of the recordings; where a recording's own
+times step back, its packets keep their order and count with the largest time so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mlbatch.readers._bytes import SLACK, copy_runs
+from mlbatch.types import I64Array, PacketBatch, Recording, U8Array
+
+
+def merge(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
+    """Yield all packets of all recordings; a single recording passes through untouched.
+
+    A recording is opened when its time has come: memory holds those that overlap, not all.
+    """
+    if len(recordings) == 1:
+        yield from recordings[0].packets()
+        return
+    feeds = [_Feed.peek(recording) for recording in recordings]
+    out = np.zeros(0, np.uint8)
+    while waiting := [feed for feed in feeds if not feed.ended]:
+        # The feed that ends first bounds what is known; of equals, the first in order.
+        slowest = min(waiting, key=lambda feed: feed.known_until_ns)
+        bound_ns, before = slowest.known_until_ns, True
+        ready = []
+        for feed in waiting:
+            before = before and feed is not slowest
+            ready.append(feed.take(bound_ns, inclusive=before or feed is slowest))
+        ready = [(batch, key) for batch, key in ready if len(batch)]
+        if len(ready) == 1:
+            yield ready[0][0]
+        elif ready:
+            batch, out = _interleave(ready, out)
+            yield batch
+        slowest.advance()
+
+
+@dataclass(slots=True)
+class _Feed:
+    """One recording's packets that are known and not yet given out.
+
+    key_ns: (n,) largest host time up to each packet of `batch`; known_until_ns: no later packet
+    of this recording can come before it.
+    """
+
+    recording: Recording
+    known_until_ns: int = 0
+    ended: bool = False
+    batch: PacketBatch | None = None
+    key_ns: I64Array = field(default_factory=lambda: np.zeros(0, np.int64))
+    _source: Iterator[PacketBatch] | None = None
+
+    @classmethod
+    def peek(cls, recording: Recording) -> _Feed:
+        """A feed that knows its first packet's time, but holds no buffer yet."""
+        packets = recording.packets(until_ns=0)
+        first = next((batch for batch in packets if len(batch)), None)
+        if first is None:
+            return cls(recording, ended=True)
+        known_until_ns = int(first.host_ns[0])
+        # Closing ends the look ahead, and gives its buffer back.
+        del packets
+        return cls(recording, known_until_ns)
+
+    def take(self, bound_ns: int, inclusive: bool) -> tuple[PacketBatch, I64Array]:
+        """The packets up to `bound_ns`, with their keys; they are then given out."""
+        if self.batch is None:
+            return _NOTHING, self.key_ns
+        stop = int(np.searchsorted(self.key_ns, bound_ns, side="right" if inclusive else "left"))
+        given, key = self.batch.take(slice(0, stop)), self.key_ns[:stop]
+        self.batch, self.key_ns = self.batch.take(slice(stop, None)), self.key_ns[stop:]
+        return given, key
+
+    def advance(self) -> None:
+        """Get the next batch; its bytes replace those of the one before."""
+        if self._source is None:
+            self._source = self.recording.packets()
+        batch = next((batch for batch in self._source if len(batch)), None)
+        if batch is None:
+            self.ended, self.batch, self._source = True, None, None
+            return
+        largest = np.maximum.accumulate(batch.host_ns)
+        self.batch, self.key_ns = batch, np.maximum(largest, self.known_until_ns)
+        self.known_until_ns = int(self.key_ns[-1])
+
+
+def _interleave(
+    ready: list[tuple[PacketBatch, I64Array]], out: U8Array
+) -> tuple[PacketBatch, U8Array]:
+    """One batch in the order of keys, its payloads copied to `out` (grown where it is small)."""
+    size = np.concatenate([batch.size for batch, _ in ready])
+    end = np.cumsum(size)
+    start = end - size
+    if len(out) < end[-1] + SLACK:
+        out = np.zeros(int(end[-1]) * 3 // 2 + SLACK, np.uint8)
+    first = 0
+    for batch, _ in ready:
+        rows = slice(first, first + len(batch))
+        copy_runs(batch.data, batch.start, batch.size, out, start[rows])
+        first += len(batch)
+    order = np.argsort(np.concatenate([key for _, key in ready]), kind="stable")
+    stream = np.concatenate([batch.stream for batch, _ in ready])
+    host_ns = np.concatenate([batch.host_ns for batch, _ in ready])
+    return PacketBatch(out, start, size, stream, host_ns).take(order), out
+
+
+_NONE = np.zeros(0, np.int64)
+_NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)

@@ -1,0 +1,108 @@
+"""pcap files of libpcap: microseconds or nanoseconds, either byte order.
+
+Layout: draft-ietf-opsawg-pcap, sections 4 (file header) and 5 (packet record).
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RecordingError
+from mlbatch.readers import _links
+from mlbatch.readers._bytes import records
+from mlbatch.readers._capture import MAX_FRAME_BYTES, CaptureRecording, Walk
+from mlbatch.readers._frames import Frames
+from mlbatch.readers._source import read_head
+from mlbatch.types import I64Array, Recording, StreamTable, U8Array
+from mlbatch.units import NS_PER_S, NS_PER_US
+
+CONTAINER = "pcap"
+
+# Magic as it stands in the file: byte order and nanoseconds per unit of the fraction.
+_MAGIC = {
+    b"\xd4\xc3\xb2\xa1": ("<", NS_PER_US),
+    b"\xa1\xb2\xc3\xd4": (">", NS_PER_US),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+# Alexey Kuznetzov's variant with longer record headers, written by some old Linux tools.
+_MODIFIED = (b"\x34\xcd\xb2\xa1", b"\xa1\xb2\xcd\x34")
+_FILE_HEADER_BYTES = 24
+_LINK_AT = 20
+_RECORD_BYTES = 16
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a pcap file."""
+    return head[:4] in _MAGIC or head[:4] in _MODIFIED
+
+
+def open_packets(path: Path, streams: StreamTable) -> Recording:
+    """Open a pcap file; its payloads come from streams (source IP, destination port)."""
+    head = read_head(path)
+    if head[:4] in _MODIFIED:
+        raise RecordingError(
+            f"{path}: wanted a pcap file, got the modified kind (magic a1b2cd34); "
+            f"convert it: editcap -F pcap {path.name} plain.pcap"
+        )
+    if head[:4] not in _MAGIC or len(head) < _FILE_HEADER_BYTES:
+        raise RecordingError(
+            f"{path}: wanted a pcap header of {_FILE_HEADER_BYTES} bytes, got {len(head)} "
+            f"({head[:8].hex(' ')}); record or copy it again"
+        )
+    order, unit_ns = _MAGIC[head[:4]]
+    link = struct.unpack_from(order + "I", head, _LINK_AT)[0] & 0xFFFF
+    if link not in _links.LINKS:
+        raise RecordingError(f"{path}: {_links.unknown_link(link)}")
+    walker = partial(_Walker, order, unit_ns, link)
+    return CaptureRecording(path, CONTAINER, path.stat().st_size, walker, streams)
+
+
+class _Walker:
+    """Steps from record to record."""
+
+    def __init__(self, order: str, unit_ns: int, link: int) -> None:
+        names = ("seconds", "fraction", "captured", "original")
+        self.layout = np.dtype([(name, order + "u4") for name in names])
+        self.length = struct.Struct(order + "I")
+        self.unit_ns = unit_ns
+        self.link = link
+        self.skip = _FILE_HEADER_BYTES
+
+    def walk(self, data: U8Array, begin: int, end: int) -> Walk:
+        """The frames in `data[begin:end]`, as far as their records are whole."""
+        begin, self.skip = begin + self.skip, 0
+        starts = self._starts(data, begin, end)
+        record = records(data, self.layout, starts)
+        captured = record["captured"].astype(np.int64)
+        after = starts + _RECORD_BYTES + captured
+        lies = np.flatnonzero(captured > MAX_FRAME_BYTES)
+        count = int(lies[0]) if len(lies) else int(np.searchsorted(after, end, side="right"))
+        frames = Frames(
+            start=starts[:count] + _RECORD_BYTES,
+            captured=captured[:count],
+            original=record["original"][:count].astype(np.int64),
+            link=np.full(count, self.link, np.int64),
+            host_ns=record["seconds"][:count].astype(np.int64) * NS_PER_S
+            + record["fraction"][:count].astype(np.int64) * self.unit_ns,
+        )
+        place = int(after[count - 1]) if count else begin
+        need = int(captured[count]) + _RECORD_BYTES if count < len(starts) else 0
+        if not len(lies):
+            return Walk(frames, place, need)
+        fault = f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {captured[count]}"
+        return Walk(frames, place, fault=fault)
+
+    def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
+        """Where records begin whose headers are whole; the last one's frame may be cut off."""
+        view, length_at = data.data, self.length.unpack_from
+        starts = []
+        at = begin
+        while at <= end - _RECORD_BYTES:
+            starts.append(at)
+            at += _RECORD_BYTES + length_at(view, at + 8)[0]
+        return np.array(starts, np.int64)
