@@ -15,12 +15,12 @@ from mlbatch.writers._atomic import (
     side_path,
     write_text,
 )
+from mlbatch.types import RunInfo
+from mlbatch.writers._atomic import check_free_space, discard
 from mlbatch.writers._options import ScanWriter, WriterModule, WriterOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from mlbatch.types import RunInfo
 
 __all__ = [
     "ReportPaths",
@@ -101,6 +101,16 @@ def report_paths(target: Path, name: str) -> ReportPaths:
     if plugin(name).SUFFIX is None:
         return ReportPaths(target / REPORT_JSON, target / SCANS_CSV)
     return ReportPaths(side_path(target, REPORT_JSON), side_path(target, SCANS_CSV))
+
+
+def check_target(name: str, target: Path, options: WriterOptions, layout: str) -> None:
+    """Refuse at the start what could not be written at the end.
+
+    The surest way to know that an output can be opened is to open it; what that made is removed.
+    """
+    info = RunInfo((), "", "10", "unknown", layout=layout)
+    open_writer(name, target, info, replace(options, split=False)).abandon()
+    discard(target)
 
 
 def _refuse_file_name(target: Path, suffix: str) -> None:

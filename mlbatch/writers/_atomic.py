@@ -100,6 +100,13 @@ def prepare(target: Path, overwrite: bool, folder: bool) -> Output:
     return Output(target, partial, overwrite)
 
 
+def discard(target: Path) -> None:
+    """Remove the `.partial` of an output that will not be."""
+    partial = target.with_name(target.name + PARTIAL_SUFFIX)
+    with export_errors(partial):
+        _remove(partial)
+
+
 def side_path(target: Path, name: str) -> Path:
     """Where `name` lies beside an output that is a file."""
     return target.with_name(f"{target.name}.{name}")

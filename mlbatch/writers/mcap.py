@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, cast
 
-import mlbatch
 from mlbatch.errors import UsageError
 from mlbatch.types import ImuSamples, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import (
@@ -24,12 +21,10 @@ from mlbatch.writers._atomic import (
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._ros2_messages import CloudMessage, imu_message, static_transforms
-from mlbatch.writers._ros2_types import definition, qos
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
 
-CHUNK_BYTES = 4 * 2**20
 # IMU samples that may wait for the first scan: minutes at the rates of built-in IMUs.
 WAITING_SAMPLES = 65536
 
@@ -49,6 +44,9 @@ class McapWriter:
     """Writes a run; IMU samples wait for the first scan, since /tf_static precedes everything."""
 
     def __init__(self, target: Path, info: RunInfo, options: WriterOptions, layout: Layout) -> None:
+        # The library comes in here, so that naming the format does not load it.
+        from mlbatch.writers._mcap_file import Container
+
         self._info = info
         self._cloud = CloudMessage(layout, info.frame_id)
         self._waiting: list[ImuSamples] = []
@@ -129,52 +127,3 @@ class McapWriter:
             "timescale": info.timescale,
             "frame_id": info.frame_id,
         }
-
-
-class Container:
-    """The MCAP file itself: topics, numbers and chunks, by the reference library."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        from mcap.writer import CompressionType, Writer
-
-        self._writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        self._writer.start(profile="ros2", library=f"mlbatch {mlbatch.__version__}")
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._sent: dict[str, int] = {}
-
-    def send(
-        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
-    ) -> None:
-        """Append a message of type `kind`; a topic is made at its first message."""
-        if topic not in self._channels:
-            self._open_topic(topic, kind, latched)
-        # The library only copies what it is given into its chunk: any buffer will do.
-        data = cast(bytes, message)
-        self._writer.add_message(self._channels[topic], log_ns, data, log_ns, self._sent[topic])
-        self._sent[topic] += 1
-
-    def note(self, name: str, values: dict[str, str]) -> None:
-        """Append a metadata record."""
-        self._writer.add_metadata(name, values)
-
-    def attach(self, name: str, media_type: str, log_ns: int, text: str) -> None:
-        """Append a text as an attachment."""
-        # Time 0 means unknown: files must not depend on when they were written.
-        self._writer.add_attachment(0, log_ns, name, media_type, text.encode())
-
-    def finish(self) -> None:
-        """Append the index."""
-        finish: Callable[[], None] = self._writer.finish
-        finish()
-
-    def _open_topic(self, topic: str, kind: str, latched: bool) -> None:
-        if kind not in self._schemas:
-            name = kind.replace("/", "/msg/")
-            text = definition(kind).encode()
-            self._schemas[kind] = self._writer.register_schema(name, "ros2msg", text)
-        metadata = {"offered_qos_profiles": qos(latched)}
-        self._channels[topic] = self._writer.register_channel(
-            topic, "cdr", self._schemas[kind], metadata
-        )
-        self._sent[topic] = 0

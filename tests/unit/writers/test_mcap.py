@@ -14,6 +14,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
 
 from mlbatch.types import Scan, Summary
 from mlbatch.writers import WriterOptions, open_writer
@@ -251,15 +252,35 @@ def test_metadata_and_table_of_scans(tmp_path: Path) -> None:
 
 
 def test_files_are_chunked_and_indexed(tmp_path: Path) -> None:
-    path = written(tmp_path, *(dense_scan(index, 80_000) for index in range(6)))
+    # 24 bytes a point: three scans of 1.92 MB end a chunk each, ten of 0.48 MB collect in chunks
+    # that end above 4 MiB, after the ninth; the last holds the tenth and an IMU sample.
+    large = [dense_scan(index, 80_000) for index in range(3)]
+    small = [dense_scan(index, 20_000) for index in range(3, 13)]
+    path = written(tmp_path, *large, *small)
     with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        found = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
     assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == 1 + 3 + 6
-    # 6 x 1.92 MB in chunks that close above 4 MiB, and the last IMU sample.
-    assert summary.statistics.chunk_count == 3
-    assert all(index.message_index_offsets for index in summary.chunk_indexes)
+    statistics = summary.statistics
+    assert statistics is not None
+    assert statistics.message_count == len(found) == 1 + 3 + 13
+    assert statistics.message_start_time == START_NS - 5
+    assert statistics.message_end_time == START_NS + 12 * PERIOD_NS
+    assert statistics.chunk_count == len(summary.chunk_indexes) == 3 + 2
+    clouds = [message.data for topic, message in found if topic == "/points"]
+    for data, scan in zip(clouds, [*large, *small], strict=True):
+        last = struct.unpack("<fff", data[-25:-13])
+        assert last == tuple(scan.xyz[-1].tolist())
+
+
+def test_records_follow_each_other_without_gaps(tmp_path: Path) -> None:
+    path = written(tmp_path, dense_scan(0, 80_000), dense_scan(1, 100))
+    with path.open("rb") as file:
+        records = list(StreamReader(file, validate_crcs=True).records)
+    assert type(records[0]).__name__ == "Header"
+    assert type(records[-1]).__name__ == "Footer"
+    assert sum(isinstance(record, Message) for record in records) == 6
 
 
 def test_rosbags_reads_every_message(tmp_path: Path) -> None:

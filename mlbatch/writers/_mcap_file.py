@@ -1,0 +1,208 @@
+"""The MCAP container: records, chunks and index (MCAP specification, mcap.dev/spec).
+
+Records are encoded by the reference library. Chunks are not: it would copy every scan three times,
+while here a large message goes from the buffer it was assembled in straight to the file.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterable
+from typing import BinaryIO
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+import mlbatch
+from mlbatch.writers._ros2_types import definition, qos
+
+CHUNK_BYTES = 4 * 2**20
+# Messages of this size end the chunk they are in; smaller ones are collected.
+LARGE_BYTES = 2**20
+# Opcode, length of what follows, channel, sequence, log time, publish time.
+_MESSAGE = struct.Struct("<BQHIQQ")
+# Opcode, length of what follows, first and last log time, size, CRC, empty name of a compression,
+# size again: that of the records, which are not compressed.
+_CHUNK = struct.Struct("<BQQQQIIQ")
+_RECORD_HEAD = 9  # opcode and length, not counted in the length
+# What the CRC of the summary covers of the footer: all but the CRC itself.
+_FOOTER_HEAD = struct.Struct("<BQQQ")
+_FOOTER_LENGTH = 20
+
+
+class Container:
+    """Topics, messages in chunks, metadata and attachments of one file."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._at = 0
+        self._schemas: dict[str, Schema] = {}
+        self._channels: dict[str, Channel] = {}
+        self._sent: dict[int, int] = {}
+        self._span_ns = (0, 0)
+        self._chunk = bytearray()
+        self._chunk_index: dict[int, MessageIndex] = {}
+        self._chunks: list[ChunkIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._put(MCAP0_MAGIC)
+        self._put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
+
+    def send(
+        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+    ) -> None:
+        """Append a message of type `kind`; a topic is made at its first message."""
+        channel = self._channels.get(topic) or self._open_topic(topic, kind, latched)
+        index = self._chunk_index.setdefault(channel.id, MessageIndex(channel.id, []))
+        index.records.append((log_ns, len(self._chunk)))
+        length = _MESSAGE.size - _RECORD_HEAD + len(message)
+        sent = self._sent.get(channel.id, 0)
+        self._sent[channel.id] = sent + 1
+        self._chunk += _MESSAGE.pack(Opcode.MESSAGE, length, channel.id, sent, log_ns, log_ns)
+        if len(message) >= LARGE_BYTES:
+            self._end_chunk(message)
+            return
+        self._chunk += message
+        if len(self._chunk) >= CHUNK_BYTES:
+            self._end_chunk(b"")
+
+    def note(self, name: str, values: dict[str, str]) -> None:
+        """Append a metadata record."""
+        self._end_chunk(b"")
+        data = encoded(Metadata(name, values))
+        self._metadata.append(MetadataIndex(self._at, len(data), name))
+        self._put(data)
+
+    def attach(self, name: str, media_type: str, log_ns: int, text: str) -> None:
+        """Append a text as an attachment."""
+        self._end_chunk(b"")
+        content = text.encode()
+        # Time 0 means unknown: files must not depend on when they were written.
+        data = encoded(Attachment(0, log_ns, name, media_type, content))
+        self._attachments.append(
+            AttachmentIndex(self._at, len(data), 0, log_ns, len(content), name, media_type)
+        )
+        self._put(data)
+
+    def finish(self) -> None:
+        """Append the index; the file itself stays open."""
+        self._end_chunk(b"")
+        self._put(encoded(DataEnd(0)))
+        start, summary, offsets = self._at, b"", b""
+        for opcode, records in self._groups():
+            data = b"".join(map(encoded, records))
+            if data:
+                offsets += encoded(SummaryOffset(opcode, start + len(summary), len(data)))
+            summary += data
+        offsets_start = start + len(summary)
+        head = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, offsets_start)
+        crc = zlib.crc32(summary + offsets + head)
+        self._put(summary + offsets + encoded(Footer(start, offsets_start, crc)) + MCAP0_MAGIC)
+
+    def _open_topic(self, topic: str, kind: str, latched: bool) -> Channel:
+        schema = self._schemas.get(kind)
+        if schema is None:
+            name, text = kind.replace("/", "/msg/"), definition(kind).encode()
+            schema = Schema(len(self._schemas) + 1, text, "ros2msg", name)
+            self._schemas[kind] = schema
+            self._chunk += encoded(schema)
+        metadata = {"offered_qos_profiles": qos(latched)}
+        number = len(self._channels) + 1
+        channel = Channel(number, topic, "cdr", metadata, schema.id)
+        self._channels[topic] = channel
+        self._chunk += encoded(channel)
+        return channel
+
+    def _end_chunk(self, tail: bytes | memoryview) -> None:
+        """Write the chunk under construction, `tail` being its last bytes, and its index."""
+        if not self._chunk_index:
+            return
+        times_ns = [log_ns for index in self._chunk_index.values() for log_ns, _ in index.records]
+        first_ns, last_ns = min(times_ns), max(times_ns)
+        size = len(self._chunk) + len(tail)
+        length = _CHUNK.size - _RECORD_HEAD + size
+        crc = zlib.crc32(tail, zlib.crc32(self._chunk))
+        start = self._at
+        self._put(_CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, crc, 0, size))
+        self._put(self._chunk)
+        self._put(tail)
+        index_start = self._at
+        offsets = {}
+        for number, index in self._chunk_index.items():
+            offsets[number] = self._at
+            self._put(encoded(index))
+        self._note_chunk(
+            ChunkIndex(
+                chunk_length=index_start - start,
+                chunk_start_offset=start,
+                compression="",
+                compressed_size=size,
+                message_end_time=last_ns,
+                message_index_length=self._at - index_start,
+                message_index_offsets=offsets,
+                message_start_time=first_ns,
+                uncompressed_size=size,
+            )
+        )
+
+    def _note_chunk(self, chunk: ChunkIndex) -> None:
+        """Keep what the summary needs of a chunk and start the next one."""
+        first_ns, last_ns = chunk.message_start_time, chunk.message_end_time
+        if self._chunks:
+            first_ns, last_ns = min(first_ns, self._span_ns[0]), max(last_ns, self._span_ns[1])
+        self._span_ns = (first_ns, last_ns)
+        self._chunks.append(chunk)
+        self._chunk.clear()
+        self._chunk_index.clear()
+
+    def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:
+        """The records of the summary by their kind."""
+        statistics = Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._sent,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._sent.values()),
+            message_end_time=self._span_ns[1],
+            message_start_time=self._span_ns[0],
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+        return [
+            (Opcode.SCHEMA, self._schemas.values()),
+            (Opcode.CHANNEL, self._channels.values()),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+
+    def _put(self, data: bytes | bytearray | memoryview) -> None:
+        self._file.write(data)
+        self._at += len(data)
+
+
+def encoded(record: McapRecord) -> bytes:
+    """The bytes of a record."""
+    builder = RecordBuilder()
+    record.write(builder)
+    end: Callable[[], bytes] = builder.end
+    return end()
