@@ -34,9 +34,7 @@ def report_inputs(run: Conversion) -> ReportInputs:
     """All that report.json is made of."""
     table = run.table
     return ReportInputs(
-        inputs=tuple(
-            InputReport(str(r.path), r.size_bytes, r.container) for r in run.recordings
-        ),
+        inputs=tuple(InputReport(str(r.path), r.size_bytes, r.container) for r in run.recordings),
         timescale="unknown" if run.info is None else run.info.timescale,
         rate_hz=rate_text(run.grid.rate),
         t_init_ns=run.batcher.t_init_ns,

@@ -253,9 +253,7 @@ class Decoder:
                 target[rows, : source.shape[1]] = source[: len(rows)]
         return merged
 
-    def _compress(
-        self, tile: _Tile, due: Due, begin: int, end: int, at: int, start_ns: int
-    ) -> int:
+    def _compress(self, tile: _Tile, due: Due, begin: int, end: int, at: int, start_ns: int) -> int:
         """Move the wanted points of a tile to their final rows; gives their number."""
         count, buffer = end - begin, self._buffer
         keep = tile.keep[:count]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from mlbatch.lidar import Calibration
 from mlbatch.readers import merge
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, read_rig
 from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig
-from mlbatch.types import F64Array, Recording, StreamTable
+from mlbatch.types import F64Array, PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
 LOOK_NS = 10 * NS_PER_S
@@ -75,9 +75,24 @@ class Setup:
 def look(recordings: Sequence[Recording], table: StreamTable) -> Sampler:
     """Look at the first 10 s of a session."""
     sampler = Sampler(table)
-    for batch in merge(list(recordings), until_ns=LOOK_NS):
+    for batch in first_seconds(recordings):
         sampler.add(batch)
     return sampler
+
+
+def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
+    """The packets of the first 10 s of a session, whatever the size of the batches."""
+    until_ns: int | None = None
+    for batch in merge(recordings):
+        if not len(batch):
+            continue
+        if until_ns is None:
+            until_ns = int(batch.host_ns[0]) + LOOK_NS
+        over = np.flatnonzero(batch.host_ns > until_ns)
+        if len(over):
+            yield batch.take(slice(0, int(over[0])))
+            return
+        yield batch
 
 
 def calibrations_for(
@@ -111,9 +126,7 @@ def _read_given(path: Path) -> Calibration:
     return calibration
 
 
-def discover(
-    recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
-) -> Setup:
+def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes) -> Setup:
     """Find the sensors of a session; errors name what is missing and the ways to give it."""
     rig = None if wishes.rig is None else read_rig(wishes.rig)
     sampler = look(recordings, table)
@@ -187,16 +200,16 @@ def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[Path]) -> Note:
 def _nothing_found(
     sampler: Sampler, paths: Sequence[Path], lidar_kinds: Sequence[Kind], looked: Sequence[Path]
 ) -> RecordingError:
-    where = ", ".join(str(path) for path in paths)
+    where, table = ", ".join(str(path) for path in paths), sampler.table
     if lidar_kinds:
         kind = lidar_kinds[0]
-        stream = sampler.table.streams[kind[0]]
+        stream = table.streams[kind[0]]
         return RecordingError(
             f"{where}: {stream} carries {describe(sampler, kind)}, but no metadata fits it; "
             f"looked at {_files(looked)}; give the sensor's metadata with --metadata FILE"
         )
     seen = [
-        f"{sampler.table.streams[kind[0]]} ({kind[1]} bytes: {describe(sampler, kind) or 'unknown'})"
+        f"{table.streams[kind[0]]} ({kind[1]} bytes: {describe(sampler, kind) or 'unknown'})"
         for kind in sampler.samples
     ]
     return RecordingError(

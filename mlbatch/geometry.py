@@ -1,4 +1,4 @@
-"""The universal form of a turning lidar: six vectors per beam, cosine and sine of one angle per column.
+"""The universal form of a turning lidar: six vectors per beam, one angle per column.
 
     xyz = (r + reach[b]) * (cos a * U1[b] + sin a * U2[b] + U3[b])
                          + (cos a * O1[b] + sin a * O2[b] + O3[b])
@@ -21,9 +21,9 @@ from mlbatch.types import F32Array, F64Array
 class BeamTable:
     """Geometry of a sensor's beams in one frame, float64, metres.
 
-    direction: (3, B, 3), the vectors U1, U2, U3 of every beam; origin: (3, B, 3), or (3, 1, 3) where
-    all beams share it: O1, O2, O3; reach_m: (B,) or (1,), added to the range before it is projected;
-    angle_rad: (W,) angle of every encoder position.
+    direction: (3, B, 3), the vectors U1, U2, U3 of every beam; origin: (3, B, 3), or (3, 1, 3)
+    where all beams share it: O1, O2, O3; reach_m: (B,) or (1,), added to the range before it is
+    projected; angle_rad: (W,) angle of every encoder position.
     """
 
     direction: F64Array
@@ -39,7 +39,7 @@ class BeamTable:
         return replace(self, direction=_rotated(self.direction, rotation), origin=origin)
 
     def directions(self) -> F32Array:
-        """Directions of all beams at all encoder positions: (3, W, B) float32, one plane an axis."""
+        """Directions of the beams at all encoder positions: (3, W, B) float32, a plane an axis."""
         return self._turned(self.direction)
 
     def origins(self) -> F32Array:

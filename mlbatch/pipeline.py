@@ -107,18 +107,14 @@ class Conversion:
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
         self.feeds = [_feed(sensor) for sensor in self.setup.sensors]
-        intakes = [
-            _intake(sensor, job.host_clock) for sensor in self.setup.sensors
-        ]
+        intakes = [_intake(sensor, job.host_clock) for sensor in self.setup.sensors]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
         self.batcher = Batcher(self.grid, intakes, policy)
         self.feeder = Feeder(self.setup, self.feeds, host_clock=job.host_clock)
         self._decoders: list[Decoder] = []
         self._imu: list[ImuSamples] = []
         if job.max_wait_ns is None:
-            self.warn(
-                Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent")
-            )
+            self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
 
     # -- the run ------------------------------------------------------------------------------
 
@@ -204,9 +200,7 @@ class Conversion:
                 names.append(self.timescale_of(sensor, *stamps))
         shared = common_timescale(names)
         if len(set(names)) > 1:
-            self.warn(
-                Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}")
-            )
+            self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
         if self.job.limits_are_dates and shared not in ("utc", "tai"):
             raise UsageError(
                 f"--start/--end: wanted seconds, since the sensors' clock ({shared}) knows no "
@@ -236,7 +230,8 @@ class Conversion:
 
     def imu_until(self, end_ns: int | None) -> list[ImuSamples]:
         """Take IMU samples before `end_ns` (None: all), by stamp, then sensor."""
-        ready, later = [], []
+        ready: list[ImuSamples] = []
+        later: list[ImuSamples] = []
         for samples in self._imu:
             due = len(samples.stamp_ns) == 0 or end_ns is None or samples.stamp_ns[0] < end_ns
             (ready if due else later).append(samples)

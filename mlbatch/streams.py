@@ -7,6 +7,7 @@ prove to be its own.
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -58,8 +59,7 @@ class Sampler:
     table: StreamTable
     samples: dict[Kind, list[bytes]] = field(default_factory=dict)
     packets: dict[Kind, int] = field(default_factory=dict)
-    first_host_ns: dict[int, int] = field(default_factory=dict)
-    last_host_ns: dict[int, int] = field(default_factory=dict)
+    span_ns: dict[Kind, tuple[int, int]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
         """Look at a batch."""
@@ -69,9 +69,8 @@ class Sampler:
                 begin = int(batch.start[at])
                 kept.append(batch.data[begin : begin + kind[1]].tobytes())
             self.packets[kind] = self.packets.get(kind, 0) + len(index)
-            stream = kind[0]
-            self.first_host_ns.setdefault(stream, int(batch.host_ns[index[0]]))
-            self.last_host_ns[stream] = int(batch.host_ns[index[-1]])
+            first_ns, last_ns = int(batch.host_ns[index[0]]), int(batch.host_ns[index[-1]])
+            self.span_ns[kind] = self.span_ns.get(kind, (first_ns, 0))[0], last_ns
 
     def evidence(self, kind: Kind) -> Evidence:
         """What is known of a kind."""
@@ -172,22 +171,36 @@ def match(
 
     Raises RecordingError where the packets do not tell which of several calibrations is theirs.
     """
-    lidars = [calibration.lidar(options) for calibration in calibrations]
+    usable, lidars = _readable(calibrations, options)
     found: dict[int, Found] = {}
     unknown = []
     for kind in sampler.samples:
-        best = _best_fits(sampler.evidence(kind), calibrations, lidars)
+        best = _best_fits(sampler.evidence(kind), usable, lidars)
         if not best:
             unknown.append(kind)
         for number in best:
             sensor = found.setdefault(number, Found("", lidars[number]))
             sensor.kinds.add(kind)
+    calibrations = usable
     _refuse_shared(sampler.table, found, calibrations)
     sensors = sorted(found.values(), key=lambda sensor: _order(sampler.table, sensor))
     for count, sensor in enumerate(sensors):
-        maker = "lidar" if not sensor.lidar.maker else sensor.lidar.maker.lower()
-        sensor.name = f"{maker}_{sensor.lidar.serial or count + 1}"
+        sensor.name = f"{sensor.lidar.maker.lower()}_{sensor.lidar.serial or count + 1}"
     return sensors, unknown
+
+
+def _readable(
+    calibrations: Sequence[Calibration], options: dict[str, str]
+) -> tuple[list[Calibration], list[Lidar]]:
+    """The calibrations of lidars that send; one that is switched off sends nothing."""
+    usable, lidars = [], []
+    for calibration in calibrations:
+        try:
+            lidars.append(calibration.lidar(options))
+        except RigError:
+            continue
+        usable.append(calibration)
+    return usable, lidars
 
 
 def _best_fits(
@@ -235,13 +248,17 @@ def _refuse_shared(
             )
 
 
-def _order(table: StreamTable, sensor: Found) -> tuple[int, int, tuple[tuple[str, int, str], ...]]:
+def _order(table: StreamTable, sensor: Found) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
     """By serial number, else source IP and port, else topic."""
     streams = (table.streams[number] for number, _ in sensor.kinds)
-    places = tuple(sorted((s.source_ip, s.port, s.topic) for s in streams))
+    places = tuple(sorted((_ip_number(s.source_ip), s.port, s.topic) for s in streams))
     if sensor.lidar.serial.isdigit():
         return (0, int(sensor.lidar.serial), places)
     return (1, 0, places)
+
+
+def _ip_number(text: str) -> int:
+    return int(ipaddress.ip_address(text)) if text else 0
 
 
 @dataclass(frozen=True, slots=True)

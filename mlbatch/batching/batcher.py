@@ -219,9 +219,7 @@ class Batcher:
 
     # -- steps --------------------------------------------------------------------------------
 
-    def _check_clocks(
-        self, accepted: Sequence[Arrival | None], ranks: Sequence[I64Array]
-    ) -> None:
+    def _check_clocks(self, accepted: Sequence[Arrival | None], ranks: Sequence[I64Array]) -> None:
         """As soon as two sensors have a packet, their stamps must be comparable."""
         firsts = []
         for number, (track, arrival) in enumerate(zip(self._tracks, accepted, strict=True)):
@@ -285,8 +283,8 @@ class Batcher:
             return np.zeros(newest.shape, bool)
         leading = newest.max(axis=0)
         own = np.where(newest > NEVER, newest, first_of_all)
-        stalled: BoolArray = leading - own > self._policy.max_wait_ns
-        return stalled & (leading > NEVER)
+        behind = leading - own > self._policy.max_wait_ns
+        return np.logical_and(behind, leading > NEVER)
 
     def _begin(self, present: BoolArray, stalled: BoolArray) -> int:
         """Evaluate eq. (1) at the first delivery that allows it; its number, or past the end."""
@@ -314,9 +312,7 @@ class Batcher:
         if not len(stamp):
             return
         column = np.arange(valid.shape[1])
-        columns = Columns(
-            stamp, (arrival.place[:, None] + column)[valid], heads.encoder[valid]
-        )
+        columns = Columns(stamp, (arrival.place[:, None] + column)[valid], heads.encoder[valid])
         running = np.maximum.accumulate(np.concatenate([[track.newest_ns], stamp]))
         self._note_gaps(track, running)
         per_packet = np.count_nonzero(valid, axis=1)
@@ -336,7 +332,7 @@ class Batcher:
 
     def _late(self, stamp: I64Array, limit: I64Array) -> BoolArray:
         """Which columns come after the end of their window was passed: (n,) bool."""
-        late = stamp < limit
+        late: BoolArray = stamp < limit
         for at in np.flatnonzero(late):
             end = self._grid.bound(self._grid.index_of(int(stamp[at])) + 1)
             late[at] = end <= limit[at]
@@ -426,9 +422,7 @@ class Batcher:
         """Every sensor delivered before or at the start and past the end, with no stall between."""
         covered = (progress.oldest[:, at] <= start) & (progress.newest[:, at] >= end)
         return bool(covered.all()) and not any(
-            before < end and after > start
-            for track in self._tracks
-            for before, after in track.gaps
+            before < end and after > start for track in self._tracks for before, after in track.gaps
         )
 
     def _drop(self, sensor: I64Array, reason: str) -> None:

@@ -130,7 +130,7 @@ class Intake:
         return known & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
 
     def _judge(self, arrival: Arrival) -> Arrival:
-        """Hold packets that step, until the sensor's next one; packet by packet, since it is rare."""
+        """Hold packets that step until the sensor's next one: packet by packet, since it is rare."""
         rows = arrival if self._held is None else _joined(self._held, arrival)
         low, high = extremes(rows.heads)
         position = rows.position.copy()
@@ -139,9 +139,7 @@ class Intake:
         for row in range(0 if held is None else 1, len(high)):
             lowest, highest = int(low[row]), int(high[row])
             if highest > NEVER:
-                steps = newest > NEVER and (
-                    highest > newest + STEP_NS or lowest < newest - STEP_NS
-                )
+                steps = newest > NEVER and (highest > newest + STEP_NS or lowest < newest - STEP_NS)
                 if held is not None:
                     first = self._first_stamp(rows, held)
                     near = first - STEP_NS <= lowest and highest <= first + STEP_NS

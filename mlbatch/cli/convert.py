@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mlbatch.errors import UsageError
 
 if TYPE_CHECKING:
-    from mlbatch.pipeline import Job
+    pass
 
 _BYTES_PER_POINT = {"mcap": 24, "npz": 36, "ply": 30}
 
@@ -20,15 +20,15 @@ def convert(
         list[Path], typer.Argument(help="Recordings of one session: pcap or pcapng, .gz or .zst.")
     ],
     output: Annotated[
-        Optional[Path],
+        Path | None,
         typer.Option("-o", "--output", help="A .mcap file, or a folder for one file a scan."),
     ] = None,
-    rig: Annotated[Optional[Path], typer.Option(help="Rig file (YAML).")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
     rate: Annotated[
-        Optional[str], typer.Option(help="Scans a second, Hz: 10, 29.97, 10/3. [default: rig's, 10]")
+        str | None, typer.Option(help="Scans a second, Hz: 10, 29.97, 10/3. [default: rig's, 10]")
     ] = None,
     format_: Annotated[
-        Optional[str],
+        str | None,
         typer.Option("--format", help="mcap, npz or ply. [default: by OUTPUT; a folder: npz]"),
     ] = None,
     layout: Annotated[
@@ -48,10 +48,10 @@ def convert(
         str, typer.Option(help="Wait for a silent sensor so long, s of stamps, or inf.")
     ] = "1.0",
     start: Annotated[
-        Optional[str],
+        str | None,
         typer.Option(help="First window starts at or after: epoch s, ISO time (UTC), or +S."),
     ] = None,
-    end: Annotated[Optional[str], typer.Option(help="Windows start before: as --start.")] = None,
+    end: Annotated[str | None, typer.Option(help="Windows start before: as --start.")] = None,
     clock: Annotated[
         str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
     ] = "sensor",
@@ -60,32 +60,32 @@ def convert(
         float, typer.Option(help="Drop farther points, m.", show_default="none")
     ] = float("inf"),
     exclude_box: Annotated[
-        Optional[list[str]],
+        list[str] | None,
         typer.Option(help="Drop points in x0,y0,z0,x1,y1,z1, m, body frame; repeatable."),
     ] = None,
     keep_repeated: Annotated[
         bool, typer.Option("--keep-repeated", help="Keep the second of two equal returns.")
     ] = False,
     metadata: Annotated[
-        Optional[list[Path]],
+        list[Path] | None,
         typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
     ] = None,
     identity_extrinsics: Annotated[
         bool, typer.Option("--identity-extrinsics", help="Sensors without extrinsics: at 0, 0, 0.")
     ] = False,
     decode: Annotated[
-        Optional[list[str]], typer.Option(help="KEY=VALUE for decoders: crc=check; repeatable.")
+        list[str] | None, typer.Option(help="KEY=VALUE for decoders: crc=check; repeatable.")
     ] = None,
     only: Annotated[
-        Optional[list[str]], typer.Option(help="Use this sensor (name or serial); repeatable.")
+        list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
     ] = None,
     ignore: Annotated[
-        Optional[list[str]], typer.Option(help="Leave this sensor out; repeatable.")
+        list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Do all but write; print the report.")
     ] = False,
-    report: Annotated[Optional[Path], typer.Option(help="Where the report goes (JSON).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; 1 in this version.")] = 1,
     engine: Annotated[str, typer.Option(help="auto or numpy.")] = "auto",
     strict: Annotated[

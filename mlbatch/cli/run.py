@@ -11,7 +11,7 @@ from pathlib import Path
 import typer
 
 from mlbatch.pipeline import Conversion, Job, OpenWriter, Progress, convert
-from mlbatch.report import report_paths, report_text, summary_lines, write_text
+from mlbatch.report import report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -19,6 +19,8 @@ from mlbatch.writers import (
     check_target,
     choose_format,
     open_writer,
+    report_paths,
+    write_text,
 )
 
 
@@ -91,9 +93,11 @@ def _progress(quiet: bool) -> Iterator[Progress | None]:
     from rich.progress import (
         BarColumn,
         DownloadColumn,
-        Progress as Bar,
         TimeRemainingColumn,
         TransferSpeedColumn,
+    )
+    from rich.progress import (
+        Progress as Bar,
     )
 
     with Bar(

@@ -16,7 +16,7 @@ def sensors(
     """List the supported lidars, what they need, and how each was verified."""
     from mlbatch.sensors import models
 
-    rows = [
+    rows: list[dict[str, object]] = [
         {
             "model": model.name,
             "maker": model.maker,

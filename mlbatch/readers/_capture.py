@@ -38,16 +38,16 @@ MAX_RECORD_BYTES = 1 << 20
 class Walk:
     """Frames found in a buffer; all before byte `next` is dealt with.
 
-    `next` may lie behind the buffer's end: the bytes until there are of no interest. need: length
-    of the record at `next` if known, else 0; is_frame: that record is a frame; fault: why nothing
-    from `next` on can be read.
+    `next` may lie behind the buffer's end: the bytes until there are of no interest. need: bytes
+    that must be there from `next` on, 0 if walking can go on; is_frame: a frame begins at `next`;
+    fault: why nothing from `next` on can be read.
     """
 
-    frames: Frames
     next: int
     need: int = 0
     is_frame: bool = True
     fault: str = ""
+    frames: Frames = field(default_factory=Frames.none)
 
 
 class Walker(Protocol):
@@ -166,24 +166,22 @@ class _Run:
     def batches(self, source: Source) -> Iterator[PacketBatch]:
         """All packets of the file."""
         window = _Window.of(self.recording.buffer_bytes)
-        more = window.refill(source, 0)
-        while more or window.begin < window.end:
+        window.refill(source, 0)
+        while True:
             self.recording.position_bytes = source.position_bytes
             walk = self.walker.walk(window.data, window.begin, window.end)
             for frames in self._portions(walk.frames):
                 batch = self._batch(window.data, frames)
                 if len(batch):
                     yield batch
-            progress = walk.next > window.begin
             window.begin = walk.next
             if walk.fault:
                 self._stop(window, walk.fault)
                 return
-            if not progress or window.begin >= window.end:
-                more = window.refill(source, walk.need)
-                if not more:
-                    self._end(window, walk, source)
-                    return
+            more = not walk.need and window.begin < window.end
+            if not more and not window.refill(source, walk.need):
+                self._end(window, walk, source)
+                return
 
     def _portions(self, frames: Frames) -> Iterator[Frames]:
         """Frames in portions whose datagrams fit into the arena, whatever their fragments."""
@@ -238,9 +236,10 @@ class _Run:
         if window.begin == window.end:
             return
         at, left = window.origin + window.begin, max(window.end - window.begin, 0)
-        wanted = f"wanted {walk.need} bytes" if walk.need else "wanted a whole record"
         self.recording.notes.append(
-            f"byte {at}: the file ends within a record; {wanted}, got {left}"
+            f"byte {at}: the file ends within a record; wanted {walk.need} bytes, got {left}"
+            if walk.need
+            else f"byte {at}: wanted more of the file, got its end"
         )
         if walk.is_frame:
             self._count_cut()

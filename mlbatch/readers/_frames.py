@@ -53,6 +53,12 @@ class Frames:
     link: I64Array
     host_ns: I64Array
 
+    @classmethod
+    def none(cls) -> Frames:
+        """No frames."""
+        empty = np.zeros(0, np.int64)
+        return cls(empty, empty, empty, empty, empty)
+
     def __len__(self) -> int:
         return len(self.start)
 

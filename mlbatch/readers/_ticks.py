@@ -46,8 +46,8 @@ class Resolution:
         # Twice the bound leaves room for a negative offset, and int64 for the sum.
         whole = np.minimum(seconds, np.uint64(1 << 62)).astype(np.int64)
         offset_s = min(max(self.offset_s, -(1 << 61)), 1 << 61)
-        whole = np.clip(whole + offset_s, -_MOST_S, _MOST_S)
-        return whole * NS_PER_S + rest_ns.astype(np.int64)
+        whole_ns: I64Array = np.clip(whole + offset_s, -_MOST_S, _MOST_S) * NS_PER_S
+        return whole_ns + rest_ns.astype(np.int64)
 
     def _slow_ns(self, ticks: U64Array) -> I64Array:
         bound_ns = _MOST_S * NS_PER_S

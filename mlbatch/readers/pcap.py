@@ -91,11 +91,11 @@ class _Walker:
             + record["fraction"][:count].astype(np.int64) * self.unit_ns,
         )
         place = int(after[count - 1]) if count else begin
-        need = int(captured[count]) + _RECORD_BYTES if count < len(starts) else 0
-        if not len(lies):
-            return Walk(frames, place, need)
-        fault = f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {captured[count]}"
-        return Walk(frames, place, fault=fault)
+        if len(lies):
+            fault = f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {captured[count]}"
+            return Walk(place, fault=fault, frames=frames)
+        more = int(captured[count]) if count < len(starts) else 0
+        return Walk(place, _RECORD_BYTES + more, frames=frames)
 
     def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
         """Where records begin whose headers are whole; the last one's frame may be cut off."""

@@ -82,19 +82,20 @@ class _Walker:
                 head = struct.Struct(self.order + "II").unpack_from
                 kind, length = head(view, at)
             if length < _LEAST_BLOCK_BYTES or length % 4:
-                return Walk(_no_frames(), at, fault=f"wanted the length of a block, got {length}")
+                return Walk(at, fault=f"wanted the length of a block, got {length}")
             if kind in _NEEDED:
                 if length > MAX_RECORD_BYTES:
                     wanted = f"wanted a block of at most {MAX_RECORD_BYTES} bytes, got {length}"
-                    return Walk(_no_frames(), at, fault=wanted)
+                    return Walk(at, fault=wanted)
                 if at + length > end:
-                    return Walk(_no_frames(), at, length, kind in _PACKETS)
+                    return Walk(at, length, kind in _PACKETS)
                 if kind in _PACKETS:
                     starts.append(at)
                 else:
                     self._learn(kind, bytes(view[at : at + length]))
             at += length
-        return Walk(_no_frames(), at, is_frame=False)
+        need = 0 if starts and at + _LEAST_BLOCK_BYTES <= end else _LEAST_BLOCK_BYTES
+        return Walk(at, need, is_frame=False)
 
     def _learn(self, kind: int, block: bytes) -> None:
         if kind == _SECTION:
@@ -158,8 +159,3 @@ class _Walker:
                 rows = interface == number
                 host_ns[rows] = self.interfaces[number].resolution.ns(ticks[rows])
         return host_ns
-
-
-def _no_frames() -> Frames:
-    none = np.zeros(0, np.int64)
-    return Frames(none, none, none, none, none)

@@ -134,8 +134,11 @@ class OusterLidar:
 
     def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:
         layout = described.layout
+        self.maker = MAKER
         self.model = model
         self.serial = serial
+        # LEGACY packets have no header, and so name nobody.
+        self.carries_serial = layout.profile.name != LEGACY and bool(serial)
         self.mode = f"{described.lidar_mode or described.columns_per_frame} {layout.profile.name}"
         self.channels = layout.beams
         self.returns = layout.profile.returns

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 from mlbatch.errors import UsageError
+from mlbatch.types import RunInfo
 from mlbatch.writers._atomic import (
     REPORT_JSON,
     SCANS_CSV,
     check_free_space,
+    discard,
     side_path,
     write_text,
 )
-from mlbatch.types import RunInfo
-from mlbatch.writers._atomic import check_free_space, discard
 from mlbatch.writers._options import ScanWriter, WriterModule, WriterOptions
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ __all__ = [
     "ScanWriter",
     "WriterOptions",
     "check_free_space",
+    "check_target",
     "choose_format",
     "formats",
     "open_writer",

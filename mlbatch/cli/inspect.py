@@ -1,0 +1,47 @@
+"""`mlbatch inspect`: what a recording holds, at a glance."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def inspect(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of one session: pcap or pcapng, .gz or .zst.")
+    ],
+    metadata: Annotated[
+        list[Path] | None,
+        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    write_rig: Annotated[
+        Path | None, typer.Option(help="Write a rig file that `convert` accepts.")
+    ] = None,
+) -> None:
+    """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
+    from mlbatch.cli.tables import columns
+    from mlbatch.survey import survey
+
+    found = survey(tuple(recordings), tuple(metadata or ()))
+    if write_rig is not None:
+        from mlbatch.errors import ExportError
+        from mlbatch.writers import write_text
+
+        if write_rig.exists():
+            raise ExportError(
+                f"{write_rig}: wanted a new rig file, got an existing one; choose another name"
+            )
+        write_text(write_rig, found.rig_text(write_rig.parent))
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+        return
+    for line in columns(found.rows()):
+        typer.echo(line)
+    for note in found.notes:
+        typer.echo(f"note: {note}")
+    if write_rig is not None:
+        typer.echo(f"wrote {write_rig}")

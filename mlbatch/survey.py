@@ -1,0 +1,202 @@
+"""What `inspect` tells: every stream of a session, what it is, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from mlbatch.batching.loss import Loss
+from mlbatch.clock import timescale
+from mlbatch.discover import calibrations_for, describe, first_seconds, look
+from mlbatch.errors import RigError
+from mlbatch.lidar import Lidar
+from mlbatch.readers import open_recording
+from mlbatch.rig import Rig, RigSensor, StreamSelector, write_rig
+from mlbatch.ring import RawRing
+from mlbatch.streams import Found, Kind, Sampler, match, split_by_kind
+from mlbatch.types import Recording, StreamTable
+from mlbatch.units import NS_PER_MS, NS_PER_S
+
+Value: TypeAlias = str | int | float | None
+HEAD = (
+    *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
+    *("clock", "calibration", "extrinsics", "missing"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamReport:
+    """One kind of packets: where from, what, how many; times by the recorder's clock.
+
+    offset_ms: first stamp minus its arrival; extrinsics: where they come from, or "".
+    """
+
+    stream: str
+    what: str
+    sensor: str
+    model: str
+    mode: str
+    serial: str
+    bytes: int
+    packets: int
+    rate_hz: float
+    lost: int | None
+    first_host_ns: int
+    last_host_ns: int
+    timescale: str
+    offset_ms: float | None
+    calibration: str
+    extrinsics: str
+    missing: str
+
+    def row(self) -> list[str]:
+        """Cells for people, as HEAD."""
+        clock = self.timescale
+        if self.offset_ms is not None:
+            clock += f" {self.offset_ms:+.3f} ms"
+        return [
+            *(self.stream, self.what, self.sensor, str(self.packets), f"{self.rate_hz:.1f}"),
+            "" if self.lost is None else str(self.lost),
+            f"{(self.last_host_ns - self.first_host_ns) / NS_PER_S:.3f}",
+            *(clock, self.calibration, self.extrinsics, self.missing),
+        ]
+
+
+@dataclass(slots=True)
+class _Count:
+    """What a pass over the first seconds shows of one sensor."""
+
+    ring: RawRing
+    loss: Loss
+    first: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """All streams of the first 10 seconds of a session."""
+
+    streams: tuple[StreamReport, ...]
+    sensors: tuple[Found, ...]
+    files: dict[str, Path] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def rows(self) -> list[list[str]]:
+        """The table, head first."""
+        return [list(HEAD), *(stream.row() for stream in self.streams)]
+
+    def as_json(self) -> dict[str, str | list[dict[str, Value]] | list[str]]:
+        """For programs."""
+        return {
+            "schema": "mlbatch.inspect/1",
+            "streams": [asdict(stream) for stream in self.streams],
+            "notes": list(self.notes),
+        }
+
+    def rig_text(self, folder: Path) -> str:
+        """A rig file for these sensors; identity extrinsics are marked as to be measured."""
+        if not self.sensors:
+            raise RigError(
+                "--write-rig: wanted at least one lidar with its metadata, got none; "
+                "give --metadata FILE"
+            )
+        sensors = tuple(
+            RigSensor(
+                name=sensor.name,
+                stream=self._selector(sensor),
+                metadata=self.files.get(sensor.name),
+                extrinsics=sensor.lidar.extrinsics
+                if sensor.lidar.extrinsics is not None
+                else np.eye(4),
+            )
+            for sensor in self.sensors
+        )
+        notes = {
+            sensor.name: "extrinsics unknown: measure them"
+            for sensor in self.sensors
+            if sensor.lidar.extrinsics is None
+        }
+        return write_rig(Rig(sensors), folder, notes)
+
+    def _selector(self, sensor: Found) -> StreamSelector:
+        if sensor.lidar.carries_serial:
+            return StreamSelector(serial=sensor.lidar.serial)
+        return sensor.selector
+
+
+def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
+    """Look at the first 10 s of recordings, with the metadata given or found beside them."""
+    table = StreamTable()
+    opened = [open_recording(path, table) for path in recordings]
+    sampler = look(opened, table)
+    calibrations, looked = calibrations_for(recordings, metadata)
+    found, _ = match(sampler, calibrations, {})
+    for sensor in found:
+        streams = [table.streams[stream] for stream, _ in sensor.kinds]
+        sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
+    counts = _count(opened, found)
+    reports = tuple(_report(sampler, kind, found, counts) for kind in sampler.samples)
+    notes = []
+    if not sampler.samples:
+        notes.append("no UDP packet in the first 10 seconds")
+    elif not found:
+        names = ", ".join(path.name for path in looked) or "none"
+        notes.append(f"no lidar with its metadata; files looked at: {names}")
+    files = {sensor.name: Path(sensor.lidar.calibration) for sensor in found}
+    return Survey(reports, tuple(found), files, tuple(notes))
+
+
+def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Count]:
+    counts = [_Count(_ring(s.lidar), Loss(s.lidar.sequence_modulus)) for s in found]
+    for batch in first_seconds(recordings):
+        for kind, index in split_by_kind(batch):
+            for sensor, count in zip(found, counts, strict=True):
+                if kind not in sensor.kinds:
+                    continue
+                packets, _ = count.ring.store(batch.data, batch.start[index], None)
+                good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
+                count.loss.add(sensor.lidar.sequence(packets[good]))
+                heads = sensor.lidar.heads(packets[good])
+                if count.first is None and heads.valid.any():
+                    row, column = np.argwhere(heads.valid)[0]
+                    host_ns = int(batch.host_ns[index[good]][row])
+                    count.first = int(heads.stamp_ns[row, column]), host_ns
+    return counts
+
+
+def _ring(lidar: Lidar) -> RawRing:
+    return RawRing(lidar.packet_size, lidar.record_start, lidar.record_size)
+
+
+def _report(
+    sampler: Sampler, kind: Kind, found: Sequence[Found], counts: Sequence[_Count]
+) -> StreamReport:
+    first_ns, last_ns = sampler.span_ns[kind]
+    packets = sampler.packets[kind]
+    at = next((n for n, sensor in enumerate(found) if kind in sensor.kinds), None)
+    lidar = None if at is None else found[at].lidar
+    first = None if at is None else counts[at].first
+    what = describe(sampler, kind) or "unknown"
+    unmatched = lidar is None and "lidar" in what
+    return StreamReport(
+        stream=str(sampler.table.streams[kind[0]]),
+        what=what if lidar is None else f"{lidar.model} {lidar.mode}",
+        sensor="" if at is None else found[at].name,
+        model="" if lidar is None else lidar.model,
+        mode="" if lidar is None else lidar.mode,
+        serial="" if lidar is None else lidar.serial,
+        bytes=kind[1],
+        packets=packets,
+        rate_hz=(packets - 1) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else 0.0,
+        lost=None if at is None else counts[at].loss.lost,
+        first_host_ns=first_ns,
+        last_host_ns=last_ns,
+        timescale="" if first is None else timescale(*first),
+        offset_ms=None if first is None else (first[0] - first[1]) / NS_PER_MS,
+        calibration="" if lidar is None else Path(lidar.calibration).name,
+        extrinsics="" if lidar is None else ("metadata" if lidar.extrinsics is not None else ""),
+        missing="metadata" if unmatched else "",
+    )
