@@ -14,6 +14,7 @@ import sys
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +84,7 @@ def main() -> int:
     try:
         cloud = load(pick(arguments.scans), arguments.below)
         arguments.out.write_bytes(png(draw(cloud)))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
         print(f"picture: {error}", file=sys.stderr)
         return 1
     print(f"{arguments.out}: {cloud.title}")
@@ -148,7 +149,8 @@ def fitted(cloud: Cloud, axes: F64, panel: tuple[int, int, int, int]) -> View:
     flat = cloud.xyz @ axes[:2].T
     low, high = np.percentile(flat, 0.1, axis=0), np.percentile(flat, 99.9, axis=0)
     left, top, right, bottom = (2 * edge for edge in panel)
-    scale = min((right - left) / (high[0] - low[0]), (bottom - top) / (high[1] - low[1]))
+    extent_m = np.maximum(high - low, 0.1)
+    scale = min((right - left) / extent_m[0], (bottom - top) / extent_m[1])
     centre = np.array([(left + right) / 2, (top + bottom) / 2])
     return View(axes, float(scale), centre, (low + high) / 2)
 

@@ -6,6 +6,9 @@ import hashlib
 import json
 import math
 import struct
+import subprocess
+import sys
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +21,8 @@ import yaml
 from tests.builders.make_fixtures import FOLDER, main
 from tests.builders.scene import Pillar, Rectangle, Scene, Vector, box, hall
 from tests.builders.two_lidars import LEFT, RIGHT, FixtureLidar, body_from_sensor, crc64
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 # A square of 2 m at x = 4, centred on the x axis.
 SHIELD = Scene((Rectangle((4.0, -1.0, -1.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.0), 10),))
@@ -240,3 +245,44 @@ def test_extrinsics_turn_about_fixed_axes() -> None:
     down, left = math.radians(22.0), math.radians(80.0)
     wanted = (math.cos(left) * math.cos(down), math.sin(left) * math.cos(down), -math.sin(down))
     assert forward.tolist() == pytest.approx(wanted)
+
+
+def run(script: str, *arguments: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(DOCS / script), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_time_span_picture_is_what_its_script_draws() -> None:
+    assert run("time_span.py").stdout == (DOCS / "time_span.svg").read_text()
+
+
+def test_picture_shows_each_lidar_in_its_colour(tmp_path: Path) -> None:
+    side = np.linspace(0.0, 3.0, 50)
+    xyz = np.stack([side, side % 0.7, side], axis=1)
+    np.savez(
+        tmp_path / "000000.npz",
+        xyz=np.concatenate([xyz, xyz + 1.0]).astype(np.float32),
+        lidar_id=np.repeat([0, 1], 50).astype(np.uint8),
+        sensors=np.array(["left", "right"]),
+        index=0,
+        start_ns=0,
+        end_ns=100_000_000,
+    )
+    assert run("picture.py", tmp_path, tmp_path / "out.png").returncode == 0
+    raw = (tmp_path / "out.png").read_bytes()
+    assert raw[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack_from(">II", raw, 16)
+    (length,) = struct.unpack_from(">I", raw, 33)
+    assert struct.unpack_from(">I", raw, 41 + length)[0] == zlib.crc32(raw[37 : 41 + length])
+    rows = np.frombuffer(zlib.decompress(raw[41 : 41 + length]), np.uint8)
+    pixels = rows.reshape(height, 1 + 3 * width)[:, 1:].reshape(-1, 3)
+    # Orange has more red than blue, cyan more blue than red.
+    assert (pixels[:, 0] > pixels[:, 2] + 80).any()
+    assert (pixels[:, 2] > pixels[:, 0] + 80).any()
+
+
+def test_picture_of_nothing_is_refused_in_one_line(tmp_path: Path) -> None:
+    done = run("picture.py", tmp_path, tmp_path / "out.png")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "wanted a folder with npz scans" in done.stderr
