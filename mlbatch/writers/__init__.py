@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 from mlbatch.errors import UsageError
-from mlbatch.types import RunInfo
 from mlbatch.writers._atomic import (
     REPORT_JSON,
     SCANS_CSV,
@@ -21,6 +20,8 @@ from mlbatch.writers._options import ScanWriter, WriterModule, WriterOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from mlbatch.types import RunInfo
 
 __all__ = [
     "ReportPaths",
@@ -109,6 +110,9 @@ def check_target(name: str, target: Path, options: WriterOptions, layout: str) -
 
     The surest way to know that an output can be opened is to open it; what that made is removed.
     """
+    # Imported here, since the types need numpy and naming formats must not.
+    from mlbatch.types import RunInfo
+
     info = RunInfo((), "", "10", "unknown", layout=layout)
     open_writer(name, target, info, replace(options, split=False)).abandon()
     discard(target)

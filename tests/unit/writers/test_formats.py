@@ -8,8 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.errors import UsageError
-from mlbatch.writers import WriterOptions, choose_format, formats, open_writer, plugin, report_paths
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.writers import (
+    WriterOptions,
+    check_target,
+    choose_format,
+    formats,
+    open_writer,
+    plugin,
+    report_paths,
+)
 
 from .scans import run_info
 
@@ -93,3 +101,18 @@ def test_places_of_side_files() -> None:
     file = report_paths(Path("a/x.mcap"), "mcap")
     assert file.report == Path("a/x.mcap.report.json")
     assert file.scans_csv == Path("a/x.mcap.scans.csv")
+
+
+@pytest.mark.parametrize(("name", "file"), [("mcap", "x.mcap"), ("npz", "x"), ("ply", "x")])
+def test_checking_a_target_leaves_nothing(name: str, file: str, tmp_path: Path) -> None:
+    check_target(name, tmp_path / file, WriterOptions(split=True), "dense")
+    assert not list(tmp_path.iterdir())
+
+
+def test_checking_a_target_refuses_as_opening_does(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_text("old")
+    with pytest.raises(ExportError, match="existing"):
+        check_target("mcap", tmp_path / "x.mcap", WriterOptions(), "dense")
+    assert (tmp_path / "x.mcap").read_text() == "old"
+    with pytest.raises(UsageError, match="organized"):
+        check_target("ply", tmp_path / "x", WriterOptions(), "organized")
