@@ -43,11 +43,12 @@ class Resolution:
         per_second = np.uint64(self.per_second)
         seconds = ticks // per_second
         rest_ns = (ticks % per_second) * np.uint64(NS_PER_S) // per_second
-        # Twice the bound leaves room for a negative offset, and int64 for the sum.
+        # Bounded so that the sum of both stays within int64.
         whole = np.minimum(seconds, np.uint64(1 << 62)).astype(np.int64)
         offset_s = min(max(self.offset_s, -(1 << 61)), 1 << 61)
         whole_ns: I64Array = np.clip(whole + offset_s, -_MOST_S, _MOST_S) * NS_PER_S
-        return whole_ns + rest_ns.astype(np.int64)
+        whole_ns += rest_ns.astype(np.int64)
+        return whole_ns
 
     def _slow_ns(self, ticks: U64Array) -> I64Array:
         bound_ns = _MOST_S * NS_PER_S
