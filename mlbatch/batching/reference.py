@@ -5,7 +5,7 @@ in arrival order, one after the other, column by column, and shares no helper wi
 Where the contract leaves room, these rules decide (N, M: newest and oldest stamp delivered by a
 sensor, G: the largest N; slack: 10 ms):
 
-1. Intake: see `reference_intake.py`.
+1. Intake: see `reference_intake.py`. A held packet is delivered when one confirms it.
 2. Invalid columns are dropped `invalid` and are never stamps, but count as decoded.
 3. Clocks are compared when a sensor's first valid column is delivered, with the first sensor that
    had one (not with the host clock).
@@ -15,10 +15,9 @@ sensor, G: the largest N; slack: 10 ms):
    over those that have one and are not stalled; else at the end, over all that have one.
 6. Slices are windows q = k * slices + j with bounds ceil(q * 1e9 / (rate * slices)).
 7. After each delivery the watermark is the smallest N of the sensors not stalled, minus the slack,
-   if that is larger than before; windows that end at or before it are published. A held packet is
-   delivered at the arrival of the one that confirms it. A column is `late` if its window ends at or
-   before its sensor's newest stamp before it minus the slack, or the end of what was published
-   before its packet.
+   if that is larger than before; windows that end at or before it are published. A column is `late`
+   if its window ends at or before its sensor's newest stamp before it minus the slack, or the end
+   of what was published before its packet.
 8. `complete` is judged at publication: M <= start and N >= end for every sensor, and no stall
    overlaps. A stall is a step of a sensor's running maximum from a to b > a + max-wait; it overlaps
    if a < end and b > start.
@@ -94,7 +93,6 @@ class Sensor:
     first: int | None = None
     newest: int | None = None
     oldest: int | None = None
-    offset: int = 0
     stalls: list[tuple[int, int]] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     decoded: int = 0
@@ -184,10 +182,8 @@ class Session:
         newest = [other.newest for other in self.sensors if other.newest is not None]
         if wait is None or not newest:
             return False
-        own = sensor.newest
-        if own is None:
-            own = min(other.first for other in self.sensors if other.first is not None)
-        return max(newest) - own > wait
+        firsts = [other.first for other in self.sensors if other.first is not None]
+        return max(newest) - (min(firsts) if sensor.newest is None else sensor.newest) > wait
 
     def initialise(self) -> None:
         """Eq. (1), if it can be evaluated: rule 5."""

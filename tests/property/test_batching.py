@@ -1,0 +1,124 @@
+"""The laws of batching: the fast batcher is the paper, and neither grouping nor arrival matters."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mlbatch.batching.reference import FeedPacket, Outcome, Settings, reference_scans
+from mlbatch.errors import ClockError
+from tests.builders.fast import run_fast
+from tests.builders.feeds import Case, feeds, groups, interleavings, random_feed
+
+SEEDS_A_BLOCK = 250
+BLOCKS = range(20)
+INTERLEAVED_BLOCKS = range(100, 104)
+
+
+def by_reference(feed: list[FeedPacket], options: Settings) -> Outcome | None:
+    """What the paper makes of a feed; None for clocks that cannot be used."""
+    try:
+        return reference_scans(feed, options)
+    except ClockError:
+        return None
+
+
+def by_fast(feed: list[FeedPacket], options: Settings, sizes: list[int]) -> Outcome | None:
+    """What the fast batcher makes of a feed in batches of these sizes."""
+    try:
+        return run_fast(feed, options, sizes)
+    except ClockError:
+        return None
+
+
+def differences(wanted: Outcome | None, got: Outcome | None) -> list[str]:
+    """Names and values of all fields in which two outcomes differ; for windows the first pair."""
+    if wanted is None or got is None:
+        return [] if wanted is got else [f"clock error: wanted {wanted is None}, got {got is None}"]
+    found = []
+    for name in Outcome.__slots__:
+        one, two = getattr(wanted, name), getattr(got, name)
+        if one == two:
+            continue
+        if name == "windows":
+            pairs = [pair for pair in zip(one, two, strict=False) if pair[0] != pair[1]]
+            one, two = pairs[0] if pairs else (len(one), len(two))
+        found.append(f"{name}: wanted {one}, got {two}")
+    return found
+
+
+def apart_from_arrival(outcome: Outcome | None) -> Outcome | None:
+    """The outcome without what depends on the order of arrival between sensors."""
+    if outcome is None:
+        return None
+    # Whether the head is complete follows from the oldest stamps at its publication; one that steps
+    # back before the head's start may be delivered before or after it. Later windows begin after
+    # the first stamps of all sensors.
+    windows = [
+        replace(window, ready_host_ns=0, complete=window.complete and window.index >= 0)
+        for window in outcome.windows
+    ]
+    return replace(outcome, windows=windows, incomplete=0)
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_fast_batcher_equals_the_reference(block: int) -> None:
+    for seed in range(block * SEEDS_A_BLOCK, (block + 1) * SEEDS_A_BLOCK):
+        feed, options = random_feed(seed)
+        sizes = groups(random.Random(seed), len(feed))
+        wanted = by_reference(feed, options)
+        found = differences(wanted, by_fast(feed, options, sizes))
+        assert not found, f"random_feed({seed}), {options}, groups {sizes}: {found}"
+
+
+@settings(max_examples=100, deadline=None)
+@given(feeds(), st.randoms(use_true_random=False))
+def test_grouping_does_not_matter(case: Case, rng: random.Random) -> None:
+    feed, options = case
+    wanted = by_reference(feed, options)
+    for sizes in ([1] * len(feed), [len(feed)], groups(rng, len(feed))):
+        assert not differences(wanted, by_fast(feed, options, sizes))
+
+
+@pytest.mark.parametrize("block", INTERLEAVED_BLOCKS)
+def test_arrival_between_sensors_does_not_matter(block: int) -> None:
+    compared = 0
+    for seed in range(block * SEEDS_A_BLOCK, (block + 1) * SEEDS_A_BLOCK):
+        case = random_feed(seed)
+        options, rng = case[1], random.Random(seed)
+        if options.sensors == 1:
+            continue
+        wanted = apart_from_arrival(by_reference(*case))
+        for feed in interleavings(case, rng, count=2):
+            compared += 1
+            for got in (
+                by_reference(feed, options),
+                by_fast(feed, options, groups(rng, len(feed))),
+            ):
+                found = differences(wanted, apart_from_arrival(got))
+                assert not found, f"random_feed({seed}), interleaved: {found}"
+    # Too many stalls in the feeds would leave the law untested.
+    assert compared > SEEDS_A_BLOCK // 4
+
+
+def test_feeds_show_every_reason_and_every_kind_of_window() -> None:
+    reasons: set[str] = set()
+    kinds: set[tuple[bool, bool]] = set()
+    for seed in range(150):
+        outcome = by_reference(*random_feed(seed))
+        if outcome is None:
+            reasons.add("clock")
+            continue
+        for counts in [*outcome.rejected, *outcome.dropped]:
+            reasons.update(counts)
+        kinds.update((window.complete, window.index < 0) for window in outcome.windows)
+        reasons.update(["empty"] if outcome.empty else [])
+    assert reasons == {
+        *("before_start", "late", "tail", "head", "invalid", "outside_time"),
+        *("bad_stamp", "duplicate", "clock", "empty"),
+    }
+    assert kinds >= {(True, False), (False, False), (False, True)}
