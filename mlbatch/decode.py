@@ -74,34 +74,52 @@ class Label:
 
 
 class _Tile:
-    """Planes of a tile of columns, (TILE_COLUMNS, slots) each; `point` is x, y, z, intensity."""
+    """Points of a tile of columns, as flat planes; each sensor has a part of them, row by row.
+
+    `point` is x, y, z, intensity. Sensors lie one after the other; the order of the scan comes
+    from the index by which points leave the tile, so that no plane has to be reordered.
+    """
 
     def __init__(self, slots: int) -> None:
-        shape = (TILE_COLUMNS, slots)
-        self.point = np.zeros((*shape, 4), np.float32)
-        self.range_m = np.zeros(shape, np.float32)
-        self.reflectivity = np.zeros(shape, np.uint16)
-        self.ring = np.zeros(shape, np.uint16)
-        self.return_type = np.zeros(shape, np.uint8)
-        self.keep = np.zeros(shape, np.bool_)
+        size = TILE_COLUMNS * slots
+        self.point = np.zeros((size, 4), np.float32)
+        self.range_m = np.zeros(size, np.float32)
+        self.reflectivity = np.zeros(size, np.uint16)
+        self.ring = np.zeros(size, np.uint16)
+        self.return_type = np.zeros(size, np.uint8)
+        self.keep = np.zeros(size, np.bool_)
 
-    def planes(self) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.generic]], ...]:
-        """All planes."""
-        return (
-            self.point,
-            self.range_m,
-            self.reflectivity,
-            self.ring,
-            self.return_type,
-            self.keep,
+    def part(self, begin: int, count: int, slots: int) -> _Part:
+        """`count` columns of `slots` slots each, from element `begin` on."""
+        place, shape = slice(begin, begin + count * slots), (count, slots)
+        return _Part(
+            self.point[place].reshape(*shape, 4),
+            self.range_m[place].reshape(shape),
+            self.reflectivity[place].reshape(shape),
+            self.ring[place].reshape(shape),
+            self.return_type[place].reshape(shape),
+            self.keep[place].reshape(shape),
         )
 
 
+@dataclass(slots=True)
+class _Part:
+    """The part of one sensor in a tile: (n, slots) views, `point` (n, slots, 4)."""
+
+    point: F32Array
+    range_m: F32Array
+    reflectivity: U16Array
+    ring: U16Array
+    return_type: U8Array
+    keep: BoolArray
+
+
 class _Projector:
-    """One sensor: from places in its ring to a tile of points in the body frame."""
+    """One sensor: from places in its ring to points in the body frame."""
 
     def __init__(self, source: Source, boxes_m: F64Array) -> None:
         self.counts = PointCounts()
+        self.slots = source.slots
         self._source = source
         self._boxes_m = boxes_m.astype(np.float32)
         lidar = source.lidar
@@ -115,46 +133,54 @@ class _Projector:
         self._moved = np.empty_like(self._towards)
         self._range_m = np.empty((lidar.returns, *shape), np.float32)
         self._reached_m = np.empty(shape, np.float32)
-        self.tile = _Tile(source.slots)
         slot = np.arange(source.slots)
-        self.tile.ring[:] = source.ring_base + slot // lidar.returns
-        self.tile.return_type[:] = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
+        self._ring = (source.ring_base + slot // lidar.returns).astype(np.uint16)
+        self._return_type = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
+        self.return_type = _constant(self._return_type) if not lidar.strongest_first else None
 
-    def project(self, place: I64Array, encoder: I64Array) -> None:
-        """Fill the first rows of the own tile with the columns at `place`."""
-        lidar, count, tile = self._source.lidar, len(place), self.tile
+    def project(self, place: I64Array, encoder: I64Array, part: _Part) -> None:
+        """Decode the columns at `place` into `part`."""
+        lidar, count = self._source.lidar, len(place)
         records = self._records[:count]
         self._source.ring.gather(place, records)
-        towards = self._towards[:count]
-        np.take(self._direction, encoder, axis=0, out=towards, mode="clip")
-        origin = np.take(self._origin, encoder, axis=0, mode="clip")
+        towards, origin = self._geometry(encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
-            range_m = self._range_m[which, :count]
-            pixels = Pixels(
-                range_m,
-                tile.point[:count, slots, 3],
-                tile.reflectivity[:count, slots] if lidar.has_reflectivity else None,
-            )
-            lidar.read(records, which, pixels)
+            # One return fills its plane in one piece; of several, each is every n-th slot.
+            range_m = part.range_m if lidar.returns == 1 else self._range_m[which, :count]
+            reflectivity = part.reflectivity[:, slots] if lidar.has_reflectivity else None
+            lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
             reached_m = np.add(range_m, self._reach_m, out=self._reached_m[:count])
             moved = np.multiply(reached_m[:, None, :], towards, out=self._moved[:count])
-            np.add(moved, origin, out=tile.point[:count, slots, :3].transpose(0, 2, 1))
-            tile.range_m[:count, slots] = range_m
-        if lidar.returns == 2 and lidar.strongest_first:
-            self._type_returns(count)
-        self._keep(count)
+            np.add(moved, origin, out=part.point[:, slots, :3].transpose(0, 2, 1))
+            if lidar.returns > 1:
+                part.range_m[:, slots] = range_m
+        part.ring[:] = self._ring
+        if self.return_type is None:
+            part.return_type[:] = self._return_type
+            if lidar.strongest_first:
+                self._type_returns(part.return_type)
+        self._keep(part)
 
-    def _type_returns(self, count: int) -> None:
+    def _geometry(self, encoder: I64Array) -> tuple[F32Array, F32Array]:
+        """Directions (n, 3, channels) and origins (n, 3, channels or 1) at rotor positions."""
+        first, count = int(encoder[0]), len(encoder)
+        if int(encoder[-1]) - first == count - 1 and bool((np.diff(encoder) == 1).all()):
+            turn = slice(first, first + count)
+            return self._direction[turn], self._origin[turn]
+        towards = self._towards[:count]
+        np.take(self._direction, encoder, axis=0, out=towards, mode="clip")
+        return towards, np.take(self._origin, encoder, axis=0, mode="clip")
+
+    def _type_returns(self, types: U8Array) -> None:
         """Which of two returns is nearer: numbering of facts/outputs.md section 3."""
-        strong, weak = self._range_m[0, :count], self._range_m[1, :count]
-        types = self.tile.return_type[:count]
+        strong, weak = self._range_m[:, : len(types)]
         types[:, 0::2] = np.where(weak == 0, 7, np.where(strong < weak, 3, 4))
         types[:, 1::2] = np.where(strong < weak, 6, 5)
 
-    def _keep(self, count: int) -> None:
+    def _keep(self, part: _Part) -> None:
         """Mark the points that are wanted, and count the others under their reason."""
-        range_m, keep = self.tile.range_m[:count], self.tile.keep[:count]
+        range_m, keep = part.range_m, part.keep
         counts, source = self.counts, self._source
         np.greater(range_m, 0, out=keep)
         left = int(np.count_nonzero(keep))
@@ -165,15 +191,19 @@ class _Projector:
             keep &= range_m <= np.float32(source.max_range_m)
             counts.range += left - (left := int(np.count_nonzero(keep)))
         if len(self._boxes_m):
-            self._cut_boxes(count, keep)
+            self._cut_boxes(part.point[..., :3], keep)
             counts.box += left - (left := int(np.count_nonzero(keep)))
         counts.written += left
 
-    def _cut_boxes(self, count: int, keep: BoolArray) -> None:
-        xyz = self.tile.point[:count, :, :3]
+    def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self._boxes_m:
             inside = (xyz >= box[:3]) & (xyz <= box[3:])
             keep &= ~inside.all(axis=2)
+
+
+def _constant(values: U8Array) -> int | None:
+    """The value that all have, or None if they differ."""
+    return int(values[0]) if bool((values == values[0]).all()) else None
 
 
 class _Buffer:
@@ -191,6 +221,22 @@ class _Buffer:
         self.time_ns = np.empty(shape, np.uint32)
         self.column = np.empty(rows if slots is None else 0, np.uint32)
 
+    def clear(self, rows: slice) -> None:
+        """Empty slots: NaN for what is measured in metres or as a level, else 0."""
+        for real in (self.point, self.range_m):
+            real[rows] = _NAN
+        for whole in (self.reflectivity, self.ring, self.return_type, self.time_ns):
+            whole[rows] = 0
+
+
+@dataclass(slots=True)
+class _Laid:
+    """One sensor's columns of a tile: their part, their rows in the tile's order, where they lie."""
+
+    part: _Part
+    rows: I64Array | slice
+    begin: int
+
 
 class Decoder:
     """Turns the columns of windows into scans; `only` (a sensor) serves `--split`."""
@@ -202,10 +248,13 @@ class Decoder:
         self._only = only
         self._projectors = [_Projector(source, boxes_m) for source in sources]
         self._slots = max(source.slots for source in sources)
-        self._merged = _Tile(self._slots) if len(sources) > 1 else None
+        self._tile = _Tile(self._slots)
+        self._keep = np.zeros((TILE_COLUMNS, self._slots), np.bool_)
         self._organized = info.layout == "organized"
         self._has_reflectivity = any(source.lidar.has_reflectivity for source in sources)
-        self._buffer = _Buffer(0, self._slots if self._organized else None)
+        types = {projector.return_type for projector in self._projectors}
+        self._return_type = types.pop() if len(types) == 1 else None
+        self._buffer = self._new_buffer(0)
 
     @property
     def counts(self) -> list[PointCounts]:
@@ -214,87 +263,114 @@ class Decoder:
 
     def scan(self, due: Due, label: Label) -> Scan:
         """Decode the columns of one window; the arrays are valid until the next call."""
-        self._reserve(len(due))
+        rows = len(due) if self._organized else len(due) * self._slots
+        if rows > self._buffer.rows:
+            self._buffer = self._new_buffer(rows)
         points = 0
         for begin in range(0, len(due), TILE_COLUMNS):
-            end = min(begin + TILE_COLUMNS, len(due))
-            tile = self._tile(due, slice(begin, end))
+            tile = slice(begin, min(begin + TILE_COLUMNS, len(due)))
+            laid = self._project(due, tile)
             if self._organized:
-                points += self._place(tile, due, begin, end, label.start_ns)
+                points += self._place(laid, due, tile, label.start_ns)
             else:
-                points += self._compress(tile, due, begin, end, points, label.start_ns)
+                points += self._compress(laid, due, tile, points, label.start_ns)
         return self._scan(due, label, points)
 
-    def _reserve(self, columns: int) -> None:
-        rows = columns if self._organized else columns * self._slots
-        if rows > self._buffer.rows:
-            self._buffer = _Buffer(rows, self._slots if self._organized else None)
+    def _new_buffer(self, rows: int) -> _Buffer:
+        buffer = _Buffer(rows, self._slots if self._organized else None)
+        if self._return_type is not None:
+            buffer.return_type[:] = self._return_type
+        return buffer
 
-    def _tile(self, due: Due, part: slice) -> _Tile:
-        """The columns of one tile, of all sensors, in their final order."""
-        sensor = due.sensor[part]
-        present = np.flatnonzero(np.bincount(sensor))
-        place, encoder = due.place[part], due.encoder[part]
-        if len(present) == 1:
-            projector = self._projectors[int(present[0])]
-            projector.project(place, encoder)
-            if self._merged is None or projector.tile.keep.shape == self._merged.keep.shape:
-                return projector.tile
-        merged = self._merged
-        if merged is None:
-            raise AssertionError("one sensor needs no merging")
-        merged.keep[:] = False
-        for number in present:
-            projector = self._projectors[int(number)]
+    def _project(self, due: Due, tile: slice) -> list[_Laid]:
+        """Decode the columns of one tile, sensor by sensor."""
+        sensor, place, encoder = due.sensor[tile], due.place[tile], due.encoder[tile]
+        laid, begin = [], 0
+        counts = np.bincount(sensor).tolist()
+        for number, projector in enumerate(self._projectors[: len(counts)]):
+            count = counts[number]
+            if not count:
+                continue
+            part = self._tile.part(begin, count, projector.slots)
+            if count == len(sensor):
+                projector.project(place, encoder, part)
+                return [_Laid(part, slice(0, count), begin)]
             rows = np.flatnonzero(sensor == number)
-            if len(present) > 1:
-                projector.project(place[rows], encoder[rows])
-            for target, source in zip(merged.planes(), projector.tile.planes(), strict=True):
-                target[rows, : source.shape[1]] = source[: len(rows)]
-        return merged
+            projector.project(place[rows], encoder[rows], part)
+            laid.append(_Laid(part, rows, begin))
+            begin += count * projector.slots
+        return laid
 
-    def _compress(self, tile: _Tile, due: Due, begin: int, end: int, at: int, start_ns: int) -> int:
-        """Move the wanted points of a tile to their final rows; gives their number."""
-        count, buffer = end - begin, self._buffer
-        keep = tile.keep[:count]
+    def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, I64Array]:
+        """Elements of the tile's planes in the order of the scan, and how many of each column."""
+        if len(laid) == 1:
+            keep = laid[0].part.keep
+            return np.flatnonzero(keep), np.add.reduce(keep, axis=1, dtype=np.int64)
+        keep = self._keep[:columns]
+        shift = np.empty(columns, np.int64)
+        for one in laid:
+            count, slots = one.part.keep.shape
+            keep[one.rows, :slots] = one.part.keep
+            keep[one.rows, slots:] = False
+            shift[one.rows] = one.begin + np.arange(count) * slots
+        shift -= np.arange(columns) * self._slots
+        counts = np.add.reduce(keep, axis=1, dtype=np.int64)
         index = np.flatnonzero(keep)
+        index += np.repeat(shift, counts)
+        return index, counts
+
+    def _compress(
+        self, laid: Sequence[_Laid], due: Due, columns: slice, at: int, start_ns: int
+    ) -> int:
+        """Move the wanted points of a tile to their final rows; gives their number."""
+        tile, buffer = self._tile, self._buffer
+        index, counts = self._index(laid, columns.stop - columns.start)
         rows = slice(at, at + len(index))
-        _take(tile.point, index, buffer.point[rows])
-        _take(tile.range_m, index, buffer.range_m[rows])
-        _take(tile.ring, index, buffer.ring[rows])
-        _take(tile.return_type, index, buffer.return_type[rows])
+        whole = tile.point.view(np.complex128).reshape(-1)
+        whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="clip")
+        tile.range_m.take(index, out=buffer.range_m[rows], mode="clip")
+        tile.ring.take(index, out=buffer.ring[rows], mode="clip")
+        if self._return_type is None:
+            tile.return_type.take(index, out=buffer.return_type[rows], mode="clip")
         if self._has_reflectivity:
-            _take(tile.reflectivity, index, buffer.reflectivity[rows])
-        wanted = np.add.reduce(keep, axis=1, dtype=np.uint32)
-        offset = (due.stamp_ns[begin:end] - start_ns).astype(np.uint32)
-        buffer.time_ns[rows] = np.repeat(offset, wanted)
-        buffer.lidar_id[rows] = np.repeat(self._lidar_id(due, begin, end), wanted)
-        buffer.column[rows] = np.repeat(np.arange(begin, end, dtype=np.uint32), wanted)
+            tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
+        offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
+        buffer.time_ns[rows] = np.repeat(offset, counts)
+        buffer.lidar_id[rows] = np.repeat(self._lidar_id(due, columns), counts)
+        number = np.arange(columns.start, columns.stop, dtype=np.uint32)
+        buffer.column[rows] = np.repeat(number, counts)
         return len(index)
 
-    def _lidar_id(self, due: Due, begin: int, end: int) -> U8Array:
+    def _lidar_id(self, due: Due, columns: slice) -> U8Array:
+        sensor = due.sensor[columns]
         if self._only is not None:
-            return np.full(end - begin, self._only, np.uint8)
-        return due.sensor[begin:end].astype(np.uint8)
+            return np.full(len(sensor), self._only, np.uint8)
+        return sensor.astype(np.uint8)
 
-    def _place(self, tile: _Tile, due: Due, begin: int, end: int, start_ns: int) -> int:
+    def _place(self, laid: Sequence[_Laid], due: Due, columns: slice, start_ns: int) -> int:
         """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points."""
-        rows, count, buffer = slice(begin, end), end - begin, self._buffer
-        keep = tile.keep[:count]
-        empty = ~keep
-        buffer.point[rows] = tile.point[:count]
-        buffer.point[rows][empty] = _NAN
-        buffer.range_m[rows] = np.where(keep, tile.range_m[:count], _NAN)
-        buffer.ring[rows] = tile.ring[:count] * keep
-        buffer.return_type[rows] = tile.return_type[:count] * keep
-        buffer.reflectivity[rows] = tile.reflectivity[:count] * keep
-        offset = (due.stamp_ns[rows] - start_ns).astype(np.uint32)
-        buffer.time_ns[rows] = offset[:, None] * keep
-        buffer.lidar_id[rows] = self._lidar_id(due, begin, end)[:, None]
-        return int(np.count_nonzero(keep))
+        buffer, points = self._buffer, 0
+        buffer.clear(columns)
+        offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
+        buffer.lidar_id[columns] = self._lidar_id(due, columns)[:, None]
+        for one in laid:
+            part, keep = one.part, one.part.keep
+            points += int(np.count_nonzero(keep))
+            row, slot = np.nonzero(keep)
+            order = np.arange(columns.start, columns.stop)[one.rows]
+            at = (order[row], slot)
+            buffer.point[at] = part.point[keep]
+            buffer.range_m[at] = part.range_m[keep]
+            buffer.ring[at] = part.ring[keep]
+            buffer.reflectivity[at] = part.reflectivity[keep]
+            kind = part.return_type[keep] if self._return_type is None else self._return_type
+            buffer.return_type[at] = kind
+            buffer.time_ns[at] = offset[one.rows][row]
+        return points
 
     def _scan(self, due: Due, label: Label, points: int) -> Scan:
         rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
+        lidar_id = self._lidar_id(due, slice(None))
         return Scan(
             info=self._info,
             index=label.index,
@@ -313,31 +389,16 @@ class Decoder:
             lidar_id=buffer.lidar_id[rows],
             column=None if self._organized else buffer.column[rows],
             column_stamp_ns=due.stamp_ns,
-            column_lidar_id=self._lidar_id(due, 0, len(due)),
+            column_lidar_id=lidar_id,
             points=points,
-            columns_per_sensor=self._per_sensor(due),
-            max_gap_ns=self._gaps(due),
+            columns_per_sensor=tuple(
+                np.bincount(lidar_id, minlength=len(self._info.sensors)).tolist()
+            ),
+            max_gap_ns=self._gaps(due.stamp_ns, lidar_id),
         )
 
-    def _per_sensor(self, due: Due) -> tuple[int, ...]:
-        lidar_id = self._lidar_id(due, 0, len(due))
-        return tuple(np.bincount(lidar_id, minlength=len(self._info.sensors)).tolist())
-
-    def _gaps(self, due: Due) -> tuple[int, ...]:
+    def _gaps(self, stamp_ns: I64Array, lidar_id: U8Array) -> tuple[int, ...]:
         """Widest step between columns of each sensor, ns."""
-        lidar_id = self._lidar_id(due, 0, len(due))
-        steps = (
-            np.diff(due.stamp_ns[lidar_id == number]) for number in range(len(self._info.sensors))
-        )
+        numbers = range(len(self._info.sensors))
+        steps = (np.diff(stamp_ns[lidar_id == number]) for number in numbers)
         return tuple(int(step.max(initial=0)) for step in steps)
-
-
-def _take(
-    plane: F32Array | U16Array | U8Array, index: I64Array, out: F32Array | U16Array | U8Array
-) -> None:
-    """Gather elements of a plane (points of 16 bytes as one), without a temporary array."""
-    if plane.ndim == 3:
-        whole = plane.reshape(-1, 4).view(np.complex128).reshape(-1)
-        np.take(whole, index, out=out.view(np.complex128).reshape(-1), mode="clip")
-    else:
-        np.take(plane.reshape(-1), index, out=out, mode="clip")

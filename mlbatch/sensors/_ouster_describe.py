@@ -32,8 +32,8 @@ from mlbatch.sensors._ouster_profiles import (
     ZONE_PACKET,
     PacketLayout,
 )
-from mlbatch.types import I64Array, U8Array
-from mlbatch.units import NS_PER_S
+from mlbatch.types import F64Array, I64Array, U8Array
+from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
 
 _COLUMNS = 16
 _BEAMS = (16, 32, 64, 128, 256)
@@ -43,8 +43,8 @@ _ONE_WORD = PROFILES["RNG15_RFL8_NIR8"]
 _PIXELS_SIZES = {
     beams * profile.pixel_size for beams in _BEAMS for profile in PROFILES.values()
 } - {0}
-# No machine that carries a lidar feels more, in g.
-_MOST_G = 100.0
+# What a machine that carries a lidar feels, in g.
+_LEAST_G, _MOST_G = 0.05, 100.0
 
 
 def describe(size: int, sample: U8Array) -> str | None:
@@ -88,8 +88,7 @@ def _describe_imu(size: int, packets: U8Array) -> str | None:
         bool((stamp > 0).all()) and bool((np.abs(stamp - stamps[0]) < NS_PER_S).all())
         for stamp in stamps
     )
-    felt = np.abs(sample["acceleration_g"].astype(np.float64))
-    return "Ouster IMU" if near and bool((felt < _MOST_G).all()) else None
+    return "Ouster IMU" if near and _feels(sample["acceleration_g"].astype(np.float64)) else None
 
 
 def _describe_lidar(size: int, packets: U8Array) -> str | None:
@@ -113,13 +112,22 @@ def _describe_other(size: int, packets: U8Array) -> str | None:
         raw = packets[:, SAMPLES_START : size - FOOTER_SIZE].reshape(
             len(packets), -1, SAMPLE.itemsize
         )
-        stamp = np.ascontiguousarray(raw).view(SAMPLE)[..., 0]["stamp_ns"]
-        proven = bool((stamp > 0).all()) and bool((np.ptp(stamp, axis=1) < NS_PER_S).all())
+        samples = np.ascontiguousarray(raw).view(SAMPLE)[..., 0]
+        step_ns = np.diff(samples["stamp_ns"], axis=1)
+        in_order = bool(((step_ns > 0) & (step_ns < NS_PER_S)).all())
+        felt_g = samples["acceleration"].astype(np.float64) / STANDARD_GRAVITY
+        proven = in_order and _feels(felt_g)
     else:
         name, packet_type = "zone monitor", ZONE_PACKET
         proven = size == _ZONE_SIZE
     header = _header_type(packets, packet_type) if proven else None
     return None if header is None else f"Ouster {name}, {_serial(packets, header)}{size} bytes"
+
+
+def _feels(acceleration_g: F64Array) -> bool:
+    """Whether every packet (k, ..., 3) has a sample like gravity, and no sample is absurd."""
+    felt_g = np.linalg.norm(acceleration_g, axis=-1).reshape(len(acceleration_g), -1)
+    return bool((felt_g.max(axis=1) > _LEAST_G).all()) and bool((felt_g < _MOST_G).all())
 
 
 def _header_type(packets: U8Array, packet_type: int) -> str | None:
