@@ -92,7 +92,6 @@ class OusterSpec:
 def metadata_json(spec: OusterSpec) -> JsonObject:
     """A complete nested metadata document."""
     offset_x, offset_z = spec.beam_offset_mm
-    window = spec.window or (0, spec.columns_per_frame - 1)
     document: JsonObject = {
         "beam_intrinsics": {
             "beam_altitude_angles": spec.altitudes_deg(),
@@ -113,17 +112,7 @@ def metadata_json(spec: OusterSpec) -> JsonObject:
             "status": "RUNNING",
         },
         "calibration_status": {"reflectivity": {"valid": True, "timestamp": ""}},
-        "lidar_data_format": {
-            "pixels_per_column": spec.beams,
-            "columns_per_packet": spec.columns_per_packet,
-            "columns_per_frame": spec.columns_per_frame,
-            "column_window": list(window),
-            "pixel_shift_by_row": [0] * spec.beams,
-            "udp_profile_lidar": spec.profile,
-            "udp_profile_imu": spec.imu_profile,
-            "header_type": spec.header_type,
-            "fps": spec.rate_hz,
-        },
+        "lidar_data_format": _data_format(spec),
         "config_params": {
             "lidar_mode": f"{spec.columns_per_frame}x{spec.rate_hz}",
             "timestamp_mode": spec.timestamp_mode,
@@ -139,6 +128,20 @@ def metadata_json(spec: OusterSpec) -> JsonObject:
     if spec.extrinsic_m is not None:
         document["ouster-sdk"] = {"extrinsic": list(spec.extrinsic_m)}
     return document
+
+
+def _data_format(spec: OusterSpec) -> JsonObject:
+    return {
+        "pixels_per_column": spec.beams,
+        "columns_per_packet": spec.columns_per_packet,
+        "columns_per_frame": spec.columns_per_frame,
+        "column_window": list(spec.window or (0, spec.columns_per_frame - 1)),
+        "pixel_shift_by_row": [0] * spec.beams,
+        "udp_profile_lidar": spec.profile,
+        "udp_profile_imu": spec.imu_profile,
+        "header_type": spec.header_type,
+        "fps": spec.rate_hz,
+    }
 
 
 def flat_json(spec: OusterSpec) -> JsonObject:

@@ -1,0 +1,202 @@
+"""Which metadata belong to which packets; and what unknown packets are called."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.lidar import Evidence
+from mlbatch.sensors import describe, ouster, read_calibration
+from mlbatch.sensors.ouster import OusterCalibration
+from mlbatch.sensors.ouster import read_calibration as read_content
+from mlbatch.types import Stream, U8Array
+from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
+from tests.unit.sensors.captures import (
+    CASES,
+    OUSTER,
+    Case,
+    datagrams,
+    evidence,
+    needs_recordings,
+)
+
+SAME = OUSTER / "two-sensors_same-ports_nonlegacy"
+SOURCES = {1: "169.254.92.158", 2: "169.254.238.111"}
+
+
+def calibration_at(path: Path) -> OusterCalibration:
+    found = read_calibration(path)
+    assert isinstance(found, OusterCalibration)
+    return found
+
+
+def calibration_of(spec: OusterSpec) -> OusterCalibration:
+    found = read_content(Path("a.json"), json.dumps(metadata_json(spec)).encode())
+    assert found is not None
+    return found
+
+
+def packets_of(spec: OusterSpec, columns: int = 32) -> U8Array:
+    mids = np.arange(columns)
+    packets = encode_packets(spec, 10**9 + mids, mids, np.full(columns, 7), {})
+    return np.array([np.frombuffer(packet, np.uint8) for packet in packets])
+
+
+def seen(packets: U8Array, port: int = 7502, *sizes: tuple[int, int]) -> Evidence:
+    size = packets.shape[1]
+    return Evidence(Stream("192.0.2.7", port), size, packets, frozenset({(port, size), *sizes}))
+
+
+@needs_recordings
+@pytest.mark.parametrize(
+    ("kind", "sizes"), [("legacy", (24896, 12608)), ("nonlegacy", (16640,) * 2)]
+)
+def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> None:
+    folder = OUSTER / f"two-sensors_same-ports_{kind}"
+    for number, size in zip(SOURCES, sizes, strict=True):
+        found = evidence(folder / f"same_ports_{kind}.pcap", size, SOURCES[number])
+        fits = {
+            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").fit(found)
+            for other in SOURCES
+        }
+        assert fits[number] > 0
+        assert [other for other in SOURCES if fits[other]] == [number]
+
+
+@needs_recordings
+def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
+    found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
+    assert (7502, 48) in found.sizes
+    shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
+    apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
+    assert shared.fit(found) > apart.fit(found) > 0
+    moved = replace(found, sizes=frozenset({(7502, 16640), (7503, 48)}))
+    assert apart.fit(moved) > shared.fit(moved) > 0
+
+
+@needs_recordings
+def test_no_metadata_take_packets_of_another_unit() -> None:
+    calibrations = [calibration_at(case.metadata_path) for case in CASES]
+    for case in CASES:
+        own = calibration_at(case.metadata_path)
+        size = own.metadata.layout.packet_size
+        found = evidence(OUSTER / case.folder / case.capture, size, case.source)
+        for other in calibrations:
+            # Without serial numbers any unit with packets of this size may be the one.
+            might = own.serial in ("", other.serial) or own.metadata.layout.legacy
+            same = might and other.metadata.layout.packet_size == size
+            assert (other.fit(found) > 0) == same, (case, other.path)
+
+
+def test_serial_numbers_decide_then_configuration_then_ports() -> None:
+    spec = OusterSpec(beams=16, serial=111, init_id=5)
+    packets = seen(packets_of(spec), 7502, (7503, 48))
+    order = [
+        spec,
+        replace(spec, imu_port=7999),
+        replace(spec, lidar_port=7999),
+        replace(spec, init_id=6),
+        replace(spec, init_id=6, lidar_port=7999, imu_port=7999),
+        replace(spec, serial=0),
+        replace(spec, serial=0, init_id=6, lidar_port=7999, imu_port=7999),
+    ]
+    fits = [calibration_of(candidate).fit(packets) for candidate in order]
+    assert fits == sorted(set(fits), reverse=True)
+    assert fits[-1] > 0
+    assert calibration_of(replace(spec, serial=112)).fit(packets) == 0
+
+
+def test_packets_without_serial_number_fit_any_unit() -> None:
+    spec = OusterSpec(beams=16, serial=0, init_id=0)
+    assert calibration_of(replace(spec, serial=111)).fit(seen(packets_of(spec))) > 0
+
+
+def test_size_and_size_plus_one_fit() -> None:
+    spec = OusterSpec(beams=16)
+    packets = packets_of(spec)
+    longer = np.hstack([packets, np.zeros((2, 1), np.uint8)])
+    calibration = calibration_of(spec)
+    assert calibration.fit(seen(packets)) == calibration.fit(seen(longer)) > 0
+    assert calibration.fit(seen(np.hstack([longer, longer[:, :1]]))) == 0
+    assert calibration.fit(seen(packets[:, :-1])) == 0
+    assert calibration.fit(seen(packets[:0])) == 0
+
+
+@pytest.mark.parametrize("profile", ["LEGACY", "RNG15_RFL8_NIR8"])
+def test_other_bytes_of_the_right_size_do_not_fit(profile: str) -> None:
+    spec = OusterSpec(profile=profile, beams=16)
+    shape = packets_of(spec).shape
+    noise = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    assert calibration_of(spec).fit(seen(noise)) == 0
+
+
+def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:
+    document = metadata_json(OusterSpec(beams=16))
+    document["lidar_data_format"]["udp_profile_lidar"] = "OFF"
+    found = read_content(Path("a.json"), json.dumps(document).encode())
+    assert found is not None
+    assert found.fit(seen(np.ones((2, 256), np.uint8))) == 0
+
+
+@needs_recordings
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
+def test_real_packets_are_named(case: Case) -> None:
+    calibration = calibration_at(case.metadata_path)
+    layout = calibration.metadata.layout
+    packets = case.payloads(layout.packet_size)[:4]
+    text = describe(layout.packet_size, packets)
+    if layout.legacy:
+        assert text == f"Ouster lidar, LEGACY, {layout.beams} beams"
+    else:
+        assert text == (
+            f"Ouster lidar, serial {calibration.serial}, {layout.packet_size} bytes: "
+            "needs its metadata"
+        )
+    longer = np.hstack([packets, packets[:, :1]])
+    assert describe(layout.packet_size + 1, longer) == text
+
+
+@needs_recordings
+def test_real_imu_and_zone_packets_are_named() -> None:
+    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    serial = "serial 122247000785"
+    assert describe(452, case.payloads(452)) == f"Ouster IMU, {serial}, 452 bytes"
+    assert describe(680, case.payloads(680)) == f"Ouster zone monitor, {serial}, 680 bytes"
+    assert describe(48, CASES[0].payloads(48)[:4]) == "Ouster IMU"
+
+
+@needs_recordings
+@pytest.mark.parametrize("path", ["velodyne/vlp16_gps", "velodyne/hdl32e_named-vlp32", "other"])
+def test_real_packets_of_other_makers_are_not_ours(path: str) -> None:
+    checked = 0
+    for capture in sorted((OUSTER.parent / path).rglob("*.pcap")):
+        for _source, _port, data in datagrams(capture):
+            assert ouster.describe(len(data), np.frombuffer(data, np.uint8)[None, :]) is None
+            checked += 1
+    assert checked
+
+
+@pytest.mark.parametrize("fill", ["zero", "ones", "noise", "counting", "two"])
+def test_no_bytes_are_taken_for_ours_by_their_size(fill: str) -> None:
+    rng = np.random.default_rng(3)
+    sizes = (1, 48, 49, 200, 452, 512, 554, 568, 680, 893, 1072, 1080, 1198, 1206, 1212, 1262)
+    for size in (*sizes, 1248, 1280, 2304, 3328, 3392, 4352, 8448, 12608, 16640, 24896):
+        payload = {
+            "zero": np.zeros(size, np.uint8),
+            "ones": np.full(size, 255, np.uint8),
+            "noise": rng.integers(0, 256, size, np.uint8),
+            "counting": np.arange(size).astype(np.uint8),
+            "two": np.full(size, 2, np.uint8),
+        }[fill]
+        assert ouster.describe(size, np.stack([payload, payload])) is None
+
+
+def test_encoded_imu_packets_are_named() -> None:
+    spec = OusterSpec(beams=16, imu_profile="ACCEL32_GYRO32_NMEA", serial=5)
+    data = imu_packet(spec, np.arange(1, 5), np.ones((4, 3)), np.ones((4, 3)))
+    sample = np.frombuffer(data, np.uint8)
+    assert describe(len(data), sample) == f"Ouster IMU, serial 5, {len(data)} bytes"
