@@ -189,23 +189,27 @@ def test_large_held_sets_do_not_overflow_the_arena() -> None:
 def feed(seed: int) -> Records:
     """Datagrams of few sources and identifications, damaged in every way a network can."""
     pick = random.Random(seed)
-    records: Records = []
-    host_ns = 1000 * SECOND_NS
+    frames: list[bytes] = []
     for i in range(pick.randint(1, 25)):
-        frames = fragments(i, pick.randint(1, 3), f"10.0.0.{pick.randint(1, 2)}", 1300 + i % 3)
-        records += [(host_ns + k, frame) for k, frame in enumerate(frames)]
-        host_ns += pick.choice([1000, 1000, 1000, 600_000_000, -5 * SECOND_NS, 0])
-    for _ in range(pick.choice([0, 0, 1, 3, 9])):
-        at, to = pick.randrange(len(records)), pick.randrange(len(records))
+        source = f"10.0.0.{pick.randint(1, 2)}"
+        frames += fragments(i, pick.randint(1, 3), source, 1300 + i % 3)
+    for _ in range(pick.choice([0, 1, 3, 9])):
+        at, to = pick.randrange(len(frames)), pick.randrange(len(frames))
         deed = pick.choice(["drop", "repeat", "move", "swap"])
         if deed == "swap":
-            records[at], records[to] = records[to], records[at]
+            frames[at], frames[to] = frames[to], frames[at]
         elif deed == "repeat":
-            records.insert(to, records[at])
-        elif len(records) > 1:
-            taken = records.pop(at)
+            frames.insert(to, frames[at])
+        elif len(frames) > 1:
+            taken = frames.pop(at)
             if deed == "move":
-                records.insert(min(to, len(records)), taken)
+                frames.insert(min(to, len(frames)), taken)
+    # Half of the clocks never step back: only then do sets go together.
+    steps_ns = [0, 1000, 1000, 1000, 300_000_000, pick.choice([1000, -2 * SECOND_NS])]
+    host_ns, records = 1000 * SECOND_NS, []
+    for frame in frames:
+        records.append((host_ns, frame))
+        host_ns += pick.choice(steps_ns)
     return records
 
 
