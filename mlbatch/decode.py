@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.ledger import PointCounts
 from mlbatch.lidar import Lidar
 from mlbatch.ring import RawRing
 from mlbatch.types import (
+    EXTRAS,
     BoolArray,
     F32Array,
     F64Array,
@@ -27,7 +30,11 @@ from mlbatch.types import (
     U16Array,
 )
 
-TILE_COLUMNS = 256
+TILE_COLUMNS = 1024
+# What a point is, in the bytes of one word, so that it moves as one.
+LABEL = np.dtype([("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
+Extras: TypeAlias = frozenset[str]
+Labels: TypeAlias = npt.NDArray[np.void]
 _NAN = np.float32("nan")
 
 
@@ -85,8 +92,7 @@ class _Tile:
         self.point = np.zeros((size, 4), np.float32)
         self.range_m = np.zeros(size, np.float32)
         self.reflectivity = np.zeros(size, np.uint16)
-        self.ring = np.zeros(size, np.uint16)
-        self.return_type = np.zeros(size, np.uint8)
+        self.label = np.zeros(size, LABEL)
         self.keep = np.zeros(size, np.bool_)
 
     def part(self, begin: int, count: int, slots: int) -> _Part:
@@ -96,8 +102,7 @@ class _Tile:
             self.point[place].reshape(*shape, 4),
             self.range_m[place].reshape(shape),
             self.reflectivity[place].reshape(shape),
-            self.ring[place].reshape(shape),
-            self.return_type[place].reshape(shape),
+            self.label[place].reshape(shape),
             self.keep[place].reshape(shape),
         )
 
@@ -109,15 +114,14 @@ class _Part:
     point: F32Array
     range_m: F32Array
     reflectivity: U16Array
-    ring: U16Array
-    return_type: U8Array
+    label: Labels
     keep: BoolArray
 
 
 class _Projector:
     """One sensor: from places in its ring to points in the body frame."""
 
-    def __init__(self, source: Source, boxes_m: F64Array) -> None:
+    def __init__(self, source: Source, lidar_id: int, boxes_m: F64Array, extras: Extras) -> None:
         self.counts = PointCounts()
         self.slots = source.slots
         self._source = source
@@ -134,9 +138,11 @@ class _Projector:
         self._range_m = np.empty((lidar.returns, *shape), np.float32)
         self._reached_m = np.empty(shape, np.float32)
         slot = np.arange(source.slots)
-        self._ring = (source.ring_base + slot // lidar.returns).astype(np.uint16)
-        self._return_type = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
-        self.return_type = _constant(self._return_type) if not lidar.strongest_first else None
+        self._label = np.zeros(source.slots, LABEL)
+        self._label["ring"] = source.ring_base + slot // lidar.returns
+        self._label["return_type"] = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
+        self._label["lidar_id"] = lidar_id
+        self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
     def project(self, place: I64Array, encoder: I64Array, part: _Part) -> None:
         """Decode the columns at `place` into `part`."""
@@ -148,18 +154,16 @@ class _Projector:
             slots = slice(which, None, lidar.returns)
             # One return fills its plane in one piece; of several, each is every n-th slot.
             range_m = part.range_m if lidar.returns == 1 else self._range_m[which, :count]
-            reflectivity = part.reflectivity[:, slots] if lidar.has_reflectivity else None
+            reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
             reached_m = np.add(range_m, self._reach_m, out=self._reached_m[:count])
             moved = np.multiply(reached_m[:, None, :], towards, out=self._moved[:count])
             np.add(moved, origin, out=part.point[:, slots, :3].transpose(0, 2, 1))
             if lidar.returns > 1:
                 part.range_m[:, slots] = range_m
-        part.ring[:] = self._ring
-        if self.return_type is None:
-            part.return_type[:] = self._return_type
-            if lidar.strongest_first:
-                self._type_returns(part.return_type)
+        part.label.view(np.uint32)[:] = self._label.view(np.uint32)
+        if lidar.returns == 2 and lidar.strongest_first:
+            self._type_returns(part.label["return_type"])
         self._keep(part)
 
     def _geometry(self, encoder: I64Array) -> tuple[F32Array, F32Array]:
@@ -201,11 +205,6 @@ class _Projector:
             keep &= ~inside.all(axis=2)
 
 
-def _constant(values: U8Array) -> int | None:
-    """The value that all have, or None if they differ."""
-    return int(values[0]) if bool((values == values[0]).all()) else None
-
-
 class _Buffer:
     """Arrays of one scan, reused by the next; rows beyond a scan's points are stale."""
 
@@ -215,9 +214,7 @@ class _Buffer:
         self.point = np.empty((*shape, 4), np.float32)
         self.range_m = np.empty(shape, np.float32)
         self.reflectivity = np.empty(shape, np.uint16)
-        self.ring = np.empty(shape, np.uint16)
-        self.return_type = np.empty(shape, np.uint8)
-        self.lidar_id = np.empty(shape, np.uint8)
+        self.label = np.empty(shape, LABEL)
         self.time_ns = np.empty(shape, np.uint32)
         self.column = np.empty(rows if slots is None else 0, np.uint32)
 
@@ -225,13 +222,13 @@ class _Buffer:
         """Empty slots: NaN for what is measured in metres or as a level, else 0."""
         for real in (self.point, self.range_m):
             real[rows] = _NAN
-        for whole in (self.reflectivity, self.ring, self.return_type, self.time_ns):
+        for whole in (self.reflectivity, self.label.view(np.uint32), self.time_ns):
             whole[rows] = 0
 
 
 @dataclass(slots=True)
 class _Laid:
-    """One sensor's columns of a tile: their part, their rows in the tile's order, where they lie."""
+    """One sensor's columns of a tile: their part, rows in the tile's order, first element."""
 
     part: _Part
     rows: I64Array | slice
@@ -242,18 +239,28 @@ class Decoder:
     """Turns the columns of windows into scans; `only` (a sensor) serves `--split`."""
 
     def __init__(
-        self, info: RunInfo, sources: Sequence[Source], boxes_m: F64Array, only: int | None = None
+        self,
+        info: RunInfo,
+        sources: Sequence[Source],
+        boxes_m: F64Array,
+        extras: Extras = EXTRAS,
+        only: int | None = None,
     ) -> None:
         self._info = info
         self._only = only
-        self._projectors = [_Projector(source, boxes_m) for source in sources]
+        self._extras = extras
+        first = only or 0
+        self._projectors = [
+            _Projector(source, number, boxes_m, extras)
+            for number, source in enumerate(sources, first)
+        ]
         self._slots = max(source.slots for source in sources)
         self._tile = _Tile(self._slots)
         self._keep = np.zeros((TILE_COLUMNS, self._slots), np.bool_)
         self._organized = info.layout == "organized"
-        self._has_reflectivity = any(source.lidar.has_reflectivity for source in sources)
-        types = {projector.return_type for projector in self._projectors}
-        self._return_type = types.pop() if len(types) == 1 else None
+        self._has_reflectivity = "reflectivity" in extras and any(
+            source.lidar.has_reflectivity for source in sources
+        )
         self._buffer = self._new_buffer(0)
 
     @property
@@ -277,10 +284,7 @@ class Decoder:
         return self._scan(due, label, points)
 
     def _new_buffer(self, rows: int) -> _Buffer:
-        buffer = _Buffer(rows, self._slots if self._organized else None)
-        if self._return_type is not None:
-            buffer.return_type[:] = self._return_type
-        return buffer
+        return _Buffer(rows, self._slots if self._organized else None)
 
     def _project(self, due: Due, tile: slice) -> list[_Laid]:
         """Decode the columns of one tile, sensor by sensor."""
@@ -305,7 +309,7 @@ class Decoder:
         """Elements of the tile's planes in the order of the scan, and how many of each column."""
         if len(laid) == 1:
             keep = laid[0].part.keep
-            return np.flatnonzero(keep), np.add.reduce(keep, axis=1, dtype=np.int64)
+            return np.flatnonzero(keep), np.add.reduce(keep, axis=1, dtype=np.uint16)
         keep = self._keep[:columns]
         shift = np.empty(columns, np.int64)
         for one in laid:
@@ -314,7 +318,7 @@ class Decoder:
             keep[one.rows, slots:] = False
             shift[one.rows] = one.begin + np.arange(count) * slots
         shift -= np.arange(columns) * self._slots
-        counts = np.add.reduce(keep, axis=1, dtype=np.int64)
+        counts = np.add.reduce(keep, axis=1, dtype=np.uint16)
         index = np.flatnonzero(keep)
         index += np.repeat(shift, counts)
         return index, counts
@@ -328,17 +332,17 @@ class Decoder:
         rows = slice(at, at + len(index))
         whole = tile.point.view(np.complex128).reshape(-1)
         whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="clip")
-        tile.range_m.take(index, out=buffer.range_m[rows], mode="clip")
-        tile.ring.take(index, out=buffer.ring[rows], mode="clip")
-        if self._return_type is None:
-            tile.return_type.take(index, out=buffer.return_type[rows], mode="clip")
+        words = tile.label.view(np.uint32)
+        words.take(index, out=buffer.label[rows].view(np.uint32), mode="clip")
+        if "range_m" in self._extras:
+            tile.range_m.take(index, out=buffer.range_m[rows], mode="clip")
         if self._has_reflectivity:
             tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
         offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
         buffer.time_ns[rows] = np.repeat(offset, counts)
-        buffer.lidar_id[rows] = np.repeat(self._lidar_id(due, columns), counts)
-        number = np.arange(columns.start, columns.stop, dtype=np.uint32)
-        buffer.column[rows] = np.repeat(number, counts)
+        if "column" in self._extras:
+            number = np.arange(columns.start, columns.stop, dtype=np.uint32)
+            buffer.column[rows] = np.repeat(number, counts)
         return len(index)
 
     def _lidar_id(self, due: Due, columns: slice) -> U8Array:
@@ -352,7 +356,7 @@ class Decoder:
         buffer, points = self._buffer, 0
         buffer.clear(columns)
         offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
-        buffer.lidar_id[columns] = self._lidar_id(due, columns)[:, None]
+        buffer.label["lidar_id"][columns] = self._lidar_id(due, columns)[:, None]
         for one in laid:
             part, keep = one.part, one.part.keep
             points += int(np.count_nonzero(keep))
@@ -361,16 +365,15 @@ class Decoder:
             at = (order[row], slot)
             buffer.point[at] = part.point[keep]
             buffer.range_m[at] = part.range_m[keep]
-            buffer.ring[at] = part.ring[keep]
+            buffer.label[at] = part.label[keep]
             buffer.reflectivity[at] = part.reflectivity[keep]
-            kind = part.return_type[keep] if self._return_type is None else self._return_type
-            buffer.return_type[at] = kind
             buffer.time_ns[at] = offset[one.rows][row]
         return points
 
     def _scan(self, due: Due, label: Label, points: int) -> Scan:
         rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
         lidar_id = self._lidar_id(due, slice(None))
+        has_column = "column" in self._extras and not self._organized
         return Scan(
             info=self._info,
             index=label.index,
@@ -382,12 +385,12 @@ class Decoder:
             xyz=buffer.point[rows, ..., :3],
             intensity=buffer.point[rows, ..., 3],
             reflectivity=buffer.reflectivity[rows] if self._has_reflectivity else None,
-            range_m=buffer.range_m[rows],
+            range_m=buffer.range_m[rows] if "range_m" in self._extras else None,
             time_ns=buffer.time_ns[rows],
-            ring=buffer.ring[rows],
-            return_type=buffer.return_type[rows],
-            lidar_id=buffer.lidar_id[rows],
-            column=None if self._organized else buffer.column[rows],
+            ring=buffer.label["ring"][rows],
+            return_type=buffer.label["return_type"][rows],
+            lidar_id=buffer.label["lidar_id"][rows],
+            column=buffer.column[rows] if has_column else None,
             column_stamp_ns=due.stamp_ns,
             column_lidar_id=lidar_id,
             points=points,

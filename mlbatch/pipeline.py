@@ -26,6 +26,7 @@ from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.ring import RawRing
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
+    EXTRAS,
     F64Array,
     ImuSamples,
     PacketBatch,
@@ -47,7 +48,8 @@ DEFAULT_MAX_WAIT_NS = NS_PER_S
 class Job:
     """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
 
-    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6).
+    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
+    those of EXTRAS that the output has a place for.
     """
 
     recordings: tuple[Path, ...]
@@ -67,6 +69,7 @@ class Job:
     max_range_m: float = float("inf")
     boxes_m: tuple[tuple[float, ...], ...] = ()
     strict: bool = False
+    extras: frozenset[str] = EXTRAS
 
 
 @dataclass(slots=True)
@@ -208,7 +211,7 @@ class Conversion:
             )
         self.info = _run_info(self.setup, self.job, self.grid, shared)
         self.table = ScanTable(self.info)
-        boxes_m = _boxes(self.setup, self.job)
+        boxes_m, extras = _boxes(self.setup, self.job), self.job.extras
         sources = [
             _source(sensor, feed, info.ring_base, self.job)
             for sensor, feed, info in zip(
@@ -218,9 +221,9 @@ class Conversion:
         if self.job.split:
             for number, source in enumerate(sources):
                 source.ring_base = 0
-                self._decoders.append(Decoder(self.info, [source], boxes_m, only=number))
+                self._decoders.append(Decoder(self.info, [source], boxes_m, extras, number))
         else:
-            self._decoders = [Decoder(self.info, sources, boxes_m)]
+            self._decoders = [Decoder(self.info, sources, boxes_m, extras)]
 
     def timescale_of(self, sensor: Mounted, stamp_ns: int, host_ns: int) -> str:
         """Timescale of a sensor's stamps as they are batched."""

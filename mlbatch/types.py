@@ -181,6 +181,10 @@ class RunInfo:
     layout: str = "dense"
 
 
+# Arrays of a scan that not every output has a place for; only those that are asked for are made.
+EXTRAS = frozenset({"reflectivity", "range_m", "column"})
+
+
 @dataclass(slots=True)
 class Scan:
     """All columns of one window of the common clock, sorted by stamp; fields as in the npz.
@@ -189,8 +193,9 @@ class Scan:
     xyz: (p, 3) float32, m, body frame; intensity, range_m: (p,) float32; reflectivity: (p,) uint16
     or None; time_ns: (p,) uint32 after `start_ns`; ring: (p,) uint16; return_type, lidar_id:
     (p,) uint8; column: (p,) uint32, or None when organized; column_stamp_ns: (n,) int64;
-    column_lidar_id: (n,) uint8. `ready_host_ns` is the arrival of the packet that closed the
-    window; `max_gap_ns[s]` the widest step between columns of sensor s (0: fewer than two).
+    column_lidar_id: (n,) uint8. The arrays of EXTRAS are None where nobody asked for them.
+    `ready_host_ns` is the arrival of the packet that closed the window; `max_gap_ns[s]` the widest
+    step between columns of sensor s (0: fewer than two).
     """
 
     info: RunInfo
@@ -203,7 +208,7 @@ class Scan:
     xyz: F32Array
     intensity: F32Array
     reflectivity: U16Array | None
-    range_m: F32Array
+    range_m: F32Array | None
     time_ns: U32Array
     ring: U16Array
     return_type: U8Array

@@ -283,8 +283,9 @@ class Batcher:
             return np.zeros(newest.shape, bool)
         leading = newest.max(axis=0)
         own = np.where(newest > NEVER, newest, first_of_all)
-        behind = leading - own > self._policy.max_wait_ns
-        return np.logical_and(behind, leading > NEVER)
+        behind: BoolArray = np.greater(leading - own, self._policy.max_wait_ns)
+        behind &= leading > NEVER
+        return behind
 
     def _begin(self, present: BoolArray, stalled: BoolArray) -> int:
         """Evaluate eq. (1) at the first delivery that allows it; its number, or past the end."""
@@ -332,10 +333,10 @@ class Batcher:
 
     def _late(self, stamp: I64Array, limit: I64Array) -> BoolArray:
         """Which columns come after the end of their window was passed: (n,) bool."""
-        late: BoolArray = stamp < limit
-        for at in np.flatnonzero(late):
+        late = np.less(stamp, limit)
+        for at in np.flatnonzero(late).tolist():
             end = self._grid.bound(self._grid.index_of(int(stamp[at])) + 1)
-            late[at] = end <= limit[at]
+            late[at] = end <= int(limit[at])
         return late
 
     # -- windows ------------------------------------------------------------------------------

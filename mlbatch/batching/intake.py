@@ -130,7 +130,7 @@ class Intake:
         return known & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
 
     def _judge(self, arrival: Arrival) -> Arrival:
-        """Hold packets that step until the sensor's next one: packet by packet, since it is rare."""
+        """Hold packets that step until the next one: packet by packet, since it is rare."""
         rows = arrival if self._held is None else _joined(self._held, arrival)
         low, high = extremes(rows.heads)
         position = rows.position.copy()

@@ -22,7 +22,7 @@ class Loss:
         self._doubtful: int | None = None
 
     def add(self, sequence: I64Array) -> None:
-        """Count accepted packets (n,), in order of arrival; negative numbers are outside the count."""
+        """Count accepted packets (n,), in order of arrival; negative: outside the count."""
         sequence = sequence[sequence >= 0]
         if not self._modulus or not len(sequence):
             return

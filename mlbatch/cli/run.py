@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import typer
@@ -18,6 +18,7 @@ from mlbatch.writers import (
     WriterOptions,
     check_target,
     choose_format,
+    extras,
     open_writer,
     report_paths,
     write_text,
@@ -41,9 +42,11 @@ class Wanted:
 def run(job: Job, wanted: Wanted) -> None:
     """Convert, write the report, print the summary."""
     opener, report_path = None, wanted.report
+    options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
+    # A dry run without an output decodes what a .mcap of this point layout would hold.
+    name = choose_format(wanted.output or Path("scans.mcap"), wanted.format)
+    job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
-        name = choose_format(wanted.output, wanted.format)
-        options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
         check_target(name, wanted.output, options, job.layout)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report

@@ -30,6 +30,7 @@ __all__ = [
     "check_free_space",
     "check_target",
     "choose_format",
+    "extras",
     "formats",
     "open_writer",
     "plugin",
@@ -103,6 +104,11 @@ def report_paths(target: Path, name: str) -> ReportPaths:
     if plugin(name).SUFFIX is None:
         return ReportPaths(target / REPORT_JSON, target / SCANS_CSV)
     return ReportPaths(side_path(target, REPORT_JSON), side_path(target, SCANS_CSV))
+
+
+def extras(name: str, options: WriterOptions) -> frozenset[str]:
+    """Those of `types.EXTRAS` that an output in the format called `name` holds."""
+    return plugin(name).extras(options)
 
 
 def check_target(name: str, target: Path, options: WriterOptions, layout: str) -> None:

@@ -14,6 +14,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.errors import ExportError
 from mlbatch.types import (
     F32Array,
     F64Array,
@@ -44,7 +45,7 @@ class Points:
     xyz: F32Array
     intensity: F32Array
     reflectivity: U16Array | None
-    range_m: F32Array
+    range_m: F32Array | None
     time_ns: U32Array
     ring: U16Array
     return_type: U8Array
@@ -58,7 +59,7 @@ class Points:
             self.xyz[rows],
             self.intensity[rows],
             None if self.reflectivity is None else self.reflectivity[rows],
-            self.range_m[rows],
+            None if self.range_m is None else self.range_m[rows],
             self.time_ns[rows],
             self.ring[rows],
             self.return_type[rows],
@@ -69,16 +70,14 @@ class Points:
 def points_of(scan: Scan) -> Points:
     """The points of a scan; organized ones are turned so that a column is a column of the image."""
     turned = scan.info.layout == "organized"
-    reflectivity = scan.reflectivity
-    if turned and reflectivity is not None:
-        reflectivity = reflectivity.T
+    reflectivity, range_m = scan.reflectivity, scan.range_m
     return Points(
         scan.info.sensors,
         scan.start_ns,
         scan.xyz.transpose(1, 0, 2) if turned else scan.xyz,
         scan.intensity.T,
-        reflectivity,
-        scan.range_m.T,
+        None if reflectivity is None else reflectivity.T,
+        None if range_m is None else range_m.T,
         scan.time_ns.T,
         scan.ring.T,
         scan.return_type.T,
@@ -115,11 +114,15 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Fields of a point record of `step` bytes; bytes between fields are zero."""
+    """Fields of a point record of `step` bytes; bytes between fields are zero.
+
+    extras: those of `types.EXTRAS` that the fields are made of.
+    """
 
     name: str
     step: int
     fields: tuple[Field, ...]
+    extras: frozenset[str] = frozenset()
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -188,6 +191,8 @@ def _reflectivity(points: Points) -> Values:
 
 
 def _range_mm(points: Points) -> Values:
+    if points.range_m is None:
+        raise ExportError("point layout with ranges: wanted them decoded, got none; please report")
     range_mm: F64Array = np.multiply(np.nan_to_num(points.range_m), MM_PER_M, dtype=np.float64)
     np.rint(range_mm, out=range_mm)
     return range_mm
@@ -274,7 +279,7 @@ CLOUD_LAYOUTS = {
     for layout in (
         Layout("standard", 24, _STANDARD),
         Layout("velodyne", 22, _VELODYNE),
-        Layout("ouster", 48, _OUSTER),
+        Layout("ouster", 48, _OUSTER, frozenset({"reflectivity", "range_m"})),
         Layout("hesai", 26, _HESAI),
         Layout("autoware", 32, _AUTOWARE),
         Layout("kiss-icp", 16, (*_XYZ, _time(12))),

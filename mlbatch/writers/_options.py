@@ -58,6 +58,10 @@ class WriterModule(Protocol):
     FORMAT: str
     SUFFIX: str | None
 
+    def extras(self, options: WriterOptions) -> frozenset[str]:
+        """Those of `types.EXTRAS` that the output holds."""
+        ...
+
     def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
         """Start an output; nothing stands at `target` before the writer's `finish`."""
         ...

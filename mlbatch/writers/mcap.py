@@ -29,6 +29,12 @@ SUFFIX: str | None = ".mcap"
 WAITING_SAMPLES = 65536
 
 
+def extras(options: WriterOptions) -> frozenset[str]:
+    """What the fields of the point layout are made of."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    return frozenset() if layout is None else layout.extras
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)

@@ -14,7 +14,7 @@ from typing import BinaryIO, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import F32Array, RunInfo, Scan
+from mlbatch.types import EXTRAS, F32Array, RunInfo, Scan
 from mlbatch.writers._folder import FolderWriter
 from mlbatch.writers._options import ScanWriter, WriterOptions
 
@@ -26,6 +26,11 @@ Array: TypeAlias = npt.NDArray[np.generic]
 
 # The earliest date a zip can hold: files must not depend on when they were written.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def extras(options: WriterOptions) -> frozenset[str]:
+    """All: an npz keeps what was decoded."""
+    return EXTRAS
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

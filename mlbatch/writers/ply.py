@@ -24,6 +24,11 @@ SUFFIX: str | None = None
 _TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
 
 
+def extras(options: WriterOptions) -> frozenset[str]:
+    """None: the properties are those of `_layouts.PLY_LAYOUT`."""
+    return frozenset()
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of PLY files."""
     if info.layout == "organized":
