@@ -7,8 +7,8 @@ sensor, G: the largest N; slack: 10 ms):
 
 1. Intake: see `reference_intake.py`. A held packet is delivered when one confirms it.
 2. Invalid columns are dropped `invalid` and are never stamps, but count as decoded.
-3. Clocks are compared when a sensor's first valid column is delivered, with the first sensor that
-   had one (not with the host clock).
+3. Clocks are compared when a sensor's first valid column is delivered, with every sensor that had
+   one: with the first alone it would matter which came first. Not with the host clock.
 4. Sensor s is stalled after a delivery if G - N[s], or before its first column G minus the smallest
    t0, exceeds max-wait.
 5. Eq. (1) is evaluated after the first delivery at which every sensor has a column or is stalled,
@@ -119,7 +119,7 @@ class Session:
         self.slices_per_ns = settings.rate * settings.slices / SECOND_NS
         self.intakes = [Intake(s, settings.host_clock) for s in range(settings.sensors)]
         self.sensors = [Sensor() for _ in range(settings.sensors)]
-        self.reference_offset: tuple[int, int] | None = None
+        self.offsets: dict[int, int] = {}
         self.k0: int | None = None
         self.watermark: int | None = None
         self.published_end: int | None = None
@@ -155,14 +155,13 @@ class Session:
 
     def compare_clocks(self, number: int, offset: int) -> None:
         """Rule 3."""
-        if self.reference_offset is None:
-            self.reference_offset = (number, offset)
-        first, reference = self.reference_offset
-        if not self.settings.host_clock and abs(offset - reference) > SECOND_NS:
-            raise ClockError(
-                f"sensors {first} and {number}: wanted comparable clocks, got stamp minus host "
-                f"{reference} ns and {offset} ns; use --clock host or clock.offset_s"
-            )
+        for other, known in self.offsets.items():
+            if not self.settings.host_clock and abs(offset - known) > SECOND_NS:
+                raise ClockError(
+                    f"sensors {other} and {number}: wanted comparable clocks, got stamp minus "
+                    f"host {known} ns and {offset} ns; use --clock host or clock.offset_s"
+                )
+        self.offsets[number] = offset
 
     def load(self, number: int, stamp: int, packet: int, column: int) -> None:
         """Put a column into its window, unless it is late: rule 7."""

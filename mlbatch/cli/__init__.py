@@ -7,6 +7,9 @@ import sys
 
 from mlbatch.errors import MlbatchError, UsageError
 
+# numpy's linear algebra, which nothing here uses, would start a thread on every core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
 
