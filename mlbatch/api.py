@@ -1,0 +1,89 @@
+"""The Python face: the scans that `mlbatch convert` writes, one after the other in memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from mlbatch.discover import Wishes
+from mlbatch.errors import UsageError
+from mlbatch.pipeline import Conversion, Job
+from mlbatch.rate import parse_rate
+from mlbatch.types import Scan
+from mlbatch.units import NS_PER_S
+
+PathLike: TypeAlias = str | Path
+
+
+def scans(
+    *recordings: PathLike,
+    rig: PathLike | None = None,
+    rate: int | float | str | Fraction | None = None,
+    slices: int = 1,
+    layout: str = "dense",
+    keep_partial: bool = False,
+    max_wait: float = 1.0,
+    clock: str = "sensor",
+    min_range: float = 0.0,
+    max_range: float = math.inf,
+    metadata: Sequence[PathLike] = (),
+    only: Sequence[str] = (),
+    ignore: Sequence[str] = (),
+    identity_extrinsics: bool = False,
+    strict: bool = False,
+) -> Iterator[Scan]:
+    """Yield the merged scans of one session, each with arrays of its own.
+
+    Arguments are the options of `mlbatch convert` (max_wait in s, ranges in m, rate in Hz); fields
+    of a Scan are named as the npz keys. Raises MlbatchError where the command ends with an error.
+    """
+    for name, value, known in (
+        ("layout", layout, ("dense", "organized")),
+        ("clock", clock, ("sensor", "host")),
+    ):
+        if value not in known:
+            raise UsageError(f"{name}: wanted {' or '.join(known)}, got {value!r}; choose one")
+    job = Job(
+        recordings=tuple(Path(path) for path in recordings),
+        wishes=Wishes(
+            rig=None if rig is None else Path(rig),
+            metadata=tuple(Path(path) for path in metadata),
+            only=tuple(only),
+            ignore=tuple(ignore),
+            identity_extrinsics=identity_extrinsics,
+        ),
+        # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
+        rate=None if rate is None else parse_rate(str(rate)),
+        slices=slices,
+        layout=layout,
+        keep_partial=keep_partial,
+        max_wait_ns=None if math.isinf(max_wait) else round(max_wait * NS_PER_S),
+        host_clock=clock == "host",
+        min_range_m=min_range,
+        max_range_m=max_range,
+        strict=strict,
+    )
+    for scan, _ in Conversion(job).scans():
+        yield _owned(scan)
+
+
+def _owned(scan: Scan) -> Scan:
+    """The scan with arrays that the next one does not overwrite."""
+    return replace(
+        scan,
+        xyz=np.array(scan.xyz, order="C"),
+        intensity=scan.intensity.copy(),
+        reflectivity=None if scan.reflectivity is None else scan.reflectivity.copy(),
+        range_m=None if scan.range_m is None else scan.range_m.copy(),
+        time_ns=scan.time_ns.copy(),
+        ring=scan.ring.copy(),
+        return_type=scan.return_type.copy(),
+        lidar_id=scan.lidar_id.copy(),
+        column=None if scan.column is None else scan.column.copy(),
+    )
