@@ -11,8 +11,8 @@ from mlbatch.batching.reference import FeedPacket
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
 
-FAULTS = ["gap", "back", "repeat", "wild", "pair", "blind", "crossed", "reset"]
-FAULT_WEIGHTS = [6, 6, 6, 4, 3, 3, 3, 0.2]
+FAULTS = ["gap", "back", "repeat", "wild", "pair", "blind", "crossed", "edge", "reset"]
+FAULT_WEIGHTS = [6, 6, 6, 4, 3, 3, 3, 3, 0.2]
 
 
 def spoiled(rng: random.Random, packets: Sequence[FeedPacket], chance: float) -> list[FeedPacket]:
@@ -25,7 +25,7 @@ def spoiled(rng: random.Random, packets: Sequence[FeedPacket], chance: float) ->
     for packet in packets:
         packet = _shifted(packet, shift)
         fault = rng.choices(FAULTS, FAULT_WEIGHTS)[0] if rng.random() < chance else ""
-        # First stamps are right or absurd: nearly comparable clocks are not a law of batching.
+        # First stamps are right or absurd: else few clocks would be comparable.
         if not begun and fault not in ("repeat", "blind", "wild"):
             fault = ""
         begun = begun or any(packet.valid)
@@ -72,7 +72,24 @@ def _with_fault(
         stamps = [packet.stamps[i] for i in order]
         stamps[0] += rng.choice([0, 0, -1, 1]) * rng.choice([30 * NS_PER_MS, 3 * NS_PER_S])
         return [replace(packet, stamps=tuple(stamps), valid=tuple(packet.valid[i] for i in order))]
+    if fault == "edge":
+        return _on_the_edge(rng, packet, before[-1])
     return [packet]
+
+
+def _on_the_edge(rng: random.Random, packet: FeedPacket, previous: FeedPacket) -> list[FeedPacket]:
+    """Steps and spans of 1 s to the nanosecond, where packets begin to be held or rejected."""
+    past, edge_ns = rng.choice([-1, 0, 0, 1]), NS_PER_S + rng.choice([-1, 0, 0, 1])
+    newest = max(previous.valid_stamps(), default=max(previous.stamps))
+    forth = _shifted(packet, newest + edge_ns - max(packet.stamps))
+    back = _shifted(packet, newest - edge_ns - min(packet.stamps))
+    longest = packet.stamps[0] + edge_ns
+    long = replace(packet, stamps=(*packet.stamps[:-1], longest))
+    held = _renamed(_shifted(packet, 40 * NS_PER_S))
+    after = held.stamps[0] + NS_PER_S + past - max(packet.stamps)
+    ahead = held.stamps[0] - NS_PER_S - past - min(packet.stamps)
+    confirming = _shifted(packet, rng.choice([after, ahead]))
+    return rng.choice([[forth], [back], [long], [_renamed(forth), forth], [held, confirming]])
 
 
 def _leap(rng: random.Random) -> int:

@@ -113,7 +113,7 @@ def _limit(rng: random.Random, epoch_ns: int, length_ns: int) -> int | None:
 def _sensor_packets(rng: random.Random, scene: Scene, sensor: int) -> list[FeedPacket]:
     """A sensor without faults: columns at its rate, some of them on the bounds of windows."""
     settings = scene.settings
-    # No packet lasts longer than 0.4 s: delay and duration together keep clocks comparable.
+    # No packet lasts longer than 0.4 s: delay and duration alone keep clocks comparable.
     width, step_ms = rng.choice([(1, 50), (1, 5), (2, 20), (4, 10), (8, 50), (8, 10), (16, 5)])
     step_ns = step_ms * NS_PER_MS + rng.choice([0, 1, 333_333])
     jitter_ns = rng.choice([0, 0, 1000, step_ns // 2])
@@ -164,8 +164,8 @@ def _arrivals(
 ) -> list[tuple[int, int, FeedPacket]]:
     """Arrival and place of each packet: after it was measured, some in bursts, none crossed."""
     latency_ns = rng.randint(0, 200) * NS_PER_MS
-    # Beyond 1 s clocks cannot be compared.
-    offset_ns = rng.choice([0] * 120 + [-3 * NS_PER_S, 3 * NS_PER_S])
+    # More than 1 s apart clocks cannot be compared.
+    offset_ns = rng.choice([0] * 120 + [-600, 600] * 3 + [-3000, 3000]) * NS_PER_MS
     burst = 0.0 if scene.quiet else rng.choice([0, 0, 0.1])
     arrivals, at, begun = [], 0, False
     for number, packet in enumerate(packets):

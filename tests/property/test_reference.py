@@ -228,3 +228,11 @@ def test_clocks_more_than_a_second_apart_are_refused(offset_ms: float, comparabl
     with pytest.raises(ClockError, match="sensors 0 and 1"):
         reference_scans(feed, TWO)
     assert reference_scans(feed, replace(TWO, host_clock=True)).decoded == [1, 1]
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0)])
+def test_all_pairs_of_clocks_are_compared_whichever_came_first(order: tuple[int, ...]) -> None:
+    # Each is within 1 s of sensor 0, but 1 and 2 are 1.8 s apart.
+    feed = [packet(0, 5_000), packet(1, 5_900, host_ms=5_000), packet(2, 4_100, host_ms=5_000)]
+    with pytest.raises(ClockError, match="wanted comparable clocks"):
+        reference_scans([feed[sensor] for sensor in order], replace(TEN_HZ, sensors=3))
