@@ -109,8 +109,7 @@ def _sensor(run: Conversion, number: int) -> SensorReport:
 
 def _clock(run: Conversion, number: int) -> ClockReport:
     sensor, first = run.setup.sensors[number], run.batcher.firsts[number]
-    host = run.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
-    source = "host" if host else "sensor"
+    source = "host" if run.uses_host_clock(sensor) else "sensor"
     mode = sensor.found.lidar.timestamp_mode
     notes = (f"timestamp mode {mode}",) if mode else ()
     if first is None:

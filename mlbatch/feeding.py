@@ -36,11 +36,11 @@ class Fed:
 class Feeder:
     """Sorts packets to their sensors; what belongs to none is counted in `unassigned`."""
 
-    def __init__(self, setup: Setup, feeds: Sequence[Feed], *, host_clock: bool) -> None:
+    def __init__(self, setup: Setup, feeds: Sequence[Feed], host_clocks: Sequence[bool]) -> None:
         self.unassigned: dict[Kind, int] = {}
         self._router = setup.router
         self._feeds = list(feeds)
-        self._host_clock = host_clock
+        self._host_clocks = list(host_clocks)
 
     def feed(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Fed:
         """Route a batch, copy lidar packets to their rings and read their heads."""
@@ -109,11 +109,13 @@ class Feeder:
     def _imu(self, batch: PacketBatch, index: I64Array, number: int) -> list[ImuSamples]:
         feed = self._feeds[number]
         feed.ledger.imu_packets += len(index)
+        payloads = batch.data[batch.start[index, None] + np.arange(int(batch.size[index[0]]))]
+        if not self._host_clocks[number]:
+            return [feed.lidar.imu(payloads, number)]
         samples = []
-        for at in index.tolist():
-            begin = int(batch.start[at])
-            sample = feed.lidar.imu(batch.data[begin : begin + int(batch.size[at])], number)
-            if self._host_clock and len(sample.stamp_ns):
-                sample.stamp_ns = sample.stamp_ns + (int(batch.host_ns[at]) - sample.stamp_ns[-1])
+        for host_ns, payload in zip(batch.host_ns[index].tolist(), payloads, strict=True):
+            sample = feed.lidar.imu(payload[None], number)
+            if len(sample.stamp_ns):
+                sample.stamp_ns = sample.stamp_ns + (host_ns - sample.stamp_ns[-1])
             samples.append(sample)
         return samples

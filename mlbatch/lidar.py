@@ -116,8 +116,8 @@ class Lidar(Protocol):
         """Whether a payload of this size on the sensor's streams is an IMU packet."""
         ...
 
-    def imu(self, payload: U8Array, sensor: int) -> ImuSamples:
-        """Samples of one IMU packet (bytes,)."""
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """Samples of IMU packets (P, size), in their order."""
         ...
 
     def sensor_from_imu(self) -> F64Array:

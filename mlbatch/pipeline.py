@@ -110,10 +110,14 @@ class Conversion:
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
         self.feeds = [_feed(sensor) for sensor in self.setup.sensors]
-        intakes = [_intake(sensor, job.host_clock) for sensor in self.setup.sensors]
+        intakes = [
+            _intake(sensor, host_clock=self.uses_host_clock(sensor))
+            for sensor in self.setup.sensors
+        ]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
         self.batcher = Batcher(self.grid, intakes, policy)
-        self.feeder = Feeder(self.setup, self.feeds, host_clock=job.host_clock)
+        host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
+        self.feeder = Feeder(self.setup, self.feeds, host_clocks)
         self._decoders: list[Decoder] = []
         self._imu: list[ImuSamples] = []
         if job.max_wait_ns is None:
@@ -225,9 +229,13 @@ class Conversion:
         else:
             self._decoders = [Decoder(self.info, sources, boxes_m, extras)]
 
+    def uses_host_clock(self, sensor: Mounted) -> bool:
+        """Whether a sensor's stamps are replaced by arrival times."""
+        return self.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
+
     def timescale_of(self, sensor: Mounted, stamp_ns: int, host_ns: int) -> str:
         """Timescale of a sensor's stamps as they are batched."""
-        if self.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host"):
+        if self.uses_host_clock(sensor):
             return timescale(host_ns, host_ns)
         return timescale(stamp_ns, host_ns)
 
@@ -360,11 +368,11 @@ def _feed(sensor: Mounted) -> Feed:
     return Feed(lidar, RawRing(lidar.packet_size, lidar.record_start, lidar.record_size))
 
 
-def _intake(sensor: Mounted, host_clock: bool) -> Intake:
+def _intake(sensor: Mounted, *, host_clock: bool) -> Intake:
     rig, lidar = sensor.rig, sensor.found.lidar
     return Intake(
         sensor.name,
-        host_clock=host_clock or (rig is not None and rig.clock == "host"),
+        host_clock=host_clock,
         offset_ns=0 if rig is None else rig.offset_ns,
         modulus=lidar.sequence_modulus,
     )

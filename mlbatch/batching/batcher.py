@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import FOREVER, NEVER, Arrival, Intake, extremes
+from mlbatch.batching.intake import FOREVER, NEVER, Arrival, Delivery, Intake
 from mlbatch.errors import ClockError
 from mlbatch.types import BoolArray, Columns, I64Array
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -71,7 +71,6 @@ class _Track:
     intake: Intake
     first_ns: int = NEVER
     newest_ns: int = NEVER
-    oldest_ns: int = FOREVER
     offset_ns: int | None = None
     gaps: list[tuple[int, int]] = field(default_factory=list)
     waiting: list[Columns] = field(default_factory=list)
@@ -85,10 +84,9 @@ class _Track:
 
 @dataclass(slots=True)
 class _Progress:
-    """State of all sensors after each delivery of a batch; (S, E) int64 each, watermark (E,)."""
+    """State of all sensors after each delivery of a batch; newest (S, E) int64, the others (E,)."""
 
     newest: I64Array
-    oldest: I64Array
     watermark: I64Array
     host_ns: I64Array
 
@@ -119,7 +117,8 @@ class Batcher:
             for track, arrival in zip(self._tracks, arrivals, strict=True)
         ]
         events = [
-            np.empty(0, np.int64) if arrival is None else arrival.position for arrival in accepted
+            np.empty(0, np.int64) if delivery is None else delivery.packets.position
+            for delivery in accepted
         ]
         order = np.argsort(np.concatenate(events), kind="stable")
         if not len(order):
@@ -132,12 +131,11 @@ class Batcher:
         position = np.concatenate(events)[order]
         progress = self._advance(accepted, ranks, host_ns[position])
         before = np.concatenate([[self._watermark], progress.watermark[:-1]])
-        for number, arrival in enumerate(accepted):
-            if arrival is not None:
-                self._wait(number, arrival, before[ranks[number]])
+        for number, delivery in enumerate(accepted):
+            if delivery is not None:
+                self._wait(number, delivery.packets, before[ranks[number]])
         for number, track in enumerate(self._tracks):
             track.newest_ns = int(progress.newest[number, -1])
-            track.oldest_ns = int(progress.oldest[number, -1])
         self._watermark = int(progress.watermark[-1])
         yield from self._publish(progress)
 
@@ -154,7 +152,6 @@ class Batcher:
         yield from self._publish(
             _Progress(
                 np.array([[track.newest_ns] for track in self._tracks]),
-                np.array([[track.oldest_ns] for track in self._tracks]),
                 np.array([FOREVER]),
                 np.array([host_ns]),
             ),
@@ -194,9 +191,9 @@ class Batcher:
 
     @property
     def spans_ns(self) -> list[tuple[int, int] | None]:
-        """Oldest and newest stamp of each sensor; None if it gave none."""
+        """First and newest stamp of each sensor; None if it gave none."""
         return [
-            None if track.first_ns == NEVER else (track.oldest_ns, track.newest_ns)
+            None if track.first_ns == NEVER else (track.first_ns, track.newest_ns)
             for track in self._tracks
         ]
 
@@ -219,12 +216,13 @@ class Batcher:
 
     # -- steps --------------------------------------------------------------------------------
 
-    def _check_clocks(self, accepted: Sequence[Arrival | None], ranks: Sequence[I64Array]) -> None:
+    def _check_clocks(self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array]) -> None:
         """As soon as two sensors have a packet, their stamps must be comparable."""
         firsts = []
-        for number, (track, arrival) in enumerate(zip(self._tracks, accepted, strict=True)):
-            if arrival is None or track.first_ns > NEVER:
+        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
+            if delivery is None or track.first_ns > NEVER:
                 continue
+            arrival = delivery.packets
             measured = np.flatnonzero(arrival.heads.valid.any(axis=1))
             if len(measured):
                 row = int(measured[0])
@@ -251,21 +249,16 @@ class Batcher:
                 )
 
     def _advance(
-        self, accepted: Sequence[Arrival | None], ranks: Sequence[I64Array], host_ns: I64Array
+        self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array], host_ns: I64Array
     ) -> _Progress:
-        """Newest and oldest stamps and the watermark after each delivery; evaluates eq. (1)."""
+        """Newest stamps and the watermark after each delivery; evaluates eq. (1)."""
         shape = (len(self._tracks), len(host_ns))
-        newest, oldest = np.full(shape, NEVER), np.full(shape, FOREVER)
-        first = np.full(shape, FOREVER)
-        for number, (track, arrival) in enumerate(zip(self._tracks, accepted, strict=True)):
-            if arrival is not None:
-                oldest[number, ranks[number]], newest[number, ranks[number]] = extremes(
-                    arrival.heads
-                )
+        newest, first = np.full(shape, NEVER), np.full(shape, FOREVER)
+        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
+            if delivery is not None:
+                newest[number, ranks[number]] = delivery.newest_ns
             newest[number, 0] = max(newest[number, 0], track.newest_ns)
-            oldest[number, 0] = min(oldest[number, 0], track.oldest_ns)
             np.maximum.accumulate(newest[number], out=newest[number])
-            np.minimum.accumulate(oldest[number], out=oldest[number])
             first[number, newest[number] > NEVER] = track.first_ns
         stalled = self._stalled(newest, first.min(axis=0))
         watermark = np.where(stalled, FOREVER, newest).min(axis=0) - SLACK_NS
@@ -275,7 +268,7 @@ class Batcher:
         watermark[:began] = NEVER
         watermark[0] = max(watermark[0], self._watermark)
         np.maximum.accumulate(watermark, out=watermark)
-        return _Progress(newest, oldest, watermark, host_ns)
+        return _Progress(newest, watermark, host_ns)
 
     def _stalled(self, newest: I64Array, first_of_all: I64Array) -> BoolArray:
         """Which sensors are not waited for, after each delivery: (S, E)."""
@@ -306,18 +299,21 @@ class Batcher:
     def _wait(self, number: int, arrival: Arrival, published: I64Array) -> None:
         """Queue the valid columns of a sensor, except late ones; published: watermarks before."""
         track, heads = self._tracks[number], arrival.heads
-        valid = heads.valid
-        track.decoded += valid.size
-        track.drop("invalid", valid.size - int(np.count_nonzero(valid)))
-        stamp = heads.stamp_ns[valid]
-        if not len(stamp):
+        valid = heads.valid.reshape(-1)
+        count = int(np.count_nonzero(valid))
+        track.decoded += len(valid)
+        track.drop("invalid", len(valid) - count)
+        if not count:
             return
-        column = np.arange(valid.shape[1])
-        columns = Columns(stamp, (arrival.place[:, None] + column)[valid], heads.encoder[valid])
+        place = arrival.place[:, None] + np.arange(heads.valid.shape[1])
+        columns = Columns(heads.stamp_ns.reshape(-1), place.reshape(-1), heads.encoder.reshape(-1))
+        published = np.repeat(published, heads.valid.shape[1])
+        if count < len(valid):
+            columns, published = columns.take(valid), published[valid]
+        stamp = columns.stamp_ns
         running = np.maximum.accumulate(np.concatenate([[track.newest_ns], stamp]))
         self._note_gaps(track, running)
-        per_packet = np.count_nonzero(valid, axis=1)
-        limit = np.maximum(running[:-1] - SLACK_NS, np.repeat(published, per_packet))
+        limit = np.maximum(running[:-1] - SLACK_NS, published)
         late = self._late(stamp, limit)
         if late.any():
             track.drop("late", int(np.count_nonzero(late)))
@@ -420,10 +416,11 @@ class Batcher:
         )
 
     def _complete(self, progress: _Progress, at: int, start: int, end: int) -> bool:
-        """Every sensor delivered before or at the start and past the end, with no stall between."""
-        covered = (progress.oldest[:, at] <= start) & (progress.newest[:, at] >= end)
-        return bool(covered.all()) and not any(
-            before < end and after > start for track in self._tracks for before, after in track.gaps
+        """Every sensor began at or before the start and came past the end, and none stalled."""
+        return bool((progress.newest[:, at] >= end).all()) and not any(
+            track.first_ns > start
+            or any(before < end and after > start for before, after in track.gaps)
+            for track in self._tracks
         )
 
     def _drop(self, sensor: I64Array, reason: str) -> None:

@@ -50,6 +50,17 @@ class Arrival:
         )
 
 
+@dataclass(slots=True)
+class Delivery:
+    """Accepted packets of one sensor on the common clock, in order of delivery.
+
+    newest_ns: (A,) int64, largest valid stamp of each, NEVER where none is valid.
+    """
+
+    packets: Arrival
+    newest_ns: I64Array
+
+
 def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
     """Smallest and largest valid stamp of each packet; FOREVER and NEVER where none is valid."""
     stamp, valid = heads.stamp_ns, heads.valid
@@ -74,10 +85,13 @@ class Intake:
         self._newest = NEVER
         self._held: Arrival | None = None
         self._recent = np.empty(0, np.int64)
+        self._largest_key = -1
 
-    def accept(self, arrival: Arrival) -> Arrival:
-        """The accepted packets of a batch, stamps on the common clock, in order of delivery."""
-        arrival = arrival.take(self._distinct(arrival.key))
+    def accept(self, arrival: Arrival) -> Delivery:
+        """Let in the packets of a batch, as far as they are good."""
+        fresh = self._distinct(arrival.key)
+        if not fresh.all():
+            arrival = arrival.take(fresh)
         heads = arrival.heads
         if self._offset_ns:
             heads.stamp_ns = heads.stamp_ns + self._offset_ns
@@ -94,9 +108,10 @@ class Intake:
         self.loss.add(arrival.key)
         self._newest = max(self._newest, int(high.max(initial=NEVER)))
         if self._host_clock and len(high):
-            stamp = arrival.heads.stamp_ns
+            stamp, known = arrival.heads.stamp_ns, high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
-        return arrival
+            high = np.where(known, arrival.host_ns, NEVER)
+        return Delivery(arrival, high)
 
     def finish(self) -> None:
         """End of input: a packet that is still held was never confirmed."""
@@ -112,6 +127,10 @@ class Intake:
         """Which packets are not a repetition of one of the last DUPLICATE_REACH packets."""
         known = len(self._recent)
         keys = np.concatenate([self._recent, key])
+        if len(key) and key[0] > self._largest_key and bool((key[1:] > key[:-1]).all()):
+            # As nearly always: every number is larger than all before it.
+            self._recent, self._largest_key = keys[-DUPLICATE_REACH:], int(key[-1])
+            return np.ones(len(key), bool)
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
         again = (ordered[1:] == ordered[:-1]) & (ordered[1:] >= 0)
@@ -119,6 +138,7 @@ class Intake:
         fresh = np.ones(len(keys), bool)
         fresh[order[1:][again]] = False
         self._recent = keys[-DUPLICATE_REACH:]
+        self._largest_key = int(self._recent.max(initial=-1))
         self._reject("duplicate", int(np.count_nonzero(~fresh[known:])))
         return fresh[known:]
 

@@ -2,8 +2,8 @@
 
 Source: Faitli et al. (2025), section 2.1, as CONTRACT.md section 1 makes it exact. It takes packets
 in arrival order, one after the other, column by column, and shares no helper with the fast code.
-Where the contract leaves room, these rules decide (N, M: newest and oldest stamp delivered by a
-sensor, G: the largest N; slack: 10 ms):
+Where the contract leaves room, these rules decide (N: newest stamp delivered by a sensor, t0: its
+first, G: the largest N; slack: 10 ms):
 
 1. Intake: see `reference_intake.py`. A held packet is delivered when one confirms it.
 2. Invalid columns are dropped `invalid` and are never stamps, but count as decoded.
@@ -18,7 +18,7 @@ sensor, G: the largest N; slack: 10 ms):
    if that is larger than before; windows that end at or before it are published. A column is `late`
    if its window ends at or before its sensor's newest stamp before it minus the slack, or the end
    of what was published before its packet.
-8. `complete` is judged at publication: M <= start and N >= end for every sensor, and no stall
+8. `complete` is judged at publication: t0 <= start and N >= end for every sensor, and no stall
    overlaps. A stall is a step of a sensor's running maximum from a to b > a + max-wait; it overlaps
    if a < end and b > start.
 9. End of input publishes everything else, at the arrival of the feed's last packet.
@@ -92,7 +92,6 @@ class Sensor:
     packets: int = 0
     first: int | None = None
     newest: int | None = None
-    oldest: int | None = None
     stalls: list[tuple[int, int]] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     decoded: int = 0
@@ -103,12 +102,11 @@ class Sensor:
         self.dropped[reason] = self.dropped.get(reason, 0) + 1
 
     def note(self, stamp: int, max_wait_ns: int | None) -> None:
-        """Move N and M, and remember a step of N that is a stall."""
+        """Move N, and remember a step of N that is a stall."""
         before = stamp if self.newest is None else self.newest
         if max_wait_ns is not None and stamp - before > max_wait_ns:
             self.stalls.append((before, stamp))
         self.newest = max(before, stamp)
-        self.oldest = stamp if self.oldest is None else min(self.oldest, stamp)
 
 
 class Session:
@@ -256,7 +254,7 @@ class Session:
     def complete(self, start: int, end: int) -> bool:
         """Rule 8."""
         for sensor in self.sensors:
-            if sensor.oldest is None or sensor.oldest > start:
+            if sensor.first is None or sensor.first > start:
                 return False
             if sensor.newest is None or sensor.newest < end:
                 return False

@@ -49,9 +49,9 @@ def imu_size(samples: int) -> int:
     return SAMPLES_START + samples * SAMPLE.itemsize + FOOTER_SIZE
 
 
-def read_legacy(payload: U8Array, sensor: int) -> ImuSamples:
-    """The one sample of a 48-byte packet; its stamp is the gyroscope's, as in the maker's SDK."""
-    sample = np.frombuffer(payload[:LEGACY_SIZE].tobytes(), LEGACY_IMU)
+def read_legacy(payloads: U8Array, sensor: int) -> ImuSamples:
+    """The one sample of each 48-byte packet; its stamp is the gyroscope's, as in the SDK."""
+    sample = np.ascontiguousarray(payloads[:, :LEGACY_SIZE]).view(LEGACY_IMU)[:, 0]
     return ImuSamples(
         sensor,
         sample["gyroscope_ns"].astype(np.int64),
@@ -60,10 +60,11 @@ def read_legacy(payload: U8Array, sensor: int) -> ImuSamples:
     )
 
 
-def read_accel32(payload: U8Array, sensor: int) -> ImuSamples:
-    """The valid samples of an ACCEL32_GYRO32_NMEA packet."""
-    count = (len(payload) - SAMPLES_START - FOOTER_SIZE) // SAMPLE.itemsize
-    samples = np.frombuffer(payload[SAMPLES_START:].tobytes(), SAMPLE, count)
+def read_accel32(payloads: U8Array, sensor: int) -> ImuSamples:
+    """The valid samples of ACCEL32_GYRO32_NMEA packets."""
+    count = (payloads.shape[1] - SAMPLES_START - FOOTER_SIZE) // SAMPLE.itemsize
+    end = SAMPLES_START + count * SAMPLE.itemsize
+    samples = np.ascontiguousarray(payloads[:, SAMPLES_START:end]).view(SAMPLE).reshape(-1)
     samples = samples[(samples["status"] & 1) != 0]
     return ImuSamples(
         sensor,

@@ -27,6 +27,8 @@ from mlbatch.types import BoolArray, Heads, I64Array, U8Array
 
 BAD_HEADER = FAULTS.index("bad_header")
 BAD_CRC = FAULTS.index("bad_crc")
+# The measurement id follows the stamp in the columns of all layouts.
+_ID_OFFSET, _ID_BYTES = 8, 2
 # Firmware before 2.3 leaves the footer empty, 2.3 and 2.4 write DE C0 00 00 EF BE AD DE.
 _NO_CRC = (0, 0xDEADBEEF0000C0DE)
 
@@ -39,6 +41,11 @@ def unsigned(packets: U8Array, place: tuple[int, int]) -> I64Array:
         value <<= 8
         value |= packets[:, first + byte]
     return value
+
+
+def first_measurement_ids(packets: U8Array, layout: PacketLayout) -> I64Array:
+    """Measurement id of each packet's first column (P,)."""
+    return unsigned(packets, (layout.record_start + _ID_OFFSET, _ID_BYTES))
 
 
 def column_bytes(packets: U8Array, layout: PacketLayout) -> U8Array:

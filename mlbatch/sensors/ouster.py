@@ -25,7 +25,12 @@ from mlbatch.sensors._ouster_imu import (
     sample_count,
 )
 from mlbatch.sensors._ouster_metadata import Metadata, metadata
-from mlbatch.sensors._ouster_packets import Headers, LegacyHeaders, PacketHeaders
+from mlbatch.sensors._ouster_packets import (
+    Headers,
+    LegacyHeaders,
+    PacketHeaders,
+    first_measurement_ids,
+)
 from mlbatch.sensors._ouster_pixels import PixelReader
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
@@ -177,7 +182,8 @@ class OusterLidar:
     def sequence(self, packets: U8Array) -> I64Array:
         """Frame id and rank within the frame as one number."""
         frame = self._headers.frame_ids(packets) % self._frame_ids
-        block = self._headers.heads(packets).encoder[:, 0] // self.columns_per_packet
+        first = first_measurement_ids(packets, self._metadata.layout)
+        block = first // self.columns_per_packet
         rank = self._rank[np.minimum(block, len(self._rank) - 1)]
         outside = -1 - (frame * len(self._rank) + block)
         return np.where(rank >= 0, frame * self._packets_per_frame + rank, outside)
@@ -194,10 +200,10 @@ class OusterLidar:
         """Whether a payload of this size is an IMU packet (perhaps with a driver's extra byte)."""
         return size != self.packet_size and _is_imu(self._metadata, size)
 
-    def imu(self, payload: U8Array, sensor: int) -> ImuSamples:
-        """Samples of an IMU packet."""
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """Samples of IMU packets (P, size)."""
         read = read_accel32 if self._metadata.imu_profile == ACCEL32 else read_legacy
-        return read(payload, sensor)
+        return read(payloads, sensor)
 
     def sensor_from_imu(self) -> F64Array:
         """Pose of the IMU in the sensor frame, metres."""

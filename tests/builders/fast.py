@@ -9,7 +9,7 @@ import numpy as np
 from mlbatch.batching.batcher import Batcher, Limit, Policy
 from mlbatch.batching.batcher import Window as FastWindow
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import Arrival, Intake
+from mlbatch.batching.intake import Arrival, Delivery, Intake
 from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
 from mlbatch.types import Heads
 
@@ -21,15 +21,13 @@ class _Watched(Intake):
         super().__init__(name, host_clock=host_clock)
         self.accepted: list[int] = []
 
-    def accept(self, arrival: Arrival) -> Arrival:
-        accepted = super().accept(arrival)
-        self.accepted += accepted.place.tolist()
-        return accepted
+    def accept(self, arrival: Arrival) -> Delivery:
+        delivery = super().accept(arrival)
+        self.accepted += delivery.packets.place.tolist()
+        return delivery
 
 
-def run_fast(
-    feed: Sequence[FeedPacket], settings: Settings, group_sizes: Sequence[int]
-) -> Outcome:
+def run_fast(feed: Sequence[FeedPacket], settings: Settings, group_sizes: Sequence[int]) -> Outcome:
     """Push a feed in groups through the fast batcher."""
     intakes = [_Watched(str(s), host_clock=settings.host_clock) for s in range(settings.sensors)]
     policy = Policy(
@@ -64,9 +62,7 @@ def run_fast(
 _WIDEST = 64
 
 
-def _arrivals(
-    group: Sequence[FeedPacket], sensors: int, seen: list[int]
-) -> list[Arrival | None]:
+def _arrivals(group: Sequence[FeedPacket], sensors: int, seen: list[int]) -> list[Arrival | None]:
     arrivals: list[Arrival | None] = []
     for sensor in range(sensors):
         own = [(at, packet) for at, packet in enumerate(group) if packet.sensor == sensor]

@@ -55,14 +55,8 @@ def apart_from_arrival(outcome: Outcome | None) -> Outcome | None:
     """The outcome without what depends on the order of arrival between sensors."""
     if outcome is None:
         return None
-    # Whether the head is complete follows from the oldest stamps at its publication; one that steps
-    # back before the head's start may be delivered before or after it. Later windows begin after
-    # the first stamps of all sensors.
-    windows = [
-        replace(window, ready_host_ns=0, complete=window.complete and window.index >= 0)
-        for window in outcome.windows
-    ]
-    return replace(outcome, windows=windows, incomplete=0)
+    windows = [replace(window, ready_host_ns=0) for window in outcome.windows]
+    return replace(outcome, windows=windows)
 
 
 @pytest.mark.parametrize("block", BLOCKS)

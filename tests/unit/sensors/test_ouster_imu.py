@@ -33,7 +33,7 @@ def test_a_legacy_packet_worked_by_hand() -> None:
     data = struct.pack("<QQQffffff", 11, 22, 33, 0.5, 0.0, -1.0, 180.0, 0.0, -90.0)
     for extra in (b"", b"\x00"):
         assert lidar.is_imu(len(data + extra))
-        samples = lidar.imu(payload_of(data + extra), 3)
+        samples = lidar.imu(payload_of(data + extra)[None], 3)
         assert samples.sensor == 3
         assert samples.stamp_ns.tolist() == [33]
         assert samples.acceleration.tolist() == [[4.903325, 0.0, -9.80665]]
@@ -49,7 +49,7 @@ def test_a_new_packet_worked_by_hand() -> None:
     data = b"\x02" + bytes(131) + b"".join(samples) + bytes(32)
     assert len(data) == 164 + 3 * 36
     assert lidar.is_imu(len(data))
-    found = lidar.imu(payload_of(data), 0)
+    found = lidar.imu(payload_of(data)[None], 0)
     assert found.stamp_ns.tolist() == [1000, 1002]
     assert found.acceleration.tolist() == [[0.0, 0.5, 9.75], [2.0, 0.5, 9.75]]
     assert found.angular_velocity.tolist() == [[0.25, 0.0, 0.0], [0.25, -2.0, 0.0]]
@@ -82,7 +82,7 @@ def test_encode_then_decode_is_identity(profile: str, count: int) -> None:
     data = imu_packet(spec, stamps, acceleration, turn, valid)
     lidar = lidar_of(spec)
     assert lidar.is_imu(len(data))
-    found = lidar.imu(payload_of(data), 0)
+    found = lidar.imu(payload_of(data)[None], 0)
     assert found.stamp_ns.tolist() == stamps[valid].tolist()
     np.testing.assert_allclose(found.acceleration, acceleration[valid], rtol=1e-6)
     np.testing.assert_allclose(found.angular_velocity, turn[valid], rtol=1e-6)
@@ -98,7 +98,7 @@ def test_real_packets_equal_the_reference() -> None:
     assert lidar.notes == ("the metadata say that the lidar output was off",)
     assert not lidar.is_imu(680)
     assert lidar.is_imu(452)
-    packets = [lidar.imu(payload, 0) for payload in case.payloads(452)]
+    packets = [lidar.imu(payload[None], 0) for payload in case.payloads(452)]
     kept = (reference["imu_status"] & 1) != 0
     stamps = np.concatenate([samples.stamp_ns for samples in packets])
     acceleration = np.concatenate([samples.acceleration for samples in packets])
@@ -117,7 +117,7 @@ def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) 
     assert calibration is not None
     lidar = calibration.lidar({})
     assert lidar.is_imu(48)
-    samples = [lidar.imu(payload, 0) for payload in case.payloads(48)]
+    samples = [lidar.imu(payload[None], 0) for payload in case.payloads(48)]
     stamps = np.concatenate([sample.stamp_ns for sample in samples])
     first, last = np.sort(lidar.heads(case.payloads(lidar.packet_size)).stamp_ns.ravel())[[0, -1]]
     assert len(stamps) >= 10
