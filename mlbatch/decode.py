@@ -169,12 +169,12 @@ class _Projector:
     def _geometry(self, encoder: I64Array) -> tuple[F32Array, F32Array]:
         """Directions (n, 3, channels) and origins (n, 3, channels or 1) at rotor positions."""
         first, count = int(encoder[0]), len(encoder)
-        if int(encoder[-1]) - first == count - 1 and bool((np.diff(encoder) == 1).all()):
+        if bool((encoder[1:] - encoder[:-1] == 1).all()):
             turn = slice(first, first + count)
             return self._direction[turn], self._origin[turn]
         towards = self._towards[:count]
-        np.take(self._direction, encoder, axis=0, out=towards, mode="clip")
-        return towards, np.take(self._origin, encoder, axis=0, mode="clip")
+        self._direction.take(encoder, axis=0, out=towards, mode="clip")
+        return towards, self._origin.take(encoder, axis=0, mode="clip")
 
     def _type_returns(self, types: U8Array) -> None:
         """Which of two returns is nearer: numbering of facts/outputs.md section 3."""
@@ -299,7 +299,7 @@ class Decoder:
             if count == len(sensor):
                 projector.project(place, encoder, part)
                 return [_Laid(part, slice(0, count), begin)]
-            rows = np.flatnonzero(sensor == number)
+            rows = (sensor == number).nonzero()[0]
             projector.project(place[rows], encoder[rows], part)
             laid.append(_Laid(part, rows, begin))
             begin += count * projector.slots
@@ -309,7 +309,7 @@ class Decoder:
         """Elements of the tile's planes in the order of the scan, and how many of each column."""
         if len(laid) == 1:
             keep = laid[0].part.keep
-            return np.flatnonzero(keep), np.add.reduce(keep, axis=1, dtype=np.uint16)
+            return keep.reshape(-1).nonzero()[0], np.add.reduce(keep, axis=1, dtype=np.uint16)
         keep = self._keep[:columns]
         shift = np.empty(columns, np.int64)
         for one in laid:
@@ -319,8 +319,8 @@ class Decoder:
             shift[one.rows] = one.begin + np.arange(count) * slots
         shift -= np.arange(columns) * self._slots
         counts = np.add.reduce(keep, axis=1, dtype=np.uint16)
-        index = np.flatnonzero(keep)
-        index += np.repeat(shift, counts)
+        index = keep.reshape(-1).nonzero()[0]
+        index += shift.repeat(counts)
         return index, counts
 
     def _compress(
@@ -339,10 +339,10 @@ class Decoder:
         if self._has_reflectivity:
             tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
         offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
-        buffer.time_ns[rows] = np.repeat(offset, counts)
+        buffer.time_ns[rows] = offset.repeat(counts)
         if "column" in self._extras:
             number = np.arange(columns.start, columns.stop, dtype=np.uint32)
-            buffer.column[rows] = np.repeat(number, counts)
+            buffer.column[rows] = number.repeat(counts)
         return len(index)
 
     def _lidar_id(self, due: Due, columns: slice) -> U8Array:

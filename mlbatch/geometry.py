@@ -48,11 +48,12 @@ class BeamTable:
 
     def _turned(self, vectors: F64Array) -> F32Array:
         cosine, sine = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
-        planes = [
-            cosine * vectors[0, :, axis] + sine * vectors[1, :, axis] + vectors[2, :, axis]
-            for axis in range(3)
-        ]
-        return np.stack(planes).astype(np.float32)
+        turned = np.empty((3, len(self.angle_rad), vectors.shape[1]), np.float32)
+        for axis in range(3):
+            turned[axis] = (
+                cosine * vectors[0, :, axis] + sine * vectors[1, :, axis] + vectors[2, :, axis]
+            )
+        return turned
 
 
 def _rotated(vectors: F64Array, rotation: F64Array) -> F64Array:

@@ -56,7 +56,7 @@ class RawRing:
 
     def gather(self, place: I64Array, out: U8Array) -> None:
         """Copy the records at `place` (n,) to the rows of `out` (n, record_size)."""
-        np.take(self._rows, place % len(self._rows), axis=0, out=out, mode="clip")
+        self._rows.take(place % len(self._rows), axis=0, out=out, mode="clip")
 
     def _allocate(self, packets: int) -> None:
         self._capacity = packets

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import NoReturn
 
 from mlbatch.errors import MlbatchError, UsageError
 
@@ -18,7 +19,10 @@ def main() -> None:
     from mlbatch.cli.app import app
 
     try:
-        app()
+        code = app(standalone_mode=False)
+        if code == EXIT_INTERRUPTED:
+            raise KeyboardInterrupt
+        sys.exit(code)
     except UsageError as err:
         _fail(str(err), EXIT_USAGE)
     except MlbatchError as err:
@@ -32,6 +36,8 @@ def main() -> None:
     except MemoryError:
         _fail("out of memory; use a smaller --max-wait, or convert a part with --end", EXIT_ERROR)
     except Exception as err:
+        if _is_usage(err):
+            _fail(f"{err}; see `mlbatch --help`", EXIT_USAGE)
         if os.environ.get("MLBATCH_TRACEBACK"):
             raise
         _fail(
@@ -41,7 +47,14 @@ def main() -> None:
         )
 
 
-def _fail(message: str, code: int) -> None:
+def _is_usage(err: Exception) -> bool:
+    """Whether the parser of the command line refused it; typer names a leaf of its errors only."""
+    import typer
+
+    return isinstance(err, typer.BadParameter.__mro__[1])
+
+
+def _fail(message: str, code: int) -> NoReturn:
     line = " ".join(message.split())
     print(f"mlbatch: error: {line}", file=sys.stderr)
     sys.exit(code)

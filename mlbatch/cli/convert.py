@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mlbatch.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
-
-_BYTES_PER_POINT = {"mcap": 24, "npz": 36, "ply": 30}
 
 
 def convert(
@@ -37,7 +32,7 @@ def convert(
     point_layout: Annotated[
         str, typer.Option(help="Fields of a PointCloud2 point (preset).")
     ] = "standard",
-    slices: Annotated[int, typer.Option(min=1, max=10000, help="Partial scans a window.")] = 1,
+    slices: Annotated[int, typer.Option(help="Partial scans a window.")] = 1,
     split: Annotated[
         bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
     ] = False,
@@ -55,7 +50,7 @@ def convert(
     clock: Annotated[
         str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
     ] = "sensor",
-    min_range: Annotated[float, typer.Option(min=0.0, help="Drop nearer points, m.")] = 0.0,
+    min_range: Annotated[float, typer.Option(help="Drop nearer points, m.")] = 0.0,
     max_range: Annotated[
         float, typer.Option(help="Drop farther points, m.", show_default="none")
     ] = float("inf"),
@@ -86,7 +81,7 @@ def convert(
         bool, typer.Option("--dry-run", help="Do all but write; print the report.")
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes; 1 in this version.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Processes; 1 in this version.")] = 1,
     engine: Annotated[str, typer.Option(help="auto or numpy.")] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
@@ -104,7 +99,6 @@ def convert(
     from mlbatch.cli.run import Wanted, run
     from mlbatch.discover import Wishes
     from mlbatch.pipeline import Job
-    from mlbatch.rate import parse_rate
 
     values.choice("--layout", layout, ("dense", "organized"))
     values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
@@ -113,12 +107,11 @@ def convert(
         raise UsageError(f"--jobs: wanted 1, got {jobs}; more than one is not in this version")
     if output is None and not dry_run:
         raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
-    if max_range <= min_range:
-        raise UsageError(
-            f"--max-range: wanted more than --min-range ({min_range} m), got {max_range} m; swap"
-        )
+    values.slices(slices)
+    values.ranges_m(min_range, max_range)
     first, first_is_date = values.time_limit("--start", start)
     last, last_is_date = values.time_limit("--end", end)
+    values.in_order(first, last)
     job = Job(
         recordings=tuple(recordings),
         wishes=Wishes(
@@ -129,7 +122,7 @@ def convert(
             identity_extrinsics=identity_extrinsics,
             decode=values.decode_options(decode or ()),
         ),
-        rate=None if rate is None else parse_rate(rate),
+        rate=None if rate is None else values.rate(rate),
         slices=slices,
         layout=layout,
         split=split,

@@ -6,17 +6,55 @@ import datetime
 import math
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
+from fractions import Fraction
 
 from mlbatch.batching.batcher import Limit
 from mlbatch.errors import UsageError
+from mlbatch.rate import parse_rate
 from mlbatch.units import NS_PER_S
 
+MAX_SLICES = 10_000
 DECODE_KEYS = {
     "firing_azimuth": ("on", "off"),
     "vertical_offset": ("on", "off"),
     "optical_centre": ("on", "off"),
     "crc": ("check",),
 }
+
+
+def rate(text: str) -> Fraction:
+    """`--rate`, exactly the number in the text."""
+    try:
+        return parse_rate(text)
+    except UsageError as err:
+        raise UsageError(f"--{err}") from err
+
+
+def slices(count: int) -> None:
+    """`--slices`."""
+    if not 1 <= count <= MAX_SLICES:
+        raise UsageError(f"--slices: wanted 1 to {MAX_SLICES}, got {count}; leave it out for 1")
+
+
+def ranges_m(low: float, high: float) -> None:
+    """`--min-range` and `--max-range`."""
+    if not 0 <= low < math.inf:
+        raise UsageError(f"--min-range: wanted 0 or more metres, got {low}; write 0.5")
+    if not high > low:
+        raise UsageError(
+            f"--max-range: wanted more than --min-range ({low} m), got {high} m; write 100"
+        )
+
+
+def in_order(first: Limit | None, last: Limit | None) -> None:
+    """`--start` before `--end`, where both count from the same time."""
+    if first is None or last is None or first.from_t_init != last.from_t_init:
+        return
+    if last.ns <= first.ns:
+        raise UsageError(
+            f"--end: wanted a time after --start ({first.ns / NS_PER_S:g} s), got "
+            f"{last.ns / NS_PER_S:g} s; swap them"
+        )
 
 
 def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:

@@ -1,15 +1,18 @@
 """Pixels of gathered Ouster columns: the hot path.
 
 Source: facts/ouster.md section 3. No field crosses a 32-bit word, so a column is a row of words and
-a field is one of them, shifted and masked. Few passes over scratch that is reused; where a pixel
-is one word, whole rows are shifted and masked, header included, since short rows cost more.
+a range is one of them, shifted and masked; reflectivity and signal are whole bytes in all profiles.
+Few passes over scratch that is reused; where a pixel is one word, whole rows are shifted and
+masked, header included, since short rows cost more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.sensors._ouster_profiles import Field, PacketLayout, Profile
 from mlbatch.types import F32Array, I32Array, Pixels, U8Array, U32Array
@@ -29,13 +32,21 @@ class _Part:
 
 
 @dataclass(frozen=True, slots=True)
+class _Whole:
+    """A field that is whole bytes of a pixel, and so is read where it stands."""
+
+    first: int
+    dtype: np.dtype[np.unsignedinteger[Any]]
+
+
+@dataclass(frozen=True, slots=True)
 class _Return:
     """The fields of one return; `per_metre`: units of the raw range in a metre."""
 
     range: _Part
     per_metre: np.float32
-    reflectivity: _Part
-    signal: _Part | None
+    reflectivity: _Whole
+    signal: _Whole | None
 
 
 class PixelReader:
@@ -63,12 +74,11 @@ class PixelReader:
         np.copyto(floats, self._take(words, fields.range))
         # Below 2**24, so exact; one division of exact values is correctly rounded.
         np.divide(floats, fields.per_metre, out=out.range_m)
-        intensity = self._take(words, fields.reflectivity)
+        reflectivity = self._whole(records, fields.reflectivity)
         if out.reflectivity is not None:
-            np.copyto(out.reflectivity, intensity, casting="unsafe")
-        if fields.signal is not None:
-            intensity = self._take(words, fields.signal)
-        np.copyto(out.intensity, intensity)
+            np.copyto(out.reflectivity, reflectivity)
+        signal = fields.signal
+        np.copyto(out.intensity, reflectivity if signal is None else self._whole(records, signal))
 
     def _take(self, words: U32Array, part: _Part) -> I32Array:
         """A field of all pixels (n, H), in scratch: signed, as CPUs turn those into floats fast."""
@@ -81,6 +91,15 @@ class PixelReader:
         if part.mask is not None:
             source = np.bitwise_and(source, part.mask, out=taken)
         return source[:, pixels].view(np.int32)
+
+    def _whole(self, records: U8Array, field: _Whole) -> npt.NDArray[np.unsignedinteger[Any]]:
+        """A field of all pixels (n, H), where it stands in the records."""
+        first = self._first * _WORD_BYTES
+        size = self._step * _WORD_BYTES
+        pixels = records[:, first : first + self._beams * size]
+        pixels = pixels.reshape(len(records), self._beams, size)
+        last = field.first + field.dtype.itemsize
+        return pixels[:, :, field.first : last].view(field.dtype)[:, :, 0]
 
     def _grow(self, columns: int) -> None:
         if columns > len(self._words):
@@ -95,9 +114,13 @@ def _fields_of(profile: Profile, suffix: str) -> _Return:
     return _Return(
         _part(range_field),
         np.float32(MM_PER_M / (1 << range_field.shift)),
-        _part(fields[f"REFLECTIVITY{suffix}"]),
-        None if signal is None else _part(signal),
+        _whole(fields[f"REFLECTIVITY{suffix}"]),
+        None if signal is None else _whole(signal),
     )
+
+
+def _whole(field: Field) -> _Whole:
+    return _Whole(field.first_bit // 8, np.dtype(f"<u{field.width // 8}"))
 
 
 def _part(field: Field) -> _Part:
