@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch import accounts
-from mlbatch.batching.batcher import Batcher, Limit, Policy, Window
+from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Intake
+from mlbatch.batching.windows import Limit, Policy, Window
 from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Due, Label, Source
 from mlbatch.discover import Mounted, Note, Setup, Wishes, absent, discover

@@ -12,56 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, Arrival, Delivery, Intake
-from mlbatch.errors import ClockError
+from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.types import BoolArray, Columns, I64Array
-from mlbatch.units import NS_PER_MS, NS_PER_S
+from mlbatch.units import NS_PER_MS
 
 # A window closes this long after its end in stamps, so that packets swapped by the network count.
 SLACK_NS = 10 * NS_PER_MS
-COMPARABLE_NS = NS_PER_S
-
-
-@dataclass(frozen=True, slots=True)
-class Limit:
-    """An end of `--start`/`--end`: a time, or (from_t_init) a time after t_init; int ns."""
-
-    ns: int
-    from_t_init: bool = False
-
-    def at(self, t_init: int) -> int:
-        """The limit as a time on the common clock."""
-        return self.ns + t_init if self.from_t_init else self.ns
-
-
-@dataclass(frozen=True, slots=True)
-class Policy:
-    """Options of the batching; max_wait_ns None waits for ever (the paper to the letter)."""
-
-    max_wait_ns: int | None = NS_PER_S
-    keep_partial: bool = False
-    start: Limit | None = None
-    end: Limit | None = None
-
-
-@dataclass(slots=True)
-class Window:
-    """Columns of one window (or slice) of all sensors, by (stamp, sensor, arrival).
-
-    stamp_ns, sensor, place, encoder: (n,) int64; `index` is -1 for the head.
-    """
-
-    index: int
-    slice: int
-    start_ns: int
-    end_ns: int
-    complete: bool
-    ready_host_ns: int
-    stamp_ns: I64Array
-    sensor: I64Array
-    place: I64Array
-    encoder: I64Array
 
 
 @dataclass(slots=True)
@@ -95,15 +54,11 @@ class Batcher:
     """Takes packets in arrival order, gives windows; one named object owns all state."""
 
     def __init__(self, grid: Grid, intakes: Sequence[Intake], policy: Policy) -> None:
-        self.t_init_ns: int | None = None
-        self.empty = 0
         self._grid = grid
         self._policy = policy
+        self._schedule = Schedule(grid, policy)
         self._tracks = [_Track(intake) for intake in intakes]
         self._watermark = NEVER
-        self._first_window = 0
-        self._seen_windows = 0
-        self._last_window: int | None = None
 
     # -- what came in -------------------------------------------------------------------------
 
@@ -147,7 +102,7 @@ class Batcher:
         if not firsts:
             return
         if self.t_init_ns is None:
-            self._start(max(firsts))
+            self._schedule.begin(max(firsts))
         self._watermark = FOREVER
         yield from self._publish(
             _Progress(
@@ -157,9 +112,18 @@ class Batcher:
             ),
             last_of_all=max(track.newest_ns for track in self._tracks),
         )
-        self._count_empty()
 
     # -- what became of it --------------------------------------------------------------------
+
+    @property
+    def t_init_ns(self) -> int | None:
+        """Eq. (1): start of the first window; None as long as it is not known."""
+        return self._schedule.t_init_ns
+
+    @property
+    def empty(self) -> int:
+        """Windows without a column between the first and the last so far."""
+        return self._schedule.empty
 
     @property
     def rejected(self) -> list[dict[str, int]]:
@@ -208,11 +172,7 @@ class Batcher:
     @property
     def past_end(self) -> bool:
         """Whether `--end` was passed, so that nothing that comes can be written any more."""
-        if self.t_init_ns is None or self._policy.end is None:
-            return False
-        # A window that begins before the end may reach past it by less than a period.
-        end = self._policy.end.at(self.t_init_ns)
-        return self._watermark >= self._grid.bound(self._grid.index_of(max(end, 0)) + 1)
+        return self._schedule.is_past_end(self._watermark)
 
     # -- steps --------------------------------------------------------------------------------
 
@@ -231,22 +191,9 @@ class Batcher:
                 track.offset_ns = track.first_ns - int(arrival.host_ns[row])
                 firsts.append((int(ranks[number][row]), number))
         for _, number in sorted(firsts):
-            self._compare(number)
-
-    def _compare(self, number: int) -> None:
-        mine = self._tracks[number]
-        for other, track in enumerate(self._tracks):
-            if other == number or track.offset_ns is None or mine.offset_ns is None:
-                continue
-            apart = mine.offset_ns - track.offset_ns
-            if abs(apart) > COMPARABLE_NS:
-                raise ClockError(
-                    f"clocks of the sensors cannot be compared: stamp minus arrival is "
-                    f"{track.offset_ns / NS_PER_S:+.3f} s for {track.intake.name} and "
-                    f"{mine.offset_ns / NS_PER_S:+.3f} s for {mine.intake.name}, "
-                    f"{abs(apart) / NS_PER_S:.3f} s apart; wanted at most 1 s; "
-                    "use --clock host, or give clock.offset_s in the rig"
-                )
+            refuse_incomparable(
+                [(track.intake.name, track.offset_ns) for track in self._tracks], number
+            )
 
     def _advance(
         self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array], host_ns: I64Array
@@ -287,14 +234,10 @@ class Batcher:
             return len(ready)
         at = int(np.argmax(ready))
         live = present[:, at] & ~stalled[:, at]
-        self._start(
+        self._schedule.begin(
             max(track.first_ns for track, use in zip(self._tracks, live, strict=True) if use)
         )
         return at
-
-    def _start(self, t0max_ns: int) -> None:
-        self._first_window = self._grid.first_window(t0max_ns)
-        self.t_init_ns = self._grid.bound(self._first_window * self._grid.slices)
 
     def _wait(self, number: int, arrival: Arrival, published: I64Array) -> None:
         """Queue the valid columns of a sensor, except late ones; published: watermarks before."""
@@ -354,13 +297,12 @@ class Batcher:
             closed_by = int(np.searchsorted(progress.watermark, end))
             part = slice(done, upto)
             done = upto
-            self._note_window(window)
-            reason = self._unwanted(window, start, end, last_of_all)
+            reason = self._schedule.enter(window, last_of_all)
             if reason:
                 self._drop(sensor[part], reason)
                 continue
             yield Window(
-                index=window // self._grid.slices - self._first_window,
+                index=self._schedule.index_of(window),
                 slice=window % self._grid.slices,
                 start_ns=start,
                 end_ns=end,
@@ -392,29 +334,6 @@ class Batcher:
             merged.encoder[order],
         )
 
-    def _unwanted(self, window: int, start: int, end: int, last_of_all: int | None) -> str:
-        """Why the columns of a window are dropped; empty if they are not."""
-        index = window // self._grid.slices - self._first_window
-        if index < -1:
-            return "before_start"
-        if not self._inside(index):
-            return "outside_time"
-        if index == -1:
-            return "" if self._policy.keep_partial else "head"
-        if last_of_all is not None and start <= last_of_all < end:
-            return "" if self._policy.keep_partial else "tail"
-        return ""
-
-    def _inside(self, index: int) -> bool:
-        """Whether the start of window `index` lies in [--start, --end)."""
-        if self.t_init_ns is None:
-            return False
-        start = self._grid.bound((index + self._first_window) * self._grid.slices)
-        low, high = self._policy.start, self._policy.end
-        return (low is None or start >= low.at(self.t_init_ns)) and (
-            high is None or start < high.at(self.t_init_ns)
-        )
-
     def _complete(self, progress: _Progress, at: int, start: int, end: int) -> bool:
         """Every sensor began at or before the start and came past the end, and none stalled."""
         return bool((progress.newest[:, at] >= end).all()) and not any(
@@ -426,34 +345,6 @@ class Batcher:
     def _drop(self, sensor: I64Array, reason: str) -> None:
         for number, count in enumerate(np.bincount(sensor, minlength=len(self._tracks))):
             self._tracks[number].drop(reason, int(count))
-
-    def _note_window(self, window: int) -> None:
-        index = window // self._grid.slices - self._first_window
-        if index >= 0:
-            self._last_window = window
-            self._seen_windows += self._inside(index)
-
-    def _count_empty(self) -> None:
-        """Windows without a column between the first and the last, by subtraction."""
-        if self._last_window is None or self.t_init_ns is None:
-            return
-        slices, first = self._grid.slices, self._first_window
-        low, high = first, self._last_window // slices
-        policy = self._policy
-        if policy.start is not None:
-            low = max(low, self._window_at_or_after(policy.start.at(self.t_init_ns)))
-        begin, stop = low * slices, self._last_window + 1
-        if policy.end is not None:
-            high_end = self._window_at_or_after(policy.end.at(self.t_init_ns))
-            if high_end <= high:
-                stop = high_end * slices
-        self.empty = max(0, stop - begin - self._seen_windows)
-
-    def _window_at_or_after(self, time_ns: int) -> int:
-        """First window whose start is at or after `time_ns`."""
-        slices = self._grid.slices
-        window = self._grid.index_of(max(time_ns, 0)) // slices
-        return window if self._grid.bound(window * slices) >= time_ns else window + 1
 
 
 def _chained(parts: Sequence[Columns]) -> Columns:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 
-from mlbatch.batching.batcher import Limit
+from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
 from mlbatch.rate import parse_rate
 from mlbatch.units import NS_PER_S

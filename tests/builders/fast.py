@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mlbatch.batching.batcher import Batcher, Limit, Policy
-from mlbatch.batching.batcher import Window as FastWindow
+from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Arrival, Delivery, Intake
 from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
+from mlbatch.batching.windows import Limit, Policy
+from mlbatch.batching.windows import Window as FastWindow
 from mlbatch.types import Heads
 
 
