@@ -1,0 +1,63 @@
+# All set-up happens here: python3 (3.10 or later), git and make are enough.
+#
+#   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
+#   make test    formatting, lint, types, all tests, branch coverage
+#   make lint    the first three of them
+#   make bench   speed, memory and writers on a recording of a minute (needs 2 GB in build/bench)
+#   make clean   remove what the others made
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+RIG := fixtures/two_lidars
+CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench clean
+
+help:
+	@sed -n 's/^#   //p' Makefile
+
+demo: $(VENV)/core.stamp
+	@mkdir -p demo
+	$(CONVERT) -o demo/two_lidars.mcap
+	$(CONVERT) -o demo/scans
+	$(BIN)/python docs/picture.py demo/scans demo/two_lidars.png
+	@$(BIN)/python docs/demo.py demo
+
+test: lint
+	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+bench: $(VENV)/dev.stamp
+	@mkdir -p build/bench
+	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m tests.bench.run speed --folder build/bench
+	$(BIN)/python -m tests.bench.run memory --folder build/bench
+	$(BIN)/python -m tests.bench.run writers --folder build/bench
+
+clean:
+	rm -rf $(VENV) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+
+# A stamp is as old as its environment: it is made again when pyproject.toml changes.
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+		echo "make: wanted Python 3.10 or later, got $$($(PYTHON) --version 2>&1);" \
+			"give another one: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "make: $(PYTHON) cannot make a virtual environment;" \
+			"on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
+
+$(VENV)/core.stamp: pyproject.toml | $(VENV)/bin/python
+	@echo "installing mlbatch into $(VENV)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/dev.stamp: pyproject.toml | $(VENV)/bin/python
+	@echo "installing mlbatch and its tools into $(VENV)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@ $(VENV)/core.stamp
