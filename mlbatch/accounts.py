@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import discover
@@ -103,7 +104,7 @@ def _sensor(run: Conversion, number: int) -> SensorReport:
         clock=_clock(run, number),
         extrinsics_source=sensor.extrinsics_source,
         body_from_sensor=sensor.body_from_sensor,
-        calibration=lidar.calibration,
+        calibration=Path(lidar.calibration).name,
     )
 
 

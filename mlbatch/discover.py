@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -172,7 +173,31 @@ def _find_rigged(
         )
         for sensor in rig.sensors
     ]
-    return match_rig(sampler, wanted, origin)
+    try:
+        found, unknown = match_rig(sampler, wanted, origin)
+    except UsageError as err:
+        raise RigError(f"{origin}: {err}") from err
+    for sensor, one in zip(rig.sensors, found, strict=True):
+        if sensor.model is not None:
+            _check_model(sensor.name, sensor.model, one.lidar.model, origin)
+    return found, unknown
+
+
+def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
+    """A model named in the rig must exist, and be the one that the calibration describes."""
+    known = [model.name for model in sensors.models()]
+    if wanted not in known:
+        near = difflib.get_close_matches(wanted, known, 1)
+        advice = f"did you mean {near[0]}?" if near else "see `mlbatch sensors`, or write auto"
+        raise RigError(
+            f"{origin}: sensor {name}: wanted a supported model, got {wanted!r}; {advice}"
+        )
+    # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
+    if not got.replace("-", "").startswith(wanted.replace("-", "")):
+        raise RigError(
+            f"{origin}: sensor {name}: wanted a {wanted}, got the metadata of a {got}; "
+            "correct model or metadata"
+        )
 
 
 def _is_lidar(sampler: Sampler, kind: Kind) -> bool:
@@ -192,7 +217,7 @@ def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[Path]) -> Note:
     return Note(
         "no_metadata",
         "",
-        f"{stream}: {describe(sampler, kind)}: no metadata fits among {_files(looked)}; "
+        f"{stream}: {describe(sampler, kind)}; wanted metadata that fits, got {_files(looked)}; "
         "its packets are counted as unassigned; give --metadata FILE",
     )
 
@@ -205,8 +230,8 @@ def _nothing_found(
         kind = lidar_kinds[0]
         stream = table.streams[kind[0]]
         return RecordingError(
-            f"{where}: {stream} carries {describe(sampler, kind)}, but no metadata fits it; "
-            f"looked at {_files(looked)}; give the sensor's metadata with --metadata FILE"
+            f"{where}: {stream} carries {describe(sampler, kind)}; wanted metadata that fits, "
+            f"got {_files(looked)}; give the sensor's with --metadata FILE"
         )
     seen = [
         f"{table.streams[kind[0]]} ({kind[1]} bytes: {describe(sampler, kind) or 'unknown'})"
@@ -220,7 +245,8 @@ def _nothing_found(
 
 
 def _files(paths: Sequence[Path]) -> str:
-    return _some([path.name for path in paths]) or "no file (none beside the recording)"
+    names = _some([path.name for path in paths])
+    return f"only {names}" if names else "none beside the recording"
 
 
 def _some(words: Sequence[str], most: int = 4) -> str:
@@ -235,8 +261,8 @@ def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
         for word in words:
             if word not in known:
                 raise UsageError(
-                    f"{option} {word}: wanted the name of a sensor, one of "
-                    f"{', '.join(sensor.name for sensor in found)}, got {word}"
+                    f"{option}: wanted the name or serial number of a sensor, one of "
+                    f"{', '.join(sensor.name for sensor in found)}, got {word!r}; choose one"
                 )
     chosen = [
         sensor
@@ -245,7 +271,10 @@ def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
         and not {sensor.name, sensor.lidar.serial} & set(wishes.ignore)
     ]
     if not chosen:
-        raise UsageError("--only/--ignore: wanted at least one sensor to convert, none is left")
+        raise UsageError(
+            "--only/--ignore: wanted at least one sensor to convert, got none that is left; "
+            "leave one of them out"
+        )
     return chosen
 
 

@@ -11,6 +11,8 @@ from mlbatch.types import CaptureCounts
 CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 COLUMN_REASONS = ("before_start", "late", "tail", "head", "invalid", "outside_time")
+# `no_place`: the format of the output has none for them.
+IMU_REASONS = ("bad_stamp", "outside_time", "no_place")
 
 
 @dataclass(slots=True)
@@ -57,6 +59,19 @@ class PointCounts:
 
 
 @dataclass(slots=True)
+class ImuCounts:
+    """IMU samples of a sensor: decoded = written + sum(dropped)."""
+
+    decoded: int = 0
+    written: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Count samples that were not written."""
+        _add(self.dropped, reason, count)
+
+
+@dataclass(slots=True)
 class SensorLedger:
     """All counters of one sensor."""
 
@@ -64,17 +79,21 @@ class SensorLedger:
     columns: ColumnCounts = field(default_factory=ColumnCounts)
     points: PointCounts = field(default_factory=PointCounts)
     imu_packets: int = 0
+    imu_samples: ImuCounts = field(default_factory=ImuCounts)
 
     def check(self) -> list[str]:
         """What does not balance, a line each; empty when all is accounted for."""
         packets, columns, points = self.packets, self.columns, self.points
+        samples = self.imu_samples
         fates = (points.no_return, points.range, points.box, points.repeated, points.written)
         return [
             *_balance("packets", packets.read, (packets.accepted, *packets.rejected.values())),
             *_balance("columns", columns.decoded, (columns.written, *columns.dropped.values())),
             *_balance("points", points.slots, fates),
+            *_balance("IMU samples", samples.decoded, (samples.written, *samples.dropped.values())),
             *_unknown("packets", packets.rejected, PACKET_REASONS),
             *_unknown("columns", columns.dropped, COLUMN_REASONS),
+            *_unknown("IMU samples", samples.dropped, IMU_REASONS),
         ]
 
 

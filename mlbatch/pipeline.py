@@ -21,6 +21,7 @@ from mlbatch.decode import Decoder, Due, Label, Source
 from mlbatch.discover import Mounted, Note, Setup, Wishes, absent, discover
 from mlbatch.errors import PacketError, RecordingError, UsageError
 from mlbatch.feeding import Feed, Feeder
+from mlbatch.inertial import ImuQueue
 from mlbatch.rate import rate_text
 from mlbatch.readers import merge, open_recording
 from mlbatch.report import ReportInputs, imbalances, report_text
@@ -28,6 +29,7 @@ from mlbatch.ring import RawRing
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
     EXTRAS,
+    IMU,
     F64Array,
     ImuSamples,
     PacketBatch,
@@ -120,7 +122,11 @@ class Conversion:
         host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
         self.feeder = Feeder(self.setup, self.feeds, host_clocks)
         self._decoders: list[Decoder] = []
-        self._imu: list[ImuSamples] = []
+        self._imu = ImuQueue(
+            [feed.ledger.imu_samples for feed in self.feeds],
+            [self._offset_ns(sensor) for sensor in self.setup.sensors],
+            wanted=IMU in job.extras,
+        )
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
 
@@ -152,7 +158,8 @@ class Conversion:
         with self._timed("merge_s"):
             places = [self.batcher.oldest_place(number) for number in range(len(self.feeds))]
             fed = self.feeder.feed(batch, places)
-            self._imu += fed.imu
+            for samples in fed.imu:
+                self._imu.add(samples)
             if self.job.strict:
                 self._refuse_rejected()
         return self.batcher.push(fed.arrivals, batch.host_ns)
@@ -202,18 +209,11 @@ class Conversion:
 
     def _begin(self) -> None:
         """What needs the clocks to be known: the timescale, and with it all labels of scans."""
-        names = []
-        for sensor, stamps in zip(self.setup.sensors, self.batcher.firsts, strict=True):
-            if stamps is not None:
-                names.append(self.timescale_of(sensor, *stamps))
+        names = self._timescales()
         shared = common_timescale(names)
         if len(set(names)) > 1:
             self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
-        if self.job.limits_are_dates and shared not in ("utc", "tai"):
-            raise UsageError(
-                f"--start/--end: wanted seconds, since the sensors' clock ({shared}) knows no "
-                "date, got a date; write +SECONDS after the first scan"
-            )
+        self._check_dates(shared)
         self.info = _run_info(self.setup, self.job, self.grid, shared)
         self.table = ScanTable(self.info)
         boxes_m, extras = _boxes(self.setup, self.job), self.job.extras
@@ -230,9 +230,31 @@ class Conversion:
         else:
             self._decoders = [Decoder(self.info, sources, boxes_m, extras)]
 
+    def _timescales(self) -> list[str]:
+        """Timescale of each sensor that gave a stamp."""
+        return [
+            self.timescale_of(sensor, *stamps)
+            for sensor, stamps in zip(self.setup.sensors, self.batcher.firsts, strict=True)
+            if stamps is not None
+        ]
+
+    def _check_dates(self, shared: str) -> None:
+        """Refuse dates for a clock that knows none."""
+        if self.job.limits_are_dates and shared not in ("utc", "tai"):
+            raise UsageError(
+                f"--start/--end: wanted seconds, since the sensors' clock ({shared}) knows no "
+                "date, got a date; write +SECONDS after the first scan"
+            )
+
     def uses_host_clock(self, sensor: Mounted) -> bool:
         """Whether a sensor's stamps are replaced by arrival times."""
         return self.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
+
+    def _offset_ns(self, sensor: Mounted) -> int:
+        """What is added to the stamps of a sensor; arrival times need no correction."""
+        if sensor.rig is None or self.uses_host_clock(sensor):
+            return 0
+        return sensor.rig.offset_ns
 
     def timescale_of(self, sensor: Mounted, stamp_ns: int, host_ns: int) -> str:
         """Timescale of a sensor's stamps as they are batched."""
@@ -242,14 +264,7 @@ class Conversion:
 
     def imu_until(self, end_ns: int | None) -> list[ImuSamples]:
         """Take IMU samples before `end_ns` (None: all), by stamp, then sensor."""
-        ready: list[ImuSamples] = []
-        later: list[ImuSamples] = []
-        for samples in self._imu:
-            due = len(samples.stamp_ns) == 0 or end_ns is None or samples.stamp_ns[0] < end_ns
-            (ready if due else later).append(samples)
-        self._imu = later
-        ready = [samples for samples in ready if len(samples.stamp_ns)]
-        return sorted(ready, key=lambda samples: (int(samples.stamp_ns[0]), samples.sensor))
+        return self._imu.take(end_ns, self.batcher.limits_ns)
 
     # -- the end ------------------------------------------------------------------------------
 
@@ -270,6 +285,9 @@ class Conversion:
         for sensor, feed in zip(self.setup.sensors, self.feeds, strict=True):
             if sensor.rig is not None and not sensor.rig.optional and not feed.ledger.packets.read:
                 raise absent(sensor, self.job.wishes.rig)
+        if self.info is None and (names := self._timescales()):
+            # A date can lie so far from an uptime clock that no window was ever reached.
+            self._check_dates(common_timescale(names))
         if self.table is None or not self.table.rows:
             raise RecordingError(accounts.why_nothing(self))
 
@@ -344,8 +362,8 @@ def convert(
             writer.write(scan, only)
             run.stages.write_s += time.perf_counter() - began_s
         began_s = time.perf_counter()
-        if writer is not None:
-            for samples in run.imu_until(None):
+        for samples in run.imu_until(None):
+            if writer is not None:
                 writer.write_imu(samples)
         inputs = accounts.report_inputs(run)
         broken = imbalances(inputs)

@@ -12,6 +12,7 @@ import mlbatch
 from mlbatch.ledger import (
     CAPTURE_REASONS,
     COLUMN_REASONS,
+    IMU_REASONS,
     PACKET_REASONS,
     SensorLedger,
     check_capture,
@@ -220,6 +221,11 @@ def _sensor(sensor: SensorReport) -> Section:
             "reordered": packets.reordered,
         },
         "imu_packets": sensor.ledger.imu_packets,
+        "imu_samples": {
+            "decoded": sensor.ledger.imu_samples.decoded,
+            "written": sensor.ledger.imu_samples.written,
+            "dropped": ordered(sensor.ledger.imu_samples.dropped, IMU_REASONS),
+        },
         "columns": {
             "decoded": columns.decoded,
             "written": columns.written,

@@ -183,6 +183,8 @@ class RunInfo:
 
 # Arrays of a scan that not every output has a place for; only those that are asked for are made.
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
+# Said together with EXTRAS by outputs that also hold IMU samples.
+IMU = "imu"
 
 
 @dataclass(slots=True)

@@ -170,6 +170,11 @@ class Batcher:
         return min(places, default=None)
 
     @property
+    def limits_ns(self) -> tuple[int | None, int | None]:
+        """`--start` and `--end` on the common clock, once eq. (1) is known."""
+        return self._schedule.limits_ns
+
+    @property
     def past_end(self) -> bool:
         """Whether `--end` was passed, so that nothing that comes can be written any more."""
         return self._schedule.is_past_end(self._watermark)

@@ -100,6 +100,12 @@ class Schedule:
         return watermark_ns >= self._grid.bound(self._at_or_after(end) * self._grid.slices)
 
     @property
+    def limits_ns(self) -> tuple[int | None, int | None]:
+        """`--start` and `--end` on the common clock; None where there is none."""
+        low, high, begin = self._policy.start, self._policy.end, self.t_init_ns or 0
+        return None if low is None else low.at(begin), None if high is None else high.at(begin)
+
+    @property
     def empty(self) -> int:
         """Windows without a column from the first to the last that holds one, by subtraction."""
         if self._last is None or self.t_init_ns is None:

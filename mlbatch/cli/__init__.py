@@ -36,8 +36,9 @@ def main() -> None:
     except MemoryError:
         _fail("out of memory; use a smaller --max-wait, or convert a part with --end", EXIT_ERROR)
     except Exception as err:
-        if _is_usage(err):
-            _fail(f"{err}; see `mlbatch --help`", EXIT_USAGE)
+        usage = _usage(err)
+        if usage:
+            _fail(f"{usage}; see `mlbatch --help`", EXIT_USAGE)
         if os.environ.get("MLBATCH_TRACEBACK"):
             raise
         _fail(
@@ -47,11 +48,14 @@ def main() -> None:
         )
 
 
-def _is_usage(err: Exception) -> bool:
-    """Whether the parser of the command line refused it; typer names a leaf of its errors only."""
+def _usage(err: Exception) -> str:
+    """What the parser of the command line refused; empty for other errors."""
     import typer
 
-    return isinstance(err, typer.BadParameter.__mro__[1])
+    # typer names a leaf of its usage errors only; their root lies in another place each version.
+    if not isinstance(err, typer.BadParameter.__mro__[1]):
+        return ""
+    return str(getattr(err, "format_message", err.__str__)()).rstrip(".")
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import typer
 
+from mlbatch.cli import checks
 from mlbatch.pipeline import Conversion, Job, OpenWriter, Progress, convert
 from mlbatch.report import report_text, summary_lines
 from mlbatch.types import RunInfo
@@ -50,6 +51,8 @@ def run(job: Job, wanted: Wanted) -> None:
         check_target(name, wanted.output, options, job.layout)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
+        checks.disk(job, wanted.output)
+    checks.report(job, wanted.report, wanted.output)
     with _progress(wanted.quiet) as progress:
         conversion, inputs = convert(job, opener, progress)
     for note in conversion.notes:

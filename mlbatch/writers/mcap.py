@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from mlbatch.errors import UsageError
-from mlbatch.types import ImuSamples, RunInfo, Scan, Summary
+from mlbatch.types import IMU, ImuSamples, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import (
     SCANS_CSV,
     export_errors,
@@ -30,9 +30,9 @@ WAITING_SAMPLES = 65536
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """What the fields of the point layout are made of."""
+    """What the fields of the point layout are made of, and IMU samples."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)
-    return frozenset() if layout is None else layout.extras
+    return frozenset({IMU}) if layout is None else layout.extras | {IMU}
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
