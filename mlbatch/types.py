@@ -35,11 +35,43 @@ class Stream:
         return self.topic or f"{self.source_ip} > port {self.port}"
 
 
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag as its recording describes it.
+
+    type: package/Type, without the /msg/ of ROS 2; encoding: `cdr` or `ros1`; definition: text
+    stored in the recording ("" if none) in the format `ros1msg`, `ros2msg` or `ros2idl`; qos: the
+    recorder's text; latched: ROS 1 latching, or transient local durability.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    definition: str = ""
+    format: str = ""
+    qos: str = ""
+    latched: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message that holds no lidar packets, as it is stored; host_ns: log time."""
+
+    topic: Topic
+    host_ns: int
+    data: bytes
+
+
 @dataclass(slots=True)
 class StreamTable:
-    """Numbers the streams of a session; all its readers share one table."""
+    """Numbers the streams of a session; all its readers share one table.
+
+    untimed: streams whose packets have no arrival time of their own (`host_ns` is then the log
+    time of the message that holds many of them), so that `--clock host` cannot be used.
+    """
 
     streams: list[Stream] = field(default_factory=list)
+    untimed: set[int] = field(default_factory=set)
     _numbers: dict[Stream, int] = field(default_factory=dict)
 
     def number(self, stream: Stream) -> int:
@@ -57,7 +89,9 @@ class PacketBatch:
 
     Payload i is `data[start[i] : start[i] + size[i]]`.
     data: (bytes,) uint8; start, size: (n,) int64; stream: (n,) int64, numbers of a `StreamTable`;
-    host_ns: (n,) int64, time of arrival at the recorder (of the completing fragment).
+    host_ns: (n,) int64, time of arrival at the recorder (of the completing fragment); messages:
+    those of the topics that the recording was asked to `keep`, in file order, whose time has come
+    with this batch.
     """
 
     data: U8Array
@@ -65,12 +99,13 @@ class PacketBatch:
     size: I64Array
     stream: I64Array
     host_ns: I64Array
+    messages: tuple[Message, ...] = ()
 
     def __len__(self) -> int:
         return len(self.start)
 
     def take(self, index: I64Array | slice) -> PacketBatch:
-        """The packets at `index`, over the same bytes."""
+        """The packets at `index`, over the same bytes, without messages."""
         return PacketBatch(
             self.data, self.start[index], self.size[index], self.stream[index], self.host_ns[index]
         )
@@ -91,8 +126,15 @@ class CaptureCounts:
 
 
 class Recording(Protocol):
-    """An opened recording, whatever its container."""
+    """An opened recording, whatever its container.
 
+    topics: of a bag, all of them; keep: names of topics whose messages the batches shall hold (set
+    before `packets` is called); notes: what is wrong with the file, a line each.
+    """
+
+    topics: tuple[Topic, ...]
+    keep: frozenset[str]
+    notes: list[str]
     path: Path
     container: str
     counts: CaptureCounts

@@ -23,7 +23,7 @@ from mlbatch.readers._fragments import MAX_DATAGRAM_BYTES
 from mlbatch.readers._frames import Frames, dissect, in_order
 from mlbatch.readers._reassembly import Reassembler
 from mlbatch.readers._source import Source
-from mlbatch.types import CaptureCounts, I64Array, PacketBatch, StreamTable, U8Array
+from mlbatch.types import CaptureCounts, I64Array, PacketBatch, StreamTable, Topic, U8Array
 
 BUFFER_BYTES = 4 << 20
 # Room for fragments of earlier buffers beside those of this one.
@@ -114,6 +114,8 @@ class CaptureRecording:
     counts: CaptureCounts = field(default_factory=CaptureCounts)
     notes: list[str] = field(default_factory=list)
     position_bytes: int = 0
+    topics: tuple[Topic, ...] = ()
+    keep: frozenset[str] = frozenset()
 
     def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
         """Yield all packets from the start, in file order; may be called again (counts restart).

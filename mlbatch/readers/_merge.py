@@ -7,7 +7,7 @@ times step back, its packets keep their order and count with the largest time so
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,12 +33,15 @@ def merge(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
         for feed in waiting:
             before = before and feed is not slowest
             ready.append(feed.take(bound_ns, inclusive=before or feed is slowest))
+        messages = tuple(message for batch, _ in ready for message in batch.messages)
         ready = [(batch, key) for batch, key in ready if len(batch)]
         if len(ready) == 1:
-            yield ready[0][0]
+            yield replace(ready[0][0], messages=messages)
         elif ready:
             batch, out = _interleave(ready, out)
-            yield batch
+            yield replace(batch, messages=messages)
+        elif messages:
+            yield replace(_NOTHING, messages=messages)
         slowest.advance()
 
 
@@ -61,10 +64,11 @@ class _Feed:
     def peek(cls, recording: Recording) -> _Feed:
         """A feed that knows its first packet's time, but holds no buffer yet."""
         packets = recording.packets(until_ns=0)
-        first = next((batch for batch in packets if len(batch)), None)
+        first = next((batch for batch in packets if len(batch) or batch.messages), None)
         if first is None:
             return cls(recording, ended=True)
-        known_until_ns = int(first.host_ns[0])
+        # A recording that holds messages only is no clock for the others: it goes first.
+        known_until_ns = int(first.host_ns[0]) if len(first) else 0
         # Closing ends the look ahead, and gives its buffer back.
         del packets
         return cls(recording, known_until_ns)
@@ -73,22 +77,24 @@ class _Feed:
         """The packets up to `bound_ns`, with their keys; they are then given out."""
         if self.batch is None:
             return _NOTHING, self.key_ns
+        messages, self.batch = self.batch.messages, replace(self.batch, messages=())
         stop = int(np.searchsorted(self.key_ns, bound_ns, side="right" if inclusive else "left"))
         given, key = self.batch.take(slice(0, stop)), self.key_ns[:stop]
         self.batch, self.key_ns = self.batch.take(slice(stop, None)), self.key_ns[stop:]
-        return given, key
+        return replace(given, messages=messages), key
 
     def advance(self) -> None:
         """Get the next batch; its bytes replace those of the one before."""
         if self._source is None:
             self._source = self.recording.packets()
-        batch = next((batch for batch in self._source if len(batch)), None)
+        batch = next((batch for batch in self._source if len(batch) or batch.messages), None)
         if batch is None:
             self.ended, self.batch, self._source = True, None, None
             return
         largest = np.maximum.accumulate(batch.host_ns)
         self.batch, self.key_ns = batch, np.maximum(largest, self.known_until_ns)
-        self.known_until_ns = int(self.key_ns[-1])
+        if len(batch):
+            self.known_until_ns = int(self.key_ns[-1])
 
 
 def _interleave(
