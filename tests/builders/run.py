@@ -1,0 +1,221 @@
+"""Whole conversions in-process: the command line, or the pipeline with a writer that remembers."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import sys
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.cli import main
+from mlbatch.pipeline import Conversion, Job, OpenWriter, convert
+from mlbatch.report import ReportInputs
+from mlbatch.types import (
+    BoolArray,
+    F32Array,
+    I64Array,
+    ImuSamples,
+    RunInfo,
+    Scan,
+    Summary,
+    U8Array,
+    U16Array,
+    U32Array,
+)
+from mlbatch.writers import ScanWriter, WriterOptions, open_writer
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDINGS = ROOT / ".." / "shared" / "recordings"
+TWO_LIDARS = ROOT / "fixtures" / "two_lidars"
+
+Arrays = dict[str, npt.NDArray[np.generic]]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a command said, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(*words: str | Path) -> Told:
+    """Run `mlbatch` with these words in this process."""
+    out, err, before = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["mlbatch", *map(str, words)]
+    code: object = 0
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main()
+    except SystemExit as leave:
+        code = leave.code
+    finally:
+        sys.argv = before
+    return Told(code if isinstance(code, int) else 0, out.getvalue(), err.getvalue())
+
+
+@dataclass(slots=True)
+class Memory:
+    """A writer that keeps copies of all it is given."""
+
+    info: RunInfo
+    scans: list[tuple[Scan, int | None]] = field(default_factory=list)
+    imu: list[ImuSamples] = field(default_factory=list)
+    summary: Summary | None = None
+    abandoned: bool = False
+
+    def write(self, scan: Scan, sensor: int | None = None) -> None:
+        """Keep a scan."""
+        self.scans.append((deepcopy(scan), sensor))
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Keep IMU samples."""
+        self.imu.append(samples)
+
+    def finish(self, summary: Summary) -> None:
+        """Keep the end."""
+        self.summary = summary
+
+    def abandon(self) -> None:
+        """Remember that the run failed."""
+        self.abandoned = True
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A conversion that ended well; `memory` is None where the output went to a file."""
+
+    run: Conversion
+    report: ReportInputs
+    memory: Memory | None = None
+
+    @property
+    def scans(self) -> list[Scan]:
+        """The scans of a run in memory."""
+        return [] if self.memory is None else [scan for scan, _ in self.memory.scans]
+
+
+def in_memory(job: Job) -> Result:
+    """Convert and keep everything."""
+    kept: list[Memory] = []
+
+    def start(info: RunInfo) -> ScanWriter:
+        kept.append(Memory(info))
+        return kept[0]
+
+    run, report = convert(job, start)
+    return Result(run, report, kept[0])
+
+
+def to_file(job: Job, target: Path, name: str) -> Result:
+    """Convert to the format called `name`."""
+    return Result(*convert(job, _opener(name, target, split=job.split)))
+
+
+def _opener(name: str, target: Path, *, split: bool) -> OpenWriter:
+    def start(info: RunInfo) -> ScanWriter:
+        return open_writer(name, target, info, WriterOptions(split=split))
+
+    return start
+
+
+# -- what lies in a folder of npz files -----------------------------------------------------------
+
+
+def scan_files(folder: Path) -> list[Path]:
+    """Files of a run in the order of time: the head, then by index and slice."""
+    return sorted(folder.glob("*.npz"), key=_when)
+
+
+def _when(path: Path) -> tuple[int, int]:
+    index, _, part = path.stem.partition("-")
+    return -1 if index == "head" else int(index), int(part or 0)
+
+
+def load(path: Path) -> Arrays:
+    """All arrays of an npz; pickles are refused."""
+    with np.load(path, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files}
+
+
+def digest(array: npt.NDArray[np.generic]) -> str:
+    """SHA-256 of type, shape and values."""
+    head = f"{array.dtype.str} {array.shape} ".encode()
+    return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Points and columns of one or several dense scans, typed.
+
+    (p,) each, but xyz (p, 3); stamp_ns: int64, of the point's column; at_ns: int64, of the point;
+    reflectivity: None where the run has none; column_stamp_ns, column_lidar_id: (n,).
+    """
+
+    xyz: F32Array
+    intensity: F32Array
+    reflectivity: U16Array | None
+    range_m: F32Array
+    stamp_ns: I64Array
+    at_ns: I64Array
+    ring: U16Array
+    return_type: U8Array
+    lidar_id: U8Array
+    column: U32Array
+    column_stamp_ns: I64Array
+    column_lidar_id: U8Array
+
+    @classmethod
+    def of(cls, path: Path) -> Cloud:
+        """The scan in one npz file."""
+        with np.load(path, allow_pickle=False) as npz:
+            stamps = npz["column_stamp_ns"]
+            return cls(
+                xyz=npz["xyz"],
+                intensity=npz["intensity"],
+                reflectivity=npz["reflectivity"] if "reflectivity" in npz.files else None,
+                range_m=npz["range_m"],
+                stamp_ns=stamps[npz["column"]],
+                at_ns=npz["time_ns"].astype(np.int64) + npz["start_ns"],
+                ring=npz["ring"],
+                return_type=npz["return_type"],
+                lidar_id=npz["lidar_id"],
+                column=npz["column"],
+                column_stamp_ns=stamps,
+                column_lidar_id=npz["column_lidar_id"],
+            )
+
+    @classmethod
+    def of_all(cls, folder: Path) -> Cloud:
+        """All scans of a folder, one after the other; `column` counts through."""
+        clouds = [cls.of(path) for path in scan_files(folder)]
+        first = np.cumsum([0, *(len(cloud.column_stamp_ns) for cloud in clouds)])
+        parts = [
+            replace(cloud, column=(cloud.column + base).astype(np.uint32))
+            for cloud, base in zip(clouds, first[:-1].tolist(), strict=True)
+        ]
+        names = [part.name for part in fields(cls)]
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in names
+            if getattr(parts[0], name) is not None
+        }
+        return replace(parts[0], **joined)
+
+    def of_sensor(self, lidar_id: int) -> Cloud:
+        """Points and columns of one sensor; `column` keeps its numbers."""
+        points: BoolArray = self.lidar_id == lidar_id
+        columns: BoolArray = self.column_lidar_id == lidar_id
+        chosen = {
+            part.name: value[columns if part.name.startswith("column_") else points]
+            for part in fields(self)
+            if (value := getattr(self, part.name)) is not None
+        }
+        return replace(self, **chosen)
