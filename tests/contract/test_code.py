@@ -1,0 +1,110 @@
+"""Rules for every file of the package: who prints, how long it is, what is documented."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.contract.tree import PACKAGE, ROOT, Module, modules, plugins
+
+MODULES = modules()
+# The aim is 300 and 40 (STYLE.md); this is where it stops.
+FILE_LINES, FUNCTION_LINES = 400, 60
+SPEAKERS = ("print", "exit", "quit", "sys.exit", "os._exit", "typer.echo", "typer.Exit")
+STREAMS = ("sys.stdout", "sys.stderr")
+# What a plug-in's docstring names: a specification, a manual, or the page of facts.
+SOURCE = re.compile(r"facts/\w+\.md|RFC \d+|draft-[\w-]+|APPNOTE|Source: ")
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def _by_name(module: Module) -> str:
+    return module.name or "mlbatch"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=_by_name)
+def test_only_the_command_line_prints_or_exits(module: Module) -> None:
+    if module.top == "cli":
+        return
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Call | ast.Raise | ast.Attribute):
+            text = ast.unparse(node).partition("(")[0].removeprefix("raise ")
+            assert text not in (*SPEAKERS, *STREAMS), f"{module.path}:{node.lineno}: {text}"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=_by_name)
+def test_no_assert_at_run_time(module: Module) -> None:
+    asserts = [node.lineno for node in ast.walk(module.tree) if isinstance(node, ast.Assert)]
+    assert not asserts
+
+
+@pytest.mark.parametrize("module", MODULES, ids=_by_name)
+def test_files_and_functions_are_short(module: Module) -> None:
+    lines = module.path.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= FILE_LINES
+    for node in ast.walk(module.tree):
+        if isinstance(node, Function):
+            # The signature of a command is its table of options, and not counted.
+            length = (node.end_lineno or 0) - node.body[0].lineno + 1
+            assert length <= FUNCTION_LINES, f"{module.path}:{node.lineno}: {node.name}"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=_by_name)
+def test_everything_public_is_documented(module: Module) -> None:
+    assert ast.get_docstring(module.tree), f"{module.path}: no docstring"
+    for node in _public(module.tree):
+        assert ast.get_docstring(node), f"{module.path}:{node.lineno}: {node.name}"
+
+
+def _public(node: ast.Module | ast.ClassDef) -> Iterator[Function | ast.ClassDef]:
+    for inner in node.body:
+        if isinstance(inner, Function | ast.ClassDef) and not inner.name.startswith("_"):
+            yield inner
+            if isinstance(inner, ast.ClassDef):
+                yield from _public(inner)
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=_by_name)
+def test_a_plugin_names_its_source(plugin: Module) -> None:
+    docstring = ast.get_docstring(plugin.tree) or ""
+    assert SOURCE.search(docstring), f"{plugin.path}: name the specification that it follows"
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=_by_name)
+def test_a_plugin_has_tests_and_something_to_test_with(plugin: Module) -> None:
+    package, name = plugin.name.split(".")
+    tests = sorted((ROOT / "tests" / "unit" / package).glob(f"test_{name}*.py"))
+    assert tests, f"{plugin.path}: wanted tests/unit/{package}/test_{name}.py"
+    assert _material(package, name), f"{plugin.path}: wanted a builder or a fixture"
+
+
+def _material(package: str, name: str) -> bool:
+    """Whether there is something that makes or holds inputs for the tests of a plug-in."""
+    builders, fixtures = ROOT / "tests" / "builders", ROOT / "fixtures"
+    if package == "writers":  # Their input is a Scan, made by one builder for all.
+        return (ROOT / "tests" / "unit" / "writers" / "scans.py").is_file()
+    if package == "readers" and f"def write_{name}(" in _text(builders / "captures.py"):
+        return True
+    return (builders / f"{name}.py").is_file() or (fixtures / name / "SOURCE.md").is_file()
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def test_every_fixture_names_its_source() -> None:
+    listed = _text(ROOT / "fixtures" / "README.md")
+    for folder in (ROOT / "fixtures").iterdir():
+        if folder.is_dir():
+            source = _text(folder / "SOURCE.md")
+            assert {"Origin", "Licence"} <= set(re.findall(r"\w+", source)), folder
+            assert f"[{folder.name}]({folder.name}/SOURCE.md)" in listed
+
+
+def test_every_folder_of_the_package_is_a_package() -> None:
+    for path in PACKAGE.rglob("*.py"):
+        assert (path.parent / "__init__.py").is_file(), path.parent

@@ -1,0 +1,89 @@
+"""Imports run one way, and plug-ins are only found by name (STYLE.md, section 2)."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.contract.tree import PLUGIN_PACKAGES, Module, imports, modules, plugins
+
+# From left to right: a module imports modules of its own group, and groups of later lines.
+LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
+    (("cli", "__main__"),),
+    (("api",),),
+    (("pipeline", "accounts"), ("survey",)),
+    (("feeding",),),
+    (("inertial",), ("discover",)),
+    (
+        ("readers",),
+        ("sensors",),
+        ("batching",),
+        ("decode", "projection"),
+        ("writers",),
+        ("report",),
+        ("streams",),
+    ),
+    (("rig", "_rig_values", "_yaml"), ("ring",), ("ledger",), ("scan_table",), ("clock",)),
+    (("lidar",), ("transforms",)),
+    (("geometry",),),
+    (("types",),),
+    (("rate",), ("units",)),
+    (("errors",),),
+    # The root: its version. What else it offers, it loads when asked.
+    (("",),),
+)
+PLACE = {
+    name: (layer, group)
+    for layer, groups in enumerate(LAYERS)
+    for group, names in enumerate(groups)
+    for name in names
+}
+MODULES = modules()
+NAMES = frozenset(module.name for module in MODULES)
+
+
+def test_every_module_has_its_place() -> None:
+    assert {module.top for module in MODULES} == set(PLACE)
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
+def test_no_import_to_the_left(module: Module) -> None:
+    for found in imports(module, NAMES):
+        top = found.target.partition(".")[0]
+        if module.name == "":
+            assert found.only_for_types, f"{module.path}:{found.line}: the root must load nothing"
+            continue
+        own, other = PLACE[module.top], PLACE[top]
+        assert other == own or other[0] > own[0], (
+            f"{module.path}:{found.line}: {module.name} imports {found.target}, "
+            "which is not to its right"
+        )
+
+
+def test_modules_do_not_need_each_other_in_circles() -> None:
+    """Only what types need may point back, as `accounts` names the `Conversion` it tells of."""
+    left = {
+        module.name: {found.target for found in imports(module, NAMES) if not found.only_for_types}
+        - {"", module.name}
+        for module in MODULES
+    }
+    while left:
+        ready = [name for name, needed in left.items() if not needed & set(left)]
+        assert ready, f"circle: {sorted(left)}"
+        for name in ready:
+            del left[name]
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
+def test_nobody_names_a_plugin(module: Module) -> None:
+    found_by_name = {plugin.name for plugin in plugins()}
+    for found in imports(module, NAMES):
+        assert found.target not in found_by_name, f"{module.path}:{found.line}: {found.target}"
+
+
+def test_helpers_of_a_plugin_package_stay_inside() -> None:
+    """`_private` modules of a plug-in package are imported by that package alone."""
+    for module in MODULES:
+        for found in imports(module, NAMES):
+            top, _, rest = found.target.partition(".")
+            if top in PLUGIN_PACKAGES and rest:
+                assert module.top == top, f"{module.path}:{found.line}: {found.target}"

@@ -1,0 +1,69 @@
+"""What an installation holds, told from pyproject.toml without building anything."""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import importlib
+import re
+import sys
+from pathlib import Path
+from typing import TypeAlias, cast
+
+import mlbatch
+from tests.contract.tree import PACKAGE, ROOT, modules
+
+Table: TypeAlias = dict[str, "Table | list[str] | str"]
+# Distributions whose module has another name.
+MODULE_OF = {"pyyaml": "yaml"}
+
+
+def _settings(*keys: str) -> Table:
+    # tomllib came with 3.11; mypy brings tomli where it is missing.
+    reader = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    table: Table = reader.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    for key in keys:
+        table = cast(Table, table[key])
+    return table
+
+
+def test_the_types_travel_with_the_package() -> None:
+    data = _settings("tool", "setuptools", "package-data")
+    assert "py.typed" in data["mlbatch"]
+    assert (PACKAGE / "py.typed").is_file()
+
+
+def test_every_package_is_found() -> None:
+    include = cast(list[str], _settings("tool", "setuptools", "packages", "find")["include"])
+    packages = {"mlbatch", *(f"mlbatch.{path.parent.name}" for path in PACKAGE.glob("*/*.py"))}
+    for package in packages:
+        assert any(fnmatch.fnmatch(package, pattern) for pattern in include), package
+    assert not any(fnmatch.fnmatch("tests", pattern) for pattern in include)
+
+
+def test_the_command_is_what_it_says() -> None:
+    assert _settings("project", "scripts")["mlbatch"] == "mlbatch.cli:main"
+    assert _settings("tool", "setuptools", "dynamic")["version"] == {"attr": "mlbatch.__version__"}
+    assert re.fullmatch(r"\d+\.\d+\.\d+", mlbatch.__version__)
+
+
+def test_the_package_needs_exactly_what_it_imports() -> None:
+    wanted = cast(list[str], _settings("project")["dependencies"])
+    declared = {re.split(r"[^A-Za-z0-9_-]", text, maxsplit=1)[0].lower() for text in wanted}
+    found = {_top(node) for module in modules() for node in ast.walk(module.tree)} - {""}
+    foreign = found - set(sys.stdlib_module_names) - {"mlbatch"}
+    assert foreign == {MODULE_OF.get(name, name) for name in declared}
+
+
+def _top(node: ast.AST) -> str:
+    if isinstance(node, ast.Import):
+        return node.names[0].name.partition(".")[0]
+    if isinstance(node, ast.ImportFrom):
+        return (node.module or "").partition(".")[0]
+    return ""
+
+
+def test_licence_and_readme_are_there() -> None:
+    assert "MIT License" in Path(ROOT / "LICENSE").read_text(encoding="utf-8")
+    assert _settings("project")["license"] == {"file": "LICENSE"}
+    assert (ROOT / str(_settings("project")["readme"])).is_file()
