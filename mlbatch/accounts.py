@@ -6,7 +6,8 @@ import resource
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch import discover
+from mlbatch import discover, sensors
+from mlbatch.discover import Note
 from mlbatch.ledger import PointCounts
 from mlbatch.rate import rate_text
 from mlbatch.report import (
@@ -19,6 +20,7 @@ from mlbatch.report import (
     Warned,
 )
 from mlbatch.scan_table import ScanStatistics, Spread
+from mlbatch.streams import Kind
 from mlbatch.types import CaptureCounts
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -47,6 +49,30 @@ def report_inputs(run: Conversion) -> ReportInputs:
         timing=_timing(run),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
+
+
+def late_notes(run: Conversion) -> list[Note]:
+    """Warnings that only the end of a run knows: damaged recordings, lidars that came late."""
+    notes = [
+        Note("recording", "", f"{recording.path.name}: {text}")
+        for recording in run.recordings
+        for text in recording.notes
+    ]
+    table, seen = run.setup.sampler.table, run.setup.sampler.samples
+    for kind in sorted(run.feeder.samples):
+        what = _what(run, kind)
+        # A rig says which sensors are wanted, so that others need no warning.
+        if run.setup.rig is None and kind not in seen and "lidar" in what:
+            notes.append(
+                Note(
+                    "late_stream",
+                    "",
+                    f"{table.streams[kind[0]]}: {what}; it began after the first 10 s, where "
+                    "sensors are looked for, so that its packets are counted as unassigned; "
+                    "name the sensor in a rig file (--rig)",
+                )
+            )
+    return notes
 
 
 def why_nothing(run: Conversion) -> str:
@@ -127,15 +153,23 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     setup, rows = run.setup, []
     for kind, count in sorted(run.feeder.unassigned.items()):
         stream = setup.sampler.table.streams[kind[0]]
-        what = "not seen in the first 10 s"
-        if kind in setup.sampler.samples:
-            what = discover.describe(setup.sampler, kind) or "unknown"
+        what = _what(run, kind)
+        if kind not in setup.sampler.samples:
+            what = f"not seen in the first 10 s: {what}"
         if kind in setup.ignored:
             what = f"ignored: {what}"
         elif kind in setup.not_in_rig:
             what = f"not_in_rig: {what}"
         rows.append(Unassigned(str(stream), count, f"{what} ({kind[1]} bytes)"))
     return tuple(rows)
+
+
+def _what(run: Conversion, kind: Kind) -> str:
+    """What unassigned packets look like."""
+    if kind in run.setup.sampler.samples:
+        return discover.describe(run.setup.sampler, kind) or "unknown"
+    sample = run.feeder.samples.get(kind)
+    return (None if sample is None else sensors.describe(kind[1], sample)) or "unknown"
 
 
 def _timing(run: Conversion) -> Timing:

@@ -13,7 +13,7 @@ from mlbatch.ledger import SensorLedger
 from mlbatch.lidar import FAULTS, Lidar
 from mlbatch.ring import RawRing
 from mlbatch.streams import Kind, Role, split_by_kind
-from mlbatch.types import BoolArray, I64Array, ImuSamples, PacketBatch
+from mlbatch.types import BoolArray, I64Array, ImuSamples, PacketBatch, U8Array
 
 
 @dataclass(slots=True)
@@ -34,10 +34,14 @@ class Fed:
 
 
 class Feeder:
-    """Sorts packets to their sensors; what belongs to none is counted in `unassigned`."""
+    """Sorts packets to their sensors.
+
+    What belongs to none is counted in `unassigned`; `samples` has one of each kind, (1, size).
+    """
 
     def __init__(self, setup: Setup, feeds: Sequence[Feed], host_clocks: Sequence[bool]) -> None:
         self.unassigned: dict[Kind, int] = {}
+        self.samples: dict[Kind, U8Array] = {}
         self._router = setup.router
         self._feeds = list(feeds)
         self._host_clocks = list(host_clocks)
@@ -62,6 +66,8 @@ class Feeder:
                 packets.read += len(index)
                 packets.reject("bad_size", len(index))
             else:
+                if kind not in self.samples:
+                    self.samples[kind] = batch.data[begin : begin + kind[1]][None].copy()
                 self._unassign(kind, len(index))
         for number, parts in enumerate(own):
             if parts:

@@ -282,6 +282,8 @@ class Conversion:
             ledger.points = self._points(number)
         if self.job.strict:
             self._refuse_rejected()
+        for note in accounts.late_notes(self):
+            self.warn(note)
         for sensor, feed in zip(self.setup.sensors, self.feeds, strict=True):
             if sensor.rig is not None and not sensor.rig.optional and not feed.ledger.packets.read:
                 raise absent(sensor, self.job.wishes.rig)

@@ -1,0 +1,138 @@
+"""Small sessions of Ouster lidars as captures, and the command line run within the test's process.
+
+Every unit turns 512 columns at 10 Hz; packets arrive `latency_ns` after their last column.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.cli import main
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FIXTURE = REPOSITORY / "fixtures" / "two_lidars"
+RECORDINGS = REPOSITORY / ".." / "shared" / "recordings"
+NO_RECORDINGS = "the folder of real recordings is not here"
+NS_PER_S, NS_PER_MS = 10**9, 10**6
+EPOCH_NS = 1_800_000_000 * NS_PER_S
+PACKETS_PER_TURN = 32
+SMALL = OusterSpec(beams=16, columns_per_frame=512, serial=111)
+Records = list[tuple[int, bytes]]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A lidar in a session; begin_ns: its first stamp; host_ns: what the recorder's clock adds."""
+
+    spec: OusterSpec = SMALL
+    ip: str = "10.0.0.1"
+    port: int = 7502
+    begin_ns: int = EPOCH_NS + 20 * NS_PER_MS
+    turns: int = 3
+    host_ns: int = NS_PER_MS
+    first_frame: int = 5
+    tail: bytes = b""
+    range_mm: int = 4000
+
+    @property
+    def payloads(self) -> list[tuple[int, bytes]]:
+        """(arrival, payload) of every lidar packet."""
+        ranges = np.full((512, self.spec.beams, 1), self.range_mm)
+        found = []
+        for turn in range(self.turns):
+            begin_ns = self.begin_ns + turn * 100 * NS_PER_MS
+            packets = encode_frame(self.spec, begin_ns, self.first_frame + turn, ranges)
+            for number, payload in enumerate(packets):
+                arrival = begin_ns + (number + 1) * 100 * NS_PER_MS // PACKETS_PER_TURN
+                found.append((arrival + self.host_ns, payload + self.tail))
+        return found
+
+    @property
+    def records(self) -> Records:
+        """(arrival, frame) of every lidar packet."""
+        return [
+            (host_ns, udp_frame(payload, self.ip, dport=self.port)[0])
+            for host_ns, payload in self.payloads
+        ]
+
+    def imu_records(self, count: int = 5, port: int = 7503) -> Records:
+        """(arrival, frame) of legacy IMU packets, 10 ms apart from the first stamp on."""
+        zero = np.zeros((1, 3))
+        stamps = [self.begin_ns + i * 10 * NS_PER_MS for i in range(count)]
+        return [
+            (
+                stamp + self.host_ns,
+                udp_frame(
+                    imu_packet(self.spec, np.array([stamp]), zero + 9.8, zero), self.ip, dport=port
+                )[0],
+            )
+            for stamp in stamps
+        ]
+
+
+def twin(unit: Unit, serial: int, ip: str = "10.0.0.2") -> Unit:
+    """The same lidar with another serial number at another address."""
+    return replace(unit, spec=replace(unit.spec, serial=serial), ip=ip)
+
+
+def write_session(
+    folder: Path, *units: Unit, more: Records | None = None, metadata: bool = True
+) -> Path:
+    """A capture of the units (and `more` records) in `folder`, their metadata beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = [*(more or []), *(record for unit in units for record in unit.records)]
+    if metadata:
+        for unit in units:
+            write_metadata(folder / f"{unit.spec.serial}.json", unit.spec)
+    return write_pcap(folder / "drive.pcap", sorted(records, key=lambda record: record[0]))
+
+
+def write_metadata(path: Path, spec: OusterSpec) -> Path:
+    """The metadata file of a lidar."""
+    path.write_text(json.dumps(metadata_json(spec)), encoding="utf-8")
+    return path
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a run of the command line left: its exit code and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def warnings(self) -> list[str]:
+        """Codes of the warnings on stderr."""
+        mark = "mlbatch: warning: "
+        lines = [line for line in self.err.splitlines() if line.startswith(mark)]
+        return [line.removeprefix(mark).split(":")[0] for line in lines]
+
+
+@dataclass(frozen=True, slots=True)
+class Shell:
+    """The command line within this process."""
+
+    monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, *arguments: str | Path) -> Outcome:
+        """Run `mlbatch ARGUMENTS`; a single text is split into words, as a shell does."""
+        alone = arguments[0] if len(arguments) == 1 else ""
+        words = shlex.split(alone) if isinstance(alone, str) and alone else map(str, arguments)
+        self.monkeypatch.setattr(sys, "argv", ["mlbatch", *words])
+        self.capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        printed = self.capsys.readouterr()
+        code = end.value.code
+        return Outcome(code if isinstance(code, int) else 0, printed.out, printed.err)
