@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.ledger import PointCounts
-from mlbatch.projection import LABEL, TILE_COLUMNS, Extras, Part, Projector, Source, Tile
+from mlbatch.projection import LABEL, Extras, Part, Projector, Source, Tile, tile_columns
 from mlbatch.types import EXTRAS, F64Array, I64Array, RunInfo, Scan, U8Array
 
 __all__ = ["Decoder", "Due", "Label", "Source"]
@@ -90,13 +90,14 @@ class Decoder:
         self._only = only
         self._extras = extras
         first = only or 0
+        self._slots = max(source.slots for source in sources)
+        self._columns = tile_columns(self._slots)
         self._projectors = [
-            Projector(source, number, boxes_m, extras)
+            Projector(source, number, self._columns, boxes_m, extras)
             for number, source in enumerate(sources, first)
         ]
-        self._slots = max(source.slots for source in sources)
-        self._tile = Tile(self._slots)
-        self._keep = np.zeros((TILE_COLUMNS, self._slots), np.bool_)
+        self._tile = Tile(self._columns * self._slots)
+        self._keep = np.zeros((self._columns, self._slots), np.bool_)
         self._organized = info.layout == "organized"
         self._has_reflectivity = "reflectivity" in extras and any(
             source.lidar.has_reflectivity for source in sources
@@ -114,8 +115,8 @@ class Decoder:
         if rows > self._buffer.rows:
             self._buffer = self._new_buffer(rows)
         points = 0
-        for begin in range(0, len(due), TILE_COLUMNS):
-            tile = slice(begin, min(begin + TILE_COLUMNS, len(due)))
+        for begin in range(0, len(due), self._columns):
+            tile = slice(begin, min(begin + self._columns, len(due)))
             laid = self._project(due, tile)
             if self._organized:
                 points += self._place(laid, due, tile, label.start_ns)

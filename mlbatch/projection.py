@@ -25,7 +25,8 @@ from mlbatch.types import (
     U16Array,
 )
 
-TILE_COLUMNS = 1024
+# Enough work for a call to be cheap, little enough for the planes to stay in the caches.
+TILE_SLOTS = 1 << 17
 # What a point is, in the bytes of one word, so that it moves as one.
 LABEL = np.dtype([("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
 Extras: TypeAlias = frozenset[str]
@@ -49,6 +50,11 @@ class Source:
         return self.lidar.channels * self.lidar.returns
 
 
+def tile_columns(slots: int) -> int:
+    """Columns of a tile, for columns of up to `slots` slots."""
+    return max(16, TILE_SLOTS // slots)
+
+
 class Tile:
     """Points of a tile of columns, as flat planes; each sensor has a part of them, row by row.
 
@@ -56,8 +62,7 @@ class Tile:
     from the index by which points leave the tile, so that no plane has to be reordered.
     """
 
-    def __init__(self, slots: int) -> None:
-        size = TILE_COLUMNS * slots
+    def __init__(self, size: int) -> None:
         self.point = np.zeros((size, 4), np.float32)
         self.range_m = np.zeros(size, np.float32)
         self.reflectivity = np.zeros(size, np.uint16)
@@ -88,9 +93,11 @@ class Part:
 
 
 class Projector:
-    """One sensor: from places in its ring to points in the body frame."""
+    """One sensor: from places in its ring to points in the body frame, `columns` at most."""
 
-    def __init__(self, source: Source, lidar_id: int, boxes_m: F64Array, extras: Extras) -> None:
+    def __init__(
+        self, source: Source, lidar_id: int, columns: int, boxes_m: F64Array, extras: Extras
+    ) -> None:
         self.counts = PointCounts()
         self.slots = source.slots
         self._source = source
@@ -100,9 +107,9 @@ class Projector:
         self._direction = np.ascontiguousarray(beams.directions().transpose(1, 0, 2))
         self._origin = np.ascontiguousarray(beams.origins().transpose(1, 0, 2))
         self._reach_m = beams.reach_m.astype(np.float32)
-        self._records = np.empty((TILE_COLUMNS, lidar.record_size), np.uint8)
-        shape = (TILE_COLUMNS, lidar.channels)
-        self._towards = np.empty((TILE_COLUMNS, 3, lidar.channels), np.float32)
+        self._records = np.empty((columns, lidar.record_size), np.uint8)
+        shape = (columns, lidar.channels)
+        self._towards = np.empty((columns, 3, lidar.channels), np.float32)
         self._moved = np.empty_like(self._towards)
         self._range_m = np.empty((lidar.returns, *shape), np.float32)
         self._reached_m = np.empty(shape, np.float32)
