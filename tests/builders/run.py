@@ -14,9 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.cli import main
-from mlbatch.pipeline import Conversion, Job, OpenWriter, convert
+from mlbatch.discover import Wishes
+from mlbatch.pipeline import Conversion, Job, convert
 from mlbatch.report import ReportInputs
 from mlbatch.types import (
+    EXTRAS,
+    IMU,
     BoolArray,
     F32Array,
     I64Array,
@@ -28,13 +31,20 @@ from mlbatch.types import (
     U16Array,
     U32Array,
 )
-from mlbatch.writers import ScanWriter, WriterOptions, open_writer
+from mlbatch.writers import ScanWriter, WriterOptions, extras, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT / ".." / "shared" / "recordings"
 TWO_LIDARS = ROOT / "fixtures" / "two_lidars"
 
 Arrays = dict[str, npt.NDArray[np.generic]]
+
+# The two lidars of the fixture, head and tail included.
+FIXTURE = Job(
+    recordings=(TWO_LIDARS / "two_lidars.pcap",),
+    wishes=Wishes(rig=TWO_LIDARS / "rig.yaml"),
+    keep_partial=True,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,20 +120,25 @@ def in_memory(job: Job) -> Result:
         kept.append(Memory(info))
         return kept[0]
 
-    run, report = convert(job, start)
+    run, report = convert(replace(job, extras=EXTRAS | {IMU}), start)
     return Result(run, report, kept[0])
 
 
 def to_file(job: Job, target: Path, name: str) -> Result:
     """Convert to the format called `name`."""
-    return Result(*convert(job, _opener(name, target, split=job.split)))
+    options = WriterOptions(split=job.split)
 
-
-def _opener(name: str, target: Path, *, split: bool) -> OpenWriter:
     def start(info: RunInfo) -> ScanWriter:
-        return open_writer(name, target, info, WriterOptions(split=split))
+        return open_writer(name, target, info, options)
 
-    return start
+    return Result(*convert(replace(job, extras=extras(name, options)), start))
+
+
+def csv_without_arrival(text: str) -> str:
+    """scans.csv without `ready_host_ns`, the one column that depends on arrival."""
+    rows = [line.rsplit(",", 1) for line in text.splitlines()]
+    assert rows[0][1] == "ready_host_ns"
+    return "".join(f"{row[0]}\n" for row in rows)
 
 
 # -- what lies in a folder of npz files -----------------------------------------------------------

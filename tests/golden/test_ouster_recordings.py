@@ -135,9 +135,7 @@ def compare(got: Cloud, want: Reference, *, ring_base: int = 0) -> None:
     if want.signal is not None:
         assert np.array_equal(got.intensity, want.signal)
     error_m = np.abs(got.xyz.astype(np.float64) - want.xyz_m).max(axis=1)
-    # Both sides are rounded to float32.
-    allowed_m = TOLERANCE_M + 2 * np.spacing(np.abs(want.xyz_m).max(axis=1))
-    assert (error_m <= allowed_m).all(), f"off by {error_m.max()} m"
+    assert error_m.max() <= TOLERANCE_M
 
 
 @pytest.mark.parametrize("case", ALONE, ids=name_of)
