@@ -26,7 +26,7 @@ from mlbatch.types import (
 )
 
 # Enough work for a call to be cheap, little enough for the planes to stay in the caches.
-TILE_SLOTS = 1 << 17
+TILE_SLOTS = 1 << 16
 # What a point is, in the bytes of one word, so that it moves as one.
 LABEL = np.dtype([("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
 Extras: TypeAlias = frozenset[str]
