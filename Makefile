@@ -3,7 +3,7 @@
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
 #   make test    formatting, lint, types, all tests, branch coverage
 #   make lint    the first three of them
-#   make bench   speed, memory and writers on a recording of a minute (needs 2 GB in build/bench)
+#   make bench   speed, memory and writers (needs the shared recordings and 10 GB in build/bench)
 #   make clean   remove what the others made
 
 PYTHON ?= python3
