@@ -113,6 +113,11 @@ def _capture(run: Conversion) -> CaptureCounts:
         total.datagrams += recording.counts.datagrams
         for reason, count in recording.counts.skipped.items():
             total.skip(reason, count)
+    if run.batcher.past_end:
+        # What several recordings read ahead of each other was never looked at.
+        ahead = total.datagrams - run.delivered
+        total.frames -= ahead
+        total.datagrams -= ahead
     return total
 
 

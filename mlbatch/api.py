@@ -13,7 +13,8 @@ import numpy as np
 
 from mlbatch.discover import Wishes
 from mlbatch.errors import UsageError
-from mlbatch.pipeline import Conversion, Job
+from mlbatch.job import Job
+from mlbatch.pipeline import Conversion
 from mlbatch.rate import parse_rate
 from mlbatch.types import Scan
 from mlbatch.units import NS_PER_S

@@ -5,74 +5,37 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from mlbatch import accounts
+from mlbatch.assembly import boxes_of, feed_of, intake_of, run_info, source_of
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import Intake
-from mlbatch.batching.windows import Limit, Policy, Window
+from mlbatch.batching.windows import Policy, Window
 from mlbatch.clock import common_timescale, timescale
-from mlbatch.decode import Decoder, Due, Label, Source
-from mlbatch.discover import Mounted, Note, Setup, Wishes, absent, discover
+from mlbatch.decode import Decoder, Due, Label
+from mlbatch.discover import Mounted, Note, Setup, absent, discover
 from mlbatch.errors import PacketError, RecordingError, UsageError
-from mlbatch.feeding import Feed, Feeder
+from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
-from mlbatch.rate import rate_text
+from mlbatch.job import DEFAULT_RATE, Job
 from mlbatch.readers import merge, open_recording
 from mlbatch.report import ReportInputs, imbalances, report_text
-from mlbatch.ring import RawRing
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
-    EXTRAS,
     IMU,
-    F64Array,
     ImuSamples,
     PacketBatch,
     Recording,
     RunInfo,
     Scan,
-    SensorInfo,
     StreamTable,
     Summary,
 )
 from mlbatch.units import NS_PER_S
 from mlbatch.writers import ScanWriter
-
-DEFAULT_RATE = Fraction(10)
-DEFAULT_MAX_WAIT_NS = NS_PER_S
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
-
-    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
-    those of EXTRAS that the output has a place for.
-    """
-
-    recordings: tuple[Path, ...]
-    wishes: Wishes = field(default_factory=Wishes)
-    rate: Fraction | None = None
-    slices: int = 1
-    layout: str = "dense"
-    split: bool = False
-    keep_partial: bool = False
-    keep_repeated: bool = False
-    max_wait_ns: int | None = DEFAULT_MAX_WAIT_NS
-    start: Limit | None = None
-    end: Limit | None = None
-    limits_are_dates: bool = False
-    host_clock: bool = False
-    min_range_m: float = 0.0
-    max_range_m: float = float("inf")
-    boxes_m: tuple[tuple[float, ...], ...] = ()
-    strict: bool = False
-    extras: frozenset[str] = EXTRAS
 
 
 @dataclass(slots=True)
@@ -98,6 +61,7 @@ class Conversion:
         self.table: ScanTable | None = None
         self.info: RunInfo | None = None
         self.recordings: list[Recording] = []
+        self.delivered = 0
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
@@ -112,9 +76,9 @@ class Conversion:
         job, rig = self.job, self.setup.rig
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
-        self.feeds = [_feed(sensor) for sensor in self.setup.sensors]
+        self.feeds = [feed_of(sensor) for sensor in self.setup.sensors]
         intakes = [
-            _intake(sensor, host_clock=self.uses_host_clock(sensor))
+            intake_of(sensor, host_clock=self.uses_host_clock(sensor))
             for sensor in self.setup.sensors
         ]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
@@ -150,6 +114,7 @@ class Conversion:
         with self._timed("read_s"):
             batch = next(batches, None)
         if batch is not None and len(batch):
+            self.delivered += len(batch)
             first = int(batch.host_ns[0]) if self._hosts_ns is None else self._hosts_ns[0]
             self._hosts_ns = first, int(batch.host_ns[-1])
         return batch
@@ -214,11 +179,11 @@ class Conversion:
         if len(set(names)) > 1:
             self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
         self._check_dates(shared)
-        self.info = _run_info(self.setup, self.job, self.grid, shared)
+        self.info = run_info(self.setup, self.job, self.grid, shared)
         self.table = ScanTable(self.info)
-        boxes_m, extras = _boxes(self.setup, self.job), self.job.extras
+        boxes_m, extras = boxes_of(self.setup, self.job), self.job.extras
         sources = [
-            _source(sensor, feed, info.ring_base, self.job)
+            source_of(sensor, feed, info.ring_base, self.job)
             for sensor, feed, info in zip(
                 self.setup.sensors, self.feeds, self.info.sensors, strict=True
             )
@@ -382,52 +347,3 @@ def convert(
         if writer is not None:
             writer.abandon()
     return run, inputs
-
-
-def _feed(sensor: Mounted) -> Feed:
-    lidar = sensor.found.lidar
-    return Feed(lidar, RawRing(lidar.packet_size, lidar.record_start, lidar.record_size))
-
-
-def _intake(sensor: Mounted, *, host_clock: bool) -> Intake:
-    rig, lidar = sensor.rig, sensor.found.lidar
-    return Intake(
-        sensor.name,
-        host_clock=host_clock,
-        offset_ns=0 if rig is None else rig.offset_ns,
-        modulus=lidar.sequence_modulus,
-    )
-
-
-def _source(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
-    rig = sensor.rig
-    low = [job.min_range_m, 0.0 if rig is None else rig.min_range_m or 0.0]
-    high = [job.max_range_m, float("inf") if rig is None else rig.max_range_m or float("inf")]
-    return Source(feed.lidar, feed.ring, sensor.body_from_sensor, ring_base, max(low), min(high))
-
-
-def _boxes(setup: Setup, job: Job) -> F64Array:
-    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
-    if setup.rig is None:
-        return boxes_m
-    return np.concatenate([setup.rig.exclude_boxes_m, boxes_m])
-
-
-def _run_info(setup: Setup, job: Job, grid: Grid, scale: str) -> RunInfo:
-    sensors, ring_base = [], 0
-    for sensor in setup.sensors:
-        lidar = sensor.found.lidar
-        sensors.append(
-            SensorInfo(
-                sensor.name,
-                lidar.model,
-                lidar.channels,
-                lidar.returns,
-                0 if job.split else ring_base,
-                sensor.body_from_sensor,
-            )
-        )
-        ring_base += lidar.channels
-    return RunInfo(
-        tuple(sensors), setup.frame_id, rate_text(grid.rate), scale, job.slices, job.layout
-    )

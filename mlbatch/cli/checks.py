@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline import Job
+from mlbatch.job import Job
 from mlbatch.rig import read_rig
 from mlbatch.writers import check_free_space
 

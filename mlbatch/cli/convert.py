@@ -98,7 +98,7 @@ def convert(
     from mlbatch.cli import values
     from mlbatch.cli.run import Wanted, run
     from mlbatch.discover import Wishes
-    from mlbatch.pipeline import Job
+    from mlbatch.job import Job
 
     values.choice("--layout", layout, ("dense", "organized"))
     values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))

@@ -11,7 +11,8 @@ from pathlib import Path
 import typer
 
 from mlbatch.cli import checks
-from mlbatch.pipeline import Conversion, Job, OpenWriter, Progress, convert
+from mlbatch.job import Job
+from mlbatch.pipeline import Conversion, OpenWriter, Progress, convert
 from mlbatch.report import report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import struct
 import sys
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
@@ -15,7 +16,8 @@ import numpy.typing as npt
 
 from mlbatch.cli import main
 from mlbatch.discover import Wishes
-from mlbatch.pipeline import Conversion, Job, convert
+from mlbatch.job import Job
+from mlbatch.pipeline import Conversion, convert
 from mlbatch.report import ReportInputs
 from mlbatch.types import (
     EXTRAS,
@@ -132,6 +134,16 @@ def to_file(job: Job, target: Path, name: str) -> Result:
         return open_writer(name, target, info, options)
 
     return Result(*convert(replace(job, extras=extras(name, options)), start))
+
+
+def read_pcap(path: Path) -> list[tuple[int, bytes]]:
+    """(host_ns, frame) of all records of a little-endian pcap in us, as the fixture is."""
+    data, at, records = path.read_bytes(), 24, []
+    while at < len(data):
+        seconds, us, captured, _ = struct.unpack_from("<4I", data, at)
+        records.append((seconds * 10**9 + us * 1000, data[at + 16 : at + 16 + captured]))
+        at += 16 + captured
+    return records
 
 
 def csv_without_arrival(text: str) -> str:

@@ -11,7 +11,8 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("cli", "__main__"),),
     (("api",),),
     (("pipeline", "accounts"), ("survey",)),
-    (("feeding",),),
+    (("assembly",),),
+    (("feeding",), ("job",)),
     (("inertial",), ("discover",)),
     (
         ("readers",),

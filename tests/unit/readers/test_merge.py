@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.readers import merge
-from mlbatch.types import CaptureCounts, PacketBatch, StreamTable
+from mlbatch.types import CaptureCounts, PacketBatch, StreamTable, Topic
 from tests.builders.captures import udp_frame, write_pcap
 from tests.unit.readers.reading import Seen, open_capture, seen_of
 
@@ -26,6 +26,9 @@ class Batches:
         self.container = "values"
         self.counts = CaptureCounts()
         self.size_bytes = self.position_bytes = 0
+        self.topics: tuple[Topic, ...] = ()
+        self.keep: frozenset[str] = frozenset()
+        self.notes: list[str] = []
         self.number = number
         self.host_ns = host_ns
         self.cuts = cuts

@@ -1,0 +1,69 @@
+"""The stages of a run, made from what was found and what is wanted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.batching.grid import Grid
+from mlbatch.batching.intake import Intake
+from mlbatch.decode import Source
+from mlbatch.discover import Mounted, Setup
+from mlbatch.feeding import Feed
+from mlbatch.job import Job
+from mlbatch.rate import rate_text
+from mlbatch.ring import RawRing
+from mlbatch.types import F64Array, RunInfo, SensorInfo
+
+
+def feed_of(sensor: Mounted) -> Feed:
+    """A sensor's ring and ledger."""
+    lidar = sensor.found.lidar
+    return Feed(lidar, RawRing(lidar.packet_size, lidar.record_start, lidar.record_size))
+
+
+def intake_of(sensor: Mounted, *, host_clock: bool) -> Intake:
+    """The door of a sensor, with what the rig says of its clock."""
+    rig, lidar = sensor.rig, sensor.found.lidar
+    return Intake(
+        sensor.name,
+        host_clock=host_clock,
+        offset_ns=0 if rig is None else rig.offset_ns,
+        modulus=lidar.sequence_modulus,
+    )
+
+
+def source_of(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
+    """What the decoder has to know of a sensor."""
+    rig = sensor.rig
+    low = [job.min_range_m, 0.0 if rig is None else rig.min_range_m or 0.0]
+    high = [job.max_range_m, float("inf") if rig is None else rig.max_range_m or float("inf")]
+    return Source(feed.lidar, feed.ring, sensor.body_from_sensor, ring_base, max(low), min(high))
+
+
+def boxes_of(setup: Setup, job: Job) -> F64Array:
+    """Boxes to leave out, of rig and job: (k, 6), m, body frame."""
+    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
+    if setup.rig is None:
+        return boxes_m
+    return np.concatenate([setup.rig.exclude_boxes_m, boxes_m])
+
+
+def run_info(setup: Setup, job: Job, grid: Grid, scale: str) -> RunInfo:
+    """What is the same for all scans; scale: their timescale."""
+    sensors, ring_base = [], 0
+    for sensor in setup.sensors:
+        lidar = sensor.found.lidar
+        sensors.append(
+            SensorInfo(
+                sensor.name,
+                lidar.model,
+                lidar.channels,
+                lidar.returns,
+                0 if job.split else ring_base,
+                sensor.body_from_sensor,
+            )
+        )
+        ring_base += lidar.channels
+    return RunInfo(
+        tuple(sensors), setup.frame_id, rate_text(grid.rate), scale, job.slices, job.layout
+    )

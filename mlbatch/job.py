@@ -1,0 +1,43 @@
+"""What to make of which recordings: the options of `mlbatch convert` as values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+from mlbatch.batching.windows import Limit
+from mlbatch.discover import Wishes
+from mlbatch.types import EXTRAS
+from mlbatch.units import NS_PER_S
+
+DEFAULT_RATE = Fraction(10)
+DEFAULT_MAX_WAIT_NS = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
+
+    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
+    those of EXTRAS that the output has a place for.
+    """
+
+    recordings: tuple[Path, ...]
+    wishes: Wishes = field(default_factory=Wishes)
+    rate: Fraction | None = None
+    slices: int = 1
+    layout: str = "dense"
+    split: bool = False
+    keep_partial: bool = False
+    keep_repeated: bool = False
+    max_wait_ns: int | None = DEFAULT_MAX_WAIT_NS
+    start: Limit | None = None
+    end: Limit | None = None
+    limits_are_dates: bool = False
+    host_clock: bool = False
+    min_range_m: float = 0.0
+    max_range_m: float = float("inf")
+    boxes_m: tuple[tuple[float, ...], ...] = ()
+    strict: bool = False
+    extras: frozenset[str] = EXTRAS
