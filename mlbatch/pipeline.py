@@ -62,7 +62,6 @@ class Conversion:
         self.info: RunInfo | None = None
         self.recordings: list[Recording] = []
         self.delivered = 0
-        self.delivered = 0
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
@@ -115,7 +114,6 @@ class Conversion:
         with self._timed("read_s"):
             batch = next(batches, None)
         if batch is not None and len(batch):
-            self.delivered += len(batch)
             self.delivered += len(batch)
             first = int(batch.host_ns[0]) if self._hosts_ns is None else self._hosts_ns[0]
             self._hosts_ns = first, int(batch.host_ns[-1])
