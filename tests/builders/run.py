@@ -5,19 +5,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import struct
 import sys
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch import pipeline
 from mlbatch.cli import main
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, convert
+from mlbatch.readers import open_recording
+from mlbatch.readers._capture import CaptureRecording
 from mlbatch.report import ReportInputs
 from mlbatch.types import (
     EXTRAS,
@@ -26,8 +30,10 @@ from mlbatch.types import (
     F32Array,
     I64Array,
     ImuSamples,
+    Recording,
     RunInfo,
     Scan,
+    StreamTable,
     Summary,
     U8Array,
     U16Array,
@@ -136,14 +142,30 @@ def to_file(job: Job, target: Path, name: str) -> Result:
     return Result(*convert(replace(job, extras=extras(name, options)), start))
 
 
-def read_pcap(path: Path) -> list[tuple[int, bytes]]:
-    """(host_ns, frame) of all records of a little-endian pcap in us, as the fixture is."""
-    data, at, records = path.read_bytes(), 24, []
-    while at < len(data):
-        seconds, us, captured, _ = struct.unpack_from("<4I", data, at)
-        records.append((seconds * 10**9 + us * 1000, data[at + 16 : at + 16 + captured]))
-        at += 16 + captured
-    return records
+Values = tuple[str | int | bool | tuple[int, ...], ...]
+
+
+def print_of(scan: Scan) -> Values:
+    """All of a scan but the arrival of the packet that closed it; arrays as digests."""
+    values: list[str | int | bool | tuple[int, ...]] = []
+    for part in fields(scan):
+        value = getattr(scan, part.name)
+        if part.name not in ("info", "ready_host_ns"):
+            values.append(digest(value) if isinstance(value, np.ndarray) else value)
+    return tuple(values)
+
+
+def prints(result: Result) -> list[Values]:
+    """All that identity covers (CONTRACT.md section 1), of a run in memory."""
+    assert result.memory is not None
+    assert result.memory.summary is not None
+    table = csv_without_arrival(result.memory.summary.scans_csv)
+    samples = sorted(
+        (imu.sensor, stamp_ns, digest(imu.acceleration[row]), digest(imu.angular_velocity[row]))
+        for imu in result.memory.imu
+        for row, stamp_ns in enumerate(imu.stamp_ns.tolist())
+    )
+    return [(repr(result.memory.info),), *map(print_of, result.scans), *samples, (table,)]
 
 
 def csv_without_arrival(text: str) -> str:
@@ -151,6 +173,20 @@ def csv_without_arrival(text: str) -> str:
     rows = [line.rsplit(",", 1) for line in text.splitlines()]
     assert rows[0][1] == "ready_host_ns"
     return "".join(f"{row[0]}\n" for row in rows)
+
+
+@contextlib.contextmanager
+def buffers_of(size: int) -> Iterator[None]:
+    """Recordings are read through buffers of `size` bytes."""
+
+    def opened(path: Path, streams: StreamTable) -> Recording:
+        recording = open_recording(path, streams)
+        if isinstance(recording, CaptureRecording):
+            recording.buffer_bytes = size
+        return recording
+
+    with patch.object(pipeline, "open_recording", opened):
+        yield
 
 
 # -- what lies in a folder of npz files -----------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,7 @@ from tests.golden.expected import EXPECTED, describe
 LIDARS = (LEFT, RIGHT)
 PERIOD_NS = 100_000_000
 # SOURCE.md, "What a conversion at 10 Hz must give".
-T_INIT_NS = int(datetime(2026, 5, 4, 8, 0, 0, 100_000, timezone.utc).timestamp() * 10) * 10**8
+T_INIT_NS = SECOND_NS + PERIOD_NS
 COUNTS = {
     "head.npz": ((398, 400), 22440),
     **{f"{index:06d}.npz": ((512, 512), 27998) for index in range(7)},

@@ -1,0 +1,190 @@
+"""Laws of whole conversions: scans depend only on the packets (CONTRACT.md section 1)."""
+
+from __future__ import annotations
+
+import gzip
+import random
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.reader import make_reader
+
+from mlbatch.job import Job
+from tests.builders.captures import SLL2, Interface, Packet, Section, pcap_bytes, section_bytes
+from tests.builders.make_fixtures import START_NS
+from tests.builders.run import FIXTURE, Values, buffers_of, in_memory, prints, to_file
+from tests.builders.traffic import Records, datagrams, frames, source
+from tests.builders.two_lidars import LEFT, RIGHT
+
+# Head, two whole windows and a tail.
+LENGTH_NS = 350_000_000
+BUFFERS = (1 << 12, 10_000, 1 << 16, 300_000)
+LARGE = 4 << 20
+
+
+Message = tuple[str, int, int, int, bytes]
+
+
+def messages(job: Job, target: Path) -> list[Message]:
+    """All messages of an MCAP output by topic and time."""
+    to_file(job, target, "mcap")
+    with target.open("rb") as file:
+        return sorted(
+            (channel.topic, found.log_time, found.publish_time, found.sequence, found.data)
+            for _, channel, found in make_reader(file, validate_crcs=True).iter_messages()
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the shortened fixture gives, with and without its head and tail."""
+
+    scans: list[Values]
+    messages: list[Message]
+    whole_messages: list[Message]
+
+    def check(self, paths: Sequence[Path], folder: Path, buffer_bytes: int = LARGE) -> None:
+        """Convert recordings that hold the same packets, and compare."""
+        job = replace(FIXTURE, recordings=tuple(paths))
+        whole = replace(job, keep_partial=False)
+        with buffers_of(buffer_bytes):
+            assert prints(in_memory(job)) == self.scans
+            assert messages(job, folder / "all.mcap") == self.messages
+            assert messages(whole, folder / "whole.mcap") == self.whole_messages
+
+
+@pytest.fixture(scope="module")
+def wanted(tmp_path_factory: pytest.TempPathFactory) -> Wanted:
+    """The outputs of the frames as they are."""
+    folder = tmp_path_factory.mktemp("wanted")
+    path = folder / "plain.pcap"
+    path.write_bytes(pcap_bytes(frames(LENGTH_NS), ns=False))
+    job = replace(FIXTURE, recordings=(path,))
+    result = in_memory(job)
+    assert [scan.index for scan in result.scans] == [-1, 0, 1, 2]
+    return Wanted(
+        prints(result),
+        messages(job, folder / "all.mcap"),
+        messages(replace(job, keep_partial=False), folder / "whole.mcap"),
+    )
+
+
+# -- containers -----------------------------------------------------------------------------------
+
+
+def pcapng(
+    records: Iterable[tuple[int, bytes]], *, tsresol: int, big_endian: bool = False
+) -> bytes:
+    """A pcapng file with stamps in units of 10 to the power of minus `tsresol` s."""
+    unit_ns = 10 ** (9 - tsresol)
+    section = Section(
+        [Packet(frame, host_ns // unit_ns) for host_ns, frame in records],
+        [Interface(tsresol=tsresol)],
+        big_endian,
+    )
+    return section_bytes(section)
+
+
+CONTAINERS: dict[str, Callable[[], bytes]] = {
+    "pcap ns": lambda: pcap_bytes(frames(LENGTH_NS)),
+    "pcap us big endian": lambda: pcap_bytes(frames(LENGTH_NS), ns=False, big_endian=True),
+    "pcap ns big endian": lambda: pcap_bytes(frames(LENGTH_NS), big_endian=True),
+    "pcapng ns": lambda: pcapng(frames(LENGTH_NS), tsresol=9),
+    "pcapng us big endian": lambda: pcapng(frames(LENGTH_NS), tsresol=6, big_endian=True),
+    "gzip": lambda: gzip.compress(pcap_bytes(frames(LENGTH_NS)), 1),
+    "zstd": lambda: zstandard.compress(pcapng(frames(LENGTH_NS), tsresol=9)),
+    "unfragmented": lambda: pcap_bytes([one.frame() for one in datagrams(LENGTH_NS)]),
+    "cooked link": lambda: pcap_bytes(
+        [one.frame(SLL2) for one in datagrams(LENGTH_NS)], linktype=SLL2
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_containers_do_not_matter(name: str, wanted: Wanted, tmp_path: Path) -> None:
+    path = tmp_path / "recording"
+    path.write_bytes(CONTAINERS[name]())
+    wanted.check([path], tmp_path)
+
+
+@pytest.mark.parametrize("size", BUFFERS)
+def test_buffer_size_does_not_matter(size: int, wanted: Wanted, tmp_path: Path) -> None:
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes(frames(LENGTH_NS)))
+    wanted.check([path], tmp_path, size)
+
+
+# -- several files and other orders ---------------------------------------------------------------
+
+
+def by_sensor() -> tuple[Records, Records]:
+    """The frames of `right`, and all others."""
+    mine = [record for record in frames(LENGTH_NS) if source(record[1]) == RIGHT.ip]
+    return mine, [record for record in frames(LENGTH_NS) if source(record[1]) != RIGHT.ip]
+
+
+def by_turns() -> tuple[Records, Records]:
+    """Datagrams cut in time, as a recorder that begins a new file does."""
+    records = [one.frame() for one in datagrams(LENGTH_NS)]
+    return records[: len(records) // 2], records[len(records) // 2 :]
+
+
+@pytest.mark.parametrize("parts", [by_sensor, by_turns])
+@pytest.mark.parametrize("step", [1, -1])
+@pytest.mark.parametrize("size", [10_000, LARGE])
+def test_several_files_in_any_order_are_one_session(
+    parts: Callable[[], tuple[Records, Records]],
+    step: int,
+    size: int,
+    wanted: Wanted,
+    tmp_path: Path,
+) -> None:
+    paths = [tmp_path / "z.pcap", tmp_path / "a.pcap"]
+    for path, records in zip(paths, parts(), strict=True):
+        path.write_bytes(pcap_bytes(records))
+    wanted.check(paths[::step], tmp_path, size)
+
+
+def shuffled(rng: random.Random) -> Records:
+    """Frames of the two sensors interleaved anew, each in its own order, in bursts of any length.
+
+    All stamps lie within 0.4 s: whoever waits lags by less than --max-wait.
+    """
+    mine, others = (list(reversed(records)) for records in by_sensor())
+    burst = rng.choice([1, 4, 40, 400, 4000])
+    records: Records = []
+    while mine or others:
+        chosen = rng.choice([part for part in (mine, others) if part])
+        for _ in range(min(rng.randint(1, burst), len(chosen))):
+            records.append((START_NS + 100_000 * len(records), chosen.pop()[1]))
+    return records
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_interleaving_does_not_matter(seed: int, wanted: Wanted, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes(shuffled(rng)))
+    wanted.check([path], tmp_path, rng.choice(BUFFERS))
+
+
+@pytest.mark.parametrize("lag_ms", [-900, -300, 300, 900])
+def test_a_late_network_does_not_matter(lag_ms: int, wanted: Wanted, tmp_path: Path) -> None:
+    mine, others = by_sensor()
+    late = [(host_ns + lag_ms * 10**6, frame) for host_ns, frame in mine]
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes(sorted(late + others, key=lambda record: record[0])))
+    wanted.check([path], tmp_path)
+
+
+def test_datagrams_are_those_of_the_lidars() -> None:
+    sizes = {(one.source, one.port, len(one.payload)) for one in datagrams(LENGTH_NS)}
+    assert {row for row in sizes if row[1] != 5353} == {
+        (LEFT.ip, 7502, 6400),
+        (LEFT.ip, 7503, 48),
+        (RIGHT.ip, 7502, 2304),
+        (RIGHT.ip, 7503, 48),
+    }
