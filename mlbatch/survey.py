@@ -17,10 +17,12 @@ from mlbatch.lidar import Lidar
 from mlbatch.readers import open_recording
 from mlbatch.rig import Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
-from mlbatch.streams import Found, Kind, Sampler, match, split_by_kind
+from mlbatch.streams import Found, Kind, Role, Router, Sampler, match, split_by_kind
+from mlbatch.transforms import from_rpy_deg
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
+MS_PER_S = NS_PER_S // NS_PER_MS
 Value: TypeAlias = str | int | float | None
 HEAD = (
     *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
@@ -57,7 +59,9 @@ class StreamReport:
         """Cells for people, as HEAD."""
         clock = self.timescale
         if self.offset_ms is not None:
-            clock += f" {self.offset_ms:+.3f} ms"
+            near = abs(self.offset_ms) < MS_PER_S
+            offset = f"{self.offset_ms:+.3f} ms" if near else f"{self.offset_ms / MS_PER_S:+.3f} s"
+            clock += f" {offset}"
         return [
             *(self.stream, self.what, self.sensor, str(self.packets), f"{self.rate_hz:.1f}"),
             "" if self.lost is None else str(self.lost),
@@ -110,7 +114,8 @@ class Survey:
                 metadata=self.files.get(sensor.name),
                 extrinsics=sensor.lidar.extrinsics
                 if sensor.lidar.extrinsics is not None
-                else np.eye(4),
+                # As angles, which are easier to fill in than a matrix.
+                else from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
             )
             for sensor in self.sensors
         )
@@ -138,8 +143,9 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]
         sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
     counts = _count(opened, found)
-    reports = tuple(_report(sampler, kind, found, counts) for kind in sampler.samples)
-    notes = []
+    router = Router(table, found, has_rig=False)
+    reports = tuple(_report(sampler, kind, found, counts, router) for kind in sampler.samples)
+    notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
     if not sampler.samples:
         notes.append("no UDP packet in the first 10 seconds")
     elif not found:
@@ -171,8 +177,18 @@ def _ring(lidar: Lidar) -> RawRing:
     return RawRing(lidar.packet_size, lidar.record_start, lidar.record_size)
 
 
+def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router) -> str:
+    """Name of the sensor that sends a kind of packets beside its lidar packets; empty if none."""
+    route = router.route(kind, np.frombuffer(sampler.samples[kind][0], np.uint8))
+    return found[route.sensors[0]].name if route.role in (Role.IMU, Role.BAD_SIZE) else ""
+
+
 def _report(
-    sampler: Sampler, kind: Kind, found: Sequence[Found], counts: Sequence[_Count]
+    sampler: Sampler,
+    kind: Kind,
+    found: Sequence[Found],
+    counts: Sequence[_Count],
+    router: Router,
 ) -> StreamReport:
     first_ns, last_ns = sampler.span_ns[kind]
     packets = sampler.packets[kind]
@@ -184,7 +200,7 @@ def _report(
     return StreamReport(
         stream=str(sampler.table.streams[kind[0]]),
         what=what if lidar is None else f"{lidar.model} {lidar.mode}",
-        sensor="" if at is None else found[at].name,
+        sensor=_owner(sampler, kind, found, router) if at is None else found[at].name,
         model="" if lidar is None else lidar.model,
         mode="" if lidar is None else lidar.mode,
         serial="" if lidar is None else lidar.serial,
