@@ -1,0 +1,105 @@
+"""Every command explains itself, and does so without loading what only a run needs."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from mlbatch.cli.app import app
+from tests.contract.tree import run_python
+
+# The options of this version (CONTRACT.md, section 2), and what their help has to say.
+OPTIONS: dict[str, dict[str, str]] = {
+    "convert": {
+        "--output": r"\.mcap.*folder",
+        "--rig": "YAML",
+        "--rate": "Hz",
+        "--format": "mcap, npz or ply",
+        "--layout": "dense.*organized",
+        "--point-layout": "preset",
+        "--slices": "window",
+        "--split": "sensor",
+        "--keep-partial": "first and last",
+        "--max-wait": r"\bs\b.*inf",
+        "--start": r"epoch s.*ISO.*\+S",
+        "--end": "--start",
+        "--clock": "sensor.*host",
+        "--min-range": r"\bm\b",
+        "--max-range": r"\bm\b",
+        "--exclude-box": r"x0,y0,z0,x1,y1,z1, m, body frame.*repeatable",
+        "--keep-repeated": "second",
+        "--metadata": "repeatable",
+        "--identity-extrinsics": "without extrinsics",
+        "--decode": "KEY=VALUE.*repeatable",
+        "--only": "repeatable",
+        "--ignore": "repeatable",
+        "--dry-run": "report",
+        "--report": "JSON",
+        "--jobs": "this version",
+        "--engine": "auto or numpy",
+        "--strict": "error",
+        "--overwrite": "existing",
+        "--quiet": "progress",
+        "--verbose": "chosen",
+    },
+    "inspect": {"--metadata": "repeatable", "--json": "JSON", "--write-rig": "convert"},
+    "sensors": {"--json": "JSON"},
+}
+HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
+
+
+def _help(*arguments: str) -> str:
+    result = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    return " ".join(result.stdout.split())
+
+
+def _described(command: str) -> dict[str, str]:
+    """Help text by the long name of each option of a command."""
+    commands = getattr(get_command(app), "commands")  # noqa: B009 - typer hides its type
+    return {
+        name: parameter.help or ""
+        for parameter in commands[command].params
+        for name in parameter.opts
+        if name.startswith("--")
+    }
+
+
+def test_the_first_page_names_every_command() -> None:
+    page = _help()
+    for command in (*OPTIONS, "--version"):
+        assert re.search(rf" {command} \S", page), command
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_the_options_are_those_of_the_contract(command: str) -> None:
+    found = _described(command)
+    assert set(found) - {"--help"} == set(OPTIONS[command])
+    for name, words in OPTIONS[command].items():
+        assert re.search(words, found[name]), f"{command} {name}: {found[name]!r}"
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_help_shows_every_option(command: str) -> None:
+    page = _help(command)
+    for name in OPTIONS[command]:
+        assert re.search(rf"{name}\b", page), name
+
+
+def test_help_loads_nothing_heavy() -> None:
+    loaded = run_python(
+        f"import sys, mlbatch.cli.app\nprint([name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    assert loaded.strip() == "[]"
+
+
+def test_the_root_offers_its_names_without_loading_them() -> None:
+    printed = run_python(
+        "import sys, mlbatch\n"
+        "assert 'numpy' not in sys.modules\n"
+        "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
+    )
+    assert printed.strip() == "['MlbatchError', 'Scan', 'scans']"
