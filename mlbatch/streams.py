@@ -304,8 +304,19 @@ def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found:
             scored[number] = (max(before, usable[number].fit(evidence)), kinds | {kind})
     best = max(scored, key=lambda number: scored[number][0], default=None)
     if best is None:
+        _refuse_guess(wanted, usable, origin)
         return Found(wanted.name, lidars[0], wanted.selector)
     return Found(wanted.name, lidars[best], wanted.selector, scored[best][1])
+
+
+def _refuse_guess(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> None:
+    """A sensor that is silent at first needs metadata that are surely its own."""
+    if len(usable) > 1:
+        raise RigError(
+            f"{origin}: sensor {wanted.name}: wanted a packet of it ({wanted.selector}) in the "
+            f"first 10 seconds, got none to tell which of {_paths(usable)} is its metadata; "
+            "correct its stream, or give `metadata:`"
+        )
 
 
 def _paths(calibrations: Sequence[Calibration]) -> str:

@@ -258,6 +258,13 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "extrinsics, clock, min_range_m, max_range_m, optional, decode, got 'extrinsic'; the "
         "nearest known key is extrinsics",
     ),
+    "rig sensor of no stream": (
+        "fix/two_lidars.pcap --rig fix/astray.yaml",
+        1,
+        "fix/astray.yaml: sensor rear: wanted a packet of it (source_ip 10.5.5.99) in the first "
+        "10 seconds, got none to tell which of fix/left.json, fix/right.json is its metadata; "
+        "correct its stream, or give `metadata:`",
+    ),
     "rig sensor that is silent": (
         "fix/two_lidars.pcap --rig fix/silent.yaml",
         1,
@@ -399,10 +406,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for file in FIXTURE.iterdir():
         (folder / "fix" / file.name).write_bytes(file.read_bytes())
     rig = (FIXTURE / "rig.yaml").read_text()
-    silent = "  - name: rear\n    stream: {source_ip: 10.5.5.99}\n    extrinsics: {matrix: M}\n"
-    rows = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
+    rear = "  - name: rear\n    stream: {source_ip: 10.5.5.99}\n    extrinsics: {matrix: M}\n"
+    rear = rear.replace("M", "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]")
     cut = rig.index("# The machine's own body")
-    (folder / "fix" / "silent.yaml").write_text(rig[:cut] + silent.replace("M", rows))
+    (folder / "fix" / "astray.yaml").write_text(rig[:cut] + rear)
+    silent = f"{rig[:cut]}{rear}    metadata: left.json\n"
+    (folder / "fix" / "silent.yaml").write_text(silent)
     (folder / "fix" / "frame.yaml").write_text(
         "sensors:\n- {name: left, metadata: left.json, extrinsics: {frame: os_left}}\n"
     )

@@ -55,17 +55,8 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     ends = [*starts[1:], None]
     cells = [[row[a:b].strip() for a, b in zip(starts, ends, strict=True)] for row in [head, *rows]]
     assert cells[0] == [
-        "stream",
-        "what",
-        "sensor",
-        "packets",
-        "Hz",
-        "lost",
-        "seconds",
-        "clock",
-        "calibration",
-        "extrinsics",
-        "missing",
+        *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
+        *("clock", "calibration", "extrinsics", "missing"),
     ]
     table = {row[0]: row[1:] for row in cells[1:]}
     # Packets, rates and spans by fixtures/two_lidars/SOURCE.md.
