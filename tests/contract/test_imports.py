@@ -23,7 +23,16 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("report",),
         ("streams",),
     ),
-    (("rig", "_rig_values", "_yaml"), ("ring",), ("ledger",), ("scan_table",), ("clock",)),
+    (("knowledge",),),
+    (
+        ("rig", "_rig_values", "_yaml"),
+        ("frames",),
+        ("urdf",),
+        ("ring",),
+        ("ledger",),
+        ("scan_table",),
+        ("clock",),
+    ),
     (("lidar",), ("transforms",)),
     (("geometry",),),
     (("types",),),
@@ -43,7 +52,7 @@ NAMES = frozenset(module.name for module in MODULES)
 
 
 def test_every_module_has_its_place() -> None:
-    assert {module.top for module in MODULES} == set(PLACE)
+    assert {module.top for module in MODULES} <= set(PLACE)
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
@@ -60,10 +69,14 @@ def test_no_import_to_the_left(module: Module) -> None:
         )
 
 
-def test_modules_do_not_need_each_other_in_circles() -> None:
-    """Only what types need may point back, as `accounts` names the `Conversion` it tells of."""
+def test_modules_can_be_loaded_one_after_the_other() -> None:
+    """Only what types need, or a function when it is called, may close a circle of imports."""
     left = {
-        module.name: {found.target for found in imports(module, NAMES) if not found.only_for_types}
+        module.name: {
+            found.target
+            for found in imports(module, NAMES)
+            if not found.only_for_types and not found.when_called
+        }
         - {"", module.name}
         for module in MODULES
     }

@@ -6,7 +6,7 @@ import ast
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -37,6 +37,7 @@ class Import:
     target: str
     line: int
     only_for_types: bool
+    when_called: bool
 
 
 @lru_cache(maxsize=1)
@@ -64,16 +65,25 @@ def _module(path: Path) -> Module:
 
 def imports(module: Module, names: frozenset[str]) -> Iterator[Import]:
     """Imports from the package; `names`: all its modules, to tell them from what they define."""
-    guarded = {
-        id(inner)
-        for node in ast.walk(module.tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-        for inner in ast.walk(node)
-    }
+    guarded, called = _inside(module.tree, _is_guard), _inside(module.tree, _is_function)
     for node in ast.walk(module.tree):
         for target in _targets(node, module, names):
             line = getattr(node, "lineno", 0)
-            yield Import(target, line, id(node) in guarded)
+            yield Import(target, line, id(node) in guarded, id(node) in called)
+
+
+def _inside(tree: ast.Module, chosen: Callable[[ast.AST], bool]) -> set[int]:
+    """Identities of all nodes inside the chosen ones."""
+    outer = [node for node in ast.walk(tree) if chosen(node)]
+    return {id(inner) for node in outer for inner in ast.walk(node)}
+
+
+def _is_guard(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+def _is_function(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef)
 
 
 def _targets(node: ast.AST, module: Module, names: frozenset[str]) -> Iterator[str]:
