@@ -90,6 +90,8 @@ def as_rows(payloads: Sequence[bytes], size: int) -> U8Array:
 
 def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
     """Packets of a batch by stream and size: ((stream, size), indices in arrival order)."""
+    if not len(batch):
+        return []
     key = batch.stream << 17 | batch.size
     kinds, inverse = np.unique(key, return_inverse=True)
     order = np.argsort(inverse, kind="stable")

@@ -180,6 +180,16 @@ def test_a_late_network_does_not_matter(lag_ms: int, wanted: Wanted, tmp_path: P
     wanted.check([path], tmp_path)
 
 
+@pytest.mark.parametrize("size", [*BUFFERS, LARGE])
+def test_a_pause_of_the_recorder_does_not_matter(size: int, wanted: Wanted, tmp_path: Path) -> None:
+    """Sensors are looked for in the first 10 s; a buffer may end exactly there."""
+    records = [one.frame() for one in datagrams(LENGTH_NS)]
+    late = [(host_ns + 11 * 10**9, frame) for host_ns, frame in records[100:]]
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes(records[:100] + late))
+    wanted.check([path], tmp_path, size)
+
+
 def test_datagrams_are_those_of_the_lidars() -> None:
     sizes = {(one.source, one.port, len(one.payload)) for one in datagrams(LENGTH_NS)}
     assert {row for row in sizes if row[1] != 5353} == {
