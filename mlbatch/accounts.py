@@ -156,8 +156,13 @@ def _clock(run: Conversion, number: int) -> ClockReport:
 
 def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     setup, rows = run.setup, []
-    for kind, count in sorted(run.feeder.unassigned.items()):
-        stream = setup.sampler.table.streams[kind[0]]
+    streams = setup.sampler.table.streams
+    # Not by the streams' numbers, which follow the order in which files are read.
+    by_name = sorted(
+        run.feeder.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
+    )
+    for kind, count in by_name:
+        stream = streams[kind[0]]
         what = _what(run, kind)
         if kind not in setup.sampler.samples:
             what = f"not seen in the first 10 s: {what}"

@@ -122,6 +122,7 @@ class Feeder:
         for host_ns, payload in zip(batch.host_ns[index].tolist(), payloads, strict=True):
             sample = feed.lidar.imu(payload[None], number)
             if len(sample.stamp_ns):
-                sample.stamp_ns = sample.stamp_ns + (host_ns - sample.stamp_ns[-1])
+                # Ages first: damaged stamps may be too large to be added to an arrival.
+                sample.stamp_ns = sample.stamp_ns - sample.stamp_ns[-1:] + host_ns
             samples.append(sample)
         return samples

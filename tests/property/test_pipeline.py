@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import random
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,8 @@ from tests.builders.two_lidars import LEFT, RIGHT
 LENGTH_NS = 350_000_000
 BUFFERS = (1 << 12, 10_000, 1 << 16, 300_000)
 LARGE = 4 << 20
+# The smallest int64.
+LEAST = bytes(7) + b"\x80"
 
 
 Message = tuple[str, int, int, int, bytes]
@@ -188,6 +191,38 @@ def test_a_pause_of_the_recorder_does_not_matter(size: int, wanted: Wanted, tmp_
     path = tmp_path / "recording.pcap"
     path.write_bytes(pcap_bytes(records[:100] + late))
     wanted.check([path], tmp_path, size)
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_the_report_names_streams_in_one_order(step: int, tmp_path: Path) -> None:
+    """Two files, each with packets of a stranger."""
+    first = datagrams(LENGTH_NS)[0]
+    paths = [tmp_path / "one.pcap", tmp_path / "two.pcap"]
+    strangers = ("10.5.5.31", "10.5.5.30")
+    for path, records, ip in zip(paths, by_sensor(), strangers, strict=True):
+        stranger = replace(first, source=ip, port=1900, payload=b"hello").frame()
+        path.write_bytes(pcap_bytes([stranger, *records]))
+    report = in_memory(replace(FIXTURE, recordings=tuple(paths[::step]))).report
+    streams = [row.stream.split(" ")[0] for row in report.unassigned]
+    assert streams == ["10.5.5.20", *sorted(strangers)]
+
+
+def test_imu_on_the_clock_of_the_recorder_has_arrivals_as_stamps(tmp_path: Path) -> None:
+    """Also samples whose own stamps are damaged beyond all arithmetic."""
+    sent = [
+        replace(one, payload=one.payload[:16] + LEAST + one.payload[24:])
+        if one.port == 7503 and number % 3
+        else one
+        for number, one in enumerate(datagrams(LENGTH_NS))
+    ]
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes([one.frame() for one in sent]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        memory = in_memory(replace(FIXTURE, recordings=(path,), host_clock=True)).memory
+    assert memory is not None
+    stamps = sorted(stamp for samples in memory.imu for stamp in samples.stamp_ns.tolist())
+    assert stamps == [one.host_ns for one in sent if one.port == 7503]
 
 
 def test_datagrams_are_those_of_the_lidars() -> None:
