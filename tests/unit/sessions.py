@@ -10,8 +10,10 @@ import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from mlbatch.cli import main
@@ -27,6 +29,8 @@ EPOCH_NS = 1_800_000_000 * NS_PER_S
 PACKETS_PER_TURN = 32
 SMALL = OusterSpec(beams=16, columns_per_frame=512, serial=111)
 Records = list[tuple[int, bytes]]
+Report = dict[str, Any]
+Arrays = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -136,3 +140,20 @@ class Shell:
         printed = self.capsys.readouterr()
         code = end.value.code
         return Outcome(code if isinstance(code, int) else 0, printed.out, printed.err)
+
+
+def arrays(path: str) -> Arrays:
+    """All of an npz file."""
+    with np.load(path) as scan:
+        return dict(scan)
+
+
+def names(folder: str, suffix: str = ".npz") -> list[str]:
+    """Files of an output, sorted."""
+    return sorted(p.relative_to(folder).as_posix() for p in Path(folder).rglob("*" + suffix))
+
+
+def report_of(path: str) -> Report:
+    """A report file."""
+    report: Report = json.loads(Path(path).read_text())
+    return report

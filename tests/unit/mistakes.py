@@ -1,0 +1,387 @@
+"""Mistakes of users and the line that answers each; their files: `test_cli_mistakes.py`."""
+
+from __future__ import annotations
+
+FIX = "fix/two_lidars.pcap --rig fix/rig.yaml"
+DIGEST = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10_digest.json"
+ONE_UNIT = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10"
+PAIR = "R/ouster/two-sensors_same-ports_nonlegacy/same_ports_nonlegacy.pcap"
+NO_LIDAR = (
+    "no lidar packets; wanted raw UDP packets of a supported lidar (see `mlbatch sensors`), got "
+)
+DATA_PORT = "; check that the recording holds the sensor's data port"
+
+# (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} stands
+# for words of the parser, which differ between its versions, and for lists that grow.
+MISTAKES: dict[str, tuple[str, int, str]] = {
+    "nothing at all": ("-o out", 2, "Missing argument {*}; see `mlbatch --help`"),
+    "misspelt option": (
+        f"{FIX} --overwrit",
+        2,
+        "No such option: --overwrit{*}; see `mlbatch --help`",
+    ),
+    "no number": (
+        f"{FIX} --slices many",
+        2,
+        "Invalid value for '--slices'{*}; see `mlbatch --help`",
+    ),
+    "missing recording": (
+        "none.pcap",
+        1,
+        "none.pcap: wanted a recording, got no such file; check the path",
+    ),
+    "folder": ("fix", 1, "fix: wanted a recording, got a folder; name the files inside it"),
+    "empty file": (
+        "empty.pcap",
+        1,
+        "empty.pcap: wanted a recording, got 0 bytes; record or copy it again",
+    ),
+    "text": (
+        "text.txt",
+        1,
+        "text.txt: wanted a recording ({*}; also gzip or zstd of them), got a file that "
+        "begins with 68 65 6c 6c 6f 0a; check that it is the right file",
+    ),
+    "no output": (
+        f"{FIX} --quiet",
+        2,
+        "-o: wanted an output, got none; give -o scans.mcap, or --dry-run",
+    ),
+    "file name for a folder": (
+        f"{FIX} -o out.npz",
+        2,
+        "-o out.npz: wanted a folder, since npz output is a file a scan, got a file name; "
+        "give -o out --format npz",
+    ),
+    "later suffix": (
+        f"{FIX} -o out.bag",
+        2,
+        "-o out.bag: wanted a .mcap file or a folder, got .bag (rosbag1, not in this version); "
+        "choose another output",
+    ),
+    "later format": (
+        f"{FIX} --format las",
+        2,
+        "--format: wanted one of mcap, npz, ply, got 'las' (not in this version); choose one",
+    ),
+    "folder format for a file": (
+        f"{FIX} -o out.mcap --format ply",
+        2,
+        "-o out.mcap: wanted a folder for --format ply, got the name of a mcap file; "
+        "leave out .mcap or the option",
+    ),
+    "existing output": (
+        f"{FIX} -o old",
+        1,
+        "old: wanted a new output, got an existing one; choose another or --overwrite",
+    ),
+    "strangers in the output": (
+        f"{FIX} -o old --overwrite",
+        1,
+        "old: wanted a folder that only holds scans to overwrite, got diary.txt in it as well; "
+        "choose another output",
+    ),
+    "output folder missing": (
+        f"{FIX} -o none/out",
+        1,
+        "none/out: wanted an output in an existing folder, got none, which is none; create it "
+        "(mkdir -p) or choose another",
+    ),
+    "report folder missing": (
+        f"{FIX} --report none/r.json",
+        1,
+        "none/r.json: wanted a report in an existing folder, got none, which is none; create it "
+        "(mkdir -p) or choose another",
+    ),
+    "report is a folder": (
+        f"{FIX} --report old",
+        1,
+        "old: wanted a file for the report, got a folder; add a name",
+    ),
+    "report over the recording": (
+        f"{FIX} --report fix/two_lidars.pcap",
+        1,
+        "fix/two_lidars.pcap: wanted a new file for the report, got one that is read; "
+        "choose another",
+    ),
+    "rate no number": (
+        f"{FIX} --rate fast",
+        2,
+        "--rate: wanted a positive number of Hz (10, 29.97 or 10/3), got 'fast'; write a decimal "
+        "number or a fraction",
+    ),
+    "rate too low": (
+        f"{FIX} --rate 0.1",
+        2,
+        "--rate: wanted 0.25 to 1000000 Hz, got '0.1'; lidars turn at 5 to 20 Hz",
+    ),
+    "no slices": (
+        f"{FIX} --slices 0",
+        2,
+        "--slices: wanted 1 to 10000, got 0; leave it out for 1",
+    ),
+    "wait": (
+        f"{FIX} --max-wait soon",
+        2,
+        "--max-wait: wanted seconds above 0, or inf, got 'soon'; write 1.0",
+    ),
+    "no wait": (
+        f"{FIX} --max-wait 0",
+        2,
+        "--max-wait: wanted seconds above 0, or inf, got '0'; write 1.0",
+    ),
+    "box of three": (
+        f"{FIX} --exclude-box 1,2,3",
+        2,
+        "--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, got "
+        "'1,2,3'; write --exclude-box=-1,-1,0,1,1,2",
+    ),
+    "box inside out": (
+        f"{FIX} --exclude-box=1,0,0,-1,1,1",
+        2,
+        "--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, got "
+        "'1,0,0,-1,1,1'; write --exclude-box=-1,-1,0,1,1,2",
+    ),
+    "negative range": (
+        f"{FIX} --min-range=-1",
+        2,
+        "--min-range: wanted 0 or more metres, got -1.0; write 0.5",
+    ),
+    "range nan": (
+        f"{FIX} --max-range nan",
+        2,
+        "--max-range: wanted more than --min-range (0.0 m), got nan m; write 100",
+    ),
+    "ranges swapped": (
+        f"{FIX} --min-range 5 --max-range 3",
+        2,
+        "--max-range: wanted more than --min-range (5.0 m), got 3.0 m; write 100",
+    ),
+    "start no time": (
+        f"{FIX} --start yesterday",
+        2,
+        "--start: wanted epoch seconds, an ISO time or +SECONDS, got 'yesterday'; write "
+        "1700000000.5, 2026-05-01T12:00:00 or +12.5",
+    ),
+    "end before start": (
+        f"{FIX} --start +3 --end +2",
+        2,
+        "--end: wanted a time after --start (3 s), got 2 s; swap them",
+    ),
+    "date for an uptime clock": (
+        "uptime/drive.pcap --start 2026-05-04T08:00",
+        2,
+        "--start/--end: wanted seconds, since the sensors' clock (uptime) knows no date, got a "
+        "date; write +SECONDS after the first scan",
+    ),
+    "start after the end": (
+        "uptime/drive.pcap --start +60",
+        1,
+        "uptime/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "ouster_111 from 1000.000000 to 1000.299805 s; choose another --start/--end, or a "
+        "recording where all sensors run together",
+    ),
+    "clock": (
+        f"{FIX} --clock gps",
+        2,
+        "--clock: wanted sensor or host, got 'gps'; choose one of them",
+    ),
+    "layout": (
+        f"{FIX} --layout round",
+        2,
+        "--layout: wanted dense or organized, got 'round'; choose one of them",
+    ),
+    "organized ply": (
+        f"{FIX} --format ply --layout organized",
+        2,
+        "--layout organized: PLY has no organized form; use npz or mcap",
+    ),
+    "point layout": (
+        f"{FIX} -o out.mcap --point-layout loam",
+        2,
+        "--point-layout: wanted one of standard, velodyne, ouster, hesai, autoware, kiss-icp, "
+        "minimal, got 'loam'; choose one",
+    ),
+    "engine": (
+        f"{FIX} --engine numba",
+        2,
+        "--engine: wanted auto or numpy, got 'numba' (not in this version); choose one of them",
+    ),
+    "jobs": (
+        f"{FIX} --jobs 2",
+        2,
+        "--jobs: wanted 1, got 2; more than one is not in this version",
+    ),
+    "decoder option": (
+        f"{FIX} --decode crc=no",
+        2,
+        "--decode crc: wanted check, got 'no'; write --decode crc=check",
+    ),
+    "unknown sensor": (
+        f"{FIX} --only front",
+        2,
+        "--only: wanted the name or serial number of a sensor, one of left, right, got 'front'; "
+        "choose one",
+    ),
+    "no sensor left": (
+        f"{FIX} --ignore left --ignore 122648000456",
+        2,
+        "--only/--ignore: wanted at least one sensor to convert, got none that is left; leave one "
+        "of them out",
+    ),
+    "rig missing": (
+        "fix/two_lidars.pcap --rig none.yaml",
+        1,
+        "none.yaml: wanted a readable file, got no such file or directory; check the path",
+    ),
+    "rig without sensors": (
+        "fix/two_lidars.pcap --rig empty.yaml",
+        1,
+        "empty.yaml:1: sensors: wanted 1 to 256 sensors, got a list of 0; list each sensor with "
+        "`- name:`",
+    ),
+    "misspelt key": (
+        "fix/two_lidars.pcap --rig misspelt.yaml",
+        1,
+        "misspelt.yaml:2: sensors[0].extrinsic: wanted a key of name, model, stream, metadata, "
+        "extrinsics, clock, min_range_m, max_range_m, optional, decode, got 'extrinsic'; the "
+        "nearest known key is extrinsics",
+    ),
+    "rig sensor of no stream": (
+        "fix/two_lidars.pcap --rig fix/astray.yaml",
+        1,
+        "fix/astray.yaml: sensor rear: wanted a packet of it (source_ip 10.5.5.99) in the first "
+        "10 seconds, got none to tell which of fix/left.json, fix/right.json is its metadata; "
+        "correct its stream, or give `metadata:`",
+    ),
+    "rig sensor that is silent": (
+        "fix/two_lidars.pcap --rig fix/silent.yaml",
+        1,
+        "fix/silent.yaml: sensor rear: wanted its packets, got none from source_ip 10.5.5.99; "
+        "correct its stream or serial, or set `optional: true`",
+    ),
+    "rig sensor without metadata": (
+        "bare/drive.pcap --rig serial.yaml",
+        1,
+        "serial.yaml: sensor left: no metadata with serial number 5 among the files given; give it "
+        "as `metadata:` of the sensor, or with --metadata",
+    ),
+    "extrinsics by frame": (
+        "fix/two_lidars.pcap --rig fix/frame.yaml",
+        1,
+        "sensor left: extrinsics by frame (os_left) need a recording with /tf_static, which "
+        "captures do not have; give translation_m and a rotation",
+    ),
+    "metadata missing": (
+        "fix/two_lidars.pcap --metadata none.json",
+        1,
+        "none.json: wanted a calibration file, got no such file; check the path",
+    ),
+    "metadata is something else": (
+        "fix/two_lidars.pcap --metadata fix/rig.yaml",
+        1,
+        "fix/rig.yaml: wanted the metadata or calibration of a lidar, got another kind of file; "
+        "give the file that the sensor's driver or recorder saved",
+    ),
+    "metadata of another lidar": (
+        "bare/drive.pcap --metadata pair/222.json",
+        1,
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
+        "its metadata; wanted metadata that fits, got only 222.json; give the sensor's with "
+        "--metadata FILE",
+    ),
+    "no metadata": (
+        "bare/drive.pcap",
+        1,
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
+        "its metadata; wanted metadata that fits, got none beside the recording; give the sensor's "
+        "with --metadata FILE",
+    ),
+    "two lidars without extrinsics": (
+        "pair/drive.pcap",
+        1,
+        "extrinsics unknown for ouster_111, ouster_222; wanted for every sensor when there are two "
+        "or more; give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or "
+        "accept the body origin with --identity-extrinsics",
+    ),
+    "incomparable clocks": (
+        "apart/drive.pcap --identity-extrinsics",
+        1,
+        "clocks of the sensors cannot be compared: stamp minus arrival is -3600.004 s for "
+        "ouster_222 and -0.004 s for ouster_111, 3600.000 s apart; wanted at most 1 s; use "
+        "--clock host, or give clock.offset_s in the rig",
+    ),
+    "strict with a duplicate": (
+        "twice/drive.pcap --strict",
+        1,
+        "sensor ouster_111: 1 packet(s) rejected as duplicate while --strict was given; leave it "
+        "out to count them and go on",
+    ),
+    "strict with a warning": (
+        "cut/drive.pcap --strict",
+        1,
+        "drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1000 "
+        "(recording, an error because of --strict)",
+    ),
+    "only partial scans": (
+        "short/drive.pcap",
+        1,
+        "short/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "ouster_111 from 1800000000.020000 to 1800000000.119805 s; write the partial ones with "
+        "--keep-partial",
+    ),
+    "no common window": (
+        "parted/drive.pcap --identity-extrinsics --max-wait inf --end 1800000001",
+        1,
+        "parted/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "ouster_111 from 1800000000.020000 to 1800000000.319805 s; ouster_222 from "
+        "1800000009.020000 to 1800000009.319805 s; choose another --start/--end, or a recording "
+        "where all sensors run together",
+    ),
+}
+
+REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
+    "metadata is a digest": (
+        f"{ONE_UNIT}.pcap --metadata {DIGEST}",
+        1,
+        f"{DIGEST}: wanted the metadata or calibration of a lidar, got another kind of file; "
+        "give the file that the sensor's driver or recorder saved",
+    ),
+    "TCP only": (
+        "R/other/sick-tcp_pcapng/test.pcapng",
+        1,
+        f"R/other/sick-tcp_pcapng/test.pcapng: {NO_LIDAR}no UDP packet at all{DATA_PORT}",
+    ),
+    "look-alike": (
+        "R/other/lslidar-1212-byte-lookalike/VLI-16-one-packet.pcap",
+        1,
+        "R/other/lslidar-1212-byte-lookalike/VLI-16-one-packet.pcap: "
+        f"{NO_LIDAR}192.168.1.200 > port 2368 (1212 bytes: unknown){DATA_PORT}",
+    ),
+    "empty capture": (
+        "R/ouster/empty-pcap/empty_pcap.pcap",
+        1,
+        f"R/ouster/empty-pcap/empty_pcap.pcap: {NO_LIDAR}no UDP packet at all{DATA_PORT}",
+    ),
+    "lidar off": (
+        "R/ouster/os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap",
+        1,
+        f"R/ouster/os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap: {NO_LIDAR}127.0.0.1 > port 7513 "
+        "(452 bytes: Ouster IMU, serial 122247000785, 452 bytes), 127.0.0.1 > port 7514 (680 "
+        f"bytes: Ouster zone monitor, serial 122247000785, 680 bytes){DATA_PORT}",
+    ),
+    "two uptime clocks": (
+        f"{PAIR} --identity-extrinsics",
+        1,
+        "clocks of the sensors cannot be compared: stamp minus arrival is -1718728642.002 s for "
+        "ouster_122247000785 and -1718733565.192 s for ouster_122239000672, 4923.190 s apart; "
+        "wanted at most 1 s; use --clock host, or give clock.offset_s in the rig",
+    ),
+    "one turn is never a whole window": (
+        f"{ONE_UNIT}.pcap",
+        1,
+        f"{ONE_UNIT}.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "ouster_122150000150 from 1462.559462 to 1462.659327 s; write the partial ones with "
+        "--keep-partial",
+    ),
+}
