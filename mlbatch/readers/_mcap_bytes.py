@@ -81,8 +81,8 @@ class Window:
             left = self.begin - self.end
             got = self._source.skip(left)
             self._origin += self.end + got
-            self.begin = self.end = 0
-            if got < left:
+            self.begin, self.end = left - got, 0
+            if self.begin:
                 return False
         kept = self.end - self.begin
         self._origin += self.begin

@@ -209,7 +209,8 @@ class Walk:
         left = window.end - window.begin
         if left <= 0 and self._chunk_end is None:
             at_end = "was cut off between records" if left == 0 else "ends within a record"
-            self._note(window.place, f"the file {at_end}: wanted its footer; the rest was read")
+            place = window.place_of(window.end)
+            self._note(place, f"the file {at_end}: wanted its footer; the rest was read")
             return
         opcode, wanted, what = Op.MESSAGE, HEAD.size, "record"
         if left >= HEAD.size:
