@@ -7,9 +7,10 @@ import numpy as np
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Intake
 from mlbatch.decode import Source
-from mlbatch.discover import Mounted, Setup
+from mlbatch.discover import Setup
 from mlbatch.feeding import Feed
 from mlbatch.job import Job
+from mlbatch.mounting import Mounted
 from mlbatch.rate import rate_text
 from mlbatch.ring import RawRing
 from mlbatch.types import F64Array, RunInfo, SensorInfo

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch import sensors
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
+from mlbatch.mounting import Mounted, mount
 from mlbatch.readers import merge
-from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
 from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig
-from mlbatch.types import F64Array, PacketBatch, Recording, StreamTable
+from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
 LOOK_NS = 10 * NS_PER_S
@@ -45,21 +47,6 @@ class Note:
 
 
 @dataclass(slots=True)
-class Mounted:
-    """A sensor with its place on the body and its wishes from the rig (or their defaults)."""
-
-    found: Found
-    body_from_sensor: F64Array
-    extrinsics_source: str
-    rig: RigSensor | None = None
-
-    @property
-    def name(self) -> str:
-        """Name in all outputs."""
-        return self.found.name
-
-
-@dataclass(slots=True)
 class Setup:
     """All sensors of a session, ready to convert."""
 
@@ -73,12 +60,16 @@ class Setup:
     ignored: set[Kind] = field(default_factory=set)
 
 
-def look(recordings: Sequence[Recording], table: StreamTable) -> Sampler:
-    """Look at the first 10 s of a session."""
-    sampler = Sampler(table)
+def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:
+    """Look at the first 10 s of a session: its packets, and the messages that tell of sensors."""
+    sampler, learner = Sampler(table), Learner()
+    listen(recordings)
     for batch in first_seconds(recordings):
         sampler.add(batch)
-    return sampler
+        learner.add(batch)
+    for recording in recordings:
+        recording.keep = frozenset()
+    return sampler, learner
 
 
 def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
@@ -86,12 +77,13 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
     until_ns: int | None = None
     for batch in merge(recordings):
         if not len(batch):
+            yield batch
             continue
         if until_ns is None:
             until_ns = int(batch.host_ns[0]) + LOOK_NS
         over = np.flatnonzero(batch.host_ns > until_ns)
         if len(over):
-            yield batch.take(slice(0, int(over[0])))
+            yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
             return
         yield batch
 
@@ -130,9 +122,10 @@ def _read_given(path: Path) -> Calibration:
 def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes) -> Setup:
     """Find the sensors of a session; errors name what is missing and the ways to give it."""
     rig = None if wishes.rig is None else read_rig(wishes.rig)
-    sampler = look(recordings, table)
+    sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations, looked = calibrations_for(paths, wishes.metadata)
+    calibrations += learner.calibrations()
     if rig is None or wishes.rig is None:
         found, unknown = match(sampler, calibrations, wishes.decode)
         rigged: list[RigSensor | None] = [None] * len(found)
@@ -147,8 +140,17 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
     router = Router(table, chosen, has_rig=rig is not None)
-    mounted = _mount(chosen, rigged, wishes)
-    setup = Setup(mounted, _frame(mounted, rig), router, sampler, notes, ignored=ignored)
+    mounted, mounting = mount(
+        table,
+        chosen,
+        rigged,
+        rig,
+        learner.knowledge,
+        identity_extrinsics=wishes.identity_extrinsics,
+    )
+    setup = Setup(mounted, mounting.body_frame, router, sampler, notes, ignored=ignored)
+    notes += [Note("message", "", fault) for fault in learner.faults]
+    notes += [Note(one.code, one.sensor, one.message) for one in mounting.findings]
     if rig is not None:
         setup.rig = rig
         setup.not_in_rig = set(lidar_kinds)
@@ -276,42 +278,6 @@ def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
             "leave one of them out"
         )
     return chosen
-
-
-def _mount(
-    found: Sequence[Found], rigged: Sequence[RigSensor | None], wishes: Wishes
-) -> list[Mounted]:
-    """Give every sensor its extrinsics: rig, then metadata, else refuse (identity for one)."""
-    mounted, missing = [], []
-    for sensor, entry in zip(found, rigged, strict=True):
-        matrix, source = sensor.lidar.extrinsics, "metadata"
-        if entry is not None and isinstance(entry.extrinsics, str):
-            raise RigError(
-                f"sensor {sensor.name}: extrinsics by frame ({entry.extrinsics}) need a recording "
-                "with /tf_static, which captures do not have; give translation_m and a rotation"
-            )
-        if entry is not None and entry.extrinsics is not None:
-            matrix, source = np.asarray(entry.extrinsics, np.float64), "rig"
-        if matrix is None:
-            missing.append(sensor.name)
-            matrix, source = np.eye(4), "identity"
-        mounted.append(Mounted(sensor, matrix, source, entry))
-    if missing and len(found) > 1 and not wishes.identity_extrinsics:
-        raise RigError(
-            f"extrinsics unknown for {', '.join(missing)}; wanted for every sensor when there are "
-            "two or more; give them in a rig file (--rig) or in the metadata (ouster-sdk "
-            "extrinsic), or accept the body origin with --identity-extrinsics"
-        )
-    return mounted
-
-
-def _frame(mounted: Sequence[Mounted], rig: Rig | None) -> str:
-    """Body frame of the output; a single sensor without extrinsics keeps its own."""
-    if rig is not None:
-        return rig.body_frame
-    if len(mounted) == 1 and mounted[0].extrinsics_source == "identity":
-        return mounted[0].name
-    return DEFAULT_BODY_FRAME
 
 
 def absent(sensor: Mounted, rig: Path | None) -> RigError:

@@ -64,7 +64,8 @@ class Lidar(Protocol):
     `carries_serial`: the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown.
     `return_types`: numbering of facts/outputs.md section 3 per return; `strongest_first`: of two
     returns the first is the stronger. `extrinsics`: (4, 4)
-    body_from_sensor if the calibration knows it. `timestamp_mode`: the maker's word or "".
+    body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
+    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "".
     """
 
     maker: str
@@ -85,6 +86,7 @@ class Lidar(Protocol):
     strongest_first: bool
     beams: BeamTable
     extrinsics: F64Array | None
+    sensor_from_lidar: F64Array | None
     timestamp_mode: str
     calibration: str
     notes: tuple[str, ...]

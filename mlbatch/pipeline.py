@@ -16,11 +16,12 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Due, Label
-from mlbatch.discover import Mounted, Note, Setup, absent, discover
+from mlbatch.discover import Note, Setup, absent, discover
 from mlbatch.errors import PacketError, RecordingError, UsageError
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
+from mlbatch.mounting import Mounted
 from mlbatch.readers import merge, open_recording
 from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.scan_table import ScanTable

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.errors import RecordingError, RigError
+from mlbatch.frames import GENERIC, namespace
 from mlbatch.lidar import Calibration, Evidence, Lidar
 from mlbatch.rig import StreamSelector
 from mlbatch.types import I64Array, PacketBatch, Stream, StreamTable, U8Array
@@ -92,6 +93,8 @@ def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
     """Packets of a batch by stream and size: ((stream, size), indices in arrival order)."""
     if not len(batch):
         return []
+    if not len(batch):
+        return []
     key = batch.stream << 17 | batch.size
     kinds, inverse = np.unique(key, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
@@ -155,15 +158,16 @@ class Router:
             number
             for number, sensor in enumerate(self._found)
             if sensor.lidar.is_imu(size)
-            and any(
-                self._table.streams[other].source_ip == stream.source_ip
-                and self._table.streams[other].topic == stream.topic
-                for other, _ in sensor.kinds
-            )
+            and any(_beside(self._table.streams[other], stream) for other, _ in sensor.kinds)
         ]
-        if len(near) > 1:
+        if len(near) > 1 and not stream.topic:
             near = [n for n in near if self._found[n].lidar.imu_port == stream.port]
         return near[0] if len(near) == 1 else None
+
+
+def _beside(one: Stream, other: Stream) -> bool:
+    """Whether two streams may be of one sensor: same source IP, or topics of one namespace."""
+    return one.source_ip == other.source_ip and namespace(one.topic) == namespace(other.topic)
 
 
 def match(
@@ -187,8 +191,17 @@ def match(
     _refuse_shared(sampler.table, found, calibrations)
     sensors = sorted(found.values(), key=lambda sensor: _order(sampler.table, sensor))
     for count, sensor in enumerate(sensors):
-        sensor.name = f"{sensor.lidar.maker.lower()}_{sensor.lidar.serial or count + 1}"
+        sensor.name = _name(sampler.table, sensor, count)
     return sensors, unknown
+
+
+def _name(table: StreamTable, sensor: Found, count: int) -> str:
+    """After the namespace of its topics if that tells a place, else maker and serial number."""
+    topic = min((table.streams[stream].topic for stream, _ in sensor.kinds), default="")
+    place = "_".join(part for part in namespace(topic) if part not in GENERIC)
+    if place and place[0].isalpha() and place.replace("_", "").isalnum():
+        return place
+    return f"{sensor.lidar.maker.lower()}_{sensor.lidar.serial or count + 1}"
 
 
 def _readable(

@@ -136,8 +136,9 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     """Look at the first 10 s of recordings, with the metadata given or found beside them."""
     table = StreamTable()
     opened = [open_recording(path, table) for path in recordings]
-    sampler = look(opened, table)
+    sampler, learner = look(opened, table)
     calibrations, looked = calibrations_for(recordings, metadata)
+    calibrations += learner.calibrations()
     found, _ = match(sampler, calibrations, {})
     for sensor in found:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]

@@ -11,11 +11,20 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from mlbatch.errors import RecordingError
+from mlbatch.readers._knowledge import decode_bytes, decode_string, decode_transforms
 from mlbatch.readers._merge import merge
 from mlbatch.readers._source import read_head
 from mlbatch.types import Recording, StreamTable
 
-__all__ = ["Reader", "merge", "open_recording", "readers"]
+__all__ = [
+    "Reader",
+    "decode_bytes",
+    "decode_string",
+    "decode_transforms",
+    "merge",
+    "open_recording",
+    "readers",
+]
 
 _SHOWN_BYTES = 8
 

@@ -63,7 +63,12 @@ def read_calibration(path: Path) -> Calibration | None:
         raise RigError(f"{path}: cannot read the calibration file: {err.strerror}") from err
     if len(content) > MAX_CALIBRATION_BYTES:
         return None
-    found = (plugin.read_calibration(path, content) for plugin in plugins())
+    return parse_calibration(path, content)
+
+
+def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
+    """The calibration in a text from a file or a topic (`origin`), or None if it is none."""
+    found = (plugin.read_calibration(origin, content) for plugin in plugins())
     return next((calibration for calibration in found if calibration is not None), None)
 
 

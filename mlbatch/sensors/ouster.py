@@ -157,6 +157,7 @@ class OusterLidar:
         self.strongest_first = self.returns == 2 and described.strongest_first
         self.beams = beam_table(described)
         self.extrinsics = described.extrinsics
+        self.sensor_from_lidar: F64Array | None = described.lidar_to_sensor
         self.timestamp_mode = described.timestamp_mode
         self.calibration = str(described.path)
         self.notes = described.notes

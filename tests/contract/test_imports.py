@@ -14,6 +14,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("assembly",),),
     (("feeding",), ("job",)),
     (("inertial",), ("discover",)),
+    (("learning",), ("mounting",)),
     (
         ("readers",),
         ("sensors",),

@@ -48,7 +48,7 @@ def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
     host_ns = np.concatenate([batch.host_ns for batch in first_seconds(recordings)])
     assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
     # 32 packets a turn of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
-    sampler = look(recordings, table)
+    sampler, _ = look(recordings, table)
     assert list(sampler.packets.values()) == [60 * 32, 50 * 32 + 1]
 
 
@@ -135,7 +135,7 @@ def test_unknown_packets_are_described(tmp_path: Path) -> None:
     one = Unit()
     capture = write_session(tmp_path, one, more=one.imu_records(2), metadata=False)
     table = StreamTable()
-    sampler = look([open_recording(capture, table)], table)
+    sampler, _ = look([open_recording(capture, table)], table)
     words = {size: describe(sampler, (stream, size)) for stream, size in sampler.samples}
     assert words == {
         1280: "Ouster lidar, serial 111, 1280 bytes: needs its metadata",

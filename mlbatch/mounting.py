@@ -1,0 +1,91 @@
+"""Where the sensors of a session sit on their body, by all that is known."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mlbatch.frames import candidates
+from mlbatch.knowledge import Knowledge, Mounting
+from mlbatch.rig import Rig, RigSensor
+from mlbatch.streams import Found
+from mlbatch.types import F64Array, StreamTable
+
+
+@dataclass(slots=True)
+class Mounted:
+    """A sensor with its place on the body and its wishes from the rig (or their defaults).
+
+    chain: frames walked from body to sensor, "" where none was.
+    """
+
+    found: Found
+    body_from_sensor: F64Array
+    extrinsics_source: str
+    rig: RigSensor | None = None
+    chain: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name in all outputs."""
+        return self.found.name
+
+
+def mount(
+    table: StreamTable,
+    found: Sequence[Found],
+    rigged: Sequence[RigSensor | None],
+    rig: Rig | None,
+    knowledge: Knowledge,
+    *,
+    identity_extrinsics: bool,
+) -> tuple[list[Mounted], Mounting]:
+    """Place all sensors; RigError where two or more should be, and some have no extrinsics.
+
+    rigged: what the rig says of each sensor, None without a rig.
+    """
+    makers = Counter(sensor.lidar.maker for sensor in found)
+    frames = {
+        sensor.name: candidates(
+            sensor.lidar.maker,
+            _places(table, sensor),
+            alone=makers[sensor.lidar.maker] == 1,
+            sensor_from_lidar=sensor.lidar.sensor_from_lidar,
+        )
+        for sensor in found
+    }
+    named = dict(zip((sensor.name for sensor in found), rigged, strict=True))
+    mounting = knowledge.mount(
+        frames,
+        {
+            name: entry.extrinsics
+            for name, entry in named.items()
+            if entry is not None and entry.extrinsics is not None
+        },
+        {
+            sensor.name: sensor.lidar.extrinsics
+            for sensor in found
+            if sensor.lidar.extrinsics is not None
+        },
+        None if rig is None else rig.body_frame,
+        identity_extrinsics=identity_extrinsics,
+    )
+    mounts = mounting.mounts
+    mounted = [
+        Mounted(
+            sensor,
+            mounts[sensor.name].body_from_sensor,
+            mounts[sensor.name].source,
+            named[sensor.name],
+            mounts[sensor.name].chain,
+        )
+        for sensor in found
+    ]
+    return mounted, mounting
+
+
+def _places(table: StreamTable, sensor: Found) -> list[str]:
+    """Words for where a sensor sits: the topics of its packets, else its name."""
+    topics = sorted({table.streams[stream].topic for stream, _ in sensor.kinds} - {""})
+    return topics or [sensor.name]
