@@ -110,9 +110,10 @@ class FrameTree:
     def add(self, edge: Edge) -> None:
         """Add an edge; RigError if it is none."""
         if not edge.parent or not edge.child or edge.parent == edge.child:
+            got = "an empty name" if edge.parent != edge.child else "the same twice"
             raise RigError(
                 f"{edge.source}: transform {edge.parent!r} -> {edge.child!r}: wanted two frames, "
-                f"got {'one and the same' if edge.parent else 'an empty name'}; {_REMEDY}"
+                f"got {got}; {_REMEDY}"
             )
         self._above.setdefault(edge.child, {})[edge.parent] = edge
         self._frames.update(dict.fromkeys((edge.parent, edge.child)))
@@ -170,10 +171,10 @@ class FrameTree:
             (edge,) = parents.values()
             first = place.get(edge.parent)
             if first is not None:
-                circle = [edge.parent, *(one.child for one in reversed(edges[first:]))]
+                down = [one.child for one in reversed([*edges[first:], edge])]
                 text = (
                     f"{edge.source}: wanted frames that form a tree, got the circle "
-                    f"{' -> '.join([*circle, edge.parent])}; {_REMEDY}"
+                    f"{' -> '.join([edge.parent, *down])}; {_REMEDY}"
                 )
                 # Whatever hangs on the circle is still well placed relative to where it hangs.
                 return _Climb(list(place)[: first + 1], edges[:first], text)

@@ -192,7 +192,7 @@ class Knowledge:
             mounts[name] = options[0] if options else Mount(np.eye(4), "identity")
             if options:
                 others = [*options[1:], *_other_words(name, search, trees)]
-                findings += _contradictions(name, options[0], others)
+                findings += dict.fromkeys(_contradictions(name, options[0], others))
                 findings += self._constants(name, search, options[0])
             if name in search.reasons and mounts[name].source != "rig":
                 findings.append(Finding("extrinsics_frame", name, search.reasons[name]))
