@@ -139,7 +139,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
-    router = Router(table, chosen, has_rig=rig is not None)
+    router = Router(table, chosen, sampler.samples)
     mounted, mounting = mount(
         table,
         chosen,

@@ -66,9 +66,7 @@ class Feeder:
                 packets.read += len(index)
                 packets.reject("bad_size", len(index))
             else:
-                if kind not in self.samples:
-                    self.samples[kind] = batch.data[begin : begin + kind[1]][None].copy()
-                self._unassign(kind, len(index))
+                self._unassign(kind, batch, index)
         for number, parts in enumerate(own):
             if parts:
                 index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
@@ -76,12 +74,16 @@ class Feeder:
                     number, batch, index, owned, oldest_places[number]
                 )
         for kind, index in shared:
-            self._unassign(kind, len(index) - int(np.count_nonzero(owned[index])))
+            self._unassign(kind, batch, index[~owned[index]])
         return fed
 
-    def _unassign(self, kind: Kind, count: int) -> None:
-        if count:
-            self.unassigned[kind] = self.unassigned.get(kind, 0) + count
+    def _unassign(self, kind: Kind, batch: PacketBatch, index: I64Array) -> None:
+        if not len(index):
+            return
+        self.unassigned[kind] = self.unassigned.get(kind, 0) + len(index)
+        if kind not in self.samples:
+            begin = int(batch.start[index[0]])
+            self.samples[kind] = batch.data[begin : begin + kind[1]][None].copy()
 
     def _arrive(
         self,

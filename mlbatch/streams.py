@@ -8,7 +8,7 @@ prove to be its own.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -107,12 +107,15 @@ def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
 
 
 class Router:
-    """Tells for every kind which sensors it may come from; remembers the answer."""
+    """Tells for every kind which sensors it may come from; remembers the answer.
 
-    def __init__(self, table: StreamTable, found: Sequence[Found], *, has_rig: bool) -> None:
+    early: the kinds from which the sensors were found.
+    """
+
+    def __init__(self, table: StreamTable, found: Sequence[Found], early: Collection[Kind]) -> None:
         self._table = table
         self._found = list(found)
-        self._has_rig = has_rig
+        self._early = frozenset(early)
         self._routes: dict[Kind, Route] = {}
 
     def route(self, kind: Kind, payload: U8Array) -> Route:
@@ -147,10 +150,12 @@ class Router:
             return False
         # A stream that was not there at the start joins only by the serial number it carries,
         # or because the rig says where the sensor sends from.
+        if sensor.selector == StreamSelector() and not sensor.lidar.carries_serial:
+            return False
+        # One packet, which may be damaged, must not speak for all of a stream that begins late:
+        # each of its packets is looked at.
         size = sensor.lidar.packet_size
-        owns = bool(sensor.lidar.owns(payload[None, :size])[0])
-        named = sensor.selector != StreamSelector()
-        return owns and (named or sensor.lidar.carries_serial)
+        return kind not in self._early or bool(sensor.lidar.owns(payload[None, :size])[0])
 
     def _imu_owner(self, stream: Stream, size: int) -> int | None:
         """The sensor whose IMU this is: same source, and, among twins, the port it announces."""

@@ -144,7 +144,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]
         sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
     counts = _count(opened, found)
-    router = Router(table, found, has_rig=False)
+    router = Router(table, found, sampler.samples)
     reports = tuple(_report(sampler, kind, found, counts, router) for kind in sampler.samples)
     notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
     if not sampler.samples:

@@ -193,6 +193,23 @@ def test_a_pause_of_the_recorder_does_not_matter(size: int, wanted: Wanted, tmp_
     wanted.check([path], tmp_path, size)
 
 
+@pytest.mark.parametrize("size", [9_000, LARGE])
+def test_a_damaged_first_packet_does_not_silence_a_late_lidar(size: int, tmp_path: Path) -> None:
+    """A lidar that is switched on after the 10 s in which sensors are looked for."""
+    sent = list(datagrams(LENGTH_NS))
+    early = next(one for one in sent if one.source == LEFT.ip and one.port == 7502)
+    late = [number for number, one in enumerate(sent) if (one.source, one.port) == (RIGHT.ip, 7502)]
+    payload = bytearray(sent[late[0]].payload)
+    payload[7] ^= 1  # in the serial number, facts/ouster.md section 2
+    sent[late[0]] = replace(sent[late[0]], payload=bytes(payload))
+    records = [replace(early, host_ns=START_NS - 15 * 10**9).frame()]
+    path = tmp_path / "recording.pcap"
+    path.write_bytes(pcap_bytes([*records, *(one.frame() for one in sent)]))
+    with buffers_of(size):
+        report = in_memory(replace(FIXTURE, recordings=(path,), host_clock=True)).report
+    assert report.sensors[1].ledger.packets.read == len(late) - 1
+
+
 @pytest.mark.parametrize("step", [1, -1])
 def test_the_report_names_streams_in_one_order(step: int, tmp_path: Path) -> None:
     """Two files, each with packets of a stranger."""
