@@ -87,7 +87,7 @@ def _material(package: str, name: str) -> bool:
     builders, fixtures = ROOT / "tests" / "builders", ROOT / "fixtures"
     if package == "writers":  # Their input is a Scan, made by one builder for all.
         return (ROOT / "tests" / "unit" / "writers" / "scans.py").is_file()
-    if package == "readers" and f"def write_{name}(" in _text(builders / "captures.py"):
+    if any(f"def write_{name}(" in _text(path) for path in builders.glob("*.py")):
         return True
     return (builders / f"{name}.py").is_file() or (fixtures / name / "SOURCE.md").is_file()
 

@@ -17,6 +17,7 @@ from mlbatch import ledger
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
 from mlbatch.pipeline import convert
+from mlbatch.readers import readers
 from mlbatch.report import build_report
 from mlbatch.rig import read_rig
 from mlbatch.sensors import models
@@ -148,6 +149,11 @@ def test_layouts_are_described(name: str) -> None:
 def test_formats_are_described() -> None:
     titles = re.findall(r"^## (\w+)", _page("formats.md"), re.MULTILINE)
     assert {title.lower() for title in titles} >= set(formats())
+
+
+def test_every_container_is_named() -> None:
+    for reader in readers():
+        assert reader.CONTAINER in README
 
 
 def _first_cells(page: str) -> set[str]:
