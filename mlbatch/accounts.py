@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 from mlbatch import discover, sensors
 from mlbatch.discover import Note
-from mlbatch.ledger import PointCounts
+from mlbatch.ledger import PointCounts, ordered
+from mlbatch.passing import PASS_REASONS
 from mlbatch.rate import rate_text
 from mlbatch.report import (
     ClockReport,
     InputReport,
+    Passed,
     ReportInputs,
     SensorReport,
     Timing,
@@ -47,6 +49,10 @@ def report_inputs(run: Conversion) -> ReportInputs:
         scans=_NO_SCANS if table is None else table.statistics(run.batcher.empty),
         unassigned=_unassigned(run),
         timing=_timing(run),
+        messages=tuple(
+            Passed(topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS))
+            for topic, counts in sorted(run.passed.counts.items())
+        ),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 

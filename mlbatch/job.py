@@ -20,7 +20,7 @@ class Job:
     """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
 
     rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
-    those of EXTRAS that the output has a place for.
+    those of EXTRAS that the output has a place for; passed: patterns of topics to pass through.
     """
 
     recordings: tuple[Path, ...]
@@ -40,4 +40,5 @@ class Job:
     max_range_m: float = float("inf")
     boxes_m: tuple[tuple[float, ...], ...] = ()
     strict: bool = False
+    passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS

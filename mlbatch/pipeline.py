@@ -22,12 +22,13 @@ from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
 from mlbatch.mounting import Mounted
+from mlbatch.passing import PassQueue
 from mlbatch.readers import merge, open_recording
 from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
     IMU,
-    ImuSamples,
+    MESSAGES,
     PacketBatch,
     Recording,
     RunInfo,
@@ -92,6 +93,13 @@ class Conversion:
             [self._offset_ns(sensor) for sensor in self.setup.sensors],
             wanted=IMU in job.extras,
         )
+        self.passed = PassQueue(job.passed, wanted=MESSAGES in job.extras)
+        unknown = self.passed.missing(self.recordings)
+        if unknown:
+            raise UsageError(
+                f"--pass {unknown[0]}: wanted a topic of the recording, got none that matches; "
+                "see `mlbatch inspect`"
+            )
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
 
@@ -100,6 +108,7 @@ class Conversion:
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with split, the sensor it is of; arrays live until the next."""
         size = sum(recording.size_bytes for recording in self.recordings)
+        self.passed.keep(self.recordings)
         batches = merge(self.recordings)
         while (batch := self._read(batches)) is not None:
             yield from self._windows(self._push(batch))
@@ -126,6 +135,7 @@ class Conversion:
             fed = self.feeder.feed(batch, places)
             for samples in fed.imu:
                 self._imu.add(samples)
+            self.passed.add(batch.messages)
             if self.job.strict:
                 self._refuse_rejected()
         return self.batcher.push(fed.arrivals, batch.host_ns)
@@ -228,9 +238,24 @@ class Conversion:
             return timescale(host_ns, host_ns)
         return timescale(stamp_ns, host_ns)
 
-    def imu_until(self, end_ns: int | None) -> list[ImuSamples]:
-        """Take IMU samples before `end_ns` (None: all), by stamp, then sensor."""
-        return self._imu.take(end_ns, self.batcher.limits_ns)
+    def hand_over(self, writer: ScanWriter | None, end_ns: int | None) -> None:
+        """Write what goes past the batching and is older than `end_ns` (None: all)."""
+        limits_ns = self.batcher.limits_ns
+        for samples in self._imu.take(end_ns, limits_ns):
+            if writer is not None:
+                writer.write_imu(samples)
+        for message in self.passed.take(end_ns, limits_ns, self._clock_offset_ns()):
+            if writer is not None:
+                writer.write_message(message)
+
+    def _clock_offset_ns(self) -> int | None:
+        """Scan clock minus arrival; None where scans are not on an epoch clock."""
+        if self.info is None or self.info.timescale not in ("utc", "tai"):
+            return None
+        if self.job.host_clock:
+            return 0
+        offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
+        return next(offsets, None)
 
     # -- the end ------------------------------------------------------------------------------
 
@@ -274,6 +299,13 @@ class Conversion:
                     f"sensor {sensor.name}: {count} packet(s) rejected as {reason} while --strict "
                     "was given; leave it out to count them and go on"
                 )
+
+    def tell_of_passed(self) -> None:
+        """Warn of IMU messages that are on another clock than the scans."""
+        for topic, counts in self.passed.counts.items():
+            if other := counts.dropped.get("other_clock"):
+                text = f"{topic}: {other} message(s) dropped: their clock is not that of the scans"
+                self.warn(Note("imu_clock", "", text))
 
     def warn(self, note: Note) -> None:
         """Note a warning; with --strict it is an error."""
@@ -319,20 +351,16 @@ def convert(
     writer: ScanWriter | None = None
     try:
         for scan, only in run.scans(progress):
-            if open_writer is None:
-                run.imu_until(scan.end_ns)
-                continue
             began_s = time.perf_counter()
-            if writer is None:
+            if writer is None and open_writer is not None:
                 writer = open_writer(scan.info)
-            for samples in run.imu_until(scan.end_ns):
-                writer.write_imu(samples)
-            writer.write(scan, only)
+            run.hand_over(writer, scan.end_ns)
+            if writer is not None:
+                writer.write(scan, only)
             run.stages.write_s += time.perf_counter() - began_s
         began_s = time.perf_counter()
-        for samples in run.imu_until(None):
-            if writer is not None:
-                writer.write_imu(samples)
+        run.hand_over(writer, None)
+        run.tell_of_passed()
         inputs = accounts.report_inputs(run)
         broken = imbalances(inputs)
         if broken:

@@ -137,6 +137,8 @@ class Projector:
             np.add(moved, origin, out=part.point[:, slots, :3].transpose(0, 2, 1))
             if lidar.returns > 1:
                 part.range_m[:, slots] = range_m
+        if not lidar.has_reflectivity:
+            part.reflectivity[:] = 0
         part.label.view(np.uint32)[:] = self._label.view(np.uint32)
         if lidar.returns == 2 and lidar.strongest_first:
             self._type_returns(part.label["return_type"])

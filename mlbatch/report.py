@@ -96,6 +96,16 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
+class Passed:
+    """Messages of a topic that were to pass through: read = written + sum(dropped)."""
+
+    topic: str
+    read: int
+    written: int
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
 class Warned:
     """A warning; `sensor` is empty where it concerns the run."""
 
@@ -119,6 +129,7 @@ class ReportInputs:
     unassigned: tuple[Unassigned, ...] = ()
     timing: Timing | None = None
     warnings: tuple[Warned, ...] = ()
+    messages: tuple[Passed, ...] = ()
 
 
 def build_report(run: ReportInputs) -> Section:
@@ -142,6 +153,7 @@ def build_report(run: ReportInputs) -> Section:
         },
         "unassigned": [asdict(item) for item in run.unassigned],
         "sensors": [_sensor(sensor) for sensor in run.sensors],
+        "messages": [asdict(item) for item in run.messages],
         "scans": asdict(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
         "warnings": [asdict(item) for item in run.warnings],

@@ -227,6 +227,8 @@ class RunInfo:
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
 # Said together with EXTRAS by outputs that also hold IMU samples.
 IMU = "imu"
+# Likewise by outputs that take messages of a recording as they are.
+MESSAGES = "messages"
 
 
 @dataclass(slots=True)

@@ -20,6 +20,8 @@ class Loss:
         self._modulus = modulus
         self._newest: int | None = None
         self._doubtful: int | None = None
+        # One packet alone proves nothing: the first of all may be the damaged one.
+        self._is_sure = False
 
     def add(self, sequence: I64Array) -> None:
         """Count accepted packets (n,), in order of arrival; negative: outside the count."""
@@ -32,7 +34,7 @@ class Loss:
         steps = np.diff(sequence, prepend=self._newest) % self._modulus
         if self._doubtful is None and bool((steps == 1).all()):
             if len(sequence):
-                self._newest = int(sequence[-1])
+                self._newest, self._is_sure = int(sequence[-1]), True
             return
         for number in sequence.tolist():
             self._step(number)
@@ -44,11 +46,11 @@ class Loss:
                 self._doubtful = number
                 return
             # A restart counts anew; a long gap is a gap.
-            if step > 0:
+            if step > 0 and self._is_sure:
                 self.lost += step - 2
-            self._newest, self._doubtful = number, None
+            self._newest, self._doubtful, self._is_sure = number, None, True
             return
-        self._doubtful = None
+        self._doubtful, self._is_sure = None, True
         if step > 0:
             self.lost += step - 1
             self._newest = number

@@ -77,6 +77,10 @@ def convert(
     ignore: Annotated[
         list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
     ] = None,
+    pass_: Annotated[
+        list[str] | None,
+        typer.Option("--pass", help="Copy this topic (or pattern) of a bag; repeatable."),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Do all but write; print the report.")
     ] = False,
@@ -137,6 +141,7 @@ def convert(
         max_range_m=max_range,
         boxes_m=tuple(values.box_m(text) for text in exclude_box or ()),
         strict=strict,
+        passed=tuple(pass_ or ()),
     )
     run(
         job,

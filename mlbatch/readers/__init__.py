@@ -1,16 +1,19 @@
 """Readers of recordings. A module here without leading underscore is a plug-in for one container.
 
-A plug-in has `CONTAINER`, `recognises(head)` and `open_packets(path, streams)`, as in `Reader`.
+A plug-in has `CONTAINER`, `recognises(head)` and `open_packets(path, streams)`, as in `Reader`;
+one for bags that are folders also `open_folder(folder, files, streams, notes)`.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 from mlbatch.errors import RecordingError
+from mlbatch.readers._folder import bag_folder
 from mlbatch.readers._knowledge import decode_bytes, decode_string, decode_transforms
 from mlbatch.readers._merge import merge
 from mlbatch.readers._source import read_head
@@ -43,6 +46,17 @@ class Reader(Protocol):
         ...
 
 
+@runtime_checkable
+class FolderReader(Reader, Protocol):
+    """A plug-in whose recordings may be folders."""
+
+    def open_folder(
+        self, folder: Path, files: Sequence[Path], streams: StreamTable, notes: Sequence[str] = ()
+    ) -> Recording:
+        """Open the files of a bag as one recording; notes: what is wrong with the folder."""
+        ...
+
+
 def readers() -> list[Reader]:
     """All plug-ins, by name."""
     names = [info.name for info in pkgutil.iter_modules(__path__) if not info.name.startswith("_")]
@@ -52,13 +66,38 @@ def readers() -> list[Reader]:
 
 def open_recording(path: Path, streams: StreamTable) -> Recording:
     """Open a recording by its content, whatever its name; streams are numbered in `streams`."""
+    if path.is_dir():
+        return _open_folder(path, streams)
+    return _reader_of(path).open_packets(path, streams)
+
+
+def _reader_of(path: Path) -> Reader:
+    """The plug-in that reads a file."""
     head = read_head(path)
     known = readers()
     for reader in known:
         if reader.recognises(head):
-            return reader.open_packets(path, streams)
+            return reader
     containers = ", ".join(reader.CONTAINER for reader in known)
     raise RecordingError(
         f"{path}: wanted a recording ({containers}; also gzip or zstd of them), got a file that "
         f"begins with {head[:_SHOWN_BYTES].hex(' ')}; check that it is the right file"
     )
+
+
+def _open_folder(path: Path, streams: StreamTable) -> Recording:
+    """Open a bag that is a folder."""
+    folder = bag_folder(path)
+    found = [_reader_of(file) for file in folder.files]
+    kinds = sorted({reader.CONTAINER for reader in found})
+    if len(kinds) > 1:
+        raise RecordingError(
+            f"{path}: wanted a folder with the files of one bag, got several kinds "
+            f"({', '.join(kinds)}); name the files of one kind"
+        )
+    if not isinstance(found[0], FolderReader):
+        raise RecordingError(
+            f"{path}: wanted the folder of a bag, got one with files of {kinds[0]}; "
+            "name the files inside it"
+        )
+    return found[0].open_folder(path, folder.files, streams, folder.notes)

@@ -13,7 +13,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("pipeline", "accounts"), ("survey",)),
     (("assembly",),),
     (("feeding",), ("job",)),
-    (("inertial",), ("discover",)),
+    (("inertial",), ("passing",), ("discover",)),
     (("learning",), ("mounting",)),
     (
         ("readers",),

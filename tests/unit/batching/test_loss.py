@@ -99,3 +99,10 @@ def test_grouping_does_not_matter(steps: list[int], cuts: list[int], first: int)
 def test_what_is_taken_out_is_what_is_lost(gone: set[int]) -> None:
     numbers = [number for number in range(500) if number not in gone]
     assert _counted(numbers) == (len(gone), 0)
+
+
+def test_a_damaged_first_packet_is_no_gap() -> None:
+    """One flipped bit in the first number of all must not count as 262144 lost packets."""
+    loss = Loss(65536 * 64)
+    loss.add(np.array([500_000 ^ (1 << 18), 500_001, 500_002, 500_004]))
+    assert (loss.lost, loss.reordered) == (1, 0)

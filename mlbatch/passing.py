@@ -1,0 +1,123 @@
+"""Messages of a recording that go to the output as they are: IMU topics, and those of `--pass`.
+
+CONTRACT.md section 3: recorded Imu topics only if scans are on an epoch clock within 1 s of them,
+all at their own stamps; other topics byte for byte at their log time.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+
+from mlbatch.types import Message, Recording, Topic
+from mlbatch.units import NS_PER_S
+
+IMU_TYPE = "sensor_msgs/Imu"
+PASS_REASONS = ("no_place", "bad_stamp", "outside_time", "other_clock")
+# Ours says where the sensors are; a second one could contradict it.
+OWN_TOPIC = "/tf_static"
+NEAR_NS = NS_PER_S
+# Where the stamp of a message's header begins, and its two words, by encoding (facts/messages.md
+# section 1): CDR has 4 bytes of its own before it, ROS 1 a sequence number.
+_STAMP = {"cdr": struct.Struct("<4xiI"), "ros1": struct.Struct("<4xII")}
+
+
+@dataclass(slots=True)
+class PassCounts:
+    """Messages of one topic: read = written + sum(dropped); reasons as in PASS_REASONS."""
+
+    read: int = 0
+    written: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def drop(self, reason: str) -> None:
+        """Count a message that is not written."""
+        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+
+
+def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]:
+    """Names of topics to hand over: all Imu topics, and those that a pattern names."""
+    return frozenset(
+        topic.name
+        for topic in topics
+        if topic.type == IMU_TYPE or any(fnmatchcase(topic.name, p) for p in patterns)
+    ) - {OWN_TOPIC}
+
+
+class PassQueue:
+    """Holds messages until the scan of their time is out; `counts` by topic."""
+
+    def __init__(self, patterns: Sequence[str], *, wanted: bool) -> None:
+        self.counts: dict[str, PassCounts] = {}
+        self._patterns = list(patterns)
+        self._wanted = wanted
+        self._waiting: list[tuple[int, Message]] = []
+
+    def keep(self, recordings: Iterable[Recording]) -> None:
+        """Have recordings hand over what is selected."""
+        for recording in recordings:
+            recording.keep = selected(recording.topics, self._patterns)
+
+    def missing(self, recordings: Sequence[Recording]) -> list[str]:
+        """Patterns that no topic of the recordings matches."""
+        names = [topic.name for recording in recordings for topic in recording.topics]
+        return [p for p in self._patterns if not any(fnmatchcase(name, p) for name in names)]
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Take in messages, in file order."""
+        for message in messages:
+            counts = self.counts.setdefault(message.topic.name, PassCounts())
+            counts.read += 1
+            if not self._wanted:
+                counts.drop("no_place")
+                continue
+            stamp_ns = message.host_ns
+            if message.topic.type == IMU_TYPE:
+                own_ns = header_stamp_ns(message)
+                if own_ns is None:
+                    counts.drop("bad_stamp")
+                    continue
+                stamp_ns = own_ns
+            self._waiting.append((stamp_ns, message))
+
+    def take(
+        self, until_ns: int | None, limits_ns: tuple[int | None, int | None], offset_ns: int | None
+    ) -> list[Message]:
+        """Messages before `until_ns` (None: all), at the times they are written at.
+
+        offset_ns: scan clock minus arrival, None where scans are not on an epoch clock.
+        """
+        low, high = limits_ns
+        taken, later = [], []
+        for stamp_ns, message in self._waiting:
+            if until_ns is not None and stamp_ns >= until_ns:
+                later.append((stamp_ns, message))
+                continue
+            counts = self.counts[message.topic.name]
+            if (low is not None and stamp_ns < low) or (high is not None and stamp_ns >= high):
+                counts.drop("outside_time")
+            elif message.topic.type == IMU_TYPE and not _is_near(stamp_ns, message, offset_ns):
+                counts.drop("other_clock")
+            else:
+                counts.written += 1
+                taken.append(replace(message, host_ns=stamp_ns))
+        self._waiting = later
+        return sorted(taken, key=lambda message: (message.host_ns, message.topic.name))
+
+
+def header_stamp_ns(message: Message) -> int | None:
+    """Stamp of a message that begins with a Header, ns; None if it has none that makes sense."""
+    words = _STAMP.get(message.topic.encoding)
+    if words is None or len(message.data) < words.size:
+        return None
+    seconds, nanoseconds = words.unpack_from(message.data)
+    if not (0 < seconds < 2**31 and nanoseconds < NS_PER_S):
+        return None
+    return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def _is_near(stamp_ns: int, message: Message, offset_ns: int | None) -> bool:
+    """Whether an IMU's clock is that of the scans, both seen from the recorder's."""
+    return offset_ns is not None and abs(stamp_ns - message.host_ns - offset_ns) <= NEAR_NS

@@ -1,0 +1,263 @@
+"""One SQLite file of a ROS 2 bag: its topics, and its messages page by page.
+
+Tables: facts/messages.md, section 5. The file is never written to: it is opened as immutable, so
+that bags on read-only media and bags of other users can be read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+import tempfile
+import weakref
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RecordingError
+from mlbatch.readers._bag import Portion, is_latched
+from mlbatch.readers._definitions import definition_text, type_key
+from mlbatch.readers._source import Source
+from mlbatch.types import I64Array, Topic, U8Array
+
+MAGIC = b"SQLite format 3\0"
+BUFFER_BYTES = 4 << 20
+_MAX_MESSAGE_BYTES = 512 << 20
+_ZSTD = b"\x28\xb5\x2f\xfd"
+# Reading through a mapping saves a third of the time; it is given back every few pages, since
+# what was read through it counts as memory of the process.
+_MAPPED_BYTES, _PAGES_MAPPED = 1 << 40, 8
+_BEFORE_ALL = (-(1 << 63), -(1 << 63))
+_BY_TIME = (
+    "SELECT id, topic_id, timestamp, data FROM messages WHERE timestamp >= ?1 AND "
+    "(timestamp > ?1 OR id > ?2) AND topic_id IN ({}) ORDER BY timestamp, id"
+)
+# Without an index over times, messages come in the order of recording.
+_BY_ID = (
+    "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ?2 AND topic_id IN ({}) "
+    "ORDER BY id"
+)
+
+
+@dataclass(slots=True)
+class Damage:
+    """What could not be read: a line each, and the number of messages."""
+
+    notes: list[str] = field(default_factory=list)
+    lost: int = 0
+
+    def add(self, note: str, lost: int = 1) -> None:
+        """Note something that is lost."""
+        if note not in self.notes:
+            self.notes.append(note)
+        self.lost += lost
+
+
+class Database:
+    """An opened file.
+
+    topics: by the numbers that this file gives them; first_ns: time of its first message, or None;
+    notes: what is wrong with it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self.size_bytes = path.stat().st_size
+        self._plain = self._unpacked()
+        try:
+            with contextlib.closing(self._connect()) as connection:
+                self.topics = _topics(connection)
+                self._indexed = _has_time_index(connection)
+                self.first_ns = self._first_ns(connection)
+        except sqlite3.Error as err:
+            raise RecordingError(
+                f"{path}: wanted a ROS 2 bag (tables topics and messages), got a database that "
+                f"cannot be read ({err}); record or copy it again, or try `sqlite3 .recover`"
+            ) from err
+
+    def _unpacked(self) -> Path:
+        """The file, or a temporary copy of it if it is compressed; gone with this object."""
+        with Source(self.path) as source, self.path.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                return self.path
+            folder = Path(tempfile.mkdtemp(prefix="mlbatch-"))
+            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+            target = folder / "bag.db3"
+            piece = memoryview(bytearray(BUFFER_BYTES))
+            try:
+                with target.open("wb") as out:
+                    while count := source.fill(piece):
+                        out.write(piece[:count])
+            except OSError as err:
+                raise RecordingError(
+                    f"{self.path}: wanted room to decompress it to {folder.parent}, "
+                    f"got: {err.strerror}; free some space there, or set TMPDIR to another place"
+                ) from err
+            if source.fault:
+                self.notes.append(f"{self.path.name}: {source.fault}; its end is missing")
+            return target
+
+    def _connect(self) -> sqlite3.Connection:
+        uri = self._plain.resolve().as_uri() + "?mode=ro"
+        log = self._plain.with_name(self._plain.name + "-wal")
+        if log.is_file() and log.stat().st_size:
+            # The last messages of a recorder that crashed are still in the log.
+            with contextlib.suppress(sqlite3.Error):
+                connection = sqlite3.connect(uri, uri=True)
+                connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
+                return connection
+            note = f"{log.name}: cannot be read with the bag; its last messages are missing"
+            self.notes += [note] if note not in self.notes else []
+        connection = sqlite3.connect(uri + "&immutable=1", uri=True)
+        # Without it, a file that was cut off would be refused as a whole.
+        connection.execute("PRAGMA writable_schema = ON")
+        return connection
+
+    def _first_ns(self, connection: sqlite3.Connection) -> int | None:
+        """Time of the first message, for the order of files; None if there is none."""
+        order = "timestamp" if self._indexed else "id"
+        try:
+            row = connection.execute(
+                f"SELECT timestamp FROM messages ORDER BY {order} LIMIT 1"
+            ).fetchone()
+        except sqlite3.DatabaseError:
+            # A table that is there and cannot be read shows its damage when it is read.
+            connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'messages'")
+            return None
+        return row[0] if row is not None and isinstance(row[0], int) else None
+
+    def pages(
+        self, numbers: dict[int, int], buffer: U8Array, damage: Damage
+    ) -> Generator[Portion, None, None]:
+        """Messages of the topics `numbers` (this file's number: the recording's) in `buffer`."""
+        if not numbers:
+            return
+        with contextlib.closing(self._connect()) as connection:
+            yield from _Reading(self.path.name, connection, numbers, buffer, damage).portions(
+                indexed=self._indexed
+            )
+
+
+@dataclass(slots=True)
+class _Page:
+    """Messages in the buffer so far: (begin, end, log time, topic)."""
+
+    rows: list[tuple[int, int, int, int]] = field(default_factory=list)
+    fill: int = 0
+
+    def portion(self, buffer: U8Array) -> Portion:
+        """The page as arrays."""
+        columns: I64Array = np.array(self.rows, np.int64).reshape(-1, 4)
+        begin, end, log_ns, topic = (np.ascontiguousarray(column) for column in columns.T)
+        return Portion(buffer, begin, end, log_ns, topic)
+
+
+class _Reading:
+    """One pass over a file."""
+
+    def __init__(
+        self,
+        name: str,
+        connection: sqlite3.Connection,
+        numbers: dict[int, int],
+        buffer: U8Array,
+        damage: Damage,
+    ) -> None:
+        self._name, self._connection, self._numbers = name, connection, numbers
+        self._buffer, self._damage = buffer, damage
+        self._last = _BEFORE_ALL
+        self._marks = ", ".join(str(number) for number in numbers)
+
+    def portions(self, *, indexed: bool) -> Generator[Portion, None, None]:
+        """All messages; a database that is damaged is read as far as it goes."""
+        by_id = _BY_ID.format(self._marks)
+        query, pages, go_on = _BY_TIME.format(self._marks) if indexed else by_id, 0, True
+        while go_on:
+            if pages % _PAGES_MAPPED == 0:
+                for size in (0, _MAPPED_BYTES):
+                    self._connection.execute(f"PRAGMA mmap_size = {size}").fetchall()
+            pages += 1
+            page = _Page()
+            try:
+                go_on = self._fill(query, page)
+            except sqlite3.Error as err:
+                # Where the index leads to damage, the order of recording may lead further.
+                go_on = query != by_id
+                if go_on:
+                    note = f"{self._name}: {err}; messages come in the order of recording"
+                    self._damage.add(note, lost=0)
+                    query = by_id
+                else:
+                    self._damage.add(f"{self._name}: {err}; the rest of the file was not read")
+            if page.rows:
+                yield page.portion(self._buffer)
+
+    def _fill(self, query: str, page: _Page) -> bool:
+        """Fill a page; whether there is more."""
+        numbers, rows, view = self._numbers, page.rows, self._buffer.data
+        room, fill = len(view), 0
+        with contextlib.closing(self._connection.execute(query, self._last)) as cursor:
+            for place, topic, log_ns, data in cursor:
+                if not isinstance(data, bytes) or not isinstance(log_ns, int):
+                    self._damage.add(f"{self._name}: a message without bytes or time")
+                    self._last = self._last[0], place
+                    continue
+                if data[:4] == _ZSTD:
+                    data = self._unzipped(data)
+                end = fill + len(data)
+                if end > room:
+                    if fill:
+                        return True
+                    # A single message that is larger than the buffer.
+                    self._buffer = np.zeros(2 * end, np.uint8)
+                    view, room = self._buffer.data, 2 * end
+                view[fill:end] = data
+                rows.append((fill, end, log_ns, numbers[topic]))
+                fill, self._last = end, (log_ns, place)
+        return False
+
+    def _unzipped(self, data: bytes) -> bytes:
+        """A message that was compressed by itself; nothing if it is damaged."""
+        import zstandard
+
+        try:
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE_BYTES)
+        except zstandard.ZstdError:
+            return b""
+
+
+def _topics(connection: sqlite3.Connection) -> dict[int, Topic]:
+    """Topics by number; definitions are there from schema 4 on."""
+    connection.row_factory = sqlite3.Row
+    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    definitions: dict[str, tuple[str, str]] = {}
+    if "message_definitions" in tables:
+        for row in connection.execute("SELECT * FROM message_definitions"):
+            text, kind = str(row["encoded_message_definition"] or ""), str(row["encoding"] or "")
+            definitions[type_key(str(row["topic_type"]))] = text, kind
+    found = {}
+    for row in connection.execute("SELECT * FROM topics"):
+        cells = dict(row)
+        key = type_key(str(cells["type"]))
+        text, kind = definitions.get(key, ("", ""))
+        if not text.strip():
+            text, kind = definition_text(key), "ros2msg"
+        # Early versions have no such column, and converters leave fields empty.
+        qos = str(cells.get("offered_qos_profiles") or "")
+        encoding = str(cells.get("serialization_format") or "cdr")
+        found[int(cells["id"])] = Topic(
+            str(cells["name"]), key, encoding, text, kind if text else "", qos, is_latched(qos)
+        )
+    connection.row_factory = None
+    connection.execute("SELECT id, topic_id, timestamp, data FROM messages LIMIT 0")
+    return found
+
+
+def _has_time_index(connection: sqlite3.Connection) -> bool:
+    """Whether messages can be had in the order of time without sorting them all."""
+    plan = connection.execute("EXPLAIN QUERY PLAN " + _BY_TIME.format("1"), _BEFORE_ALL)
+    return not any("TEMP B-TREE" in str(row[3]) for row in plan)

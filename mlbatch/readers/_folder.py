@@ -1,0 +1,86 @@
+"""The files of a ROS 2 bag that is a folder.
+
+Source: facts/messages.md, section 5. Files on disk win over metadata.yaml, which may be missing,
+stale or empty; what differs is noted.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from mlbatch.errors import RecordingError
+
+_BAG_FILE = re.compile(r"\.(db3|mcap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
+_METADATA = "metadata.yaml"
+_MAX_METADATA_BYTES = 64 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class BagFolder:
+    """Files of a bag in the order of their names; notes: what is wrong, a line each."""
+
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def bag_folder(folder: Path) -> BagFolder:
+    """The files of a bag; RecordingError where a folder holds none."""
+    try:
+        inside = sorted(folder.iterdir(), key=lambda path: _natural(path.name))
+        files = [path for path in inside if path.is_file() and _BAG_FILE.search(path.name)]
+    except OSError as err:
+        raise RecordingError(
+            f"{folder}: wanted the folder of a bag, could not read it ({err.strerror}); "
+            "check its access rights"
+        ) from err
+    if not files:
+        raise RecordingError(
+            f"{folder}: wanted a recording, got a folder without .db3 or .mcap files; "
+            "name the files inside it"
+        )
+    names = {path.name for path in files}
+    # A recorder that was stopped while compressing leaves both.
+    whole = [path for path in files if path.suffix in (".db3", ".mcap") or path.stem not in names]
+    filled = [path for path in whole if path.stat().st_size] or whole[:1]
+    notes = [f"{path.name}: has 0 bytes and is left out" for path in whole if path not in filled]
+    return BagFolder(tuple(filled), (*notes, *_stale(folder / _METADATA, names)))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts bag_10 behind bag_9."""
+    return [(int(digits or 0), text) for text, digits in re.findall(r"(\D*)(\d*)", name)]
+
+
+def _stale(metadata: Path, names: set[str]) -> list[str]:
+    """How metadata.yaml differs from the files that are there."""
+    if not metadata.is_file():
+        return []
+    listed = _listed(metadata)
+    if listed is None:
+        return [f"{metadata.name}: cannot be read; the files in the folder are taken"]
+    missing = [name for name in listed if name not in names and not _packed(name, names)]
+    known = {*listed, *(f"{name}.zstd" for name in listed)}
+    extra = sorted(names - known, key=_natural)
+    notes = [f"{name}: listed in {metadata.name}, but not there" for name in missing]
+    return [*notes, *(f"{name}: not listed in {metadata.name}, but read" for name in extra)]
+
+
+def _packed(name: str, names: set[str]) -> bool:
+    """Whether a listed file is there under the name that it has with or without compression."""
+    return f"{name}.zstd" in names or name.removesuffix(".zstd") in names
+
+
+def _listed(metadata: Path) -> list[str] | None:
+    """Names of files in metadata.yaml, None where it is no such file."""
+    import yaml
+
+    try:
+        if metadata.stat().st_size > _MAX_METADATA_BYTES:
+            return None
+        document = yaml.safe_load(metadata.read_bytes())
+        paths = document["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [Path(str(path)).name for path in paths]
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return None

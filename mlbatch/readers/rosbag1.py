@@ -1,0 +1,258 @@
+"""ROS 1 bags: read from front to back, with and without an index, in constant memory.
+
+Source: wiki.ros.org/Bags/Format/2.0; facts/messages.md, section 5. The order is that of the file,
+and recordings that were cut off by a crash (`.active`) read like whole ones.
+"""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+from collections.abc import Generator, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RecordingError
+from mlbatch.readers._bag import BagRecording, Portion
+from mlbatch.readers._mcap_bytes import SkippingSource, Unzipper, Window
+from mlbatch.readers._rosbag1_records import (
+    MAX_HEAD_BYTES,
+    HeadError,
+    HeadReader,
+    Op,
+    Walked,
+    connection_topic,
+    head_fields,
+    number,
+    op_of,
+    walk,
+)
+from mlbatch.readers._source import read_head
+from mlbatch.types import Recording, StreamTable, Topic, U8Array
+
+CONTAINER = "ROS 1 bag"
+
+_NAME = b"#ROSBAG V"
+_MAGIC = b"#ROSBAG V2.0\n"
+# The recorder begins a new chunk every 0.75 MB, unless it is told otherwise.
+_MAX_CHUNK_BYTES = 1 << 30
+_MAX_INDEX_BYTES = 16 << 20
+_WORD_BYTES = 4
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a ROS 1 bag, of any version."""
+    return head.startswith(_NAME)
+
+
+def open_packets(path: Path, streams: StreamTable) -> Recording:
+    """Open a bag; its payloads come from streams (topic)."""
+    head = read_head(path)
+    if not head.startswith(_MAGIC):
+        version = head[: len(_MAGIC)].split(b"\n")[0].decode("latin-1")
+        raise RecordingError(
+            f"{path}: wanted a bag of version 2.0 ({_MAGIC.decode().strip()}), got {version}; "
+            "convert it with `rosbag fix` or `rosbag reindex`"
+        )
+    with SkippingSource(path) as source:
+        size_bytes = source.size_bytes
+        topics, note = _indexed_topics(source, path)
+    standing = (note,) if note else ()
+    recording = BagRecording(path, CONTAINER, size_bytes, topics, streams, _portions, standing)
+    if note:
+        # Connections stand where their first message does, so that all have to be passed.
+        for _ in _portions(recording):
+            pass
+        recording.notes = list(standing)
+    return recording
+
+
+def _indexed_topics(source: SkippingSource, path: Path) -> tuple[tuple[Topic, ...], str]:
+    """Topics by the index at a bag's end, or none and a note that there is no index."""
+    window = Window(source)
+    window.begin = len(_MAGIC)
+    try:
+        while not len((walked := walk(window.data, window.begin, window.end)).head):
+            if _claims_too_much(window) or not window.refill():
+                return (), "the bag ends within its header"
+        fields = head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
+        place, count = number(fields, "index_pos"), number(fields, "conn_count")
+        if fields.get("encryptor"):
+            raise RecordingError(
+                f"{path}: wanted a bag that can be read, got one that is encrypted "
+                f"({fields['encryptor'].decode('latin-1')}); decrypt it with `rosbag decrypt`"
+            )
+        if not place:
+            return (), "the bag was not closed and has no index; it is read record by record"
+        index = np.frombuffer(source.look_at(place, _MAX_INDEX_BYTES), np.uint8)
+        topics = [topic for _, topic in _connections(index, walk(index, 0, len(index)))]
+    except HeadError as err:
+        return (), f"the bag's index is damaged ({err}); it is read record by record"
+    if len(topics) < count:
+        return (), "the bag's index is not whole; it is read record by record"
+    return tuple(dict.fromkeys(topics)), ""
+
+
+def _bytes(data: U8Array, begin: int, size: int) -> bytes:
+    return data[begin : begin + size].tobytes()
+
+
+def _rows(walked: Walked) -> list[tuple[int, int, int, int]]:
+    """Records as (header, its size, data, their size)."""
+    columns = (walked.head, walked.head_size, walked.data, walked.data_size)
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _connections(data: U8Array, walked: Walked) -> Iterator[tuple[int, Topic]]:
+    """The connections among records, with their numbers."""
+    for head, head_size, body, size in _rows(walked):
+        fields = head_fields(_bytes(data, head, head_size))
+        if number(fields, "op") == Op.CONNECTION:
+            yield connection_topic(fields, _bytes(data, body, size))
+
+
+def _claims_too_much(window: Window) -> str:
+    """Why the record at the front of the window cannot be one, "" if it can."""
+    data, at, end = window.data, window.begin, window.end
+    if at + _WORD_BYTES > end:
+        return ""
+    head = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little")
+    if head > MAX_HEAD_BYTES:
+        return f"wanted a header of at most {MAX_HEAD_BYTES} bytes, got {head}"
+    at += _WORD_BYTES + head
+    size = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little") if at + 4 <= end else 0
+    if size > _MAX_CHUNK_BYTES:
+        return f"wanted a record of at most {_MAX_CHUNK_BYTES} bytes, got {size}"
+    return ""
+
+
+def _portions(recording: BagRecording) -> Generator[Portion, None, None]:
+    """One pass over a bag."""
+    with SkippingSource(recording.path) as source:
+        yield from _Pass(recording, source).portions()
+
+
+class _Pass:
+    """Reads a bag from front to back; what it cannot read is noted and counted."""
+
+    def __init__(self, recording: BagRecording, source: SkippingSource) -> None:
+        self._recording, self._source = recording, source
+        self._reader = HeadReader()
+        # Topic of each connection, -1 where its messages are not asked for.
+        self._topics: dict[int, int] = {}
+
+    def portions(self) -> Generator[Portion, None, None]:
+        """All wanted messages."""
+        window = Window(self._source)
+        window.begin = len(_MAGIC)
+        window.refill()
+        while True:
+            self._recording.position_bytes = self._source.position_bytes
+            walked = walk(window.data, window.begin, window.end)
+            try:
+                yield from self._records(window.data, walked)
+            except HeadError as err:
+                self._recording.lose(f"{_at(window)}: {err}; the rest of the bag was not read")
+                return
+            window.begin = walked.next
+            fault = _claims_too_much(window)
+            if fault:
+                self._recording.lose(f"{_at(window)}: {fault}; the rest of the bag was not read")
+                return
+            if not window.refill():
+                yield from self._end(window)
+                return
+
+    def _records(self, data: U8Array, walked: Walked) -> Generator[Portion, None, None]:
+        """Records of the file's level: chunks, and messages of one that was never closed."""
+        rows = _rows(walked)
+        bare = [False] * len(rows)
+        for index, (head, head_size, body, size) in enumerate(rows):
+            raw = _bytes(data, head, head_size)
+            op = op_of(raw)
+            bare[index] = op in (Op.MESSAGE, Op.CONNECTION)
+            if op == Op.CHUNK:
+                yield from self._chunk(head_fields(raw), data, body, size)
+        if any(bare):
+            yield from self._messages(data, walked.take(np.flatnonzero(bare)))
+
+    def _chunk(
+        self, fields: dict[str, bytes], data: U8Array, begin: int, size: int, *, cut: bool = False
+    ) -> Generator[Portion, None, None]:
+        """The messages of a chunk; cut: the file ends within it, which is already counted."""
+        compression = fields.get("compression", b"none").decode("latin-1")
+        inner, first, last = data, begin, begin + size
+        if compression != "none":
+            whole = number(fields, "size")
+            inner = _unpacked(compression, data.data[begin : begin + size], whole)
+            first, last = 0, len(inner)
+            if len(inner) < whole and not cut:
+                self._recording.lose(
+                    f"a chunk ({compression}): wanted {whole} bytes, got {len(inner)}; "
+                    "the rest of the chunk was not read"
+                )
+                cut = True
+        walked = walk(inner, first, last)
+        if walked.next < last and not cut:
+            self._recording.lose(
+                f"a chunk: wanted whole records, got {last - walked.next} bytes that are none; "
+                "the rest of the chunk was not read"
+            )
+        yield from self._messages(inner, walked)
+
+    def _messages(self, data: U8Array, walked: Walked) -> Generator[Portion, None, None]:
+        """The wanted among messages; connections on the way are remembered."""
+        heads = self._reader.read(data, walked)
+        others = walked.take(np.flatnonzero(~heads.is_message))
+        for connection, topic in _connections(data, others):
+            self._connect(connection, topic)
+        rows = np.flatnonzero(heads.is_message)
+        numbers, inverse = np.unique(heads.connection[rows], return_inverse=True)
+        known = np.array([self._topics.get(at, -1) for at in numbers.tolist()], np.int64)
+        topic_of = known[inverse]
+        rows, topic_of = rows[topic_of >= 0], topic_of[topic_of >= 0]
+        if len(rows):
+            begin = walked.data[rows]
+            end = begin + walked.data_size[rows]
+            yield Portion(data, begin, end, heads.log_ns[rows], topic_of)
+
+    def _connect(self, connection: int, topic: Topic) -> None:
+        at = self._recording.number(topic)
+        self._topics[connection] = at if self._recording.wants(topic) else -1
+
+    def _end(self, window: Window) -> Generator[Portion, None, None]:
+        """What is left at the end of the file: nothing, or a part of a record."""
+        left = window.end - window.begin
+        if self._source.fault:
+            self._recording.notes.append(f"{_at(window)}: {self._source.fault}")
+        if left <= 0:
+            return
+        self._recording.lose(f"{_at(window)}: the bag ends within a record; it was cut off")
+        data, begin = window.data, window.begin
+        body = begin + _WORD_BYTES + int.from_bytes(_bytes(data, begin, _WORD_BYTES), "little")
+        size = window.end - body - _WORD_BYTES
+        if size <= 0:
+            return
+        raw = _bytes(data, begin + _WORD_BYTES, body - begin - _WORD_BYTES)
+        with contextlib.suppress(HeadError):
+            if op_of(raw) == Op.CHUNK:
+                yield from self._chunk(head_fields(raw), data, body + _WORD_BYTES, size, cut=True)
+
+
+def _at(window: Window) -> str:
+    return f"byte {window.place}"
+
+
+def _unpacked(compression: str, stored: memoryview, size: int) -> U8Array:
+    """Up to `size` bytes of a chunk; none where it is corrupt."""
+    if not size or size > _MAX_CHUNK_BYTES:
+        return np.zeros(0, np.uint8)
+    if compression == "lz4":
+        return Unzipper().unpack(compression, stored, size)
+    if compression != "bz2":
+        return np.zeros(0, np.uint8)
+    try:
+        return np.frombuffer(bz2.BZ2Decompressor().decompress(stored, size), np.uint8)
+    except (OSError, EOFError, ValueError):
+        return np.zeros(0, np.uint8)
