@@ -1,0 +1,287 @@
+"""Damaged inputs: every run balances its ledgers or ends in one clear line, and soon."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import re
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import pytest
+
+from mlbatch.discover import Wishes
+from mlbatch.errors import MlbatchError
+from mlbatch.job import Job
+from mlbatch.report import ReportInputs, build_report
+from mlbatch.types import Scan
+from tests.builders.captures import pcap_bytes
+from tests.builders.damage import (
+    NAMES,
+    damaged,
+    damaged_file,
+    damaged_frames,
+    damaged_json,
+    damaged_payloads,
+    damaged_text,
+    with_jumps,
+)
+from tests.builders.run import FIXTURE, TWO_LIDARS, Result, Values, buffers_of, in_memory, prints
+from tests.builders.traffic import Records, datagrams, frames
+from tests.builders.two_lidars import LEFT, RIGHT
+
+# Whoever converts damaged data must not be told of the arithmetic inside.
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+LENGTH_NS = 220_000_000
+LONGEST_S = 20
+BUFFERS = (9_000, 50_000)
+# Source IP in an Ethernet frame.
+SENDER = slice(26, 30)
+RIG, LIDARS = "rig.yaml", ("left.json", "right.json")
+
+JOBS = (
+    FIXTURE,
+    replace(FIXTURE, slices=3),
+    replace(FIXTURE, split=True),
+    replace(FIXTURE, layout="organized"),
+    replace(FIXTURE, host_clock=True),
+    replace(FIXTURE, keep_partial=False, max_wait_ns=20_000_000),
+    replace(FIXTURE, rate=Fraction(100, 3), max_wait_ns=None),
+    replace(
+        FIXTURE,
+        wishes=Wishes(
+            metadata=tuple(TWO_LIDARS / name for name in LIDARS),
+            identity_extrinsics=True,
+            decode={"crc": "check"},
+        ),
+        min_range_m=3.0,
+    ),
+)
+
+
+@contextlib.contextmanager
+def within(seconds: int) -> Iterator[None]:
+    """Fail instead of hanging."""
+
+    def late(_signal: int, _frame: FrameType | None) -> None:
+        raise AssertionError(f"still running after {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+Outcome = tuple[str, list[Values]]
+Damage = Callable[[random.Random, str], str]
+
+
+def outcome(job: Job, frames_given: int | None = None) -> Outcome:
+    """Convert and judge; ledgers and scans as one can compare them, or the line of the error."""
+    try:
+        with within(LONGEST_S):
+            result = in_memory(job)
+    except MlbatchError as err:
+        line = str(err)
+        assert line.strip()
+        assert "\n" not in line
+        assert "please report" not in line
+        return line, []
+    report = result.report
+    if frames_given is not None:
+        assert report.capture.frames == frames_given
+    check_ledgers(report)
+    check_output(result)
+    said = build_report(report)
+    ledgers = {key: said[key] for key in ("capture", "sensors", "scans", "unassigned")}
+    return json.dumps(ledgers), prints(result)
+
+
+def check_ledgers(report: ReportInputs) -> None:
+    """The equations of CONTRACT.md section 4, and that no datagram is forgotten."""
+    capture, unassigned = report.capture, sum(row.packets for row in report.unassigned)
+    assert capture.frames == capture.datagrams + sum(capture.skipped.values())
+    ledgers = [sensor.ledger for sensor in report.sensors]
+    own = sum(ledger.packets.read + ledger.imu_packets for ledger in ledgers)
+    assert capture.datagrams == own + unassigned
+    for ledger in ledgers:
+        packets, columns, points = ledger.packets, ledger.columns, ledger.points
+        assert packets.read == packets.accepted + sum(packets.rejected.values())
+        assert columns.decoded == columns.written + sum(columns.dropped.values())
+        kept_out = points.no_return + points.range + points.box + points.repeated
+        assert points.slots == kept_out + points.written
+        samples = ledger.imu_samples
+        assert samples.decoded == samples.written + sum(samples.dropped.values())
+        counts = (*packets.rejected.values(), *columns.dropped.values(), kept_out)
+        assert min(counts) >= 0
+
+
+def check_output(result: Result) -> None:
+    """What the ledgers call written is there, and sound."""
+    assert result.memory is not None
+    assert not result.memory.abandoned
+    ledgers = [sensor.ledger for sensor in result.report.sensors]
+    columns, points = np.zeros(len(ledgers), np.int64), np.zeros(len(ledgers), np.int64)
+    for scan in result.scans:
+        check_scan(scan)
+        columns += np.bincount(scan.column_lidar_id, minlength=len(ledgers))
+        owner = scan.lidar_id[np.isfinite(scan.range_m)] if scan.range_m is not None else None
+        assert owner is not None
+        points += np.bincount(owner, minlength=len(ledgers))
+    assert columns.tolist() == [ledger.columns.written for ledger in ledgers]
+    assert points.tolist() == [ledger.points.written for ledger in ledgers]
+    assert result.report.scans.points == points.sum()
+    assert result.report.scans.written == len({(s.index, s.slice) for s in result.scans})
+    for number, ledger in enumerate(ledgers):
+        own = [len(s.stamp_ns) for s in result.memory.imu if s.sensor == number]
+        assert sum(own) == ledger.imu_samples.written
+
+
+def check_scan(scan: Scan) -> None:
+    """Stamps in order within the window, points finite, indices in range."""
+    stamps = scan.column_stamp_ns
+    assert len(stamps)
+    assert (np.diff(stamps) >= 0).all()
+    assert scan.start_ns <= stamps[0]
+    assert stamps[-1] < scan.end_ns
+    assert scan.range_m is not None
+    valid = np.isfinite(scan.range_m)
+    assert valid.sum() == scan.points
+    assert (scan.range_m[valid] > 0).all()
+    assert (np.isfinite(scan.xyz).all(axis=-1) == valid).all()
+    if scan.column is not None:
+        assert (np.diff(scan.column.astype(np.int64)) >= 0).all()
+        assert scan.column.max(initial=0) < len(stamps)
+
+
+def both_buffers(job: Job, frames_given: int | None, size: int) -> Outcome:
+    """The outcome, which must not depend on the size of the buffers."""
+    line, values = outcome(job, frames_given)
+    with buffers_of(size):
+        other, other_values = outcome(job, frames_given)
+    assert other_values == values
+    # An error about two sensors may name either first.
+    assert _words(other) == _words(line) if not values else other == line
+    return line, values
+
+
+def _words(line: str) -> list[str]:
+    return sorted(re.findall(r"[^\s,;:()]+", line))
+
+
+def recorded(rng: random.Random, records: Records, folder: Path) -> tuple[Path, ...]:
+    """One file, or one for each sender; sometimes by a clock that jumps."""
+    if rng.random() < 0.2:
+        records = with_jumps(rng, records)
+    count = rng.choice([1, 1, 2, 3])
+    parts: list[Records] = [[] for _ in range(count)]
+    for record in records:
+        # Fragments of a datagram stay together.
+        parts[sum(record[1][SENDER]) % count].append(record)
+    paths = tuple(folder / f"{number}.pcap" for number in range(count))
+    for path, part in zip(paths, parts, strict=True):
+        path.write_bytes(pcap_bytes(part))
+    return paths
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_frames(name: str, seed: int, tmp_path: Path) -> None:
+    rng = random.Random(f"frames {name} {seed}")
+    records = damaged_frames(rng, frames(LENGTH_NS), name)
+    job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
+    both_buffers(job, len(records), rng.choice(BUFFERS))
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_payloads(name: str, seed: int, tmp_path: Path) -> None:
+    rng = random.Random(f"payloads {name} {seed}")
+    records = damaged_payloads(rng, datagrams(LENGTH_NS), name)
+    job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
+    both_buffers(job, len(records), rng.choice(BUFFERS))
+
+
+@pytest.mark.parametrize("name", ["removed", "duplicated", "truncated"])
+def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
+    rng, sent = random.Random(f"exact {name}"), datagrams(LENGTH_NS)
+    parts = damaged(rng, [one.payload for one in sent], name)
+    records = [
+        replace(one, payload=payload).frame()
+        for one, payloads in zip(sent, parts, strict=True)
+        for payload in payloads
+    ]
+    path = tmp_path / "damaged.pcap"
+    path.write_bytes(pcap_bytes(records))
+    report = in_memory(replace(FIXTURE, recordings=(path,))).report
+    for lidar, sensor in zip((LEFT, RIGHT), report.sensors, strict=True):
+        own = [
+            (len(one.payload), [len(payload) for payload in payloads])
+            for one, payloads in zip(sent, parts, strict=True)
+            if (one.source, one.port) == (lidar.ip, 7502)
+        ]
+        whole = [sizes.count(size) for size, sizes in own]
+        packets, there = sensor.ledger.packets, np.flatnonzero(whole)
+        assert packets.read == sum(len(sizes) for _, sizes in own)
+        assert packets.accepted == len(there)
+        rejected = {
+            "bad_size": packets.read - sum(whole),
+            "duplicate": sum(whole) - len(there),
+        }
+        assert packets.rejected == {reason: n for reason, n in rejected.items() if n}
+        # What is missing at the ends nobody can know.
+        assert packets.lost == there[-1] - there[0] + 1 - len(there)
+        assert len(there) < len(own) or rejected["duplicate"]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_damaged_files(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(f"file {seed}")
+    path = tmp_path / "damaged.pcap"
+    path.write_bytes(damaged_file(rng, frames(LENGTH_NS)))
+    both_buffers(replace(rng.choice(JOBS), recordings=(path,)), None, rng.choice(BUFFERS))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound recording of some packets."""
+    path = tmp_path_factory.mktemp("short") / "short.pcap"
+    path.write_bytes(pcap_bytes([one.frame() for one in datagrams(90_000_000)]))
+    return path
+
+
+def set_up(folder: Path, name: str, text: str) -> Path:
+    """Rig and metadata in a folder, one of them with another text; the rig's path."""
+    for other in (RIG, *LIDARS):
+        (folder / other).write_bytes((TWO_LIDARS / other).read_bytes())
+    (folder / name).write_text(text, encoding="utf-8", newline="")
+    return folder / RIG
+
+
+@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("kind", [damaged_text, damaged_json])
+def test_damaged_metadata(kind: Damage, seed: int, short: Path, tmp_path: Path) -> None:
+    rng = random.Random(f"metadata {kind.__name__} {seed}")
+    name = rng.choice(LIDARS)
+    rig = set_up(tmp_path, name, kind(rng, (TWO_LIDARS / name).read_text(encoding="utf-8")))
+    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
+    given = Wishes(metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True)
+    outcome(replace(FIXTURE, recordings=(short,), wishes=given))
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_damaged_rigs(seed: int, short: Path, tmp_path: Path) -> None:
+    rng = random.Random(f"rig {seed}")
+    text = (TWO_LIDARS / RIG).read_text(encoding="utf-8")
+    rig = set_up(tmp_path, RIG, damaged_text(rng, text))
+    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
