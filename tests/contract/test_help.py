@@ -31,6 +31,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--max-range": r"\bm\b",
         "--exclude-box": r"x0,y0,z0,x1,y1,z1, m, body frame.*repeatable",
         "--keep-repeated": "second",
+        "--pass": "topic",
         "--metadata": "repeatable",
         "--identity-extrinsics": "without extrinsics",
         "--decode": "KEY=VALUE.*repeatable",

@@ -168,7 +168,7 @@ def test_report_has_the_contract_s_form() -> None:
     report = json.loads(report_text(run()))
     assert list(report) == [
         *("schema", "version", "inputs", "timescale", "grid", "capture", "unassigned"),
-        *("sensors", "scans", "timing", "warnings"),
+        *("sensors", "messages", "scans", "timing", "warnings"),
     ]
     assert report["schema"] == "mlbatch.report/1"
     assert report["inputs"] == [{"path": "/data/a.pcap", "bytes": 1000, "container": "pcap"}]
