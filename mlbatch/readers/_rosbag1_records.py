@@ -7,6 +7,7 @@ Source: wiki.ros.org/Bags/Format/2.0; facts/messages.md, section 5. A record is 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -109,6 +110,20 @@ class Walked:
         """The records at `index`."""
         head, head_size = self.head[index], self.head_size[index]
         return Walked(head, head_size, self.data[index], self.data_size[index], self.next)
+
+
+def joined(parts: Sequence[Walked]) -> Walked:
+    """Records of several stretches of one array."""
+    if len(parts) == 1:
+        return parts[0]
+    none = np.zeros(0, np.int64)
+    return Walked(
+        np.concatenate([none, *(part.head for part in parts)]),
+        np.concatenate([none, *(part.head_size for part in parts)]),
+        np.concatenate([none, *(part.data for part in parts)]),
+        np.concatenate([none, *(part.data_size for part in parts)]),
+        parts[-1].next if parts else 0,
+    )
 
 
 def walk(data: U8Array, begin: int, end: int) -> Walked:

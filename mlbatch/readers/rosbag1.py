@@ -24,12 +24,13 @@ from mlbatch.readers._rosbag1_records import (
     Walked,
     connection_topic,
     head_fields,
+    joined,
     number,
     op_of,
     walk,
 )
 from mlbatch.readers._source import read_head
-from mlbatch.types import Recording, StreamTable, Topic, U8Array
+from mlbatch.types import I64Array, Recording, StreamTable, Topic, U8Array
 
 CONTAINER = "ROS 1 bag"
 
@@ -39,6 +40,7 @@ _MAGIC = b"#ROSBAG V2.0\n"
 _MAX_CHUNK_BYTES = 1 << 30
 _MAX_INDEX_BYTES = 16 << 20
 _WORD_BYTES = 4
+_PLAIN = "none"
 
 
 def recognises(head: bytes) -> bool:
@@ -141,6 +143,7 @@ class _Pass:
         self._reader = HeadReader()
         # Topic of each connection, -1 where its messages are not asked for.
         self._topics: dict[int, int] = {}
+        self._cut = False
 
     def portions(self) -> Generator[Portion, None, None]:
         """All wanted messages."""
@@ -166,47 +169,65 @@ class _Pass:
 
     def _records(self, data: U8Array, walked: Walked) -> Generator[Portion, None, None]:
         """Records of the file's level: chunks, and messages of one that was never closed."""
-        rows = _rows(walked)
-        bare = [False] * len(rows)
-        for index, (head, head_size, body, size) in enumerate(rows):
+        plain: list[Walked] = []
+        bare: list[int] = []
+        for index, (head, head_size, body, size) in enumerate(_rows(walked)):
             raw = _bytes(data, head, head_size)
             op = op_of(raw)
-            bare[index] = op in (Op.MESSAGE, Op.CONNECTION)
-            if op == Op.CHUNK:
-                yield from self._chunk(head_fields(raw), data, body, size)
-        if any(bare):
-            yield from self._messages(data, walked.take(np.flatnonzero(bare)))
+            if op in (Op.MESSAGE, Op.CONNECTION):
+                bare.append(index)
+            elif op == Op.CHUNK:
+                fields = head_fields(raw)
+                if _compression(fields) == _PLAIN:
+                    # Messages of chunks that lie in one buffer are dealt with together.
+                    plain.append(self._inside(data, body, body + size))
+                    continue
+                yield from self._messages(data, plain)
+                plain = []
+                unpacked = self._unpack(fields, data.data[body : body + size])
+                yield from self._messages(unpacked, [self._inside(unpacked, 0, len(unpacked))])
+        plain.append(walked.take(np.array(bare, np.int64)))
+        yield from self._messages(data, plain)
 
-    def _chunk(
-        self, fields: dict[str, bytes], data: U8Array, begin: int, size: int, *, cut: bool = False
-    ) -> Generator[Portion, None, None]:
-        """The messages of a chunk; cut: the file ends within it, which is already counted."""
-        compression = fields.get("compression", b"none").decode("latin-1")
-        inner, first, last = data, begin, begin + size
-        if compression != "none":
-            whole = number(fields, "size")
-            inner = _unpacked(compression, data.data[begin : begin + size], whole)
-            first, last = 0, len(inner)
-            if len(inner) < whole and not cut:
-                self._recording.lose(
-                    f"a chunk ({compression}): wanted {whole} bytes, got {len(inner)}; "
-                    "the rest of the chunk was not read"
-                )
-                cut = True
-        walked = walk(inner, first, last)
-        if walked.next < last and not cut:
+    def _inside(self, data: U8Array, begin: int, end: int) -> Walked:
+        """The records of a chunk."""
+        walked = walk(data, begin, end)
+        if walked.next < end and not self._cut:
             self._recording.lose(
-                f"a chunk: wanted whole records, got {last - walked.next} bytes that are none; "
+                f"a chunk: wanted whole records, got {end - walked.next} bytes that are none; "
                 "the rest of the chunk was not read"
             )
-        yield from self._messages(inner, walked)
+        return walked
 
-    def _messages(self, data: U8Array, walked: Walked) -> Generator[Portion, None, None]:
+    def _unpack(self, fields: dict[str, bytes], stored: memoryview) -> U8Array:
+        """The bytes of a compressed chunk, as far as they can be had."""
+        compression, whole = _compression(fields), number(fields, "size")
+        found = _unpacked(compression, stored, whole)
+        if len(found) < whole and not self._cut:
+            self._recording.lose(
+                f"a chunk ({compression}): wanted {whole} bytes, got {len(found)}; "
+                "the rest of the chunk was not read"
+            )
+            return found[: walk(found, 0, len(found)).next]
+        return found
+
+    def _messages(self, data: U8Array, parts: list[Walked]) -> Generator[Portion, None, None]:
         """The wanted among messages; connections on the way are remembered."""
-        heads = self._reader.read(data, walked)
-        others = walked.take(np.flatnonzero(~heads.is_message))
-        for connection, topic in _connections(data, others):
-            self._connect(connection, topic)
+        walked = joined(parts)
+        if not len(walked.head):
+            return
+        try:
+            heads = self._reader.read(data, walked)
+            others = walked.take(np.flatnonzero(~heads.is_message))
+            for connection, topic in _connections(data, others):
+                self._connect(connection, topic)
+        except HeadError as err:
+            if len(parts) == 1:
+                self._recording.lose(f"a chunk: {err}; it was not read")
+                return
+            for part in parts:
+                yield from self._messages(data, [part])
+            return
         rows = np.flatnonzero(heads.is_message)
         numbers, inverse = np.unique(heads.connection[rows], return_inverse=True)
         known = np.array([self._topics.get(at, -1) for at in numbers.tolist()], np.int64)
@@ -229,15 +250,23 @@ class _Pass:
         if left <= 0:
             return
         self._recording.lose(f"{_at(window)}: the bag ends within a record; it was cut off")
-        data, begin = window.data, window.begin
-        body = begin + _WORD_BYTES + int.from_bytes(_bytes(data, begin, _WORD_BYTES), "little")
-        size = window.end - body - _WORD_BYTES
-        if size <= 0:
-            return
-        raw = _bytes(data, begin + _WORD_BYTES, body - begin - _WORD_BYTES)
+        head = window.begin + _WORD_BYTES
+        body = head + int.from_bytes(_bytes(window.data, window.begin, _WORD_BYTES), "little")
+        # What is there of a chunk is read like a whole one; that it was cut off is counted.
+        self._cut = True
+        data = body + _WORD_BYTES
+        record = Walked(_one(head), _one(body - head), _one(data), _one(window.end - data), 0)
         with contextlib.suppress(HeadError):
-            if op_of(raw) == Op.CHUNK:
-                yield from self._chunk(head_fields(raw), data, body + _WORD_BYTES, size, cut=True)
+            if window.end > data:
+                yield from self._records(window.data, record)
+
+
+def _one(value: int) -> I64Array:
+    return np.array([value], np.int64)
+
+
+def _compression(fields: dict[str, bytes]) -> str:
+    return fields.get("compression", b"").decode("latin-1") or _PLAIN
 
 
 def _at(window: Window) -> str:
