@@ -40,10 +40,8 @@ __all__ = [
 
 DEFAULT_FORMAT = "npz"
 # Announced in the contract; named here so that asking for one gets a straight answer.
-LATER_FORMATS = ("rosbag2", "rosbag1", "pcd", "las", "kitti")
+LATER_FORMATS = ("pcd", "las", "kitti")
 LATER_SUFFIXES = {
-    ".bag": "rosbag1",
-    ".db3": "rosbag2",
     ".pcd": "pcd",
     ".las": "las",
     ".laz": "las",
@@ -79,6 +77,11 @@ def choose_format(target: Path, asked: str | None) -> str:
         raise UsageError(
             f"-o {target}: wanted a folder for --format {asked}, got the name of a {found} file; "
             f"leave out {suffix} or the option"
+        )
+    if found is not None and found != asked:
+        raise UsageError(
+            f"-o {target}: wanted the name of a {plugin(asked).SUFFIX} file for --format {asked}, "
+            f"got that of a {found} file; change {suffix} or leave out the option"
         )
     return plugin(asked).FORMAT
 
@@ -132,8 +135,13 @@ def _refuse_file_name(target: Path, suffix: str) -> None:
             f"-o {target}: wanted a folder, since {name} output is a file a scan, got a file "
             f"name; give -o {target.with_suffix('')} --format {name}"
         )
+    if suffix == ".db3":
+        raise UsageError(
+            f"-o {target}: wanted a folder, since rosbag2 output is a folder with an MCAP file, "
+            f"got a file name; give -o {target.with_suffix('')} --format rosbag2"
+        )
     if suffix in LATER_SUFFIXES:
         raise UsageError(
-            f"-o {target}: wanted a .mcap file or a folder, got {suffix} "
+            f"-o {target}: wanted a .mcap file, a .bag file or a folder, got {suffix} "
             f"({LATER_SUFFIXES[suffix]}, not in this version); choose another output"
         )

@@ -23,6 +23,8 @@ SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
 # What a run writes into a folder; a folder with anything else is never replaced.
 _OWN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(npz|ply)|scans\.csv|report\.json")
+# The same of a ROS 2 bag. Recorders write such files, too: only a table of scans makes them ours.
+_OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
 _ADVICE = {
     errno.ENOSPC: "free space on this disk or choose another output",
     errno.EDQUOT: "free space in your quota or choose another output",
@@ -151,7 +153,10 @@ def _check_replaceable(target: Path, overwrite: bool, folder: bool) -> None:
 
 def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
     """Entries of a folder that no run wrote; `deep`: folders of single sensors are allowed."""
+    has_scans = (folder / SCANS_CSV).is_file()
     for entry in folder.iterdir():
+        if has_scans and _OWN_BAG_FILE.fullmatch(entry.name):
+            continue
         if deep and entry.is_dir() and not entry.is_symlink():
             yield from _strangers(entry, deep=False)
         elif not _OWN_FILE.fullmatch(entry.name):

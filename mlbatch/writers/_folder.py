@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 from mlbatch.errors import UsageError
-from mlbatch.types import ImuSamples, RunInfo, Scan, Summary
+from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
 from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, WriterOptions
 
@@ -47,6 +47,9 @@ class FolderWriter:
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Files of scans have no place for IMU samples."""
+
+    def write_message(self, message: Message) -> None:
+        """Files of scans have no place for messages."""
 
     def finish(self, summary: Summary) -> None:
         """Add scans.csv and give the folder its final name."""

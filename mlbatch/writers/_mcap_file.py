@@ -32,7 +32,8 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
-from mlbatch.writers._ros2_types import definition, qos
+from mlbatch.types import Message, Topic
+from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
 
 CHUNK_BYTES = 4 * 2**20
 # Messages of this size end the chunk they are in; smaller ones are collected.
@@ -54,8 +55,9 @@ class Container:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._at = 0
-        self._schemas: dict[str, Schema] = {}
+        self._schemas: dict[tuple[str, str, str], Schema] = {}
         self._channels: dict[str, Channel] = {}
+        self._foreign: dict[Topic, Channel] = {}
         self._sent: dict[int, int] = {}
         self._span_ns = (0, 0)
         self._chunk = bytearray()
@@ -71,6 +73,9 @@ class Container:
     ) -> None:
         """Append a message of type `kind`; a topic is made at its first message."""
         channel = self._channels.get(topic) or self._open_topic(topic, kind, latched)
+        self._append(channel, log_ns, message)
+
+    def _append(self, channel: Channel, log_ns: int, message: bytes | memoryview) -> None:
         index = self._chunk_index.setdefault(channel.id, MessageIndex(channel.id, []))
         index.records.append((log_ns, len(self._chunk)))
         length = _MESSAGE.size - _RECORD_HEAD + len(message)
@@ -83,6 +88,22 @@ class Container:
         self._chunk += message
         if len(self._chunk) >= CHUNK_BYTES:
             self._end_chunk(b"")
+
+    def forward(self, message: Message) -> None:
+        """Append a message as it was recorded, on its own topic with its own definition."""
+        channel = self._foreign.get(message.topic) or self._open_foreign(message.topic)
+        self._append(channel, message.host_ns, message.data)
+
+    def contents(self) -> list[tuple[Channel, str, int]]:
+        """Every channel with the name of its schema and the number of its messages."""
+        names = {schema.id: schema.name for schema in self._schemas.values()}
+        channels = (*self._channels.values(), *self._foreign.values())
+        return [(c, names[c.schema_id], self._sent.get(c.id, 0)) for c in channels]
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time of the file, once it is finished."""
+        return self._span_ns
 
     def note(self, name: str, values: dict[str, str]) -> None:
         """Append a metadata record."""
@@ -118,16 +139,43 @@ class Container:
         self._put(summary + offsets + encoded(Footer(start, offsets_start, crc)) + MCAP0_MAGIC)
 
     def _open_topic(self, topic: str, kind: str, latched: bool) -> Channel:
-        schema = self._schemas.get(kind)
-        if schema is None:
-            name, text = kind.replace("/", "/msg/"), definition(kind).encode()
-            schema = Schema(len(self._schemas) + 1, text, "ros2msg", name)
-            self._schemas[kind] = schema
-            self._chunk += encoded(schema)
+        schema = self._schema(_ros2_name(kind), "ros2msg", definition(kind))
         metadata = {"offered_qos_profiles": qos(latched)}
-        number = len(self._channels) + 1
-        channel = Channel(number, topic, "cdr", metadata, schema.id)
-        self._channels[topic] = channel
+        channel = self._channels[topic] = self._channel(topic, "cdr", metadata, schema)
+        return channel
+
+    def _open_foreign(self, topic: Topic) -> Channel:
+        ros1 = topic.encoding == "ros1"
+        text, kind = topic.definition, topic.type
+        if not text and not ros1 and is_known(kind):
+            # Older recorders store no definitions.
+            text = definition(kind)
+        form = topic.format or ("ros1msg" if ros1 else "ros2msg")
+        name = _ros2_name(kind) if form.startswith("ros2") else kind
+        metadata = {"offered_qos_profiles": qos_in_numbers(topic.qos) or qos(topic.latched)}
+        if ros1:
+            metadata = {"latching": "1"} if topic.latched else {}
+        schema = self._schema(name, form, text)
+        channel = self._channel(topic.name, topic.encoding, metadata, schema)
+        self._foreign[topic] = channel
+        return channel
+
+    def _schema(self, name: str, form: str, text: str) -> Schema:
+        """The schema with this content, written at its first use."""
+        schema = self._schemas.get((name, form, text))
+        if schema is None:
+            # Definitions that are no text were read in a way that keeps their bytes.
+            data = text.encode("utf-8", "surrogateescape")
+            schema = Schema(len(self._schemas) + 1, data, form, name)
+            self._schemas[name, form, text] = schema
+            self._chunk += encoded(schema)
+        return schema
+
+    def _channel(
+        self, topic: str, encoding: str, metadata: dict[str, str], schema: Schema
+    ) -> Channel:
+        number = len(self._channels) + len(self._foreign) + 1
+        channel = Channel(number, topic, encoding, metadata, schema.id)
         self._chunk += encoded(channel)
         return channel
 
@@ -177,7 +225,7 @@ class Container:
         """The records of the summary by their kind."""
         statistics = Statistics(
             attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
+            channel_count=len(self._channels) + len(self._foreign),
             channel_message_counts=self._sent,
             chunk_count=len(self._chunks),
             message_count=sum(self._sent.values()),
@@ -188,7 +236,7 @@ class Container:
         )
         return [
             (Opcode.SCHEMA, self._schemas.values()),
-            (Opcode.CHANNEL, self._channels.values()),
+            (Opcode.CHANNEL, (*self._channels.values(), *self._foreign.values())),
             (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunks),
             (Opcode.ATTACHMENT_INDEX, self._attachments),
@@ -206,3 +254,8 @@ def encoded(record: McapRecord) -> bytes:
     record.write(builder)
     end: Callable[[], bytes] = builder.end
     return end()
+
+
+def _ros2_name(kind: str) -> str:
+    """`package/Type` as ROS 2 writes it; services and actions carry their kind already."""
+    return kind.replace("/", "/msg/") if kind.count("/") == 1 else kind

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mlbatch.types import ImuSamples, RunInfo, Scan, Summary
+    from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 
 DEFAULT_POINT_LAYOUT = "standard"
 
@@ -40,6 +40,10 @@ class ScanWriter(Protocol):
         """Write IMU samples; formats without a place for them ignore the call."""
         ...
 
+    def write_message(self, message: Message) -> None:
+        """Write a message of the recording as it is; formats without a place ignore the call."""
+        ...
+
     def finish(self, summary: Summary) -> None:
         """Complete the output and move it to its final name."""
         ...
@@ -59,7 +63,7 @@ class WriterModule(Protocol):
     SUFFIX: str | None
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
-        """Those of `types.EXTRAS` that the output holds."""
+        """Those of `types.EXTRAS` that the output holds, and `types.IMU`, `types.MESSAGES`."""
         ...
 
     def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -5,6 +5,8 @@ Fields and their order: common_interfaces, rcl_interfaces and geometry2 of ROS 2
 
 from __future__ import annotations
 
+import re
+
 _SEPARATOR = "=" * 80
 
 _FIELDS = {
@@ -58,8 +60,25 @@ _FIELDS = {
     ),
 }
 
+# Numbers of the words that recorders from Jazzy on write (rmw/types.h).
+_QOS_WORDS = {
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+    "liveliness": (
+        *("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown"),
+        "best_available",
+    ),
+}
+_QOS_LINE = re.compile(rf"\b({'|'.join(_QOS_WORDS)}): ([a-z_]+)")
+
 # Codes of PointField for numpy types.
 FIELD_CODES = {"u1": 2, "<u2": 4, "<u4": 6, "<f4": 7, "<f8": 8}
+
+
+def is_known(name: str) -> bool:
+    """Whether the definition of message `pkg/Type` is among ours."""
+    return name in _FIELDS
 
 
 def definition(name: str) -> str:
@@ -99,3 +118,14 @@ def qos(latched: bool) -> str:
         f"  liveliness_lease_duration:\n  {forever}\n"
         "  avoid_ros_namespace_conventions: false\n"
     )
+
+
+def qos_in_numbers(text: str) -> str:
+    """A recorder's QoS text with numbers for words, since Humble reads no words."""
+
+    def number(match: re.Match[str]) -> str:
+        policy, word = match.groups()
+        words = _QOS_WORDS[policy]
+        return f"{policy}: {words.index(word)}" if word in words else match[0]
+
+    return _QOS_LINE.sub(number, text)

@@ -1,54 +1,28 @@
-"""ROS 2 messages as CDR bytes: OMG DDSI-RTPS 2.2 section 10, plain little-endian encapsulation.
-
-Values are aligned to their size, counted from the first byte after the 4-byte head.
-"""
+"""Messages of ROS 1 and ROS 2, field by field (facts/outputs.md, sections 3 and 4)."""
 
 from __future__ import annotations
 
-import struct
+from collections.abc import Callable
 
 import numpy as np
 
 from mlbatch.types import F64Array, ImuSamples, RunInfo
-from mlbatch.units import NS_PER_S
 from mlbatch.writers._layouts import Layout, Points
 from mlbatch.writers._ros2_types import FIELD_CODES
+from mlbatch.writers._wire import Wire
 
-_HEAD = b"\x00\x01\x00\x00"
+NewWire = Callable[[], Wire]
+
 # sensor_msgs/Imu: -1 says that there is no orientation; all 0 says that a covariance is unknown.
 _NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
 _UNKNOWN_COVARIANCE = (0.0,) * 9
 
 
-class Cdr:
-    """A message under construction."""
-
-    def __init__(self) -> None:
-        self.data = bytearray(_HEAD)
-
-    def put(self, code: str, *values: float) -> None:
-        """Append values of one type, `code` as in `struct`."""
-        size = struct.calcsize(code)
-        self.data += bytes((len(_HEAD) - len(self.data)) % size)
-        self.data += struct.pack(f"<{len(values)}{code}", *values)
-
-    def text(self, value: str) -> None:
-        """Append a string: length with the closing 0, bytes, 0."""
-        data = value.encode() + b"\x00"
-        self.put("I", len(data))
-        self.data += data
-
-    def header(self, stamp_ns: int, frame_id: str) -> None:
-        """Append a std_msgs/Header."""
-        self.put("i", stamp_ns // NS_PER_S)
-        self.put("I", stamp_ns % NS_PER_S)
-        self.text(frame_id)
-
-
 class CloudMessage:
     """Assembles sensor_msgs/PointCloud2 in one buffer that is used for every scan."""
 
-    def __init__(self, layout: Layout, frame_id: str) -> None:
+    def __init__(self, layout: Layout, frame_id: str, wire: NewWire) -> None:
+        self._wire = wire
         self._layout = layout
         self._frame_id = frame_id
         self._dtype = layout.dtype
@@ -72,39 +46,39 @@ class CloudMessage:
         """All that precedes the points; `shape`: (width,) or (height, width)."""
         step = self._layout.step
         height, width = shape if len(shape) == 2 else (1, shape[0])
-        cdr = Cdr()
-        cdr.header(stamp_ns, self._frame_id)
-        cdr.put("I", height, width, len(self._layout.fields))
+        message = self._wire()
+        message.header(stamp_ns, self._frame_id)
+        message.put("I", height, width, len(self._layout.fields))
         for field in self._layout.fields:
-            cdr.text(field.name)
-            cdr.put("I", field.offset)
-            cdr.put("B", FIELD_CODES[field.dtype])
-            cdr.put("I", 1)
-        cdr.put("B", 0)
-        cdr.put("I", step, step * width, step * width * height)
-        return cdr.data
+            message.text(field.name)
+            message.put("I", field.offset)
+            message.put("B", FIELD_CODES[field.dtype])
+            message.put("I", 1)
+        message.put("B", 0)
+        message.put("I", step, step * width, step * width * height)
+        return message.data
 
 
-def imu_message(samples: ImuSamples, which: int, frame_id: str) -> bytes:
+def imu_message(samples: ImuSamples, which: int, frame_id: str, wire: NewWire) -> bytes:
     """sensor_msgs/Imu of one of the samples."""
-    cdr = Cdr()
-    cdr.header(int(samples.stamp_ns[which]), frame_id)
-    cdr.put("d", *_NO_ORIENTATION)
-    cdr.put("d", *samples.angular_velocity[which].tolist(), *_UNKNOWN_COVARIANCE)
-    cdr.put("d", *samples.acceleration[which].tolist(), *_UNKNOWN_COVARIANCE)
-    return bytes(cdr.data)
+    message = wire()
+    message.header(int(samples.stamp_ns[which]), frame_id)
+    message.put("d", *_NO_ORIENTATION)
+    message.put("d", *samples.angular_velocity[which].tolist(), *_UNKNOWN_COVARIANCE)
+    message.put("d", *samples.acceleration[which].tolist(), *_UNKNOWN_COVARIANCE)
+    return bytes(message.data)
 
 
-def static_transforms(info: RunInfo, stamp_ns: int) -> bytes:
+def static_transforms(info: RunInfo, stamp_ns: int, wire: NewWire) -> bytes:
     """tf2_msgs/TFMessage with the pose of every sensor in the body frame."""
-    cdr = Cdr()
-    cdr.put("I", len(info.sensors))
+    message = wire()
+    message.put("I", len(info.sensors))
     for sensor in info.sensors:
         pose = sensor.body_from_sensor
-        cdr.header(stamp_ns, info.frame_id)
-        cdr.text(sensor.name)
-        cdr.put("d", *pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
-    return bytes(cdr.data)
+        message.header(stamp_ns, info.frame_id)
+        message.text(sensor.name)
+        message.put("d", *pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
+    return bytes(message.data)
 
 
 def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:

@@ -54,15 +54,16 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "give -o out --format npz",
     ),
     "later suffix": (
-        f"{FIX} -o out.bag",
+        f"{FIX} -o out.las",
         2,
-        "-o out.bag: wanted a .mcap file or a folder, got .bag (rosbag1, not in this version); "
-        "choose another output",
+        "-o out.las: wanted a .mcap file, a .bag file or a folder, got .las (las, not in this "
+        "version); choose another output",
     ),
     "later format": (
         f"{FIX} --format las",
         2,
-        "--format: wanted one of mcap, npz, ply, got 'las' (not in this version); choose one",
+        "--format: wanted one of mcap, npz, ply, rosbag1, rosbag2, got 'las' (not in this "
+        "version); choose one",
     ),
     "folder format for a file": (
         f"{FIX} -o out.mcap --format ply",

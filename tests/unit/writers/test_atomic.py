@@ -19,6 +19,7 @@ from .scans import SUMMARY, dense_scan, run_info
 
 ROOT = Path(__file__).resolve().parents[3]
 OUTPUTS = [("mcap", "out.mcap"), ("npz", "out"), ("ply", "out")]
+OUTPUTS += [("rosbag1", "out.bag"), ("rosbag2", "out")]
 
 # Writes scans until something stops it; says "ready" once data are under way.
 CHILD = """
@@ -110,7 +111,8 @@ def test_overwriting_happens_at_the_end(name: str, file: str, tmp_path: Path) ->
         writer.finish(SUMMARY)
     assert not [path for path in tmp_path.rglob("*") if ".partial" in path.name]
     if target.is_dir():
-        assert sorted(path.name for path in target.iterdir()) == [f"000007.{name}", "scans.csv"]
+        files = ["metadata.yaml", "out_0.mcap"] if name == "rosbag2" else [f"000007.{name}"]
+        assert sorted(path.name for path in target.iterdir()) == [*files, "scans.csv"]
 
 
 @pytest.mark.parametrize("stranger", ["notes.txt", "left/photo.jpg", ".git/config"])
@@ -120,6 +122,16 @@ def test_a_folder_with_other_files_is_never_replaced(stranger: str, tmp_path: Pa
     with pytest.raises(ExportError, match=Path(stranger).name):
         open_writer("npz", tmp_path / "out", run_info(), WriterOptions(overwrite=True))
     assert (tmp_path / "out" / stranger).read_text() == "mine"
+
+
+def test_a_recorded_bag_is_never_replaced(tmp_path: Path) -> None:
+    """It looks like an output of ours, but has no table of scans."""
+    (tmp_path / "drive").mkdir()
+    for name in ("drive_0.mcap", "metadata.yaml"):
+        (tmp_path / "drive" / name).write_text("mine")
+    with pytest.raises(ExportError, match=r"drive_0\.mcap|metadata\.yaml"):
+        open_writer("rosbag2", tmp_path / "drive", run_info(), WriterOptions(overwrite=True))
+    assert len(list((tmp_path / "drive").iterdir())) == 2
 
 
 def test_files_and_folders_do_not_replace_each_other(tmp_path: Path) -> None:

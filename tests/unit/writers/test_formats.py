@@ -23,7 +23,7 @@ from .scans import run_info
 
 
 def test_formats_are_the_modules_of_the_package() -> None:
-    assert formats() == ("mcap", "npz", "ply")
+    assert formats() == ("mcap", "npz", "ply", "rosbag1", "rosbag2")
 
 
 @pytest.mark.parametrize("name", formats())
@@ -42,6 +42,9 @@ def test_a_plug_in_is_called_as_its_format(name: str) -> None:
         ("out", "npz", "npz"),
         ("out", "mcap", "mcap"),
         ("out.mcap", "mcap", "mcap"),
+        ("out.bag", None, "rosbag1"),
+        ("out", "rosbag1", "rosbag1"),
+        ("out", "rosbag2", "rosbag2"),
     ],
 )
 def test_suffix_and_option_choose(target: str, asked: str | None, wanted: str) -> None:
@@ -56,9 +59,12 @@ def test_suffix_and_option_choose(target: str, asked: str | None, wanted: str) -
         ("x.ply", "mcap", "folder"),
         ("x.mcap", "npz", "leave out .mcap"),
         ("x.pcd", None, "pcd, not in this version"),
-        ("x.bag", None, "rosbag1, not in this version"),
+        ("x.db3", None, "-o x --format rosbag2"),
+        ("x.bag", "rosbag2", "leave out .bag"),
+        ("x.bag", "mcap", "the name of a .mcap file for --format mcap, got that of a rosbag1"),
+        ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
         ("x", "las", "'las' (not in this version)"),
-        ("x", "stl", "one of mcap, npz, ply"),
+        ("x", "stl", "one of mcap, npz, ply, rosbag1, rosbag2"),
     ],
 )
 def test_refusals_say_what_to_do(target: str, asked: str | None, hint: str) -> None:
@@ -103,7 +109,10 @@ def test_places_of_side_files() -> None:
     assert file.scans_csv == Path("a/x.mcap.scans.csv")
 
 
-@pytest.mark.parametrize(("name", "file"), [("mcap", "x.mcap"), ("npz", "x"), ("ply", "x")])
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("mcap", "x.mcap"), ("npz", "x"), ("ply", "x"), ("rosbag1", "x.bag"), ("rosbag2", "x")],
+)
 def test_checking_a_target_leaves_nothing(name: str, file: str, tmp_path: Path) -> None:
     check_target(name, tmp_path / file, WriterOptions(split=True), "dense")
     assert not list(tmp_path.iterdir())

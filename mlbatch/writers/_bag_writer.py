@@ -1,0 +1,183 @@
+"""What all outputs of messages share: topics, times, and the order in which messages begin.
+
+facts/outputs.md section 4, CONTRACT.md section 3. A `Sink` is the container they go to.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.types import IMU, MESSAGES, ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
+from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
+from mlbatch.writers._options import WriterOptions
+from mlbatch.writers._ros_messages import (
+    CloudMessage,
+    NewWire,
+    imu_message,
+    static_transforms,
+)
+
+# IMU samples that may wait for the first scan: minutes at the rates of built-in IMUs.
+WAITING_SAMPLES = 65536
+WAITING_BYTES = 16 << 20
+_TF_STATIC = "/tf_static"
+
+
+class Sink(Protocol):
+    """A file of messages under construction."""
+
+    def send(
+        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+    ) -> None:
+        """Append a message of type `kind`, package/Type; a topic is made at its first message."""
+        ...
+
+    def forward(self, message: Message) -> None:
+        """Append a message as it was recorded; ExportError if the file cannot hold it."""
+        ...
+
+    def finish(self, summary: Summary, grid: dict[str, str]) -> None:
+        """Add what the container has a place for, complete and close the file."""
+        ...
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        ...
+
+
+NewSink: TypeAlias = Callable[[Path], Sink]
+
+
+def extras_of(options: WriterOptions) -> frozenset[str]:
+    """What the fields of the point layout are made of, IMU samples and messages."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    return frozenset({IMU, MESSAGES}) | (frozenset() if layout is None else layout.extras)
+
+
+def layout_of(options: WriterOptions) -> Layout:
+    """The layout of points that was asked for."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    if layout is None:
+        raise UsageError(
+            f"--point-layout: wanted one of {', '.join(CLOUD_LAYOUTS)}, got "
+            f"{options.point_layout!r}; choose one"
+        )
+    return layout
+
+
+class BagWriter:
+    """Writes a run; what precedes the first scan waits, since /tf_static comes before all."""
+
+    def __init__(
+        self, output: Output, info: RunInfo, options: WriterOptions, wire: NewWire, sink: NewSink
+    ) -> None:
+        self._info = info
+        self._wire = wire
+        self._cloud = CloudMessage(layout_of(options), info.frame_id, wire)
+        self._waiting: list[ImuSamples | Message] = []
+        self._begun = False
+        self._topics: dict[int | None, str] = {None: "/points"}
+        if options.split:
+            self._topics |= {i: f"/{info.sensors[i].name}/points" for i in range(len(info.sensors))}
+        imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
+        self._own = frozenset({_TF_STATIC, *self._topics.values(), *imu})
+        self._output = output
+        with export_errors(output.partial):
+            self._sink = sink(output.partial)
+
+    def write(self, scan: Scan, sensor: int | None = None) -> None:
+        """Write one scan as a PointCloud2, after what waited for it."""
+        dense = scan.info.layout != "organized"
+        with export_errors(self._output.partial):
+            self._begin(scan.start_ns)
+            message = self._cloud.assemble(points_of(scan), scan.start_ns, dense)
+            topic = self._topics[sensor]
+            self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Write IMU samples at their own stamps."""
+        self._write_or_wait(samples)
+
+    def write_message(self, message: Message) -> None:
+        """Write a message as it was recorded, at its log time."""
+        if message.topic.name in self._own:
+            raise ExportError(
+                f"{self._output.target}: wanted topics besides those of the scans, got a recorded "
+                f"{message.topic.name} as well; leave it out of what is passed, or rename the "
+                "sensor in the rig"
+            )
+        self._write_or_wait(message)
+
+    def finish(self, summary: Summary) -> None:
+        """Add what tells of the run, close the file and give it its final name."""
+        output = self._output
+        with export_errors(output.partial):
+            self._begin(summary.t_init_ns)
+            self._sink.finish(summary, self._grid(summary))
+        if output.partial.is_dir():
+            write_text(output.partial / SCANS_CSV, summary.scans_csv)
+        is_file = output.partial.is_file()
+        output.publish()
+        if is_file:
+            write_text(side_path(output.target, SCANS_CSV), summary.scans_csv)
+
+    def abandon(self) -> None:
+        """Close the file; it has no index and stays under `.partial`."""
+        self._sink.abandon()
+
+    def _write_or_wait(self, item: ImuSamples | Message) -> None:
+        with export_errors(self._output.partial):
+            if self._begun:
+                self._send(item)
+                return
+            self._waiting.append(item)
+            samples = sum(len(i.stamp_ns) for i in self._waiting if isinstance(i, ImuSamples))
+            size = sum(len(i.data) for i in self._waiting if isinstance(i, Message))
+            if samples >= WAITING_SAMPLES or size >= WAITING_BYTES:
+                self._begin(None)
+
+    def _begin(self, start_ns: int | None) -> None:
+        """Write /tf_static at the earliest stamp known, then what waited."""
+        if self._begun:
+            return
+        self._begun = True
+        stamps = [stamp_ns for item in self._waiting for stamp_ns in _first_stamp(item)]
+        stamp_ns = min(stamps if start_ns is None else [*stamps, start_ns], default=0)
+        transforms = static_transforms(self._info, stamp_ns, self._wire)
+        self._sink.send(_TF_STATIC, "tf2_msgs/TFMessage", stamp_ns, transforms, latched=True)
+        for item in self._waiting:
+            self._send(item)
+        self._waiting.clear()
+
+    def _send(self, item: ImuSamples | Message) -> None:
+        if isinstance(item, Message):
+            self._sink.forward(item)
+            return
+        name = self._info.sensors[item.sensor].name
+        for which in range(len(item.stamp_ns)):
+            message = imu_message(item, which, f"{name}_imu", self._wire)
+            log_ns = int(item.stamp_ns[which])
+            self._sink.send(f"/{name}/imu", "sensor_msgs/Imu", log_ns, message)
+
+    def _grid(self, summary: Summary) -> dict[str, str]:
+        info = self._info
+        return {
+            "rate_hz": info.rate_hz,
+            "t_init_ns": "" if summary.t_init_ns is None else str(summary.t_init_ns),
+            "slices": str(info.slices),
+            "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
+            "timescale": info.timescale,
+            "frame_id": info.frame_id,
+        }
+
+
+def _first_stamp(item: ImuSamples | Message) -> list[int]:
+    """Earliest log time of what waits; none of samples that are none."""
+    if isinstance(item, Message):
+        return [item.host_ns]
+    return [int(item.stamp_ns.min())] if len(item.stamp_ns) else []
