@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 from tests.builders.captures import pcap_bytes
 from tests.builders.traffic import Datagram, Records
+from tests.builders.two_lidars import COLUMNS_PER_PACKET
 
 SHARE = 0.1
 # How far a network or a recorder may swap what it carries.
@@ -75,6 +76,36 @@ def damaged_payloads(rng: random.Random, sent: Sequence[Datagram], name: str) ->
     for one, payloads in zip(sent, damaged(rng, [d.payload for d in sent], name), strict=True):
         parts += [(one.host_ns, one, payload) for payload in payloads]
     return [replace(one, host_ns=host_ns, payload=data).frame() for host_ns, one, data in parts]
+
+
+# Stamps at the ends of what is accepted, and of what 8 bytes hold.
+STAMPS_NS = (0, 1, (1 << 31) * 10**9 - 1, (1 << 31) * 10**9, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
+STEPS_NS = (10**6, 15 * 10**6, 10**8, 999 * 10**6, 10**9, 2 * 10**9, 10**12)
+
+
+def damaged_heads(rng: random.Random, sent: Sequence[Datagram]) -> Records:
+    """Lidar packets with odd stamps, measurement ids and status words in some columns."""
+    kind, share = rng.randrange(4), rng.choice([0.02, 0.1, 0.4])
+    return [
+        (_odd_columns(rng, one, kind) if one.port == 7502 and rng.random() < share else one).frame()
+        for one in sent
+    ]
+
+
+def _odd_columns(rng: random.Random, one: Datagram, kind: int) -> Datagram:
+    """Column heads are 12 bytes: stamp u64, measurement id u16, status u16 (facts/ouster.md)."""
+    data = bytearray(one.payload)
+    record = (len(data) - 64) // COLUMNS_PER_PACKET
+    for _ in range(rng.choice([1, 1, COLUMNS_PER_PACKET])):
+        at = 32 + rng.randrange(COLUMNS_PER_PACKET) * record
+        stamp_ns = int.from_bytes(data[at : at + 8], "little")
+        stepped_ns = stamp_ns + rng.choice([-1, 1]) * rng.choice(STEPS_NS)
+        new_ns = (stamp_ns, rng.choice(STAMPS_NS), stepped_ns, stamp_ns)[kind]
+        data[at : at + 8] = (new_ns % (1 << 64)).to_bytes(8, "little")
+        if kind in (0, 3):
+            first = 0 if kind == 0 else 8
+            data[at + rng.randrange(first, 12)] ^= 1 << rng.randrange(8)
+    return replace(one, payload=bytes(data))
 
 
 def with_jumps(rng: random.Random, records: Records) -> Records:

@@ -27,6 +27,7 @@ from tests.builders.damage import (
     damaged,
     damaged_file,
     damaged_frames,
+    damaged_heads,
     damaged_json,
     damaged_payloads,
     damaged_text,
@@ -208,6 +209,14 @@ def test_damaged_frames(name: str, seed: int, tmp_path: Path) -> None:
 def test_damaged_payloads(name: str, seed: int, tmp_path: Path) -> None:
     rng = random.Random(f"payloads {name} {seed}")
     records = damaged_payloads(rng, datagrams(LENGTH_NS), name)
+    job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
+    both_buffers(job, len(records), rng.choice(BUFFERS))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_damaged_columns(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(f"columns {seed}")
+    records = damaged_heads(rng, datagrams(LENGTH_NS))
     job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
     both_buffers(job, len(records), rng.choice(BUFFERS))
 
