@@ -7,6 +7,7 @@ is one, tells the topics at once and which chunks need not be looked into.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +32,7 @@ from mlbatch.types import I64Array, Recording, StreamTable, Topic
 CONTAINER = "MCAP"
 # How far to look for topics in a file that has no summary; recorders tell them at the front.
 _LOOK_BYTES = 64 << 20
+_PEEK_BYTES = 1 << 16
 
 
 def recognises(head: bytes) -> bool:
@@ -40,27 +42,36 @@ def recognises(head: bytes) -> bool:
 
 def open_packets(path: Path, streams: StreamTable) -> Recording:
     """Open an MCAP file; its payloads come from streams (topic)."""
-    return open_files(path, [path], streams)
+    return open_folder(path, [path], streams)
 
 
-def open_files(
-    path: Path,
+def open_folder(
+    folder: Path,
     files: Sequence[Path],
     streams: StreamTable,
-    standing: tuple[str, ...] = (),
+    notes: Sequence[str] = (),
     buffer_bytes: int = BUFFER_BYTES,
 ) -> BagRecording:
-    """Open the files of one bag, in the order in which they are to be read.
+    """Open the files of a bag as one recording, in the order of their first messages.
 
-    path: name of the whole; standing: notes of whoever found the files; buffer_bytes: for tests.
+    buffer_bytes: for tests, results do not depend on it.
     """
+    # Equal times, and files without messages, keep their order.
+    ordered = sorted(files, key=_first_ns) if len(files) > 1 else list(files)
     topics: dict[Topic, None] = {}
-    for file in files:
+    for file in ordered:
         with SkippingSource(file) as source:
             topics |= dict.fromkeys(_look(source, buffer_bytes).topics.values())
-    size = sum(file.stat().st_size for file in files)
-    start = partial(_portions, files=tuple(files), buffer_bytes=buffer_bytes)
-    return BagRecording(path, CONTAINER, size, tuple(topics), streams, start, standing)
+    size = sum(file.stat().st_size for file in ordered)
+    start = partial(_portions, files=tuple(ordered), buffer_bytes=buffer_bytes)
+    return BagRecording(folder, CONTAINER, size, tuple(topics), streams, start, tuple(notes))
+
+
+def _first_ns(file: Path) -> float:
+    """Log time of a file's first message; those without one come last."""
+    with SkippingSource(file) as source:
+        walk = Walk(source, _everything, Channels(), limit=_LOOK_BYTES, buffer_bytes=_PEEK_BYTES)
+        return next((int(messages.log_ns[0]) for messages in walk.messages()), math.inf)
 
 
 @dataclass(slots=True)
@@ -98,6 +109,10 @@ def _look(source: SkippingSource, buffer_bytes: int) -> Channels:
 
 def _nothing(topic: Topic) -> bool:
     return False
+
+
+def _everything(topic: Topic) -> bool:
+    return True
 
 
 def _portions(

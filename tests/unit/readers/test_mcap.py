@@ -52,7 +52,7 @@ def read(recording: Recording, streams: StreamTable) -> tuple[list[Seen], list[M
 def opened(path: Path, buffer_bytes: int = 4096, keep: str = "") -> tuple[Recording, StreamTable]:
     """A file read through a buffer that is smaller than its chunks and some messages."""
     streams = StreamTable()
-    recording = mcap.open_files(path, [path], streams, buffer_bytes=buffer_bytes)
+    recording = mcap.open_folder(path, [path], streams, buffer_bytes=buffer_bytes)
     recording.keep = frozenset({keep} if keep else ())
     return recording, streams
 
@@ -139,15 +139,22 @@ def test_reading_ends_after_a_while(tmp_path: Path) -> None:
 
 
 def test_several_files_are_one_bag(tmp_path: Path) -> None:
-    # The second file numbers its channels in another order.
-    first = write_mcap(tmp_path / "a_0.mcap", packet_messages(PACKETS[:301]))
-    second = write_mcap(tmp_path / "a_1.mcap", packet_messages(PACKETS[301:]), Form(ZSTD))
+    """In the order of their first messages, whatever their names; channels differ in number."""
+    late = write_mcap(tmp_path / "a_1.mcap", packet_messages(PACKETS[301:]), Form(ZSTD))
+    early = write_mcap(tmp_path / "a_9.mcap", packet_messages(PACKETS[:301]))
+    empty = write_mcap(tmp_path / "a_0.mcap", [])
     streams = StreamTable()
-    recording = mcap.open_files(tmp_path, [first, second], streams, ("a note",))
+    recording = open_recording(tmp_path, streams)
     assert read(recording, streams)[0] == EXPECTED
-    assert recording.size_bytes == first.stat().st_size + second.stat().st_size
-    assert recording.notes == ["a note"]
+    assert recording.size_bytes == sum(path.stat().st_size for path in (late, early, empty))
     assert recording.path == tmp_path
+    late.write_bytes(late.read_bytes()[:-200_000])
+    recording = mcap.open_folder(tmp_path, [empty, late, early], streams, ["a note"])
+    seen, _ = read(recording, streams)
+    assert EXPECTED[:301] == seen[:301]
+    assert seen == EXPECTED[: len(seen)]
+    assert recording.notes[0] == "a note"
+    assert recording.notes[1].startswith("a_1.mcap: byte ")
 
 
 def test_messages_longer_than_the_buffer(tmp_path: Path) -> None:
