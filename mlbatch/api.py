@@ -58,6 +58,7 @@ def scans(
             only=tuple(only),
             ignore=tuple(ignore),
             identity_extrinsics=identity_extrinsics,
+            host_clock=clock == "host",
         ),
         # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
@@ -65,7 +66,6 @@ def scans(
         layout=layout,
         keep_partial=keep_partial,
         max_wait_ns=None if math.isinf(max_wait) else round(max_wait * NS_PER_S),
-        host_clock=clock == "host",
         min_range_m=min_range,
         max_range_m=max_range,
         strict=strict,

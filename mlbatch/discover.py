@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch import sensors
+from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
@@ -34,6 +35,7 @@ class Wishes:
     only: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
     identity_extrinsics: bool = False
+    host_clock: bool = False
     decode: dict[str, str] = field(default_factory=dict)
 
 
@@ -124,8 +126,10 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     rig = None if wishes.rig is None else read_rig(wishes.rig)
     sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
-    calibrations, looked = calibrations_for(paths, wishes.metadata)
-    calibrations += learner.calibrations()
+    calibrations, files = calibrations_for(paths, wishes.metadata)
+    recorded = learner.calibrations()
+    calibrations += recorded
+    looked = [path.name for path in files] + [str(one.path) for one in recorded]
     if rig is None or wishes.rig is None:
         found, unknown = match(sampler, calibrations, wishes.decode)
         rigged: list[RigSensor | None] = [None] * len(found)
@@ -134,12 +138,13 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         found, unknown = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
     lidar_kinds = [kind for kind in unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
-        raise _nothing_found(sampler, paths, lidar_kinds, looked)
+        raise _nothing_found(sampler, recordings, lidar_kinds, looked)
     notes = [] if rig is not None else [_unmatched(sampler, kind, looked) for kind in lidar_kinds]
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
     router = Router(table, chosen, sampler.samples)
+    _compare_clocks(sampler, chosen, rigged, wishes)
     mounted, mounting = mount(
         table,
         chosen,
@@ -202,6 +207,13 @@ def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
         )
 
 
+def named(sampler: Sampler, kind: Kind, types: Mapping[str, str]) -> str:
+    """What a kind is: by its packets, else by the type of the messages that hold them."""
+    carrier = types.get(sampler.table.streams[kind[0]].topic, "")
+    other = f"packets of {carrier}, no decoder in this version" if carrier else "unknown"
+    return describe(sampler, kind) or other
+
+
 def _is_lidar(sampler: Sampler, kind: Kind) -> bool:
     """Whether a maker's module takes packets that no calibration fits for those of a lidar."""
     what = describe(sampler, kind)
@@ -214,46 +226,83 @@ def describe(sampler: Sampler, kind: Kind) -> str | None:
     return sensors.describe(evidence.size, evidence.sample)
 
 
-def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[Path]) -> Note:
+def packet_types(recordings: Sequence[Recording]) -> dict[str, str]:
+    """Types of the messages of all topics, by the topics' names."""
+    return {topic.name: topic.type for recording in recordings for topic in recording.topics}
+
+
+def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[str]) -> Note:
     stream = sampler.table.streams[kind[0]]
     return Note(
         "no_metadata",
         "",
-        f"{stream}: {describe(sampler, kind)}; wanted metadata that fits, got {_files(looked)}; "
+        f"{stream}: {describe(sampler, kind)}; wanted metadata that fits, got {_known(looked)}; "
         "its packets are counted as unassigned; give --metadata FILE",
     )
 
 
 def _nothing_found(
-    sampler: Sampler, paths: Sequence[Path], lidar_kinds: Sequence[Kind], looked: Sequence[Path]
+    sampler: Sampler,
+    recordings: Sequence[Recording],
+    lidar_kinds: Sequence[Kind],
+    looked: Sequence[str],
 ) -> RecordingError:
-    where, table = ", ".join(str(path) for path in paths), sampler.table
+    where = ", ".join(str(recording.path) for recording in recordings)
+    table, types = sampler.table, packet_types(recordings)
     if lidar_kinds:
         kind = lidar_kinds[0]
         stream = table.streams[kind[0]]
         return RecordingError(
             f"{where}: {stream} carries {describe(sampler, kind)}; wanted metadata that fits, "
-            f"got {_files(looked)}; give the sensor's with --metadata FILE"
+            f"got {_known(looked)}; give the sensor's with --metadata FILE"
         )
     seen = [
-        f"{table.streams[kind[0]]} ({kind[1]} bytes: {describe(sampler, kind) or 'unknown'})"
+        f"{table.streams[kind[0]]} ({kind[1]} bytes: {named(sampler, kind, types)})"
         for kind in sampler.samples
-    ]
+    ] or [f"{name} ({kind})" for name, kind in sorted(types.items())]
+    remedy = (
+        "record the topic on which the lidar's driver publishes its packets"
+        if types
+        else "check that the recording holds the sensor's data port"
+    )
     return RecordingError(
         f"{where}: no lidar packets; wanted raw UDP packets of a supported lidar "
-        f"(see `mlbatch sensors`), got {_some(seen) or 'no UDP packet at all'}; "
-        "check that the recording holds the sensor's data port"
+        f"(see `mlbatch sensors`), got {_some(seen) or 'no UDP packet at all'}; {remedy}"
     )
 
 
-def _files(paths: Sequence[Path]) -> str:
-    names = _some([path.name for path in paths])
-    return f"only {names}" if names else "none beside the recording"
+def _known(words: Sequence[str]) -> str:
+    return f"only {_some(words)}" if words else "none beside the recording"
 
 
 def _some(words: Sequence[str], most: int = 4) -> str:
     text = ", ".join(words[:most])
     return text if len(words) <= most else f"{text} and {len(words) - most} more"
+
+
+def _compare_clocks(
+    sampler: Sampler, chosen: Sequence[Found], rigged: Sequence[RigSensor | None], wishes: Wishes
+) -> None:
+    """Refuse clocks that cannot be merged before anything else is asked for."""
+    offsets_ns: list[tuple[str, int | None]] = []
+    for sensor, entry in zip(chosen, rigged, strict=True):
+        by_host = wishes.host_clock or (entry is not None and entry.clock == "host")
+        offset_ns = None if by_host else sampler.clock_offset_ns(sensor)
+        if offset_ns is not None and entry is not None:
+            offset_ns += entry.offset_ns
+        offsets_ns.append((sensor.name, offset_ns))
+        refuse_incomparable(offsets_ns, len(offsets_ns) - 1)
+
+
+def untimed(table: StreamTable, sensor: Found) -> UsageError | None:
+    """The error about arrival times wanted of a sensor whose packets have none, or None."""
+    for number in sorted({stream for stream, _ in sensor.kinds} & table.untimed):
+        return UsageError(
+            f"--clock host: sensor {sensor.name}: wanted the arrival time of each packet, got only "
+            f"that of whole messages on {table.streams[number]}; use --clock sensor (in the rig: "
+            "clock.source), or record the packets with tcpdump"
+        )
+    return None
 
 
 def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:

@@ -35,7 +35,6 @@ class Job:
     start: Limit | None = None
     end: Limit | None = None
     limits_are_dates: bool = False
-    host_clock: bool = False
     min_range_m: float = 0.0
     max_range_m: float = float("inf")
     boxes_m: tuple[tuple[float, ...], ...] = ()

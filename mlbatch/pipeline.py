@@ -16,7 +16,7 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Due, Label
-from mlbatch.discover import Note, Setup, absent, discover
+from mlbatch.discover import Note, Setup, absent, discover, untimed
 from mlbatch.errors import PacketError, RecordingError, UsageError
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
@@ -86,6 +86,7 @@ class Conversion:
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
         self.batcher = Batcher(self.grid, intakes, policy)
         host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
+        self._refuse_untimed()
         self.feeder = Feeder(self.setup, self.feeds, host_clocks)
         self._decoders: list[Decoder] = []
         self._imu = ImuQueue(
@@ -224,7 +225,14 @@ class Conversion:
 
     def uses_host_clock(self, sensor: Mounted) -> bool:
         """Whether a sensor's stamps are replaced by arrival times."""
-        return self.job.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
+        return self.job.wishes.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
+
+    def _refuse_untimed(self) -> None:
+        """Refuse arrival times as stamps where packets have none of their own."""
+        for sensor in self.setup.sensors:
+            error = untimed(self.setup.sampler.table, sensor.found)
+            if error is not None and self.uses_host_clock(sensor):
+                raise error
 
     def _offset_ns(self, sensor: Mounted) -> int:
         """What is added to the stamps of a sensor; arrival times need no correction."""
@@ -252,7 +260,7 @@ class Conversion:
         """Scan clock minus arrival; None where scans are not on an epoch clock."""
         if self.info is None or self.info.timescale not in ("utc", "tai"):
             return None
-        if self.job.host_clock:
+        if self.job.wishes.host_clock:
             return 0
         offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
         return next(offsets, None)
@@ -275,6 +283,8 @@ class Conversion:
             self._refuse_rejected()
         for note in accounts.late_notes(self):
             self.warn(note)
+        # A later message may be the first without stamps.
+        self._refuse_untimed()
         for sensor, feed in zip(self.setup.sensors, self.feeds, strict=True):
             if sensor.rig is not None and not sensor.rig.optional and not feed.ledger.packets.read:
                 raise absent(sensor, self.job.wishes.rig)

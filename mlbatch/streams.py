@@ -20,9 +20,11 @@ from mlbatch.frames import GENERIC, namespace
 from mlbatch.lidar import Calibration, Evidence, Lidar
 from mlbatch.rig import StreamSelector
 from mlbatch.types import I64Array, PacketBatch, Stream, StreamTable, U8Array
+from mlbatch.units import NS_PER_S
 
 Kind = tuple[int, int]  # (number of the stream, payload size)
 SAMPLES_PER_KIND = 16
+SAMPLE_EVERY_NS = NS_PER_S // 4
 
 
 class Role(Enum):
@@ -59,6 +61,7 @@ class Sampler:
 
     table: StreamTable
     samples: dict[Kind, list[bytes]] = field(default_factory=dict)
+    sample_host_ns: dict[Kind, list[int]] = field(default_factory=dict)
     packets: dict[Kind, int] = field(default_factory=dict)
     span_ns: dict[Kind, tuple[int, int]] = field(default_factory=dict)
 
@@ -66,12 +69,43 @@ class Sampler:
         """Look at a batch."""
         for kind, index in split_by_kind(batch):
             kept = self.samples.setdefault(kind, [])
-            for at in index[: SAMPLES_PER_KIND - len(kept)].tolist():
+            hosts_ns = self.sample_host_ns.setdefault(kind, [])
+            for at in self._telling(kind, index, batch.host_ns[index]):
                 begin = int(batch.start[at])
                 kept.append(batch.data[begin : begin + kind[1]].tobytes())
+                hosts_ns.append(int(batch.host_ns[at]))
             self.packets[kind] = self.packets.get(kind, 0) + len(index)
             first_ns, last_ns = int(batch.host_ns[index[0]]), int(batch.host_ns[index[-1]])
             self.span_ns[kind] = self.span_ns.get(kind, (first_ns, 0))[0], last_ns
+
+    def _telling(self, kind: Kind, index: I64Array, host_ns: I64Array) -> list[int]:
+        """Which packets of a kind to keep: the first ones, then two of every quarter of a second.
+
+        Several sensors may share a kind, and one of them may start later than the others. The
+        choice follows arrival times, so that it does not depend on the size of batches.
+        """
+        first = SAMPLES_PER_KIND - min(SAMPLES_PER_KIND, self.packets.get(kind, 0))
+        tick = np.concatenate([[self.span_ns.get(kind, (0, 0))[1]], host_ns]) // SAMPLE_EVERY_NS
+        fresh = tick[1:] != tick[:-1]
+        fresh[1:] |= fresh[:-1]
+        fresh[:first] = True
+        chosen: list[int] = index[fresh].tolist()
+        return chosen
+
+    def clock_offset_ns(self, sensor: Found) -> int | None:
+        """First stamp of a sensor in the samples minus its arrival; None if there is none."""
+        firsts = []
+        for kind in sensor.kinds:
+            packets = as_rows(self.samples[kind], kind[1])[:, : sensor.lidar.packet_size]
+            heads = sensor.lidar.heads(packets)
+            good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
+            rows = (heads.valid.any(axis=1) & good).nonzero()[0]
+            if len(rows):
+                row = int(rows[0])
+                stamp_ns = int(heads.stamp_ns[row, int(heads.valid[row].argmax())])
+                host_ns = self.sample_host_ns[kind][row]
+                firsts.append((host_ns, stamp_ns - host_ns))
+        return min(firsts)[1] if firsts else None
 
     def evidence(self, kind: Kind) -> Evidence:
         """What is known of a kind."""
@@ -91,8 +125,6 @@ def as_rows(payloads: Sequence[bytes], size: int) -> U8Array:
 
 def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
     """Packets of a batch by stream and size: ((stream, size), indices in arrival order)."""
-    if not len(batch):
-        return []
     if not len(batch):
         return []
     key = batch.stream << 17 | batch.size

@@ -23,7 +23,7 @@ from mlbatch.pipeline import Conversion, convert
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
 from mlbatch.report import ReportInputs
-from mlbatch.types import (
+from mlbatch.types import (, Message
     EXTRAS,
     IMU,
     BoolArray,
@@ -53,6 +53,7 @@ FIXTURE = Job(
     wishes=Wishes(rig=TWO_LIDARS / "rig.yaml"),
     keep_partial=True,
 )
+BY_HOST = replace(FIXTURE, wishes=replace(FIXTURE.wishes, host_clock=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,7 @@ class Memory:
     info: RunInfo
     scans: list[tuple[Scan, int | None]] = field(default_factory=list)
     imu: list[ImuSamples] = field(default_factory=list)
+    messages: list[Message] = field(default_factory=list)
     summary: Summary | None = None
     abandoned: bool = False
 
@@ -96,6 +98,10 @@ class Memory:
     def write_imu(self, samples: ImuSamples) -> None:
         """Keep IMU samples."""
         self.imu.append(samples)
+
+    def write_message(self, message: Message) -> None:
+        """Keep recorded messages."""
+        self.messages.append(message)
 
     def finish(self, summary: Summary) -> None:
         """Keep the end."""

@@ -33,7 +33,16 @@ from tests.builders.damage import (
     damaged_text,
     with_jumps,
 )
-from tests.builders.run import FIXTURE, TWO_LIDARS, Result, Values, buffers_of, in_memory, prints
+from tests.builders.run import (
+    BY_HOST,
+    FIXTURE,
+    TWO_LIDARS,
+    Result,
+    Values,
+    buffers_of,
+    in_memory,
+    prints,
+)
 from tests.builders.traffic import Records, datagrams, frames
 from tests.builders.two_lidars import LEFT, RIGHT
 
@@ -52,7 +61,7 @@ JOBS = (
     replace(FIXTURE, slices=3),
     replace(FIXTURE, split=True),
     replace(FIXTURE, layout="organized"),
-    replace(FIXTURE, host_clock=True),
+    BY_HOST,
     replace(FIXTURE, keep_partial=False, max_wait_ns=20_000_000),
     replace(FIXTURE, rate=Fraction(100, 3), max_wait_ns=None),
     replace(

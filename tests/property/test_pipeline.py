@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mlbatch.job import Job
 from tests.builders.captures import SLL2, Interface, Packet, Section, pcap_bytes, section_bytes
 from tests.builders.make_fixtures import START_NS
-from tests.builders.run import FIXTURE, Values, buffers_of, in_memory, prints, to_file
+from tests.builders.run import BY_HOST, FIXTURE, Values, buffers_of, in_memory, prints, to_file
 from tests.builders.traffic import Records, datagrams, frames, source
 from tests.builders.two_lidars import LEFT, RIGHT
 
@@ -206,7 +206,7 @@ def test_a_damaged_first_packet_does_not_silence_a_late_lidar(size: int, tmp_pat
     path = tmp_path / "recording.pcap"
     path.write_bytes(pcap_bytes([*records, *(one.frame() for one in sent)]))
     with buffers_of(size):
-        report = in_memory(replace(FIXTURE, recordings=(path,), host_clock=True)).report
+        report = in_memory(replace(BY_HOST, recordings=(path,))).report
     assert report.sensors[1].ledger.packets.read == len(late) - 1
 
 
@@ -236,7 +236,7 @@ def test_imu_on_the_clock_of_the_recorder_has_arrivals_as_stamps(tmp_path: Path)
     path.write_bytes(pcap_bytes([one.frame() for one in sent]))
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        memory = in_memory(replace(FIXTURE, recordings=(path,), host_clock=True)).memory
+        memory = in_memory(replace(BY_HOST, recordings=(path,))).memory
     assert memory is not None
     stamps = sorted(stamp for samples in memory.imu for stamp in samples.stamp_ns.tolist())
     assert stamps == [one.host_ns for one in sent if one.port == 7503]

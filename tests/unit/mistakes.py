@@ -30,7 +30,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "none.pcap: wanted a recording, got no such file; check the path",
     ),
-    "folder": ("fix", 1, "fix: wanted a recording, got a folder; name the files inside it"),
+    "folder": ("fix", 1, "fix: wanted a recording, got a folder without .db3 or .mcap files; name the files inside it"),
     "empty file": (
         "empty.pcap",
         1,
@@ -308,8 +308,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "incomparable clocks": (
         "apart/drive.pcap --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -3600.004 s for "
-        "ouster_222 and -0.004 s for ouster_111, 3600.000 s apart; wanted at most 1 s; use "
+        "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
+        "ouster_111 and -3600.004 s for ouster_222, 3600.000 s apart; wanted at most 1 s; use "
         "--clock host, or give clock.offset_s in the rig",
     ),
     "strict with a duplicate": (
@@ -374,8 +374,8 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
     "two uptime clocks": (
         f"{PAIR} --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -1718728642.002 s for "
-        "ouster_122247000785 and -1718733565.192 s for ouster_122239000672, 4923.190 s apart; "
+        "clocks of the sensors cannot be compared: stamp minus arrival is -1718733565.192 s for "
+        "ouster_122239000672 and -1718728642.002 s for ouster_122247000785, 4923.190 s apart; "
         "wanted at most 1 s; use --clock host, or give clock.offset_s in the rig",
     ),
     "one turn is never a whole window": (
