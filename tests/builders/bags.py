@@ -137,8 +137,8 @@ def imu_message(encoding: str, stamp_ns: int, frame: str, up: float) -> bytes:
 
 
 def definition(type_name: str, encoding: str) -> str:
-    """The text that a recorder stores with a type."""
-    main, needed = TEXTS[type_name.rpartition("/")[2]]
+    """The text that a recorder stores with a type, "" for those that are not listed here."""
+    main, needed = TEXTS.get(type_name.rpartition("/")[2], ("", {}))
     parts = dict(needed)
     if "Header header" in main + "".join(needed.values()):
         parts["std_msgs/Header"] = HEADERS[encoding]
