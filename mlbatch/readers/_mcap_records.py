@@ -88,12 +88,12 @@ class Channels:
     topics: dict[int, Topic] = field(default_factory=dict)
     _seen: set[tuple[int, bytes]] = field(default_factory=set)
 
+    def knows(self, opcode: int, body: bytes) -> bool:
+        """Whether this very schema or channel was there before."""
+        return (opcode, body) in self._seen
+
     def add(self, opcode: int, body: bytes) -> bool:
         """Learn a schema or a channel; False if it cannot be parsed."""
-        # Many recorders repeat them in every chunk.
-        if (opcode, body) in self._seen:
-            return True
-        self._seen.add((opcode, body))
         from mcap.data_stream import ReadDataStream
         from mcap.exceptions import EndOfFile
         from mcap.records import Channel, Schema
@@ -108,11 +108,8 @@ class Channels:
                 self.topics[channel.id] = _topic(channel, self.schemas.get(channel.schema_id))
         except (EndOfFile, struct.error, UnicodeDecodeError):
             return False
+        self._seen.add((opcode, body))
         return True
-
-    def all(self) -> tuple[Topic, ...]:
-        """Every topic once, in the order of channels."""
-        return tuple({topic.name: topic for topic in reversed(self.topics.values())}.values())[::-1]
 
 
 def _topic(channel: Channel, schema: Schema | None) -> Topic:

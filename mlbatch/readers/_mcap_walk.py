@@ -8,13 +8,9 @@ chunk costs the rest of that chunk, one outside the rest of the file; both are t
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Generator, Iterator, Set
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from mlbatch.readers._bytes import records
 from mlbatch.readers._mcap_bytes import (
     BUFFER_BYTES,
     MAX_RECORD_BYTES,
@@ -26,59 +22,15 @@ from mlbatch.readers._mcap_records import (
     CHUNK_HEAD_BYTES,
     HEAD,
     MAGIC,
-    MESSAGE_HEAD_BYTES,
     Channels,
     ChunkHead,
     Op,
     chunk_head,
 )
-from mlbatch.types import BoolArray, I64Array, Topic, U8Array
+from mlbatch.readers._mcap_scan import Messages, Scanner, Stretch, too_long
+from mlbatch.types import Topic
 
 _COMPRESSIONS = ("lz4", "zstd")
-_CHANNEL = struct.Struct("<H")
-_MESSAGE = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_ns", "<i8"),
-        ("publish_ns", "<i8"),
-    ]
-)
-_MAX_DEFINITION_BYTES = 1 << 24
-# Records that stand outside chunks; the others may stand anywhere.
-_OF_THE_FILE = (Op.CHUNK, Op.DATA_END, Op.FOOTER)
-_SKIPPED = range(Op.CHUNK + 1, Op.DATA_END)
-
-
-@dataclass(slots=True)
-class Messages:
-    """Messages of wanted channels in file order, (n,) int64 each.
-
-    Message i is `data[begin[i] : end[i]]`; valid until the next ones are asked for.
-    """
-
-    data: U8Array
-    channel: I64Array
-    begin: I64Array
-    end: I64Array
-    log_ns: I64Array
-
-
-@dataclass(slots=True)
-class _Stretch:
-    """How far records could be walked: to byte `next`, which may lie behind the stretch.
-
-    need: bytes that the record there takes, 0 if nothing is known to be missing; opcode: of a
-    record there that only stands outside chunks, or 0; fault: why there is no going on.
-    """
-
-    next: int
-    need: int = 0
-    opcode: int = 0
-    length: int = 0
-    fault: str = ""
 
 
 @dataclass(slots=True)
@@ -99,21 +51,23 @@ class Walk:
     limit: int | None = None
     buffer_bytes: int = BUFFER_BYTES
     place: int = 0
-    _wanted: BoolArray = field(default_factory=lambda: np.zeros(1 << 16, bool))
+    _scanner: Scanner = field(init=False)
     _chunk_end: int | None = None  # In the file; None outside of chunks.
     _done: bool = False
     _unzipper: Unzipper = field(default_factory=Unzipper)
 
+    def __post_init__(self) -> None:
+        self._scanner = Scanner(self.wants, self.channels)
+
     def messages(self) -> Iterator[Messages]:
         """All wanted messages; nothing is raised for damage, only for a disk that fails."""
-        self._judge()
         window = Window(self.source, self.buffer_bytes)
         window.begin = len(MAGIC)
         starts: list[int] = []
         while not self._done and window.refill():
             yield from self._walk(window, starts)
             self.place = window.place
-            yield from self._gather(window.data, starts)
+            yield from self._scanner.gather(window.data, starts)
             if self.limit is not None and self.place >= self.limit:
                 return
         if not self._done:
@@ -128,7 +82,7 @@ class Walk:
             bound = window.end
             if self._chunk_end is not None:
                 bound = self._chunk_end - window.place_of(0)
-            stretch = self._scan(window.data, window.begin, min(window.end, bound), starts)
+            stretch = self._scanner.scan(window.data, window.begin, min(window.end, bound), starts)
             window.begin = stretch.next
             fault = stretch.fault
             if self._chunk_end is not None:
@@ -180,7 +134,7 @@ class Walk:
         elif after > window.end:
             return False
         else:
-            yield from self._gather(window.data, starts)
+            yield from self._scanner.gather(window.data, starts)
             fault = yield from self._unzipped(window, head)
             if fault:
                 self.lost += 1
@@ -194,8 +148,8 @@ class Walk:
         stored = window.data.data[begin : min(begin + head.length, window.end)]
         data = self._unzipper.unpack(head.compression, stored, head.size)
         starts: list[int] = []
-        stretch = self._scan(data, 0, len(data), starts)
-        yield from self._gather(data, starts)
+        stretch = self._scanner.scan(data, 0, len(data), starts)
+        yield from self._scanner.gather(data, starts)
         if len(data) < head.size:
             return (
                 f"wanted {head.size} bytes of {head.compression} data, got {len(data)} before "
@@ -231,82 +185,11 @@ class Walk:
             f"{max(left, 0)}; what is whole was read",
         )
 
-    # -- the records --------------------------------------------------------------------------
-
-    def _scan(self, data: U8Array, at: int, end: int, starts: list[int]) -> _Stretch:
-        """Walk over `data[at:end]`; places of whole messages are added to `starts`."""
-        view = data.data
-        while True:
-            at = _messages(view, at, end, starts)
-            if at + HEAD.size > end:
-                return _Stretch(at, HEAD.size if at < end else 0)
-            opcode, length = HEAD.unpack_from(view, at)
-            size = HEAD.size + length
-            if opcode == Op.MESSAGE:
-                if length < MESSAGE_HEAD_BYTES:
-                    return _Stretch(at, fault=f"wanted a message, got a record of {length} bytes")
-                if at + HEAD.size + _CHANNEL.size > end:
-                    return _Stretch(at, size)
-                [channel] = _CHANNEL.unpack_from(view, at + HEAD.size)
-                if self._wanted[channel]:
-                    return _Stretch(at, size, fault=_too_long(length, MAX_RECORD_BYTES))
-            elif opcode in (Op.SCHEMA, Op.CHANNEL):
-                if at + size > end:
-                    return _Stretch(at, size, fault=_too_long(length, _MAX_DEFINITION_BYTES))
-                if not self.channels.add(opcode, bytes(view[at + HEAD.size : at + size])):
-                    return _Stretch(at, fault=f"wanted a {Op(opcode).name.lower()}, got garbage")
-                self._judge()
-            elif opcode in _OF_THE_FILE:
-                return _Stretch(at, opcode=opcode, length=length)
-            elif opcode not in _SKIPPED and opcode != Op.HEADER and opcode < Op.PRIVATE:
-                return _Stretch(at, fault=f"wanted a record, got one of kind 0x{opcode:02x}")
-            at += size
-
-    def _gather(self, data: U8Array, starts: list[int]) -> Iterator[Messages]:
-        """Those of the messages at `starts` that are wanted; `starts` is then empty."""
-        if not starts:
-            return
-        at = np.array(starts, np.int64)
-        starts.clear()
-        head = records(data, _MESSAGE, at)
-        wanted = self._wanted[head["channel"]]
-        if not wanted.all():
-            at, head = at[wanted], head[wanted]
-        if len(at):
-            end = at + head["length"].astype(np.int64) + HEAD.size
-            channel = head["channel"].astype(np.int64)
-            log_ns = head["log_ns"].astype(np.int64)
-            yield Messages(data, channel, at + _MESSAGE.itemsize, end, log_ns)
-
-    def _judge(self) -> None:
-        """Note which channels are wanted."""
-        for number, topic in self.channels.topics.items():
-            self._wanted[number] = self.wants(topic)
-
     def _note(self, place: int, text: str) -> None:
         self.notes.append(f"byte {place}: {text}")
 
 
-def _messages(view: memoryview, at: int, end: int, starts: list[int]) -> int:
-    """Step over whole messages from `at` on; the place of the first record that is none."""
-    head_at, last = HEAD.unpack_from, end - HEAD.size - MESSAGE_HEAD_BYTES
-    while at <= last:
-        opcode, length = head_at(view, at)
-        after = at + 9 + length
-        if opcode != 5 or after > end or length < MESSAGE_HEAD_BYTES:
-            break
-        starts.append(at)
-        at = after
-    return at
-
-
-def _too_long(length: int, limit: int) -> str:
-    if length <= limit:
-        return ""
-    return f"wanted a record of at most {limit} bytes, got one of {length}"
-
-
-def _fault_in_chunk(stretch: _Stretch, bound: int) -> str:
+def _fault_in_chunk(stretch: Stretch, bound: int) -> str:
     """What is wrong with a stretch whose chunk ends at `bound`."""
     if stretch.opcode:
         return f"wanted a record of a chunk, got one of kind 0x{stretch.opcode:02x}"
@@ -319,4 +202,4 @@ def _fault_of(head: ChunkHead) -> str:
     """Why a chunk cannot be unpacked."""
     if head.compression not in _COMPRESSIONS:
         return f"wanted a chunk without compression, lz4 or zstd, got {head.compression!r}"
-    return _too_long(max(head.size, head.length), MAX_RECORD_BYTES)
+    return too_long(max(head.size, head.length), MAX_RECORD_BYTES)

@@ -26,7 +26,8 @@ from mlbatch.readers._mcap_records import (
     records_of,
     summary_start,
 )
-from mlbatch.readers._mcap_walk import Messages, Walk
+from mlbatch.readers._mcap_scan import Messages
+from mlbatch.readers._mcap_walk import Walk
 from mlbatch.types import I64Array, Recording, StreamTable, Topic
 
 CONTAINER = "MCAP"
@@ -89,7 +90,9 @@ def _summary(source: SkippingSource) -> _Summary:
     start = summary_start(source.look_at(place, FOOTER_BYTES))
     if not start or not 0 < place - start <= MAX_RECORD_BYTES:
         return found
-    for opcode, body in records_of(source.look_at(start, place - start)):
+    # A channel is known by its schema, which may stand behind it here.
+    records = sorted(records_of(source.look_at(start, place - start)), key=lambda record: record[0])
+    for opcode, body in records:
         if opcode in (Op.SCHEMA, Op.CHANNEL):
             found.channels.add(opcode, body)
         elif opcode == Op.CHUNK_INDEX and (chunk := chunk_of_index(body)) is not None:

@@ -5,6 +5,7 @@ Source: MCAP specification (mcap.dev/spec); message types of facts/messages.md, 
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -146,9 +147,19 @@ def write_mcap(path: Path, sent: Sequence[Sent], form: Form | None = None) -> Pa
             writer.add_message(
                 channels[message.topic], message.log_ns, message.data, message.log_ns, number
             )
-        end: Callable[[], None] = writer.finish if form.summary else writer.flush
+        end: Callable[[], None] = writer.finish
         end()
+    if not form.summary:
+        os.truncate(path, _data_end(path.read_bytes()))
     return path
+
+
+def _data_end(data: bytes) -> int:
+    """Where the last record before the end of the data ends."""
+    at = 8
+    while data[at] != 0x0F:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return at
 
 
 def _schema(writer: Writer, kind: str, ros: int) -> int:
