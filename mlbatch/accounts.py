@@ -139,7 +139,7 @@ def _sensor(run: Conversion, number: int) -> SensorReport:
         mode=lidar.mode,
         ledger=feed.ledger,
         clock=_clock(run, number),
-        extrinsics_source=sensor.extrinsics_source,
+        extrinsics_source=sensor.origin,
         body_from_sensor=sensor.body_from_sensor,
         calibration=Path(lidar.calibration).name,
     )

@@ -17,7 +17,8 @@ from mlbatch.types import F64Array, StreamTable
 class Mounted:
     """A sensor with its place on the body and its wishes from the rig (or their defaults).
 
-    chain: frames walked from body to sensor, "" where none was.
+    extrinsics_source: whose word it is; chain: frames walked from body to sensor, "" where none
+    was.
     """
 
     found: Found
@@ -30,6 +31,11 @@ class Mounted:
     def name(self) -> str:
         """Name in all outputs."""
         return self.found.name
+
+    @property
+    def origin(self) -> str:
+        """Source and chain in words, as "tf_static: base_link -> left/os_sensor"."""
+        return f"{self.extrinsics_source}: {self.chain}" if self.chain else self.extrinsics_source
 
 
 def mount(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeAlias
@@ -11,11 +11,19 @@ import numpy as np
 
 from mlbatch.batching.loss import Loss
 from mlbatch.clock import timescale
-from mlbatch.discover import calibrations_for, describe, first_seconds, look
+from mlbatch.discover import (
+    calibrations_for,
+    describe,
+    first_seconds,
+    look,
+    named,
+    packet_types,
+)
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
+from mlbatch.mounting import Mounted, mount
 from mlbatch.readers import open_recording
-from mlbatch.rig import Rig, RigSensor, StreamSelector, write_rig
+from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
 from mlbatch.streams import Found, Kind, Role, Router, Sampler, match, split_by_kind
 from mlbatch.transforms import from_rpy_deg
@@ -81,10 +89,14 @@ class _Count:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """All streams of the first 10 seconds of a session."""
+    """All streams of the first 10 seconds of a session.
+
+    files: metadata by sensor, where they lie in a file and not in the recording itself.
+    """
 
     streams: tuple[StreamReport, ...]
-    sensors: tuple[Found, ...]
+    sensors: tuple[Mounted, ...]
+    body_frame: str = DEFAULT_BODY_FRAME
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -110,26 +122,37 @@ class Survey:
         sensors = tuple(
             RigSensor(
                 name=sensor.name,
-                stream=self._selector(sensor),
+                stream=_selector(sensor.found),
                 metadata=self.files.get(sensor.name),
-                extrinsics=sensor.lidar.extrinsics
-                if sensor.lidar.extrinsics is not None
+                extrinsics=sensor.body_from_sensor
+                if _is_placed(sensor)
                 # As angles, which are easier to fill in than a matrix.
                 else from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
             )
             for sensor in self.sensors
         )
         notes = {
-            sensor.name: "extrinsics unknown: measure them"
+            sensor.name: f"extrinsics of {sensor.origin}"
+            if _is_placed(sensor)
+            else "extrinsics unknown: measure them"
             for sensor in self.sensors
-            if sensor.lidar.extrinsics is None
         }
-        return write_rig(Rig(sensors), folder, notes)
+        return write_rig(Rig(sensors, self._body_frame()), folder, notes)
 
-    def _selector(self, sensor: Found) -> StreamSelector:
-        if sensor.lidar.carries_serial:
-            return StreamSelector(serial=sensor.lidar.serial)
-        return sensor.selector
+    def _body_frame(self) -> str:
+        """The body frame, unless it has the name of a sensor, which a rig refuses."""
+        names = {sensor.name for sensor in self.sensors}
+        return DEFAULT_BODY_FRAME if self.body_frame in names else self.body_frame
+
+
+def _selector(sensor: Found) -> StreamSelector:
+    if sensor.lidar.carries_serial:
+        return StreamSelector(serial=sensor.lidar.serial)
+    return sensor.selector
+
+
+def _is_placed(sensor: Mounted) -> bool:
+    return sensor.extrinsics_source != "identity"
 
 
 def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
@@ -138,22 +161,39 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     opened = [open_recording(path, table) for path in recordings]
     sampler, learner = look(opened, table)
     calibrations, looked = calibrations_for(recordings, metadata)
+    files = {str(one.path): one.path for one in calibrations if one.path is not None}
     calibrations += learner.calibrations()
     found, _ = match(sampler, calibrations, {})
+    mounted, mounting = mount(
+        table, found, [None] * len(found), None, learner.knowledge, identity_extrinsics=True
+    )
     for sensor in found:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]
         sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
     counts = _count(opened, found)
     router = Router(table, found, sampler.samples)
-    reports = tuple(_report(sampler, kind, found, counts, router) for kind in sampler.samples)
+    types = packet_types(opened)
+    reports = tuple(
+        _report(sampler, kind, mounted, counts, _owner(sampler, kind, found, router), types)
+        for kind in sampler.samples
+    )
     notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
+    notes += [*learner.faults, *(_finding(one.sensor, one.message) for one in mounting.findings)]
     if not sampler.samples:
         notes.append("no UDP packet in the first 10 seconds")
     elif not found:
         names = ", ".join(path.name for path in looked) or "none"
         notes.append(f"no lidar with its metadata; files looked at: {names}")
-    files = {sensor.name: Path(sensor.lidar.calibration) for sensor in found}
-    return Survey(reports, tuple(found), files, tuple(notes))
+    used = {
+        sensor.name: files[sensor.lidar.calibration]
+        for sensor in found
+        if sensor.lidar.calibration in files
+    }
+    return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes))
+
+
+def _finding(sensor: str, message: str) -> str:
+    return f"{sensor}: {message}" if sensor else message
 
 
 def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Count]:
@@ -187,21 +227,21 @@ def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router)
 def _report(
     sampler: Sampler,
     kind: Kind,
-    found: Sequence[Found],
+    mounted: Sequence[Mounted],
     counts: Sequence[_Count],
-    router: Router,
+    owner: str,
+    types: Mapping[str, str],
 ) -> StreamReport:
     first_ns, last_ns = sampler.span_ns[kind]
     packets = sampler.packets[kind]
-    at = next((n for n, sensor in enumerate(found) if kind in sensor.kinds), None)
-    lidar = None if at is None else found[at].lidar
+    at = next((n for n, sensor in enumerate(mounted) if kind in sensor.found.kinds), None)
+    lidar = None if at is None else mounted[at].found.lidar
     first = None if at is None else counts[at].first
-    what = describe(sampler, kind) or "unknown"
-    unmatched = lidar is None and "lidar" in what
+    unmatched = lidar is None and "lidar" in (describe(sampler, kind) or "")
     return StreamReport(
         stream=str(sampler.table.streams[kind[0]]),
-        what=what if lidar is None else f"{lidar.model} {lidar.mode}",
-        sensor=_owner(sampler, kind, found, router) if at is None else found[at].name,
+        what=named(sampler, kind, types) if lidar is None else f"{lidar.model} {lidar.mode}",
+        sensor=owner if at is None else mounted[at].name,
         model="" if lidar is None else lidar.model,
         mode="" if lidar is None else lidar.mode,
         serial="" if lidar is None else lidar.serial,
@@ -214,6 +254,6 @@ def _report(
         timescale="" if first is None else timescale(*first),
         offset_ms=None if first is None else (first[0] - first[1]) / NS_PER_MS,
         calibration="" if lidar is None else Path(lidar.calibration).name,
-        extrinsics="" if lidar is None else ("metadata" if lidar.extrinsics is not None else ""),
+        extrinsics=mounted[at].origin if at is not None and _is_placed(mounted[at]) else "",
         missing="metadata" if unmatched else "",
     )
