@@ -1,0 +1,92 @@
+"""The same packets in every container give the same scans; real bags give all of their packets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mlbatch.readers import open_recording
+from mlbatch.types import StreamTable
+from tests.builders.run import FIXTURE, RECORDINGS, Values, command, in_memory, prints
+from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
+
+# MANIFEST.md: topic, packets, their bytes.
+BAGS = {
+    "hesai/pandar40p/1673400149412331409": ("/pandar_packets", 1439, 1262),
+    "hesai/pandar64/1673403880599376836": ("/pandar_packets", 2400, 1198),
+    "hesai/pandar64_all-points/all_points": ("/pandar_packets", 2400, 1198),
+    "hesai/pandarqt64/1673401195788312575": ("/pandar_packets", 1200, 1072),
+    "hesai/pandarxt16/1732848127890747768": ("/pandar_packets", 1626, 568),
+    "hesai/pandarxt32/1673400677802009732": ("/pandar_packets", 2000, 1080),
+    "velodyne/vlp16_ros2_dual/1673400471837873222": ("/velodyne_packets", 603, 1206),
+    "velodyne/vlp32c_ros2/1713492677464078412": (
+        "/sensing/lidar/front/velodyne_packets",
+        379,
+        1206,
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def of_the_pcap() -> list[Values]:
+    """What the fixture gives."""
+    return prints(in_memory(FIXTURE))
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_scans_do_not_depend_on_the_container(
+    name: str, of_the_pcap: list[Values], tmp_path: Path
+) -> None:
+    path = CONTAINERS[name](tmp_path)
+    assert prints(in_memory(replace(FIXTURE, recordings=(path,)))) == of_the_pcap
+
+
+def packets_of(path: Path) -> Counter[tuple[str, int]]:
+    """Packets by topic and size; the ledger must balance."""
+    table = StreamTable()
+    recording = open_recording(path, table)
+    found: Counter[tuple[str, int]] = Counter()
+    for batch in recording.packets():
+        pairs = zip(batch.stream.tolist(), batch.size.tolist(), strict=True)
+        found.update((table.streams[stream].topic, size) for stream, size in pairs)
+    counts = recording.counts
+    assert counts.frames == counts.datagrams == found.total()
+    assert recording.notes == []
+    return found
+
+
+def real_bag(name: str) -> Path:
+    """A recorded bag; the test is skipped where it is absent."""
+    if not (RECORDINGS / name).is_dir():
+        pytest.skip(f"recording {name} is not here")
+    return RECORDINGS / name
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_every_packet_of_a_real_bag_is_counted(name: str) -> None:
+    topic, packets, size = BAGS[name]
+    folder = real_bag(name)
+    assert packets_of(folder) == {(topic, size): packets}
+    (file,) = folder.glob("*.db3")
+    assert packets_of(file) == {(topic, size): packets}
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_bags_that_do_not_name_their_storage_are_read(name: str, tmp_path: Path) -> None:
+    topic, packets, size = BAGS[name]
+    copy = edited_copy(real_bag(name), tmp_path / "copy")
+    assert packets_of(copy) == {(topic, size): packets}
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_inspect_shows_the_stream_of_a_real_bag(name: str) -> None:
+    topic, packets, _ = BAGS[name]
+    told = command("inspect", real_bag(name))
+    assert (told.code, told.err) == (0, "")
+    row = next(line for line in told.out.splitlines() if line.startswith(topic))
+    assert str(packets) in row.split()
+    maker = name.split("/", maxsplit=1)[0]
+    assert maker in row.lower() or "pandar" in row.lower()
