@@ -7,6 +7,7 @@ stale or empty; what differs is noted.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def bag_folder(folder: Path) -> BagFolder:
     whole = [path for path in files if path.suffix in (".db3", ".mcap") or path.stem not in names]
     filled = [path for path in whole if path.stat().st_size] or whole[:1]
     notes = [f"{path.name}: has 0 bytes and is left out" for path in whole if path not in filled]
-    return BagFolder(tuple(filled), (*notes, *_stale(folder / _METADATA, names)))
+    return BagFolder(tuple(filled), (*notes, *_stale(folder / _METADATA, names, filled)))
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -53,7 +54,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(digits or 0), text) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
-def _stale(metadata: Path, names: set[str]) -> list[str]:
+def _stale(metadata: Path, names: set[str], read: Sequence[Path]) -> list[str]:
     """How metadata.yaml differs from the files that are there."""
     if not metadata.is_file():
         return []
@@ -62,9 +63,13 @@ def _stale(metadata: Path, names: set[str]) -> list[str]:
         return [f"{metadata.name}: cannot be read; the files in the folder are taken"]
     missing = [name for name in listed if name not in names and not _packed(name, names)]
     known = {*listed, *(f"{name}.zstd" for name in listed)}
-    extra = sorted(names - known, key=_natural)
     notes = [f"{name}: listed in {metadata.name}, but not there" for name in missing]
-    return [*notes, *(f"{name}: not listed in {metadata.name}, but read" for name in extra)]
+    extra = [
+        f"{path.name}: not listed in {metadata.name}, but read"
+        for path in read
+        if path.name not in known
+    ]
+    return [*notes, *extra]
 
 
 def _packed(name: str, names: set[str]) -> bool:
