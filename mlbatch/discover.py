@@ -17,7 +17,7 @@ from mlbatch.lidar import Calibration
 from mlbatch.mounting import Mounted, mount
 from mlbatch.readers import merge
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
-from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig
+from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig, split_by_kind
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -75,19 +75,38 @@ def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, 
 
 
 def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
-    """The packets of the first 10 s of a session, whatever the size of the batches."""
+    """The packets up to 10 s after the first lidar packet, whatever the size of the batches.
+
+    A capture is often started long before the lidars are.
+    """
     until_ns: int | None = None
+    known: set[Kind] = set()
     for batch in merge(recordings):
-        if not len(batch):
+        if until_ns is None:
+            began_ns = _lidars_begin_ns(batch, known)
+            until_ns = None if began_ns is None else began_ns + LOOK_NS
+        if until_ns is None:
             yield batch
             continue
-        if until_ns is None:
-            until_ns = int(batch.host_ns[0]) + LOOK_NS
         over = np.flatnonzero(batch.host_ns > until_ns)
         if len(over):
             yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
             return
         yield batch
+
+
+def _lidars_begin_ns(batch: PacketBatch, known: set[Kind]) -> int | None:
+    """Arrival of the first packet that looks like a lidar's; kinds already looked at are known."""
+    begins_ns = []
+    for kind, index in split_by_kind(batch):
+        if kind in known:
+            continue
+        known.add(kind)
+        begin = int(batch.start[index[0]])
+        text = sensors.describe(kind[1], batch.data[begin : begin + kind[1]][None])
+        if text is not None and "lidar" in text:
+            begins_ns.append(int(batch.host_ns[index[0]]))
+    return min(begins_ns, default=None)
 
 
 def calibrations_for(

@@ -166,6 +166,7 @@ class Router:
             and self._may_own(sensor, kind, stream, payload)
         )
         if owners:
+            self._join(kind, owners)
             return Route(Role.LIDAR, owners)
         imu = self._imu_owner(stream, size)
         if imu is not None:
@@ -174,6 +175,17 @@ class Router:
             if any(stream_number == kind[0] for stream_number, _ in sensor.kinds):
                 return Route(Role.BAD_SIZE, (number,))
         return Route(Role.UNASSIGNED)
+
+    def _join(self, kind: Kind, owners: Sequence[int]) -> None:
+        """A sensor is known to send a kind: what comes beside it may be its IMU."""
+        for number in owners:
+            if kind not in self._found[number].kinds:
+                self._found[number].kinds.add(kind)
+                self._routes = {
+                    other: route
+                    for other, route in self._routes.items()
+                    if route.role is not Role.UNASSIGNED
+                }
 
     def _may_own(self, sensor: Found, kind: Kind, stream: Stream, payload: U8Array) -> bool:
         if kind in sensor.kinds:

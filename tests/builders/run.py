@@ -23,13 +23,14 @@ from mlbatch.pipeline import Conversion, convert
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
 from mlbatch.report import ReportInputs
-from mlbatch.types import (, Message
+from mlbatch.types import (
     EXTRAS,
     IMU,
     BoolArray,
     F32Array,
     I64Array,
     ImuSamples,
+    Message,
     Recording,
     RunInfo,
     Scan,
