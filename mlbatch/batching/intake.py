@@ -84,7 +84,7 @@ class Intake:
         self._offset_ns = offset_ns
         self._newest = NEVER
         self._held: Arrival | None = None
-        self._recent = np.empty(0, np.int64)
+        self._recent: I64Array = np.empty(0, np.int64)
         self._largest_key = -1
 
     def accept(self, arrival: Arrival) -> Delivery:

@@ -24,7 +24,7 @@ def merge(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
         yield from recordings[0].packets()
         return
     feeds = [_Feed.peek(recording) for recording in recordings]
-    out = np.zeros(0, np.uint8)
+    out: U8Array = np.zeros(0, np.uint8)
     while waiting := [feed for feed in feeds if not feed.ended]:
         # The feed that ends first bounds what is known; of equals, the first in order.
         slowest = min(waiting, key=lambda feed: feed.known_until_ns)

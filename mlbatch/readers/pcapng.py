@@ -150,7 +150,8 @@ class _Walker:
 
     def _links(self, interface: I64Array) -> I64Array:
         table = np.array([*(known.link for known in self.interfaces), NO_LINK], np.int64)
-        return table[np.minimum(interface, len(self.interfaces))]
+        links: I64Array = table[np.minimum(interface, len(self.interfaces))]
+        return links
 
     def _host_ns(self, interface: I64Array, ticks: U64Array) -> I64Array:
         host_ns = np.zeros(len(ticks), np.int64)

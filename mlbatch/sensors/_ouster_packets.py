@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.lidar import FAULTS
 from mlbatch.sensors._crc import crc64
@@ -173,7 +174,7 @@ def _header_field(packets: U8Array, header: HeaderLayout, field: str) -> I64Arra
     return unsigned(packets, place)
 
 
-def _no_crc() -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+def _no_crc() -> npt.NDArray[np.uint64]:
     return np.array(_NO_CRC, np.uint64)
 
 

@@ -170,7 +170,8 @@ def _azimuth(points: Points) -> Values:
 def _elevation(points: Points) -> Values:
     """rad, upwards from the xy plane."""
     x, y, z = _in_sensor(points)
-    return np.arctan2(z, np.sqrt(x * x + y * y))
+    angle: F64Array = np.arctan2(z, np.sqrt(x * x + y * y))
+    return angle
 
 
 def _distance(points: Points) -> Values:

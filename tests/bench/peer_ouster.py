@@ -14,11 +14,12 @@ import json
 import sys
 
 import numpy as np
+import numpy.typing as npt
 
 FIELDS = ["RANGE", "REFLECTIVITY"]
 
 
-def pose(text: str) -> np.ndarray:
+def pose(text: str) -> npt.NDArray[np.float64]:
     """Body from sensor, (4, 4), metres, of a text `x,y,z,yaw_deg`."""
     x, y, z, yaw_deg = (float(part) for part in text.split(","))
     cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))

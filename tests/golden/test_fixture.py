@@ -190,7 +190,7 @@ def test_organized_holds_exactly_the_dense_points(folder: Path, tmp_path: Path) 
         filled: npt.NDArray[np.bool_] = ~np.isnan(np.asarray(grid["range_m"], np.float32))
         assert filled.shape == (columns, BEAMS)
         assert np.array_equal(np.nonzero(filled)[0], dense["column"])
-        assert np.array_equal(np.nonzero(filled)[1], dense["ring"] % np.uint16(BEAMS))
+        assert np.array_equal(np.nonzero(filled)[1], np.asarray(dense["ring"], np.int64) % BEAMS)
         for key in set(grid) & set(POINT_KEYS):
             assert grid[key].dtype == dense[key].dtype
             assert grid[key][filled].tobytes() == dense[key].tobytes(), key

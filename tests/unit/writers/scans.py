@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mlbatch.types import ImuSamples, RunInfo, Scan, SensorInfo, Summary
+from mlbatch.types import F64Array, ImuSamples, RunInfo, Scan, SensorInfo, Summary
 
 START_NS = 1_700_000_000_100_000_000
 PERIOD_NS = 100_000_000
 CHANNELS = 4
 
 
-def pose(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarray:
+def pose(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> F64Array:
     """(4, 4) rotation about z and translation."""
     cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array(
