@@ -170,6 +170,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         rigged,
         rig,
         learner.knowledge,
+        metadata_topics=learner.metadata_topics,
         identity_extrinsics=wishes.identity_extrinsics,
     )
     setup = Setup(mounted, mounting.body_frame, router, sampler, notes, ignored=ignored)

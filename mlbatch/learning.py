@@ -67,6 +67,11 @@ class Learner:
         elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
             self.knowledge.add_urdf(decode_string(topic, message.data))
 
+    @property
+    def metadata_topics(self) -> tuple[str, ...]:
+        """Topics of metadata that spoke."""
+        return tuple(self._texts)
+
     def calibrations(self) -> list[Calibration]:
         """Calibrations in metadata topics; a text that is none is a fault."""
         found: list[Calibration] = []

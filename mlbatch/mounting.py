@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from mlbatch.frames import candidates
@@ -45,17 +45,19 @@ def mount(
     rig: Rig | None,
     knowledge: Knowledge,
     *,
+    metadata_topics: Collection[str] = (),
     identity_extrinsics: bool,
 ) -> tuple[list[Mounted], Mounting]:
     """Place all sensors; RigError where two or more should be, and some have no extrinsics.
 
-    rigged: what the rig says of each sensor, None without a rig.
+    rigged: what the rig says of each sensor, None without a rig; metadata_topics: those that gave
+    calibrations.
     """
     makers = Counter(sensor.lidar.maker for sensor in found)
     frames = {
         sensor.name: candidates(
             sensor.lidar.maker,
-            _places(table, sensor),
+            _places(table, sensor, metadata_topics),
             alone=makers[sensor.lidar.maker] == 1,
             sensor_from_lidar=sensor.lidar.sensor_from_lidar,
         )
@@ -91,7 +93,9 @@ def mount(
     return mounted, mounting
 
 
-def _places(table: StreamTable, sensor: Found) -> list[str]:
-    """Words for where a sensor sits: the topics of its packets, else its name."""
+def _places(table: StreamTable, sensor: Found, metadata_topics: Collection[str]) -> list[str]:
+    """Words for where a sensor sits: topics of its packets, else of its metadata, else its name."""
     topics = sorted({table.streams[stream].topic for stream, _ in sensor.kinds} - {""})
+    if not topics and sensor.lidar.calibration in metadata_topics:
+        topics = [sensor.lidar.calibration]
     return topics or [sensor.name]

@@ -165,7 +165,13 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     calibrations += learner.calibrations()
     found, _ = match(sampler, calibrations, {})
     mounted, mounting = mount(
-        table, found, [None] * len(found), None, learner.knowledge, identity_extrinsics=True
+        table,
+        found,
+        [None] * len(found),
+        None,
+        learner.knowledge,
+        metadata_topics=learner.metadata_topics,
+        identity_extrinsics=True,
     )
     for sensor in found:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]

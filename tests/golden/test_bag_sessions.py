@@ -1,0 +1,331 @@
+"""Whole sessions in bags: everything that a conversion needs is in the recording."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from mlbatch.rig import read_rig
+from tests.builders.bags import Body, Recorded, imu_message, packet_message
+from tests.builders.ouster import metadata_json
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
+from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
+from tests.builders.sessions_of_bags import (
+    description,
+    split_at,
+    told,
+    urdf,
+    write_mcap,
+)
+from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
+from tests.unit.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
+
+Write = Callable[[Path], Path]
+# SOURCE.md of the fixture: seven whole windows, 512 columns of each lidar in each.
+WHOLE_SCANS, COLUMNS = 7, 1024
+SESSIONS: dict[str, Write] = {
+    "MCAP": lambda folder: write_mcap(folder / "drive.mcap", told()),
+    "db3 with types": lambda folder: write_rosbag2(folder / "drive.db3", told(), Form(schema=4)),
+    "db3 without types": lambda folder: write_rosbag2(folder / "drive.db3", told()),
+    "split db3": lambda folder: write_folder(folder / "drive", split_at(told(), 3)),
+    "ROS 1": lambda folder: write_rosbag1(folder / "drive.bag", told("ros1"), "lz4"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """An output in a folder of npz files."""
+
+    told: Told
+    folder: Path
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Its report."""
+        found: dict[str, Any] = json.loads((self.folder / "report.json").read_text())
+        return found
+
+    @property
+    def warnings(self) -> list[tuple[str, str]]:
+        """Codes and sensors of its warnings."""
+        return [(one["code"], one["sensor"]) for one in self.report["warnings"]]
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """All but the report, which holds timings and paths."""
+        names = [p.name for p in self.folder.iterdir() if p.name != "report.json"]
+        return {name: (self.folder / name).read_bytes() for name in sorted(names)}
+
+
+def convert(output: Path, *words: str | Path) -> Made:
+    """Convert to npz; must succeed."""
+    done = command("convert", *words, "-o", output)
+    assert done.code == 0, done.err
+    return Made(done, output)
+
+
+def refused(*words: str | Path) -> str:
+    """The one line that a refused conversion says."""
+    done = command("convert", *words, "--dry-run")
+    assert (done.code, done.out) != (0, "")
+    (line,) = done.err.splitlines()
+    return line.removeprefix("mlbatch: error: ")
+
+
+@pytest.fixture(scope="module")
+def mcap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session as an MCAP file."""
+    return SESSIONS["MCAP"](tmp_path_factory.mktemp("mcap"))
+
+
+@pytest.fixture(scope="module")
+def plain(mcap: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """What it gives without options."""
+    return convert(tmp_path_factory.mktemp("plain") / "scans", mcap)
+
+
+def test_two_lidars_need_no_options(plain: Made) -> None:
+    assert plain.told.err == ""
+    assert len(scan_files(plain.folder)) == WHOLE_SCANS
+    for sensor, lidar in zip(plain.report["sensors"], (LEFT, RIGHT), strict=True):
+        assert sensor["name"] == lidar.name
+        assert sensor["stream"] == f"/{lidar.name}/ouster/lidar_packets"
+        assert sensor["imu_packets"] == 85
+        extrinsics = sensor["extrinsics"]
+        assert extrinsics["source"] == f"tf_static: base_link -> {lidar.name}/os_sensor"
+        # Quaternions of float64 in the bag.
+        assert np.abs(extrinsics["body_from_sensor"] - body_from_sensor(lidar)).max() < 1e-12
+    assert plain.report["messages"] == [
+        {"topic": "/imu/data", "read": 85, "written": 0, "dropped": {"no_place": 85}}
+    ]
+
+
+def test_scans_are_those_of_the_capture_with_its_rig(plain: Made, tmp_path: Path) -> None:
+    rig = (TWO_LIDARS / "rig.yaml").read_text(encoding="utf-8")
+    for name in ("left.json", "right.json"):
+        shutil.copy(TWO_LIDARS / name, tmp_path)
+    (tmp_path / "rig.yaml").write_text(rig[: rig.index("# The machine's")], encoding="utf-8")
+    pcap = TWO_LIDARS / "two_lidars.pcap"
+    capture = convert(tmp_path / "scans", pcap, "--rig", tmp_path / "rig.yaml")
+    for one, other in zip(scan_files(plain.folder), scan_files(capture.folder), strict=True):
+        left, right = load(one), load(other)
+        assert left["column_stamp_ns"].shape == (COLUMNS,)
+        for key in left.keys() - {"xyz"}:
+            assert np.array_equal(left[key], right[key]), key
+        # Quaternions round the rotation differently: by less than a step of float32 at 20 m.
+        xyz_m, expected_m = (np.asarray(scan["xyz"], np.float64) for scan in (left, right))
+        assert np.abs(xyz_m - expected_m).max() < 2e-6
+
+
+@pytest.mark.parametrize("name", [name for name in SESSIONS if name != "MCAP"])
+def test_every_container_teaches_the_same(name: str, plain: Made, tmp_path: Path) -> None:
+    made = convert(tmp_path / "scans", SESSIONS[name](tmp_path))
+    assert made.told.err == ""
+    assert made.files == plain.files
+
+
+def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> None:
+    parts = [
+        write_rosbag2(tmp_path / f"{number}.db3", part)
+        for number, part in enumerate(split_at(told(), 3))
+    ]
+    # Times decide, not names or order.
+    assert convert(tmp_path / "scans", *reversed(parts)).files == plain.files
+
+
+def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
+    bag = write_mcap(tmp_path / "drive.mcap", told(without="tf_static"))
+    assert refused(bag) == (
+        "extrinsics unknown for left, right; wanted for every sensor when there are two or more; "
+        "give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or accept the "
+        "body origin with --identity-extrinsics"
+    )
+    assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == []
+
+
+@pytest.mark.parametrize(("x_m", "warns"), [(0.3, False), (0.3009, False), (0.35, True)])
+def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_path: Path) -> None:
+    messages = told()
+    messages.insert(0, description(urdf(x_m), messages[0].log_ns))
+    made = convert(tmp_path / "scans", write_mcap(tmp_path / "drive.mcap", messages))
+    assert made.warnings == ([("extrinsics_contradict", "left")] if warns else [])
+    if warns:
+        assert "differ by 50.0 mm and 0.00 degrees" in made.told.err
+    # The transforms win.
+    assert made.files == plain.files
+
+
+def test_packets_in_a_capture_and_the_rest_in_a_bag(plain: Made, tmp_path: Path) -> None:
+    shutil.copy(TWO_LIDARS / "two_lidars.pcap", tmp_path / "drive.pcap")
+    others = [one for one in told() if "packets" not in one.topic]
+    bag = write_rosbag2(tmp_path / "knows.db3", others)
+    made = convert(tmp_path / "scans", tmp_path / "drive.pcap", bag)
+    assert made.told.err == ""
+    sources = [sensor["extrinsics"]["source"] for sensor in made.report["sensors"]]
+    assert sources == [
+        "tf_static: base_link -> left/os_sensor",
+        "tf_static: base_link -> right/os_sensor",
+    ]
+    for one, other in zip(scan_files(made.folder), scan_files(plain.folder), strict=True):
+        assert np.array_equal(load(one)["xyz"], load(other)["xyz"])
+
+
+def imu_of(path: Path) -> list[tuple[int, bytes]]:
+    """(log time, data) of the messages on /imu/data."""
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(["/imu/data"])
+        return [(message.log_time, message.data) for _, _, message in found]
+
+
+def test_imu_messages_are_written_at_their_own_stamps(mcap: Path, tmp_path: Path) -> None:
+    done = command("convert", mcap, "-o", tmp_path / "scans.mcap")
+    assert (done.code, done.err) == (0, "")
+    sent = [one for one in told() if one.topic == "/imu/data"]
+    # Stamp and log time are the same there.
+    assert imu_of(tmp_path / "scans.mcap") == [(one.log_ns, one.data) for one in sent]
+
+
+def bag_of(unit: Unit, place: str) -> list[Recorded]:
+    """A unit's packets and metadata as its driver publishes them."""
+    kind, text = "ouster_sensor_msgs/PacketMsg", json.dumps(metadata_json(unit.spec))
+    data = Body("cdr").text(text).done()
+    first_ns = unit.payloads[0][0]
+    topic = f"/{place}/ouster"
+    return [
+        Recorded(f"{topic}/metadata", "std_msgs/String", first_ns, data, latched=True),
+        *(
+            Recorded(f"{topic}/lidar_packets", kind, host_ns, packet_message("cdr", payload))
+            for host_ns, payload in unit.payloads
+        ),
+    ]
+
+
+UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=1_700_000_000 * NS_PER_S)
+
+
+def test_imu_messages_on_another_clock_are_dropped_with_one_warning(tmp_path: Path) -> None:
+    messages = bag_of(UPTIME, "roof")
+    for one in messages[1::8]:
+        data = imu_message("cdr", one.log_ns, "imu", 9.8)
+        messages.append(Recorded("/imu/data", "sensor_msgs/Imu", one.log_ns, data))
+    messages.sort(key=lambda one: one.log_ns)
+    bag = write_mcap(tmp_path / "drive.mcap", messages)
+    done = command("convert", bag, "-o", tmp_path / "scans.mcap")
+    assert done.code == 0
+    assert done.err == (
+        "mlbatch: warning: imu_clock: /imu/data: 12 message(s) dropped: their clock is not that "
+        "of the scans\n"
+    )
+    assert imu_of(tmp_path / "scans.mcap") == []
+
+
+def frame_message(unit: Unit) -> bytes:
+    """All packets of a unit as a driver sends a frame: without times of their own."""
+    body = Body("cdr").header(unit.begin_ns).put("I", len(unit.payloads))
+    for _, payload in unit.payloads:
+        body.time(0).blob(payload).put("I", len(payload))
+    return body.done()
+
+
+@pytest.mark.parametrize("by_rig", [False, True])
+def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Path) -> None:
+    unit = Unit()
+    metadata, *packets = bag_of(unit, "roof")
+    frame = Recorded(
+        "/roof/ouster/frames",
+        "hesai_ros_driver/UdpFrame",
+        packets[-1].log_ns,
+        frame_message(unit),
+    )
+    bag = write_rosbag2(tmp_path / "drive.db3", [metadata, frame])
+    options: Sequence[str | Path] = ["--clock", "host"]
+    if by_rig:
+        rig = tmp_path / "rig.yaml"
+        rig.write_text("sensors: [{name: roof, clock: {source: host}}]\n", encoding="utf-8")
+        options = ["--rig", rig]
+    assert refused(bag, *options) == (
+        "--clock host: sensor roof: wanted the arrival time of each packet, got only that of whole "
+        "messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source), or record "
+        "the packets with tcpdump"
+    )
+    assert convert(tmp_path / "scans", bag).report["sensors"][0]["packets"]["read"] == 96
+
+
+def test_arrival_times_of_single_packets_are_their_log_times(tmp_path: Path) -> None:
+    unit = replace(Unit(), host_ns=3 * NS_PER_S)
+    bag = write_rosbag2(tmp_path / "drive.db3", bag_of(unit, "roof"))
+    by_host = convert(tmp_path / "host", bag, "--clock", "host", "--keep-partial")
+    stamps = np.concatenate([load(p)["column_stamp_ns"] for p in scan_files(by_host.folder)])
+    # A packet's last column has the packet's arrival; a turn of 0.1 s has 512 columns.
+    arrivals = [host_ns for host_ns, _ in unit.payloads]
+    assert set(arrivals) <= set(stamps.tolist())
+    assert stamps.max() == arrivals[-1]
+    assert stamps.min() > arrivals[0] - 4 * NS_PER_MS
+
+
+def test_inspect_of_a_folder_names_all_that_it_knows(tmp_path: Path) -> None:
+    bag = SESSIONS["split db3"](tmp_path)
+    done = command("inspect", bag, "--json")
+    assert (done.code, done.err) == (0, "")
+    found = json.loads(done.out)
+    lidars = {one["sensor"]: one for one in found["streams"] if one["serial"]}
+    for lidar in (LEFT, RIGHT):
+        one = lidars[lidar.name]
+        assert (one["packets"], one["lost"], one["serial"]) == (271, 0, lidar.serial)
+        assert one["extrinsics"] == f"tf_static: base_link -> {lidar.name}/os_sensor"
+        assert one["missing"] == ""
+    assert found["notes"] == []
+
+
+@pytest.mark.parametrize("name", ["MCAP", "split db3", "ROS 1"])
+def test_the_rig_of_inspect_gives_the_same_scans(name: str, plain: Made, tmp_path: Path) -> None:
+    bag, rig = SESSIONS[name](tmp_path), tmp_path / "rig.yaml"
+    assert command("inspect", bag, "--write-rig", rig).code == 0
+    assert "metadata:" not in rig.read_text(encoding="utf-8")
+    made = convert(tmp_path / "scans", bag, "--rig", rig)
+    assert made.told.err == ""
+    assert made.files == plain.files
+
+
+def test_packets_without_serial_number_go_by_their_topics(tmp_path: Path) -> None:
+    old = replace(Unit(), spec=replace(SMALL, profile="LEGACY"))
+    other = replace(twin(old, 222), range_mm=6000)
+    messages = sorted([*bag_of(old, "front"), *bag_of(other, "rear")], key=lambda one: one.log_ns)
+    bag, rig = write_mcap(tmp_path / "drive.mcap", messages), tmp_path / "rig.yaml"
+    assert command("inspect", bag, "--write-rig", rig).code == 0
+    topics = [sensor.stream.topic for sensor in read_rig(rig).sensors if sensor.stream]
+    assert topics == ["/front/ouster/lidar_packets", "/rear/ouster/lidar_packets"]
+    made = convert(tmp_path / "scans", bag, "--rig", rig)
+    assert [sensor["name"] for sensor in made.report["sensors"]] == ["front", "rear"]
+    scan = load(scan_files(made.folder)[0])
+    for lidar_id, range_m in enumerate((4.0, 6.0)):
+        assert set(scan["range_m"][scan["lidar_id"] == lidar_id].tolist()) == {range_m}
+
+
+def test_metadata_of_strangers_beside_a_bag_do_no_harm(plain: Made, tmp_path: Path) -> None:
+    bag = SESSIONS["MCAP"](tmp_path)
+    stranger = metadata_json(replace(SMALL, serial=999))
+    (tmp_path / "stranger.json").write_text(json.dumps(stranger), encoding="utf-8")
+    assert convert(tmp_path / "scans", bag).files == plain.files
+
+
+def test_passed_topics_keep_their_bytes(mcap: Path, tmp_path: Path) -> None:
+    done = command("convert", mcap, "--pass", "/*/ouster/metadata", "-o", tmp_path / "scans.mcap")
+    assert (done.code, done.err) == (0, "")
+    with (tmp_path / "scans.mcap").open("rb") as file:
+        topics = ["/left/ouster/metadata", "/right/ouster/metadata"]
+        found = {c.topic: m.data for _, c, m in make_reader(file).iter_messages(topics)}
+    sent = {one.topic: one.data for one in told() if one.topic.endswith("/metadata")}
+    assert found == sent
+    (length,) = struct.unpack_from("<I", found[topics[0]], 4)
+    assert json.loads(found[topics[0]][8 : 8 + length - 1])["sensor_info"]["prod_sn"] == LEFT.serial
