@@ -13,6 +13,7 @@ from mlbatch.sensors._ouster_imu import (
     LEGACY_SIZE,
     SAMPLE,
     SAMPLES_START,
+    float64,
     sample_count,
 )
 from mlbatch.sensors._ouster_packets import column_bytes, unsigned
@@ -88,7 +89,7 @@ def _describe_imu(size: int, packets: U8Array) -> str | None:
         bool((stamp > 0).all()) and bool((np.abs(stamp - stamps[0]) < NS_PER_S).all())
         for stamp in stamps
     )
-    return "Ouster IMU" if near and _feels(sample["acceleration_g"].astype(np.float64)) else None
+    return "Ouster IMU" if near and _feels(float64(sample["acceleration_g"])) else None
 
 
 def _describe_lidar(size: int, packets: U8Array) -> str | None:
@@ -115,7 +116,7 @@ def _describe_other(size: int, packets: U8Array) -> str | None:
         samples = np.ascontiguousarray(raw).view(SAMPLE)[..., 0]
         step_ns = np.diff(samples["stamp_ns"], axis=1)
         in_order = bool(((step_ns > 0) & (step_ns < NS_PER_S)).all())
-        felt_g = samples["acceleration"].astype(np.float64) / STANDARD_GRAVITY
+        felt_g = float64(samples["acceleration"]) / STANDARD_GRAVITY
         proven = in_order and _feels(felt_g)
     else:
         name, packet_type = "zone monitor", ZONE_PACKET

@@ -109,7 +109,9 @@ class Document:
         pose = values.reshape(4, 4)
         rotation = pose[:3, :3]
         rigid = (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() <= _RIGID_TOLERANCE
+            # Beyond, the product below would overflow; no rotation has such numbers.
+            np.abs(rotation).max() <= 2.0
+            and np.abs(rotation @ rotation.T - np.eye(3)).max() <= _RIGID_TOLERANCE
             and np.linalg.det(rotation) > 0
             and bool(np.all(pose[3] == (0.0, 0.0, 0.0, 1.0)))
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.sensors._ouster_profiles import FOOTER_SIZE
-from mlbatch.types import ImuSamples, U8Array
+from mlbatch.types import F32Array, F64Array, ImuSamples, U8Array
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
 # 3 x 8 + 2 x 12 = 48 bytes, no header.
@@ -49,14 +49,20 @@ def imu_size(samples: int) -> int:
     return SAMPLES_START + samples * SAMPLE.itemsize + FOOTER_SIZE
 
 
+def float64(values: F32Array) -> F64Array:
+    """The values in double precision; damaged packets may hold NaN that signal."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def read_legacy(payloads: U8Array, sensor: int) -> ImuSamples:
     """The one sample of each 48-byte packet; its stamp is the gyroscope's, as in the SDK."""
     sample = np.ascontiguousarray(payloads[:, :LEGACY_SIZE]).view(LEGACY_IMU)[:, 0]
     return ImuSamples(
         sensor,
         sample["gyroscope_ns"].astype(np.int64),
-        sample["acceleration_g"].astype(np.float64) * STANDARD_GRAVITY,
-        sample["angular_velocity_deg"].astype(np.float64) * RAD_PER_DEG,
+        float64(sample["acceleration_g"]) * STANDARD_GRAVITY,
+        float64(sample["angular_velocity_deg"]) * RAD_PER_DEG,
     )
 
 
@@ -69,6 +75,6 @@ def read_accel32(payloads: U8Array, sensor: int) -> ImuSamples:
     return ImuSamples(
         sensor,
         samples["stamp_ns"].astype(np.int64),
-        samples["acceleration"].astype(np.float64),
-        samples["angular_velocity"].astype(np.float64),
+        float64(samples["acceleration"]),
+        float64(samples["angular_velocity"]),
     )

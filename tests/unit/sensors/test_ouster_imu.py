@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mlbatch.sensors import read_calibration as read_file
+from mlbatch.sensors._ouster_imu import read_legacy
 from mlbatch.sensors.ouster import OusterLidar, read_calibration
 from mlbatch.types import U8Array
 from tests.builders.ouster import OusterSpec, imu_packet, metadata_json
@@ -127,3 +128,12 @@ def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) 
     for sample in samples:
         assert np.linalg.norm(sample.acceleration) == pytest.approx(9.8, abs=1.5)
         assert np.abs(sample.angular_velocity).max() < 2.0
+
+
+def test_a_nan_that_signals_makes_no_noise(recwarn: pytest.WarningsRecorder) -> None:
+    """0x7F800001 is a signalling NaN: a damaged packet must not print a warning of numpy's."""
+    payload = np.zeros(48, np.uint8)
+    payload[24:28] = np.frombuffer(bytes.fromhex("0100807f"), np.uint8)
+    samples = read_legacy(payload[None], 0)
+    assert np.isnan(samples.acceleration[0, 0])
+    assert len(recwarn) == 0
