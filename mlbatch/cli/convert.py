@@ -12,11 +12,13 @@ from mlbatch.errors import UsageError
 
 def convert(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap or pcapng, .gz or .zst.")
+        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="A .mcap file, or a folder for one file a scan."),
+        typer.Option(
+            "-o", "--output", help="A .mcap or .bag file, or a folder for one file a scan."
+        ),
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
     rate: Annotated[
@@ -24,7 +26,9 @@ def convert(
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", help="mcap, npz or ply. [default: by OUTPUT; a folder: npz]"),
+        typer.Option(
+            "--format", help="mcap, npz, ply, rosbag1, rosbag2. [default: by OUTPUT; a folder: npz]"
+        ),
     ] = None,
     layout: Annotated[
         str, typer.Option(help="dense: valid points only; organized: slots x columns.")

@@ -11,7 +11,7 @@ import typer
 
 def inspect(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap or pcapng, .gz or .zst.")
+        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
     ],
     metadata: Annotated[
         list[Path] | None,
