@@ -17,7 +17,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--output": r"\.mcap.*folder",
         "--rig": "YAML",
         "--rate": "Hz",
-        "--format": "mcap, npz or ply",
+        "--format": "mcap, npz, ply, rosbag1, rosbag2",
         "--layout": "dense.*organized",
         "--point-layout": "preset",
         "--slices": "window",
