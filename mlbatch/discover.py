@@ -24,6 +24,7 @@ from mlbatch.units import NS_PER_S
 LOOK_NS = 10 * NS_PER_S
 # Metadata is searched beside the recording under these suffixes, and told by content.
 SIDECAR_SUFFIXES = (".json",)
+_NO_SUPPORTED = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +192,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
 def _find_rigged(
     sampler: Sampler, rig: Rig, origin: Path, calibrations: Sequence[Calibration], wishes: Wishes
 ) -> tuple[list[Found], list[Kind]]:
+    for sensor in rig.sensors:
+        _refuse_undecodable(sampler, sensor, origin)
     wanted = [
         Wanted(
             sensor.name,
@@ -208,6 +211,20 @@ def _find_rigged(
         if sensor.model is not None:
             _check_model(sensor.name, sensor.model, one.lidar.model, origin)
     return found, unknown
+
+
+def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:
+    """Do not ask for metadata where all lidars on a sensor's stream lack a decoder."""
+    if sensor.stream is None or sensor.stream.serial:
+        return
+    streams = sampler.table.streams
+    chosen = [kind for kind in sampler.samples if sensor.stream.selects(streams[kind[0]])]
+    texts = [describe(sampler, kind) or "" for kind in chosen]
+    carried = [text for text in texts if "lidar" in text]
+    if carried and all(lacks_decoder(text) for text in carried):
+        raise RigError(
+            f"{origin}: sensor {sensor.name}: {sensor.stream} carries {carried[0]}; {_NO_SUPPORTED}"
+        )
 
 
 def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
@@ -251,14 +268,18 @@ def packet_types(recordings: Sequence[Recording]) -> dict[str, str]:
     return {topic.name: topic.type for recording in recordings for topic in recording.topics}
 
 
+def lacks_decoder(what: str) -> bool:
+    """Whether packets so described are of a lidar that no metadata would make readable."""
+    return "lidar" in what and "no decoder" in what
+
+
 def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[str]) -> Note:
-    stream = sampler.table.streams[kind[0]]
-    return Note(
-        "no_metadata",
-        "",
-        f"{stream}: {describe(sampler, kind)}; wanted metadata that fits, got {_known(looked)}; "
-        "its packets are counted as unassigned; give --metadata FILE",
-    )
+    stream, what = sampler.table.streams[kind[0]], describe(sampler, kind) or ""
+    unassigned = "its packets are counted as unassigned"
+    if lacks_decoder(what):
+        return Note("no_decoder", "", f"{stream}: {what}; {unassigned}; {_NO_SUPPORTED}")
+    text = f"{stream}: {what}; wanted metadata that fits, got {_known(looked)}; {unassigned}"
+    return Note("no_metadata", "", f"{text}; give --metadata FILE")
 
 
 def _nothing_found(
@@ -269,13 +290,16 @@ def _nothing_found(
 ) -> RecordingError:
     where = ", ".join(str(recording.path) for recording in recordings)
     table, types = sampler.table, packet_types(recordings)
-    if lidar_kinds:
-        kind = lidar_kinds[0]
-        stream = table.streams[kind[0]]
-        return RecordingError(
-            f"{where}: {stream} carries {describe(sampler, kind)}; wanted metadata that fits, "
-            f"got {_known(looked)}; give the sensor's with --metadata FILE"
-        )
+    carried = [(table.streams[kind[0]], describe(sampler, kind) or "") for kind in lidar_kinds]
+    for stream, what in carried:
+        if not lacks_decoder(what):
+            return RecordingError(
+                f"{where}: {stream} carries {what}; wanted metadata that fits, "
+                f"got {_known(looked)}; give the sensor's with --metadata FILE"
+            )
+    if carried:
+        stream, what = carried[0]
+        return RecordingError(f"{where}: {stream} carries {what}; {_NO_SUPPORTED}")
     seen = [
         f"{table.streams[kind[0]]} ({kind[1]} bytes: {named(sampler, kind, types)})"
         for kind in sampler.samples

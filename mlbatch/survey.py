@@ -15,6 +15,7 @@ from mlbatch.discover import (
     calibrations_for,
     describe,
     first_seconds,
+    lacks_decoder,
     look,
     named,
     packet_types,
@@ -243,7 +244,8 @@ def _report(
     at = next((n for n, sensor in enumerate(mounted) if kind in sensor.found.kinds), None)
     lidar = None if at is None else mounted[at].found.lidar
     first = None if at is None else counts[at].first
-    unmatched = lidar is None and "lidar" in (describe(sampler, kind) or "")
+    what = "" if lidar is not None else describe(sampler, kind) or ""
+    missing = "decoder" if lacks_decoder(what) else "metadata" if "lidar" in what else ""
     return StreamReport(
         stream=str(sampler.table.streams[kind[0]]),
         what=named(sampler, kind, types) if lidar is None else f"{lidar.model} {lidar.mode}",
@@ -261,5 +263,5 @@ def _report(
         offset_ms=None if first is None else (first[0] - first[1]) / NS_PER_MS,
         calibration="" if lidar is None else Path(lidar.calibration).name,
         extrinsics=mounted[at].origin if at is not None and _is_placed(mounted[at]) else "",
-        missing="metadata" if unmatched else "",
+        missing=missing,
     )

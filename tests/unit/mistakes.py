@@ -30,7 +30,12 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "none.pcap: wanted a recording, got no such file; check the path",
     ),
-    "folder": ("fix", 1, "fix: wanted a recording, got a folder without .db3 or .mcap files; name the files inside it"),
+    "folder": (
+        "fix",
+        1,
+        "fix: wanted a recording, got a folder without .db3 or .mcap files; "
+        "name the files inside it",
+    ),
     "empty file": (
         "empty.pcap",
         1,
@@ -357,7 +362,8 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         "R/other/lslidar-1212-byte-lookalike/VLI-16-one-packet.pcap",
         1,
         "R/other/lslidar-1212-byte-lookalike/VLI-16-one-packet.pcap: "
-        f"{NO_LIDAR}192.168.1.200 > port 2368 (1212 bytes: unknown){DATA_PORT}",
+        f"{NO_LIDAR}192.168.1.200 > port 2368 (1212 bytes: "
+        f"LSLIDAR-like, 1212 bytes: not supported){DATA_PORT}",
     ),
     "empty capture": (
         "R/ouster/empty-pcap/empty_pcap.pcap",

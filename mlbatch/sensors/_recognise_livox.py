@@ -1,0 +1,80 @@
+"""Names of Livox packets by content: lengths, data types, and stamps that step.
+
+Source: facts/others.md (Livox SDK2 and SDK1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.sensors._recognise_bytes import NO_DECODER, mostly, number, usual
+from mlbatch.types import U8Array
+from mlbatch.units import NS_PER_S, NS_PER_US
+
+_HEADER2_SIZE, _HEADER1_SIZE = 36, 18
+_MOST_TIME_TYPE2 = 2
+_TIME_TYPES1 = (0, 1, 3, 4)
+_GPS_TIME = 3
+_IMU2, _IMU1 = 0, 6
+# SDK2, by data type: bytes per point, and what they are.
+_TYPES2 = {
+    _IMU2: (24, "IMU"),
+    1: (14, "Cartesian 32 bit, single return"),
+    2: (8, "Cartesian 16 bit, single return"),
+    3: (10, "spherical, single return"),
+    0x11: (28, "Cartesian 32 bit, dual return"),
+}
+# SDK1, by data type: bytes of the payload, and what they are.
+_TYPES1 = {
+    0: (1318, "Cartesian, single return"),
+    1: (918, "spherical, single return"),
+    2: (1362, "Cartesian with tags, single return"),
+    3: (978, "spherical with tags, single return"),
+    4: (1362, "Cartesian, dual return"),
+    5: (786, "spherical, dual return"),
+    _IMU1: (42, "IMU"),
+    7: (1278, "Cartesian, triple return"),
+    8: (678, "spherical, triple return"),
+}
+
+
+def livox(size: int, packets: U8Array) -> str | None:
+    """A line on Livox packets, or None."""
+    return _describe_sdk2(size, packets) or _describe_sdk1(size, packets)
+
+
+def _describe_sdk2(size: int, packets: U8Array) -> str | None:
+    """The header announces the size twice: as a length, and by points of a type."""
+    if size <= _HEADER2_SIZE:
+        return None
+    kind = usual(number(packets, 10, 1))
+    point_size, what = _TYPES2.get(kind, (0, ""))
+    if not point_size:
+        return None
+    good = (packets[:, 10] == kind) & (packets[:, 11] <= _MOST_TIME_TYPE2)
+    good &= number(packets, 1, 2) == size
+    good &= number(packets, 5, 2) * point_size == size - _HEADER2_SIZE
+    if mostly(packets, good) is None:
+        return None
+    return "Livox IMU packet" if kind == _IMU2 else f"Livox lidar (SDK2), {what}{NO_DECODER}"
+
+
+def _describe_sdk1(size: int, packets: U8Array) -> str | None:
+    """A size and a type prove little, so the stamps of a few packets have to step forward."""
+    if len(packets) < 2 or size < _HEADER1_SIZE:
+        return None
+    kind = usual(number(packets, 9, 1))
+    wanted, what = _TYPES1.get(kind, (0, ""))
+    time_type = usual(number(packets, 8, 1))
+    if size != wanted or time_type not in _TIME_TYPES1:
+        return None
+    # Version, slot, device and reserved byte, time and data type are a stream's own; the status
+    # between them is not.
+    own = packets[:, [0, 1, 2, 3, 8, 9]]
+    if mostly(packets, (own == np.median(own, axis=0)).all(axis=1)) is None:
+        return None
+    gps = time_type == _GPS_TIME
+    step_ns = np.diff(number(packets, 14, 4) * NS_PER_US if gps else number(packets, 10, 8))
+    if not ((step_ns > 0) & (step_ns < NS_PER_S)).mean() > 0.5:
+        return None
+    return "Livox IMU packet" if kind == _IMU1 else f"Livox lidar (SDK1), {what}{NO_DECODER}"
