@@ -147,6 +147,7 @@ def _messages(view: memoryview, at: int, end: int, starts: list[int]) -> int:
 
 
 def too_long(length: int, limit: int) -> str:
+    """What is wrong with a record of this length; empty if nothing is."""
     if length <= limit:
         return ""
     return f"wanted a record of at most {limit} bytes, got one of {length}"
