@@ -148,9 +148,8 @@ class _Unpacking:
         """Packets and kept messages of a portion."""
         kept: list[tuple[int, Message]] = []
         parts: list[tuple[I64Array, Found, int]] = []
-        numbers, first = np.unique(portion.topic, return_index=True)
         # Streams get their numbers in the order in which they appear.
-        for number in numbers[np.argsort(first)].tolist():
+        for number in dict.fromkeys(portion.topic.tolist()):
             topic = self._recording.topics[number]
             rows = np.flatnonzero(portion.topic == number)
             if topic.name in self._recording.keep:

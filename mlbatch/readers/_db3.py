@@ -13,6 +13,7 @@ import tempfile
 import weakref
 from collections.abc import Generator
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +21,19 @@ import numpy as np
 from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import Portion, is_latched
 from mlbatch.readers._definitions import definition_text, type_key
+from mlbatch.readers._shapes import u32
 from mlbatch.readers._source import Source
+from mlbatch.readers._sqlite_table import WINDOW_BYTES, HandOver, Rows, Table
 from mlbatch.types import I64Array, Topic, U8Array
 
 MAGIC = b"SQLite format 3\0"
-BUFFER_BYTES = 4 << 20
+BUFFER_BYTES = WINDOW_BYTES
 _MAX_MESSAGE_BYTES = 512 << 20
 _ZSTD = b"\x28\xb5\x2f\xfd"
-# Reading through a mapping saves a third of the time; it is given back every few pages, since
-# what was read through it counts as memory of the process.
-_MAPPED_BYTES, _PAGES_MAPPED = 1 << 40, 8
 _BEFORE_ALL = (-(1 << 63), -(1 << 63))
+_COUNT = "SELECT count(*) FROM messages WHERE timestamp > ? AND timestamp < ?"
+_COLUMNS = ["id", "topic_id", "timestamp", "data"]
+_RESERVED_AT = 20
 _BY_TIME = (
     "SELECT id, topic_id, timestamp, data FROM messages WHERE timestamp >= ?1 AND "
     "(timestamp > ?1 OR id > ?2) AND topic_id IN ({}) ORDER BY timestamp, id"
@@ -68,6 +71,7 @@ class Database:
         self.notes: list[str] = []
         self.size_bytes = path.stat().st_size
         self._plain = self._unpacked()
+        self._logged = False
         try:
             with contextlib.closing(self._connect()) as connection:
                 self.topics = _topics(connection)
@@ -109,6 +113,7 @@ class Database:
             with contextlib.suppress(sqlite3.Error):
                 connection = sqlite3.connect(uri, uri=True)
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
+                self._logged = True
                 return connection
             note = f"{log.name}: cannot be read with the bag; its last messages are missing"
             self.notes += [note] if note not in self.notes else []
@@ -136,10 +141,27 @@ class Database:
         """Messages of the topics `numbers` (this file's number: the recording's) in `buffer`."""
         if not numbers:
             return
-        with contextlib.closing(self._connect()) as connection:
-            yield from _Reading(self.path.name, connection, numbers, buffer, damage).portions(
-                indexed=self._indexed
-            )
+        with (
+            contextlib.closing(self._connect()) as connection,
+            self._plain.open("rb", buffering=0) as file,
+        ):
+            reading = _Reading(self.path.name, connection, numbers, buffer, damage)
+            with contextlib.suppress(HandOver, OSError, sqlite3.Error):
+                yield from reading.direct(self._table(connection, file), indexed=self._indexed)
+                return
+            yield from reading.portions(indexed=self._indexed)
+
+    def _table(self, connection: sqlite3.Connection, file: FileIO) -> Table:
+        """The table of messages in the file; HandOver where it is not laid out as usual."""
+        columns = connection.execute("PRAGMA table_info(messages)").fetchall()
+        if self._logged or [row[1] for row in columns] != _COLUMNS or columns[0][5] != 1:
+            raise HandOver
+        (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
+        (root,) = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE type = 'table' AND name = 'messages'"
+        ).fetchone()
+        reserved = file.read(_RESERVED_AT + 1)[_RESERVED_AT]
+        return Table(file, page_bytes, page_bytes - reserved, root)
 
 
 @dataclass(slots=True)
@@ -172,15 +194,42 @@ class _Reading:
         self._last = _BEFORE_ALL
         self._marks = ", ".join(str(number) for number in numbers)
 
+    def direct(self, table: Table, *, indexed: bool) -> Generator[Portion, None, None]:
+        """Messages straight from the pages, as long as their order is that of the index."""
+        here = np.array(sorted(self._numbers), np.int64)
+        there = np.array([self._numbers[number] for number in here.tolist()], np.int64)
+        before_ns = _BEFORE_ALL[0]
+        for rows in table.rows(here, self._buffer):
+            if indexed:
+                before_ns = self._check_order(rows.log_ns, before_ns)
+            if _any_zstd(self._buffer, rows):
+                raise HandOver
+            if len(rows.number):
+                self._last = int(rows.log_ns[-1]), int(rows.number[-1])
+            if len(rows.start):
+                topic = there[np.searchsorted(here, rows.topic[rows.wanted])]
+                log_ns, end = rows.log_ns[rows.wanted], rows.start + rows.size
+                yield Portion(self._buffer, rows.start, end, log_ns, topic)
+
+    def _check_order(self, log_ns: I64Array, before_ns: int) -> int:
+        """The last of the times of rows, which must be the next ones in the order of time.
+
+        Rows that come later but belong here would be counted between the times of these.
+        """
+        if not len(log_ns):
+            return before_ns
+        last_ns = int(log_ns[-1])
+        between = int(((log_ns > before_ns) & (log_ns < last_ns)).sum())
+        (count,) = self._connection.execute(_COUNT, (before_ns, last_ns)).fetchone()
+        if log_ns[0] < before_ns or (np.diff(log_ns) < 0).any() or count != between:
+            raise HandOver
+        return last_ns
+
     def portions(self, *, indexed: bool) -> Generator[Portion, None, None]:
         """All messages; a database that is damaged is read as far as it goes."""
         by_id = _BY_ID.format(self._marks)
-        query, pages, go_on = _BY_TIME.format(self._marks) if indexed else by_id, 0, True
+        query, go_on = _BY_TIME.format(self._marks) if indexed else by_id, True
         while go_on:
-            if pages % _PAGES_MAPPED == 0:
-                for size in (0, _MAPPED_BYTES):
-                    self._connection.execute(f"PRAGMA mmap_size = {size}").fetchall()
-            pages += 1
             page = _Page()
             try:
                 go_on = self._fill(query, page)
@@ -228,6 +277,12 @@ class _Reading:
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE_BYTES)
         except zstandard.ZstdError:
             return b""
+
+
+def _any_zstd(buffer: U8Array, rows: Rows) -> bool:
+    """Whether messages are compressed one by one."""
+    start = rows.start[rows.size >= len(_ZSTD)]
+    return bool((u32(buffer, start) == int.from_bytes(_ZSTD, "little")).any())
 
 
 def _topics(connection: sqlite3.Connection) -> dict[int, Topic]:

@@ -100,7 +100,7 @@ class Unpacker:
         parts: list[Found] = []
         faults: list[tuple[int, str]] = []
         length = end - begin
-        for size in np.unique(length).tolist():
+        for size in dict.fromkeys(length.tolist()):
             rows = np.flatnonzero(length == size)
             untried = list(self._shapes.get(size, ()))
             while len(rows):

@@ -18,12 +18,14 @@ QOS[True] = QOS[False].replace("durability: 2", "durability: 1")
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a file is made; definitions: text of types where schema 4 shall hold another."""
+    """How a file is made; first_topic, row_step: numbers that the file gives to its rows."""
 
     schema: int = 3
     serialization: str = "cdr"
     zstd_messages: bool = False
     index: bool = True
+    first_topic: int = 1
+    row_step: int = 1
 
 
 def write_rosbag2(path: Path, messages: Sequence[Recorded], form: Form | None = None) -> Path:
@@ -32,17 +34,15 @@ def write_rosbag2(path: Path, messages: Sequence[Recorded], form: Form | None = 
     with sqlite3.connect(path) as connection:
         _tables(connection, form)
         numbers: dict[str, int] = {}
-        for message in messages:
+        for place, message in enumerate(messages):
             if message.topic not in numbers:
-                numbers[message.topic] = len(numbers) + 1
+                numbers[message.topic] = len(numbers) + form.first_topic
                 _topic(connection, numbers[message.topic], message, form)
             data = message.data
             if form.zstd_messages:
                 data = zstandard.ZstdCompressor().compress(data)
-            row = (numbers[message.topic], message.log_ns, data)
-            connection.execute(
-                "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", row
-            )
+            row = (1 + place * form.row_step, numbers[message.topic], message.log_ns, data)
+            connection.execute("INSERT INTO messages VALUES (?, ?, ?, ?)", row)
     connection.close()
     return path
 
