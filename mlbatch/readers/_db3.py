@@ -130,8 +130,7 @@ class Database:
                 f"SELECT timestamp FROM messages ORDER BY {order} LIMIT 1"
             ).fetchone()
         except sqlite3.DatabaseError:
-            # A table that is there and cannot be read shows its damage when it is read.
-            connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'messages'")
+            # What is wrong with the table shows when it is read.
             return None
         return row[0] if row is not None and isinstance(row[0], int) else None
 
