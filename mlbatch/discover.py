@@ -14,7 +14,7 @@ from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
-from mlbatch.mounting import Mounted, mount
+from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import merge
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
 from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig, split_by_kind
@@ -158,7 +158,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         found, unknown = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
     lidar_kinds = [kind for kind in unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
-        raise _nothing_found(sampler, recordings, lidar_kinds, looked)
+        reason = _nothing_found(sampler, recordings, lidar_kinds, looked)
+        raise RecordingError(f"{reason}{_hints(recordings, learner.faults)}")
     notes = [] if rig is not None else [_unmatched(sampler, kind, looked) for kind in lidar_kinds]
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
@@ -176,7 +177,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     )
     setup = Setup(mounted, mounting.body_frame, router, sampler, notes, ignored=ignored)
     notes += [Note("message", "", fault) for fault in learner.faults]
-    notes += [Note(one.code, one.sensor, one.message) for one in mounting.findings]
+    notes += [Note(one.code, one.sensor, in_words(one)) for one in mounting.findings]
     if rig is not None:
         setup.rig = rig
         setup.not_in_rig = set(lidar_kinds)
@@ -313,6 +314,13 @@ def _nothing_found(
         f"{where}: no lidar packets; wanted raw UDP packets of a supported lidar "
         f"(see `mlbatch sensors`), got {_some(seen) or 'no UDP packet at all'}; {remedy}"
     )
+
+
+def _hints(recordings: Sequence[Recording], faults: Sequence[str]) -> str:
+    """What is wrong with the recordings themselves, which may be why there is nothing."""
+    notes = [f"{one.path.name}: {note}" for one in recordings for note in one.notes]
+    hints = _some([*notes, *faults])
+    return f" ({hints})" if hints else ""
 
 
 def _known(words: Sequence[str]) -> str:

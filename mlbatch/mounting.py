@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from mlbatch.frames import candidates
-from mlbatch.knowledge import Knowledge, Mounting
+from mlbatch.knowledge import Finding, Knowledge, Mounting
 from mlbatch.rig import Rig, RigSensor
 from mlbatch.streams import Found
 from mlbatch.types import F64Array, StreamTable
@@ -91,6 +91,11 @@ def mount(
         for sensor in found
     ]
     return mounted, mounting
+
+
+def in_words(finding: Finding) -> str:
+    """A finding as a line that names its sensor."""
+    return f"sensor {finding.sensor}: {finding.message}" if finding.sensor else finding.message
 
 
 def _places(table: StreamTable, sensor: Found, metadata_topics: Collection[str]) -> list[str]:

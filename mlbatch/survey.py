@@ -22,7 +22,7 @@ from mlbatch.discover import (
 )
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
-from mlbatch.mounting import Mounted, mount
+from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import open_recording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
@@ -185,7 +185,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         for kind in sampler.samples
     )
     notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
-    notes += [*learner.faults, *(_finding(one.sensor, one.message) for one in mounting.findings)]
+    notes += [*learner.faults, *map(in_words, mounting.findings)]
     if not sampler.samples:
         notes.append("no UDP packet in the first 10 seconds")
     elif not found:
@@ -197,10 +197,6 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         if sensor.lidar.calibration in files
     }
     return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes))
-
-
-def _finding(sensor: str, message: str) -> str:
-    return f"{sensor}: {message}" if sensor else message
 
 
 def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Count]:

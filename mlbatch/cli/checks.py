@@ -19,6 +19,23 @@ LEAST_OUTPUT = 4
 _BYTES_PER_MB = 1_000_000
 
 
+def place(job: Job, output: Path) -> None:
+    """Refuse an output in the place of a recording, or in the folder of a bag."""
+    target = output.resolve()
+    for path in job.recordings:
+        recording = path.resolve()
+        if recording == target:
+            raise ExportError(
+                f"{output}: wanted an output besides the recordings, got one of them; "
+                "choose another name"
+            )
+        if recording.is_dir() and recording in target.parents:
+            raise ExportError(
+                f"{output}: wanted an output outside the recordings, got one inside {path}; "
+                "choose another folder"
+            )
+
+
 def disk(job: Job, output: Path) -> None:
     """Refuse a disk on which the output surely has no room; warn where it may have none."""
     if _is_limited(job):

@@ -49,6 +49,7 @@ def run(job: Job, wanted: Wanted) -> None:
     name = choose_format(wanted.output or Path("scans.mcap"), wanted.format)
     job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
+        checks.place(job, wanted.output)
         check_target(name, wanted.output, options, job.layout)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report

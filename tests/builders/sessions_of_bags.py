@@ -6,9 +6,10 @@ Messages: bags.py; what the drivers publish beside packets: facts/messages.md, s
 from __future__ import annotations
 
 import itertools
+import json
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import zstandard
@@ -24,10 +25,12 @@ from tests.builders.bags import (
     packet_message,
 )
 from tests.builders.captures import Packet, Section, write_pcapng
+from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS
 from tests.builders.traffic import read_pcap
+from tests.unit.sessions import Unit
 
 Write = Callable[[Path], Path]
 # A message record (opcode 5) that announces more bytes than follow.
@@ -199,6 +202,23 @@ def description(text: str, host_ns: int) -> Recorded:
     return Recorded("/robot_description", "std_msgs/String", host_ns, data, latched=True)
 
 
-def moved(messages: Iterable[Recorded], by_ns: int) -> list[Recorded]:
-    """The messages as a recorder with another clock would have stamped them."""
-    return [replace(one, log_ns=one.log_ns + by_ns) for one in messages]
+def unit_messages(unit: Unit, place: str) -> list[Recorded]:
+    """A unit's metadata, then its packets, as its driver publishes them."""
+    kind, text = "ouster_sensor_msgs/PacketMsg", json.dumps(metadata_json(unit.spec))
+    data, topic = Body("cdr").text(text).done(), f"/{place}/ouster"
+    first_ns = unit.payloads[0][0]
+    return [
+        Recorded(f"{topic}/metadata", "std_msgs/String", first_ns, data, latched=True),
+        *(
+            Recorded(f"{topic}/lidar_packets", kind, host_ns, packet_message("cdr", payload))
+            for host_ns, payload in unit.payloads
+        ),
+    ]
+
+
+def frame_message(unit: Unit) -> bytes:
+    """All packets of a unit as a driver sends a frame: without times of their own."""
+    body = Body("cdr").header(unit.begin_ns).put("I", len(unit.payloads))
+    for _, payload in unit.payloads:
+        body.time(0).blob(payload).put("I", len(payload))
+    return body.done()

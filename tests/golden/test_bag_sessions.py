@@ -15,15 +15,17 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.rig import read_rig
-from tests.builders.bags import Body, Recorded, imu_message, packet_message
+from tests.builders.bags import Recorded, imu_message
 from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
 from tests.builders.sessions_of_bags import (
     description,
+    frame_message,
     split_at,
     told,
+    unit_messages,
     urdf,
     write_mcap,
 )
@@ -195,26 +197,11 @@ def test_imu_messages_are_written_at_their_own_stamps(mcap: Path, tmp_path: Path
     assert imu_of(tmp_path / "scans.mcap") == [(one.log_ns, one.data) for one in sent]
 
 
-def bag_of(unit: Unit, place: str) -> list[Recorded]:
-    """A unit's packets and metadata as its driver publishes them."""
-    kind, text = "ouster_sensor_msgs/PacketMsg", json.dumps(metadata_json(unit.spec))
-    data = Body("cdr").text(text).done()
-    first_ns = unit.payloads[0][0]
-    topic = f"/{place}/ouster"
-    return [
-        Recorded(f"{topic}/metadata", "std_msgs/String", first_ns, data, latched=True),
-        *(
-            Recorded(f"{topic}/lidar_packets", kind, host_ns, packet_message("cdr", payload))
-            for host_ns, payload in unit.payloads
-        ),
-    ]
-
-
 UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=1_700_000_000 * NS_PER_S)
 
 
 def test_imu_messages_on_another_clock_are_dropped_with_one_warning(tmp_path: Path) -> None:
-    messages = bag_of(UPTIME, "roof")
+    messages = unit_messages(UPTIME, "roof")
     for one in messages[1::8]:
         data = imu_message("cdr", one.log_ns, "imu", 9.8)
         messages.append(Recorded("/imu/data", "sensor_msgs/Imu", one.log_ns, data))
@@ -229,18 +216,10 @@ def test_imu_messages_on_another_clock_are_dropped_with_one_warning(tmp_path: Pa
     assert imu_of(tmp_path / "scans.mcap") == []
 
 
-def frame_message(unit: Unit) -> bytes:
-    """All packets of a unit as a driver sends a frame: without times of their own."""
-    body = Body("cdr").header(unit.begin_ns).put("I", len(unit.payloads))
-    for _, payload in unit.payloads:
-        body.time(0).blob(payload).put("I", len(payload))
-    return body.done()
-
-
 @pytest.mark.parametrize("by_rig", [False, True])
 def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Path) -> None:
     unit = Unit()
-    metadata, *packets = bag_of(unit, "roof")
+    metadata, *packets = unit_messages(unit, "roof")
     frame = Recorded(
         "/roof/ouster/frames",
         "hesai_ros_driver/UdpFrame",
@@ -263,7 +242,7 @@ def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Pat
 
 def test_arrival_times_of_single_packets_are_their_log_times(tmp_path: Path) -> None:
     unit = replace(Unit(), host_ns=3 * NS_PER_S)
-    bag = write_rosbag2(tmp_path / "drive.db3", bag_of(unit, "roof"))
+    bag = write_rosbag2(tmp_path / "drive.db3", unit_messages(unit, "roof"))
     by_host = convert(tmp_path / "host", bag, "--clock", "host", "--keep-partial")
     stamps = np.concatenate([load(p)["column_stamp_ns"] for p in scan_files(by_host.folder)])
     # A packet's last column has the packet's arrival; a turn of 0.1 s has 512 columns.
@@ -300,7 +279,9 @@ def test_the_rig_of_inspect_gives_the_same_scans(name: str, plain: Made, tmp_pat
 def test_packets_without_serial_number_go_by_their_topics(tmp_path: Path) -> None:
     old = replace(Unit(), spec=replace(SMALL, profile="LEGACY"))
     other = replace(twin(old, 222), range_mm=6000)
-    messages = sorted([*bag_of(old, "front"), *bag_of(other, "rear")], key=lambda one: one.log_ns)
+    messages = sorted(
+        [*unit_messages(old, "front"), *unit_messages(other, "rear")], key=lambda one: one.log_ns
+    )
     bag, rig = write_mcap(tmp_path / "drive.mcap", messages), tmp_path / "rig.yaml"
     assert command("inspect", bag, "--write-rig", rig).code == 0
     topics = [sensor.stream.topic for sensor in read_rig(rig).sensors if sensor.stream]

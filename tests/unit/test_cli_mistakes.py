@@ -84,7 +84,8 @@ def shell(
     return Shell(monkeypatch, capsys)
 
 
-def _check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
+def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
+    """Run a mistake; nothing but the one line may come of it."""
     arguments, code, message = mistake
     before = _files(place)
     named = " -o " in f" {arguments}" or "--quiet" in arguments
@@ -100,13 +101,13 @@ def _check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistake(shell: Shell, place: Path, name: str) -> None:
-    _check(shell, place, MISTAKES[name])
+    check(shell, place, MISTAKES[name])
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 @pytest.mark.parametrize("name", REAL_MISTAKES)
 def test_mistake_with_a_real_recording(shell: Shell, place: Path, name: str) -> None:
-    _check(shell, place, REAL_MISTAKES[name])
+    check(shell, place, REAL_MISTAKES[name])
 
 
 def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:
