@@ -1,7 +1,7 @@
 """Raw columns of a window to the arrays of a scan: every pixel is written once, to its final row.
 
-Each sensor of a tile is projected on its own (`projection.py`); the index by which the valid points
-leave the tile lays its columns between those of the others.
+Sensors of one kind are projected together (`projection.py`); the index by which the valid points
+leave the tile lays their columns between those of other kinds.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.ledger import PointCounts
 from mlbatch.projection import LABEL, Extras, Part, Projector, Source, Tile, tile_columns
@@ -68,9 +69,13 @@ class _Buffer:
 
 @dataclass(slots=True)
 class _Laid:
-    """One sensor's columns of a tile: their part, rows in the tile's order, first element."""
+    """Columns of a tile that are decoded together.
+
+    wanted: points of each; rows: in the tile's order; begin: first element in its planes.
+    """
 
     part: Part
+    wanted: npt.NDArray[np.uint16]
     rows: I64Array | slice
     begin: int
 
@@ -89,13 +94,23 @@ class Decoder:
         self._info = info
         self._only = only
         self._extras = extras
-        first = only or 0
         self._slots = max(source.slots for source in sources)
         self._columns = tile_columns(self._slots)
+        groups = _alike(sources)
+        first = only or 0
         self._projectors = [
-            Projector(source, number, self._columns, boxes_m, extras)
-            for number, source in enumerate(sources, first)
+            Projector(
+                [(first + number, sources[number]) for number in group],
+                self._columns,
+                boxes_m,
+                extras,
+            )
+            for group in groups
         ]
+        # Of each sensor: its projector, and its number there.
+        self._seat = np.empty((len(sources), 2), np.int64)
+        for which, group in enumerate(groups):
+            self._seat[group] = [(which, member) for member in range(len(group))]
         self._tile = Tile(self._columns * self._slots)
         self._keep = np.zeros((self._columns, self._slots), np.bool_)
         self._organized = info.layout == "organized"
@@ -107,7 +122,7 @@ class Decoder:
     @property
     def counts(self) -> list[PointCounts]:
         """The ledger of pixels of each sensor."""
-        return [projector.counts for projector in self._projectors]
+        return [self._projectors[which].counts[member] for which, member in self._seat]
 
     def scan(self, due: Due, label: Label) -> Scan:
         """Decode the columns of one window; the arrays are valid until the next call."""
@@ -128,38 +143,41 @@ class Decoder:
         return _Buffer(rows, self._slots if self._organized else None)
 
     def _project(self, due: Due, tile: slice) -> list[_Laid]:
-        """Decode the columns of one tile, sensor by sensor."""
-        sensor, place, encoder = due.sensor[tile], due.place[tile], due.encoder[tile]
-        laid, begin = [], 0
-        counts = np.bincount(sensor).tolist()
+        """Decode the columns of one tile, kind by kind."""
+        place, encoder = due.place[tile], due.encoder[tile]
+        which, member = self._seat[due.sensor[tile]].T
+        laid: list[_Laid] = []
+        begin = 0
+        counts = np.bincount(which).tolist()
         for number, projector in enumerate(self._projectors[: len(counts)]):
             count = counts[number]
             if not count:
                 continue
             part = self._tile.part(begin, count, projector.slots)
-            if count == len(sensor):
-                projector.project(place, encoder, part)
-                return [_Laid(part, slice(0, count), begin)]
-            rows = (sensor == number).nonzero()[0]
-            projector.project(place[rows], encoder[rows], part)
-            laid.append(_Laid(part, rows, begin))
+            if count == len(place):
+                wanted = projector.project(member, place, encoder, part)
+                return [_Laid(part, wanted, slice(0, count), begin)]
+            rows = (which == number).nonzero()[0]
+            wanted = projector.project(member[rows], place[rows], encoder[rows], part)
+            laid.append(_Laid(part, wanted, rows, begin))
             begin += count * projector.slots
         return laid
 
-    def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, I64Array]:
+    def _index(
+        self, laid: Sequence[_Laid], columns: int
+    ) -> tuple[I64Array, npt.NDArray[np.uint16]]:
         """Elements of the tile's planes in the order of the scan, and how many of each column."""
         if len(laid) == 1:
-            keep = laid[0].part.keep
-            return keep.reshape(-1).nonzero()[0], np.add.reduce(keep, axis=1, dtype=np.uint16)
+            return laid[0].part.keep.reshape(-1).nonzero()[0], laid[0].wanted
         keep = self._keep[:columns]
-        shift = np.empty(columns, np.int64)
+        shift, counts = np.empty(columns, np.int64), np.empty(columns, np.uint16)
         for one in laid:
             count, slots = one.part.keep.shape
             keep[one.rows, :slots] = one.part.keep
             keep[one.rows, slots:] = False
             shift[one.rows] = one.begin + np.arange(count) * slots
+            counts[one.rows] = one.wanted
         shift -= np.arange(columns) * self._slots
-        counts = np.add.reduce(keep, axis=1, dtype=np.uint16)
         index = keep.reshape(-1).nonzero()[0]
         index += shift.repeat(counts)
         return index, counts
@@ -246,3 +264,11 @@ class Decoder:
         numbers = range(len(self._info.sensors))
         steps = (np.diff(stamp_ns[lidar_id == number]) for number in numbers)
         return tuple(int(step.max(initial=0)) for step in steps)
+
+
+def _alike(sources: Sequence[Source]) -> list[list[int]]:
+    """Numbers of the sensors, grouped by what their pixels look like."""
+    groups: dict[tuple[str | int | bool, ...], list[int]] = {}
+    for number, source in enumerate(sources):
+        groups.setdefault(source.lidar.pixel_layout, []).append(number)
+    return list(groups.values())

@@ -152,6 +152,7 @@ class OusterLidar:
         self.columns_per_packet = layout.columns
         self.record_start = layout.record_start
         self.record_size = layout.record_size
+        self.pixel_layout = (MAKER, layout.profile.name, layout.beams, described.strongest_first)
         # Which of two returns is the strongest depends on their order: the decoder sorts them out.
         self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
         self.strongest_first = self.returns == 2 and described.strongest_first
