@@ -1,4 +1,4 @@
-"""Measure whole processes: CPU time, peak memory, and what a writer costs a point.
+"""Measure whole processes: CPU time, peak memory, what a writer costs a point, a reader a packet.
 
 Candidates run in turn (A B A B ...) and are compared pair by pair, so that a slower minute of the
 machine slows both. What is measured and how: measure.py.
@@ -6,6 +6,7 @@ machine slows both. What is measured and how: measure.py.
     python -m tests.bench.run speed --folder /data/bench --peer-python /opt/peer/bin/python
     python -m tests.bench.run memory --folder /data/bench
     python -m tests.bench.run writers --folder /data/bench
+    python -m tests.bench.run containers --folder /data/bench
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -35,6 +37,7 @@ from tests.bench.measure import (
     spread,
 )
 
+CONTAINER_TOOL: Final = (sys.executable, "-m", "tests.bench.containers")
 PEER: Final = Path(__file__).with_name("peer_ouster.py")
 # The entry point of pyproject.toml, so that no installation is needed.
 MLBATCH: Final = (
@@ -47,6 +50,8 @@ PEER_EXTRINSICS: Final = ("--extrinsics=0,0.6,1.8,0", "--extrinsics=0,-0.6,1.8,9
 MIN_MEDIAN_MAX: Final = f"{'min':>8} {'median':>8} {'max':>8}"
 WRITERS: Final = {"mcap": "out.mcap", "npz": "out_npz", "ply": "out_ply"}
 MEMORY_SECONDS: Final = (12.0, 60.0, 300.0)
+CONTAINERS: Final = (".pcap", ".mcap", ".db3")
+CONTAINER_SECONDS: Final = (12.0, 60.0)
 
 
 def recording(folder: Path, seconds: float, fragments: bool = False) -> Path:
@@ -147,6 +152,33 @@ def writers(options: argparse.Namespace) -> dict[str, object]:
     return {"cases": [plain(case) for case in [base, *cases]], "writers": cost}
 
 
+def containers(options: argparse.Namespace) -> dict[str, object]:
+    """CPU a packet and memory of one pass of reading, by container and length; no decoding."""
+    cases = []
+    for seconds in CONTAINER_SECONDS:
+        pcap = recording(options.folder, seconds)
+        for suffix in CONTAINERS:
+            path = pcap.with_suffix(suffix)
+            if not path.exists():
+                measure([*CONTAINER_TOOL, "write", str(pcap), str(path)])
+            cases.append(Case(f"{suffix} {seconds:g} s", partial(read, path)))
+    repeat(cases, options.repeat)
+    cost_us = {}
+    print(f"{'us a packet, and peak memory':30}{MIN_MEDIAN_MAX} us {'peak':>8} MB {'packets':>9}")
+    for case in cases:
+        each = [cpu_s * 1e6 / case.found.slots for cpu_s in case.cpu_s]
+        cost_us[case.name] = each
+        print(f"{case.name:30}{spread(each)} us {max(case.rss_mb):8.1f} MB {case.found.slots:9}")
+    return {"cases": [plain(case) for case in cases], "us_a_packet": cost_us}
+
+
+def read(path: Path) -> tuple[Usage, Found]:
+    """One pass over a recording; slots are packets, and CPU is that of the pass alone."""
+    usage = measure([*CONTAINER_TOOL, "read", str(path)])
+    told = json.loads(usage.stdout)
+    return replace(usage, cpu_s=told["cpu_s"]), Found(told["packets"], 0, told["bytes"])
+
+
 def copy_s(size: int, blocks: int) -> float:
     """CPU time of numpy to copy `size` bytes, a block at a time between two warm buffers."""
     import numpy as np
@@ -172,7 +204,7 @@ def _take_away(output: Path) -> int:
     return size
 
 
-MODES: Final = {"speed": speed, "memory": memory, "writers": writers}
+MODES: Final = {"speed": speed, "memory": memory, "writers": writers, "containers": containers}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import dpkt
 import pytest
 
-from tests.bench import run
+from tests.bench import containers, run
 from tests.bench.capture import CAPTURE, PCAP_NAME
 from tests.bench.recordings import make_recording
 
@@ -123,3 +123,16 @@ def test_short_speed_run_counts_all_points(folder: Path, tmp_path: Path) -> None
     assert 2 * (FRAMES - 3) < frames <= 2 * FRAMES
     share = POINTS_PER_CAPTURE / (3 * SLOTS_PER_FRAME)
     assert plain["points"] / plain["slots"] == pytest.approx(share, abs=0.01)
+
+
+def test_containers_hold_the_same_packets(folder: Path) -> None:
+    pcap = folder / "two_os1-128_1.2s.pcap"
+    found = []
+    for suffix in run.CONTAINERS:
+        path = pcap.with_suffix(suffix)
+        if not path.exists():
+            containers.write(pcap, path)
+        _, count = run.read(path)
+        found.append((count.slots, count.written_bytes))
+    lidars, imus = 2 * LIDAR_PACKETS, 2 * IMU_PACKETS
+    assert found == [(lidars + imus, lidars * 8448 + imus * 48)] * len(run.CONTAINERS)
