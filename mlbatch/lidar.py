@@ -61,11 +61,12 @@ class Lidar(Protocol):
 
     A packet holds `columns_per_packet` columns as equal records of `record_size` bytes from byte
     `record_start` on. `sequence_modulus`: the sequence number wraps there (0: packets carry none).
-    `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`: the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown.
-    `return_types`: numbering of facts/outputs.md section 3 per return; `strongest_first`: of two
-    returns the first is the stronger. `extrinsics`: (4, 4)
-    body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
-    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "".
+    `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`: the
+    packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
+    numbering of facts/outputs.md section 3 per return; `strongest_first`: of two returns the first
+    is the stronger. `extrinsics`: (4, 4) body_from_sensor if the calibration knows it;
+    `sensor_from_lidar`: (4, 4), where the maker's driver has a lidar frame of its own.
+    `timestamp_mode`: the maker's word or "".
     """
 
     maker: str
