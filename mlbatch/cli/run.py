@@ -87,7 +87,7 @@ def _tell(conversion: Conversion) -> None:
         lidar = sensor.found.lidar
         typer.echo(
             f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-            f"extrinsics from {sensor.extrinsics_source}"
+            f"extrinsics from {sensor.origin}"
         )
 
 

@@ -159,7 +159,8 @@ def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
 def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_path: Path) -> None:
     messages = told()
     messages.insert(0, description(urdf(x_m), messages[0].log_ns))
-    made = convert(tmp_path / "scans", write_mcap(tmp_path / "drive.mcap", messages))
+    made = convert(tmp_path / "scans", write_mcap(tmp_path / "drive.mcap", messages), "-v")
+    assert "extrinsics from tf_static: base_link -> left/os_sensor\n" in made.told.out
     assert made.warnings == ([("extrinsics_contradict", "left")] if warns else [])
     if warns:
         assert "differ by 50.0 mm and 0.00 degrees" in made.told.err

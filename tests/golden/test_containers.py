@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from mlbatch.frames import NAMINGS
 from mlbatch.readers import open_recording
+from mlbatch.readers._packet_types import PACKET_TYPES
 from mlbatch.types import StreamTable
-from tests.builders.run import FIXTURE, RECORDINGS, Values, command, in_memory, prints
+from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
 
 # MANIFEST.md: topic, packets, their bytes.
@@ -42,6 +45,17 @@ def test_scans_do_not_depend_on_the_container(
 ) -> None:
     path = CONTAINERS[name](tmp_path)
     assert prints(in_memory(replace(FIXTURE, recordings=(path,)))) == of_the_pcap
+
+
+def test_the_page_on_recordings_lists_all_types_and_frames() -> None:
+    page = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
+    cells = [line.split("|") for line in page.splitlines() if line.startswith("|")]
+    first = {row[1].strip().strip("`") for row in cells}
+    assert set(PACKET_TYPES) <= first
+    by_maker = {row[1].strip().lower(): row for row in cells}
+    for maker, naming in NAMINGS.items():
+        shown = [re.findall(r"`(.+?)`", cell) for cell in by_maker[maker][2:5]]
+        assert shown == [list(naming.points), list(naming.lidar), list(naming.nick)]
 
 
 def packets_of(path: Path) -> Counter[tuple[str, int]]:
