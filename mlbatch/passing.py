@@ -49,11 +49,17 @@ def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]
 class PassQueue:
     """Holds messages until the scan of their time is out; `counts` by topic."""
 
-    def __init__(self, patterns: Sequence[str], *, wanted: bool) -> None:
+    def __init__(self, patterns: Sequence[str], encodings: frozenset[str]) -> None:
+        """encodings: those that the output has a place for."""
         self.counts: dict[str, PassCounts] = {}
         self._patterns = list(patterns)
-        self._wanted = wanted
+        self._encodings = encodings
         self._waiting: list[tuple[int, Message]] = []
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the output takes messages at all."""
+        return bool(self._encodings)
 
     def keep(self, recordings: Iterable[Recording]) -> None:
         """Have recordings hand over what is selected."""
@@ -70,7 +76,7 @@ class PassQueue:
         for message in messages:
             counts = self.counts.setdefault(message.topic.name, PassCounts())
             counts.read += 1
-            if not self._wanted:
+            if message.topic.encoding not in self._encodings:
                 counts.drop("no_place")
                 continue
             stamp_ns = message.host_ns

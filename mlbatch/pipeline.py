@@ -28,7 +28,7 @@ from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
     IMU,
-    MESSAGES,
+    MESSAGE_ENCODINGS,
     PacketBatch,
     Recording,
     RunInfo,
@@ -94,7 +94,7 @@ class Conversion:
             [self._offset_ns(sensor) for sensor in self.setup.sensors],
             wanted=IMU in job.extras,
         )
-        self.passed = PassQueue(job.passed, wanted=MESSAGES in job.extras)
+        self.passed = PassQueue(job.passed, MESSAGE_ENCODINGS & job.extras)
         unknown = self.passed.missing(self.recordings)
         if unknown:
             raise UsageError(
@@ -311,8 +311,11 @@ class Conversion:
                 )
 
     def tell_of_passed(self) -> None:
-        """Warn of IMU messages that are on another clock than the scans."""
+        """Warn of messages that were to pass through and could not."""
         for topic, counts in self.passed.counts.items():
+            if self.passed.has_room and (other := counts.dropped.get("no_place")):
+                text = f"{topic}: {other} message(s) dropped: a bag of the other ROS has no place"
+                self.warn(Note("other_ros", "", text))
             if other := counts.dropped.get("other_clock"):
                 text = f"{topic}: {other} message(s) dropped: their clock is not that of the scans"
                 self.warn(Note("imu_clock", "", text))

@@ -227,8 +227,9 @@ class RunInfo:
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
 # Said together with EXTRAS by outputs that also hold IMU samples.
 IMU = "imu"
-# Likewise by outputs that take messages of a recording as they are.
-MESSAGES = "messages"
+# Likewise by outputs that take messages of a recording as they are: the encodings they have a
+# place for.
+MESSAGE_ENCODINGS = frozenset({"cdr", "ros1"})
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from mlbatch.errors import ExportError, UsageError
-from mlbatch.types import IMU, MESSAGES, ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
 from mlbatch.writers._options import WriterOptions
@@ -53,10 +53,10 @@ class Sink(Protocol):
 NewSink: TypeAlias = Callable[[Path], Sink]
 
 
-def extras_of(options: WriterOptions) -> frozenset[str]:
-    """What the fields of the point layout are made of, IMU samples and messages."""
+def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
+    """What the fields of the point layout are made of, IMU samples, messages in `encodings`."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)
-    return frozenset({IMU, MESSAGES}) | (frozenset() if layout is None else layout.extras)
+    return frozenset({IMU, *encodings}) | (frozenset() if layout is None else layout.extras)
 
 
 def layout_of(options: WriterOptions) -> Layout:

@@ -63,7 +63,7 @@ class WriterModule(Protocol):
     SUFFIX: str | None
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
-        """Those of `types.EXTRAS` that the output holds, and `types.IMU`, `types.MESSAGES`."""
+        """Those of `types.EXTRAS` that the output holds, `types.IMU`, `types.MESSAGE_ENCODINGS`."""
         ...
 
     def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

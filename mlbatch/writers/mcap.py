@@ -19,7 +19,7 @@ SUFFIX: str | None = ".mcap"
 
 def extras(options: WriterOptions) -> frozenset[str]:
     """What the fields of the point layout are made of, IMU samples and messages."""
-    return extras_of(options)
+    return extras_of(options, "cdr", "ros1")
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

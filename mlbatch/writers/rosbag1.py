@@ -29,7 +29,7 @@ _TF_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
 
 def extras(options: WriterOptions) -> frozenset[str]:
     """What the fields of the point layout are made of, IMU samples and messages."""
-    return extras_of(options)
+    return extras_of(options, "ros1")
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -29,7 +29,7 @@ METADATA = "metadata.yaml"
 
 def extras(options: WriterOptions) -> frozenset[str]:
     """What the fields of the point layout are made of, IMU samples and messages."""
-    return extras_of(options)
+    return extras_of(options, "cdr")
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

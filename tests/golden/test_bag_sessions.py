@@ -311,3 +311,20 @@ def test_passed_topics_keep_their_bytes(mcap: Path, tmp_path: Path) -> None:
     assert found == sent
     (length,) = struct.unpack_from("<I", found[topics[0]], 4)
     assert json.loads(found[topics[0]][8 : 8 + length - 1])["sensor_info"]["prod_sn"] == LEFT.serial
+
+
+@pytest.mark.parametrize(
+    ("session", "output"),
+    [("MCAP", ("-o", "out.bag")), ("ROS 1", ("-o", "out", "--format", "rosbag2"))],
+)
+def test_messages_of_the_other_ros_are_dropped_with_a_warning(
+    session: str, output: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Their IMU topic has no place there; the scans have."""
+    bag = SESSIONS[session](tmp_path)
+    target = tmp_path / output[1]
+    told_ = command("convert", bag, output[0], target, *output[2:])
+    assert told_.code == 0, told_.err
+    (warning,) = [line for line in told_.err.splitlines() if "other_ros" in line]
+    assert "message(s) dropped: a bag of the other ROS has no place" in warning
+    assert f"{WHOLE_SCANS} scans" in told_.out

@@ -197,14 +197,13 @@ def test_organized_clouds_and_runs_without_scans(tmp_path: Path) -> None:
 
 
 def test_what_the_formats_have_a_place_for() -> None:
-    for name in ("mcap", "rosbag1", "rosbag2"):
-        assert extras(name, WriterOptions()) == {"imu", "messages"}
+    for name, encodings in (("mcap", {"cdr", "ros1"}), ("rosbag1", {"ros1"}), ("rosbag2", {"cdr"})):
+        assert extras(name, WriterOptions()) == {"imu", *encodings}
         assert extras(name, WriterOptions("ouster")) == {
-            *("imu", "messages", "range_m", "reflectivity")
+            *("imu", "range_m", "reflectivity", *encodings)
         }
     for name in ("npz", "ply"):
-        assert "messages" not in extras(name, WriterOptions())
-        assert "imu" not in extras(name, WriterOptions())
+        assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
 
 
 def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
