@@ -393,7 +393,7 @@ def _refused(missing: Sequence[str], reasons: Mapping[str, str]) -> RigError:
     known = [f"{name}: {reasons[name]}" for name in missing if name in reasons]
     return RigError(
         f"extrinsics unknown for {', '.join(missing)}; wanted for every sensor when there are "
-        "two or more; give them in a rig file (--rig) or in the metadata (ouster-sdk "
+        "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
         "extrinsic), or accept the body origin with --identity-extrinsics"
         + (f" ({'; '.join(known)})" if known else "")
     )

@@ -62,7 +62,7 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
         topics, note = _indexed_topics(source, path)
     standing = (note,) if note else ()
     recording = BagRecording(path, CONTAINER, size_bytes, topics, streams, _portions, standing)
-    if note:
+    if not topics:
         # Connections stand where their first message does, so that all have to be passed.
         for _ in _portions(recording):
             pass
@@ -71,7 +71,7 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
 
 
 def _indexed_topics(source: SkippingSource, path: Path) -> tuple[tuple[Topic, ...], str]:
-    """Topics by the index at a bag's end, or none and a note that there is no index."""
+    """Topics by the index at a bag's end, or none and why (a note, if something is wrong)."""
     window = Window(source)
     window.begin = len(_MAGIC)
     try:
@@ -87,6 +87,9 @@ def _indexed_topics(source: SkippingSource, path: Path) -> tuple[tuple[Topic, ..
             )
         if not place:
             return (), "the bag was not closed and has no index; it is read record by record"
+        if not source.is_plain:
+            # What is compressed as a whole has no places to look at; its index is not to blame.
+            return (), ""
         index = np.frombuffer(source.look_at(place, _MAX_INDEX_BYTES), np.uint8)
         topics = [topic for _, topic in _connections(index, walk(index, 0, len(index)))]
     except HeadError as err:

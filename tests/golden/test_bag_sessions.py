@@ -149,7 +149,8 @@ def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "drive.mcap", told(without="tf_static"))
     assert refused(bag) == (
         "extrinsics unknown for left, right; wanted for every sensor when there are two or more; "
-        "give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or accept the "
+        "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept "
+        "the "
         "body origin with --identity-extrinsics"
     )
     assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == []

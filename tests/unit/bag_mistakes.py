@@ -173,14 +173,14 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "unmounted.db3",
         1,
         "extrinsics unknown for left, right; wanted for every sensor when there are two or "
-        "more; give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or "
+        "more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or "
         "accept the body origin with --identity-extrinsics",
     ),
     "moving tf": (
         "moving.mcap",
         1,
         "extrinsics unknown for left; wanted for every sensor when there are two or more; "
-        "give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or accept"
+        "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept"
         " the body origin with --identity-extrinsics (left: nothing connects frame "
         "left/os_sensor with base_link: /tf changes base_link -> mast during the recording)",
     ),

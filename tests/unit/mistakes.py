@@ -307,7 +307,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "pair/drive.pcap",
         1,
         "extrinsics unknown for ouster_111, ouster_222; wanted for every sensor when there are two "
-        "or more; give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or "
+        "or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), "
+        "or "
         "accept the body origin with --identity-extrinsics",
     ),
     "incomparable clocks": (

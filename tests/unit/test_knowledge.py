@@ -81,7 +81,7 @@ def _urdf(parent: str, child: str, xyz: str, kind: str = "fixed") -> str:
 SIDES = (_at("base_link", "left/os_sensor", 0, 1, 2), _at("base_link", "right/os_sensor", 0, -1, 2))
 UNKNOWN = (
     "extrinsics unknown for left, right; wanted for every sensor when there are two or more; "
-    "give them in a rig file (--rig) or in the metadata (ouster-sdk extrinsic), or accept the "
+    "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept the "
     "body origin with --identity-extrinsics"
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import random
 import struct
 from pathlib import Path
@@ -255,3 +256,13 @@ def test_what_cannot_be_read_is_said_in_one_line(
         opened(path)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_compressed_bag_has_nothing_wrong_with_it(tmp_path: Path) -> None:
+    """Its index cannot be looked at, which is no damage; with --strict a note would be an error."""
+    plain = write_rosbag1(tmp_path / "drive.bag", fixture_messages("ros1"))
+    packed = tmp_path / "drive.bag.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    whole, gzipped = (open_recording(path, StreamTable()) for path in (plain, packed))
+    assert gzipped.notes == []
+    assert gzipped.topics == whole.topics
