@@ -23,7 +23,7 @@ from mlbatch.readers._envelopes import (
     decode_string,
     decode_transforms,
 )
-from mlbatch.types import Topic
+from mlbatch.types import Topic, U8Array
 from tests.builders.bags import Body, definition, transforms_message
 
 S = 1_000_000_000
@@ -131,12 +131,12 @@ def payloads(name: str, count: int) -> list[bytes]:
 
 def find(topic: Topic, data: bytes, pad: int = 0) -> tuple[Found, list[bytes]]:
     """What is found in a message that begins at byte `pad` of an array, and the payloads."""
-    array = np.frombuffer(bytes(pad) + data + bytes(3), np.uint8)
+    array: U8Array = np.frombuffer(bytes(pad) + data + bytes(3), np.uint8)
     found = Unpacker(topic).find(array, pad, pad + len(data), LOG_NS)
     return found, cut(array, found)
 
 
-def cut(data: np.ndarray[tuple[int], np.dtype[np.uint8]], found: Found) -> list[bytes]:
+def cut(data: U8Array, found: Found) -> list[bytes]:
     """The payloads."""
     places = zip(found.start.tolist(), found.size.tolist(), strict=True)
     return [data[start : start + size].tobytes() for start, size in places]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import zstandard
 from rosbags.highlevel import AnyReader
@@ -107,7 +108,7 @@ def test_recordings_read_as_rosbags_decodes_them(name: str) -> None:
             message = reader.deserialize(raw, connection.msgtype)
             for packet in cast("Sequence[object]", getattr(message, "packets")):  # noqa: B009
                 stamp = getattr(packet, "stamp")  # noqa: B009
-                data = bytes(cast("np.ndarray", getattr(packet, "data")))  # noqa: B009
+                data = bytes(cast("npt.NDArray[np.uint8]", getattr(packet, "data")))  # noqa: B009
                 data = data[: getattr(packet, "size", len(data))]
                 host_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
                 expected.append(Seen(host_ns, connection.topic, data))
