@@ -10,6 +10,7 @@ import typer
 
 from mlbatch.errors import ExportError
 from mlbatch.job import Job
+from mlbatch.report import SCHEMA
 from mlbatch.rig import read_rig
 from mlbatch.writers import check_free_space
 
@@ -17,6 +18,8 @@ from mlbatch.writers import check_free_space
 # low-rate ones to npz): nothing that would fit is refused.
 LEAST_OUTPUT = 4
 _BYTES_PER_MB = 1_000_000
+# A report names its schema first.
+_HEAD_BYTES = 64
 
 
 def place(job: Job, output: Path) -> None:
@@ -77,3 +80,20 @@ def report(job: Job, path: Path | None, output: Path | None) -> None:
         raise ExportError(
             f"{path}: wanted a new file for the report, got one that is read; choose another"
         )
+    if path.exists() and not _is_replaceable(path):
+        raise ExportError(
+            f"{path}: wanted a new file or an earlier report, got something else; choose another "
+            "name for the report"
+        )
+
+
+def _is_replaceable(path: Path) -> bool:
+    """Whether a file is empty or a report: anything else may be somebody's only copy."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    return not head or SCHEMA.encode() in head

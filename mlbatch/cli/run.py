@@ -54,7 +54,7 @@ def run(job: Job, wanted: Wanted) -> None:
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
         checks.disk(job, wanted.output)
-    checks.report(job, wanted.report, wanted.output)
+    checks.report(job, report_path, wanted.output)
     with _progress(wanted.quiet) as progress:
         conversion, inputs = convert(job, opener, progress)
     for note in conversion.notes:

@@ -104,6 +104,18 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "old: wanted a file for the report, got a folder; add a name",
     ),
+    "report over metadata of the rig": (
+        f"{FIX} --report fix/left.json",
+        1,
+        "fix/left.json: wanted a new file or an earlier report, got something else; choose "
+        "another name for the report",
+    ),
+    "report over a device": (
+        f"{FIX} --report /dev/null",
+        1,
+        "/dev/null: wanted a new file or an earlier report, got something else; choose another "
+        "name for the report",
+    ),
     "report over the recording": (
         f"{FIX} --report fix/two_lidars.pcap",
         1,
