@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mlbatch.batching.intake import STAMP_LIMIT_NS
-from mlbatch.ledger import ImuCounts
+from mlbatch.ledger import DecodedCounts
 from mlbatch.types import BoolArray, ImuSamples
 
 
@@ -18,7 +18,7 @@ class ImuQueue:
     """
 
     def __init__(
-        self, counts: Sequence[ImuCounts], offsets_ns: Sequence[int], *, wanted: bool
+        self, counts: Sequence[DecodedCounts], offsets_ns: Sequence[int], *, wanted: bool
     ) -> None:
         self._counts = list(counts)
         self._offsets_ns = list(offsets_ns)

@@ -34,15 +34,15 @@ class PacketCounts:
 
 
 @dataclass(slots=True)
-class ColumnCounts:
-    """Columns of a sensor: decoded = written + sum(dropped)."""
+class DecodedCounts:
+    """Columns or IMU samples of a sensor: decoded = written + sum(dropped)."""
 
     decoded: int = 0
     written: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
 
     def drop(self, reason: str, count: int = 1) -> None:
-        """Count columns that were not written."""
+        """Count what was not written."""
         _add(self.dropped, reason, count)
 
 
@@ -59,27 +59,14 @@ class PointCounts:
 
 
 @dataclass(slots=True)
-class ImuCounts:
-    """IMU samples of a sensor: decoded = written + sum(dropped)."""
-
-    decoded: int = 0
-    written: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-
-    def drop(self, reason: str, count: int = 1) -> None:
-        """Count samples that were not written."""
-        _add(self.dropped, reason, count)
-
-
-@dataclass(slots=True)
 class SensorLedger:
     """All counters of one sensor."""
 
     packets: PacketCounts = field(default_factory=PacketCounts)
-    columns: ColumnCounts = field(default_factory=ColumnCounts)
+    columns: DecodedCounts = field(default_factory=DecodedCounts)
     points: PointCounts = field(default_factory=PointCounts)
     imu_packets: int = 0
-    imu_samples: ImuCounts = field(default_factory=ImuCounts)
+    imu_samples: DecodedCounts = field(default_factory=DecodedCounts)
 
     def check(self) -> list[str]:
         """What does not balance, a line each; empty when all is accounted for."""
