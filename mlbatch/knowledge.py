@@ -1,4 +1,4 @@
-"""What a recording says of itself besides packets: transforms, robot description, metadata.
+"""What a recording says of where its sensors sit: transforms, robot description.
 
 Facts: facts/messages.md sections 2 and 6. Extrinsics in the order rig, /tf_static, constant /tf,
 fixed joints of the URDF, metadata; what disagrees is told, what is unclear is not used.
@@ -23,7 +23,6 @@ from mlbatch.frames import (
     difference,
     edge_of,
     named_frame,
-    nearest_topic,
     some,
 )
 from mlbatch.rig import DEFAULT_BODY_FRAME
@@ -120,7 +119,6 @@ class Knowledge:
     def __init__(self) -> None:
         self._static, self._urdf = FrameTree(), FrameTree()
         self._watched: dict[tuple[str, str], _Watched] = {}
-        self._metadata: dict[str, list[str]] = {}
         # By child: why a stated edge is not used. Told only to those who miss it.
         self._unused: dict[str, str] = {}
         self._findings: list[Finding] = []
@@ -148,17 +146,6 @@ class Knowledge:
                     self._unused[child] = f"joint {told} but {joint.kind or 'without a type'}"
         except RigError as err:
             self._findings.append(Finding("urdf", "", str(err)))
-
-    def add_metadata(self, topic: str, text: str) -> None:
-        """Add the text of a metadata topic."""
-        texts = self._metadata.setdefault(topic, [])
-        if text not in texts:
-            texts.append(text)
-
-    def metadata_of(self, packet_topic: str) -> tuple[str, ...]:
-        """Texts of the metadata topic that belongs to a topic of packets, in their order."""
-        topic = nearest_topic(packet_topic, self._metadata)
-        return () if topic is None else tuple(self._metadata[topic])
 
     def mount(
         self,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.errors import RecordingError, RigError
-from mlbatch.frames import GENERIC, namespace
+from mlbatch.frames import GENERIC, namespace, same_namespace
 from mlbatch.lidar import Calibration, Evidence, Lidar
 from mlbatch.rig import StreamSelector
 from mlbatch.types import I64Array, PacketBatch, Stream, StreamTable, U8Array
@@ -216,7 +216,7 @@ class Router:
 
 def _beside(one: Stream, other: Stream) -> bool:
     """Whether two streams may be of one sensor: same source IP, or topics of one namespace."""
-    return one.source_ip == other.source_ip and namespace(one.topic) == namespace(other.topic)
+    return one.source_ip == other.source_ip and same_namespace(one.topic, other.topic)
 
 
 def match(

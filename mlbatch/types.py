@@ -298,23 +298,3 @@ class Summary:
     t_init_ns: int | None
     report_json: str
     scans_csv: str
-
-
-class Writer(Protocol):
-    """Writes one run; nothing stands under the final name before `finish`."""
-
-    def write(self, scan: Scan) -> None:
-        """Write one scan; its arrays are only valid during the call."""
-        ...
-
-    def write_imu(self, samples: ImuSamples) -> None:
-        """Write IMU samples; formats without a place for them ignore the call."""
-        ...
-
-    def finish(self, summary: Summary) -> None:
-        """Complete the output and move it to its final name."""
-        ...
-
-    def abandon(self) -> None:
-        """Close files after an error; what was written stays under `.partial`."""
-        ...

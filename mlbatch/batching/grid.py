@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from mlbatch.errors import UsageError
-from mlbatch.rate import rate_text
 from mlbatch.units import NS_PER_S
 
 
@@ -54,8 +53,3 @@ class Grid:
         """
         scaled = int(t0max_ns) * self.rate.numerator
         return scaled // (NS_PER_S * self.rate.denominator) + 1
-
-    @property
-    def period_ns_text(self) -> str:
-        """Exact length of a window in ns: `100000000`, or `200000000/3` at 15 Hz."""
-        return rate_text(NS_PER_S / self.rate)

@@ -27,7 +27,7 @@ class WriterOptions:
 
 
 class ScanWriter(Protocol):
-    """A `types.Writer` that also takes scans of single sensors."""
+    """Writes one run; nothing stands under the final name before `finish`."""
 
     def write(self, scan: Scan, sensor: int | None = None) -> None:
         """Write one scan; its arrays are only valid during the call.

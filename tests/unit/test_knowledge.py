@@ -466,14 +466,3 @@ def test_a_urdf_that_is_unclear_contradicts_nobody() -> None:
     mounting = _mount(knowledge, _pair())
     assert _place(mounting, "left") == [0, 1, 2]
     assert mounting.findings == ()
-
-
-def test_metadata_belong_to_the_namespace_of_the_packets() -> None:
-    knowledge = Knowledge()
-    for topic, text in (("/left/ouster/metadata", "L"), ("/right/ouster/metadata", "R")):
-        knowledge.add_metadata(topic, text)
-        knowledge.add_metadata(topic, text)
-    knowledge.add_metadata("/left/ouster/metadata", "L2")
-    assert knowledge.metadata_of(LEFT) == ("L", "L2")
-    assert knowledge.metadata_of(RIGHT) == ("R",)
-    assert knowledge.metadata_of("/top/lidar_packets") == ()

@@ -104,14 +104,6 @@ def test_first_window_is_the_next_one_to_begin(t0max: int, rate: Fraction, slice
     assert Grid(rate, slices).first_window(t0max) == k0
 
 
-@pytest.mark.parametrize(
-    ("rate", "text"),
-    [(Fraction(10), "100000000"), (Fraction(15), "200000000/3"), (Fraction(10, 3), "300000000")],
-)
-def test_period_is_written_exactly(rate: Fraction, text: str) -> None:
-    assert Grid(rate).period_ns_text == text
-
-
 def test_a_grid_without_windows_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^rate: wanted a positive number of Hz, got 0$"):
         Grid(Fraction(0))
