@@ -19,7 +19,7 @@ from mlbatch.types import F64Array, RunInfo, SensorInfo
 def feed_of(sensor: Mounted) -> Feed:
     """A sensor's ring and ledger."""
     lidar = sensor.found.lidar
-    return Feed(lidar, RawRing(lidar.packet_size, lidar.record_start, lidar.record_size))
+    return Feed(lidar, RawRing(lidar.packet_size, lidar.records))
 
 
 def intake_of(sensor: Mounted, *, host_clock: bool) -> Intake:

@@ -110,7 +110,7 @@ class Feeder:
             position=index,
             host_ns=batch.host_ns[index],
             key=lidar.sequence(packets),
-            heads=lidar.heads(packets),
+            heads=lidar.heads(packets, batch.host_ns[index]),
             place=place,
         )
 

@@ -5,7 +5,7 @@ Facts: facts/messages.md section 2 (calibrations) and section 6 (transforms).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mlbatch import sensors
@@ -95,6 +95,7 @@ class TopicCalibration:
         self.path = inner.path
         self.model = inner.model
         self.serial = inner.serial
+        self.is_shared = inner.is_shared
         self._inner = inner
         self._topic = topic
         self._others = others
@@ -107,9 +108,9 @@ class TopicCalibration:
         score = self._inner.fit(evidence)
         return score + _FITS_TOPIC if score and topic else score
 
-    def lidar(self, options: dict[str, str]) -> Lidar:
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
         """The sensor."""
-        return self._inner.lidar(options)
+        return self._inner.lidar(options, evidence)
 
 
 def _tail(topic: Topic) -> str:

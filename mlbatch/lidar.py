@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from mlbatch.geometry import BeamTable
+from mlbatch.geometry import BeamTable, Projection
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, Stream, U8Array
 
 # Verdicts of `Lidar.faults`, in the order of their numbers; 0 is a good packet.
@@ -27,46 +28,90 @@ class SensorModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
-    """What one kind of packets of a stream looks like; used to tell where they come from.
+class Beside:
+    """Other packets from the same source (its IP, or topics of its namespace), as Evidence.
 
-    size: bytes of a payload; sample: (k, size) uint8, the first few of them; sizes: all payload
-    sizes seen from the same source IP (any port), to tell twins apart by their IMU.
+    Position packets, device packets, IMU packets: what says more of a lidar than its own packets.
     """
 
     stream: Stream
     size: int
     sample: U8Array
-    sizes: frozenset[tuple[int, int]] = frozenset()  # (port, size)
+    host_ns: I64Array
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one kind of packets of a stream looks like; used to tell where they come from.
+
+    size: bytes of a payload; sample: (k, size) uint8, the first few of them, then some of every
+    quarter of a second; host_ns: (k,) their arrival.
+    """
+
+    stream: Stream
+    size: int
+    sample: U8Array
+    host_ns: I64Array
+    beside: tuple[Beside, ...] = ()
+
+
+# What `Calibration.fit` gives for packets that could be read with it, though they name another
+# model: taken only where the rig names this one.
+READABLE = -1
 
 
 class Calibration(Protocol):
-    """A calibration or metadata file, parsed; one sensor."""
+    """What is known of one sensor, or (`is_shared`) of all sensors of a model.
+
+    path: of the file it comes from, None where it is built in.
+    """
 
     path: Path | None
     model: str
     serial: str
+    is_shared: bool
 
     def fit(self, evidence: Evidence) -> int:
-        """How well the packets fit: 0 cannot be this sensor, more is surer."""
+        """How well the packets fit: 0 cannot be this sensor, more is surer; see READABLE."""
         ...
 
-    def lidar(self, options: dict[str, str]) -> Lidar:
-        """The sensor; options are those of `--decode`. Raises RigError for an unusable file."""
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
+        """The sensor; options are those of `--decode`; evidence None: it was not seen yet.
+
+        Raises RigError where the file cannot be used, or packets are needed to say more.
+        """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """Where the columns of a packet lie.
+
+    Column c begins `start + (c // per_row) * stride + (c % per_row) * step` bytes from the start
+    of the packet, and is `size` bytes long; columns may overlap.
+    """
+
+    start: int
+    stride: int
+    size: int
+    per_row: int = 1
+    step: int = 0
 
 
 class Lidar(Protocol):
     """One physical sensor: how its packets are read, nothing of windows or files.
 
-    A packet holds `columns_per_packet` columns as equal records of `record_size` bytes from byte
-    `record_start` on. `sequence_modulus`: the sequence number wraps there (0: packets carry none).
-    `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`: the
-    packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
-    numbering of facts/outputs.md section 3 per return; `strongest_first`: of two returns the first
-    is the stronger. `extrinsics`: (4, 4) body_from_sensor if the calibration knows it;
-    `sensor_from_lidar`: (4, 4), where the maker's driver has a lidar frame of its own.
-    `timestamp_mode`: the maker's word or "".
+    `records`: where its `columns_per_packet` columns lie. `channels`: beams of a column, in the
+    order of the wire; `channel`: (channels,) the number of each in the output. `firing_ns`:
+    (T, channels) when each beam fires after its column's stamp, >= 0; rotor words choose the row,
+    all else uses row 0. `sequence_modulus`: the sequence number wraps there (0: packets carry no
+    count). `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`:
+    the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
+    numbering of facts/outputs.md section 3 per return; `typed_by`: how those of two returns are
+    told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at all).
+    `sends_twice`: a single return is sent once for each return of the mode. `extrinsics`: (4, 4)
+    body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
+    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "".
     """
 
     maker: str
@@ -79,13 +124,15 @@ class Lidar(Protocol):
     has_reflectivity: bool
     packet_size: int
     columns_per_packet: int
-    record_start: int
-    record_size: int
+    records: Records
     pixel_layout: tuple[str | int | bool, ...]
     sequence_modulus: int
     imu_port: int
     return_types: tuple[int, ...]
-    strongest_first: bool
+    typed_by: str
+    sends_twice: bool
+    channel: I64Array
+    firing_ns: I64Array
     beams: BeamTable
     extrinsics: F64Array | None
     sensor_from_lidar: F64Array | None
@@ -105,15 +152,22 @@ class Lidar(Protocol):
         ...
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) number of each packet in the sensor's own count, below `sequence_modulus`."""
+        """(P,) number of each packet in the sensor's own count, below `sequence_modulus`.
+
+        Without a count: a number that only packets of equal content share. Negative: no identity.
+        """
         ...
 
-    def heads(self, packets: U8Array) -> Heads:
-        """Stamps, rotor positions and validity of all columns; no pixel is touched."""
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Stamps, rotor positions and validity of all columns; no pixel is touched.
+
+        host_ns: (P,) arrival, for clocks that leave out the hour or the date. The answer for a
+        packet depends on it alone, not on those before it.
+        """
         ...
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n gathered records (n, record_size) into `out`."""
+        """Decode return `which` of n gathered columns (n, records.size) into `out`."""
         ...
 
     def is_imu(self, size: int) -> bool:
@@ -126,4 +180,11 @@ class Lidar(Protocol):
 
     def sensor_from_imu(self) -> F64Array:
         """Pose of the IMU in the sensor frame, (4, 4), metres; identity where unknown."""
+        ...
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """What makes points of ranges where the beams' vectors do not suffice; else None.
+
+        columns: the most that are aimed at once.
+        """
         ...

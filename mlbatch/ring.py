@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mlbatch.lidar import Records
 from mlbatch.types import I64Array, U8Array
 
 _FIRST_PACKETS = 64
@@ -12,16 +13,18 @@ _FIRST_PACKETS = 64
 class RawRing:
     """Whole packets in a reused buffer; their columns lie in rows of equal length.
 
-    A packet takes a whole number of records, so record c of the packet in slot p begins at byte
-    `(p * records_per_slot + c) * record_size + record_start`: gathering columns is one `take` of
-    rows, and a packet is copied once. Places count up for ever; the buffer holds the newest.
+    A packet takes a whole number of rows, so row r of the packet in slot p begins at byte
+    `(p * rows + r) * stride + start`: gathering columns is one `take` of rows (or of pieces of
+    them), and a packet is copied once. Places number columns and count up for ever; the buffer
+    holds the newest.
     """
 
-    def __init__(self, packet_size: int, record_start: int, record_size: int) -> None:
+    def __init__(self, packet_size: int, records: Records) -> None:
         self._packet_size = packet_size
-        self._record_start = record_start
-        self._record_size = record_size
-        self._records = -(-packet_size // record_size)
+        self._records = records
+        self._rows_per_packet = -(-packet_size // records.stride)
+        self._places = self._rows_per_packet * records.per_row
+        self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
         self._bytes = np.empty(0, np.uint8)
@@ -35,15 +38,15 @@ class RawRing:
     def store(
         self, data: U8Array, start: I64Array, oldest_place: int | None
     ) -> tuple[U8Array, I64Array]:
-        """Copy packets in; give a view of them, (P, packet_size), and the places of their records.
+        """Copy packets in; give a view of them, (P, packet_size), and the places of their columns.
 
         data, start: as in a PacketBatch; oldest_place: first place that is still needed.
-        The view and the rows are valid until the next call.
+        The view and the columns are valid until the next call.
         """
         count = len(start)
-        oldest = self._next if oldest_place is None else oldest_place // self._records
+        oldest = self._next if oldest_place is None else oldest_place // self._places
         slot = self._reserve(count, oldest)
-        stride, size = self._records * self._record_size, self._packet_size
+        stride, size = self._rows_per_packet * self._records.stride, self._packet_size
         at = (slot % self._capacity) * stride
         target, source = self._bytes.data, data.data
         for begin in start.tolist():
@@ -52,20 +55,33 @@ class RawRing:
         first = (slot % self._capacity) * stride
         packets = self._bytes[first : first + count * stride].reshape(count, stride)[:, :size]
         self._next = slot + count
-        return packets, np.arange(slot, slot + count) * self._records
+        return packets, np.arange(slot, slot + count) * self._places
 
     def gather(self, place: I64Array, out: U8Array) -> None:
-        """Copy the records at `place` (n,) to the rows of `out` (n, record_size)."""
-        self._rows.take(place % len(self._rows), axis=0, out=out, mode="clip")
+        """Copy the columns at `place` (n,) to the rows of `out` (n, records.size)."""
+        if self._is_plain:
+            self._rows.take(place % len(self._rows), axis=0, out=out, mode="clip")
+            return
+        row, part = np.divmod(place, self._records.per_row)
+        row %= len(self._pieces)
+        out.view(self._pieces.dtype)[:, 0] = self._pieces[row, part]
 
     def _allocate(self, packets: int) -> None:
         self._capacity = packets
-        rows = packets * self._records
-        # One record more than the slots need, since rows begin `record_start` bytes later.
-        spare = self._record_size + self._record_start
-        self._bytes = np.zeros(rows * self._record_size + spare, np.uint8)
-        begin = self._record_start
-        self._rows = self._bytes[begin : begin + rows * self._record_size].reshape(rows, -1)
+        rows, records = packets * self._rows_per_packet, self._records
+        # More than the slots need, since rows begin later and columns may be longer than rows.
+        spare = records.start + records.size + records.per_row * records.step
+        self._bytes = np.zeros(rows * records.stride + spare, np.uint8)
+        begin, end = records.start, records.start + rows * records.stride
+        self._rows = self._bytes[begin:end].reshape(rows, -1)
+        # As bytes of one element each, pieces may overlap and still move in one go.
+        self._pieces = np.ndarray(
+            (rows, records.per_row),
+            np.dtype((np.void, records.size)),
+            buffer=self._bytes.data,
+            offset=begin,
+            strides=(records.stride, records.step),
+        )
 
     def _reserve(self, count: int, oldest: int) -> int:
         """First of `count` slots in one piece; what is older than slot `oldest` may go."""
@@ -81,7 +97,7 @@ class RawRing:
         old, capacity = self._bytes, self._capacity
         live = np.arange(oldest, self._next)
         self._allocate(max(2 * capacity, 1 << int(np.ceil(np.log2(2 * count + 1)))))
-        stride = self._records * self._record_size
+        stride = self._rows_per_packet * self._records.stride
         before = old[: capacity * stride].reshape(capacity, stride)
         after = self._bytes[: self._capacity * stride].reshape(self._capacity, stride)
         after[live % self._capacity] = before[live % capacity]

@@ -209,7 +209,7 @@ def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Cou
                 packets, _ = count.ring.store(batch.data, batch.start[index], None)
                 good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
                 count.loss.add(sensor.lidar.sequence(packets[good]))
-                heads = sensor.lidar.heads(packets[good])
+                heads = sensor.lidar.heads(packets[good], batch.host_ns[index[good]])
                 if count.first is None and heads.valid.any():
                     row, column = np.argwhere(heads.valid)[0]
                     host_ns = int(batch.host_ns[index[good]][row])
@@ -218,7 +218,7 @@ def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Cou
 
 
 def _ring(lidar: Lidar) -> RawRing:
-    return RawRing(lidar.packet_size, lidar.record_start, lidar.record_size)
+    return RawRing(lidar.packet_size, lidar.records)
 
 
 def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router) -> str:

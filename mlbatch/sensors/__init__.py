@@ -25,6 +25,8 @@ class Plugin(Protocol):
 
     MAKER: str
     MODELS: tuple[SensorModel, ...]
+    # Calibrations that need no file: one for each model whose beams do not differ from unit to unit.
+    BUILT_IN: tuple[Calibration, ...]
 
     def read_calibration(self, path: Path, content: bytes) -> Calibration | None:
         """The calibration in a file; None if it is not this maker's, RigError if unusable."""
@@ -49,6 +51,11 @@ def plugins() -> tuple[Plugin, ...]:
 def models() -> tuple[SensorModel, ...]:
     """All supported models."""
     return tuple(model for plugin in plugins() for model in plugin.MODELS)
+
+
+def built_in() -> tuple[Calibration, ...]:
+    """Calibrations of all makers that need no file."""
+    return tuple(calibration for plugin in plugins() for calibration in plugin.BUILT_IN)
 
 
 def read_calibration(path: Path) -> Calibration | None:

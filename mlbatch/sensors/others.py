@@ -19,6 +19,7 @@ from mlbatch.types import U8Array
 
 MAKER = ""
 MODELS: tuple[SensorModel, ...] = ()
+BUILT_IN: tuple[Calibration, ...] = ()
 # The surest first: magic bytes and repeated flags before lengths.
 _MAKERS = (velodyne, hesai, robosense, livox)
 

@@ -7,13 +7,15 @@ columns with one stamp each; the pixels of a column fire together, so no firing 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from mlbatch.errors import RigError, UsageError
-from mlbatch.geometry import BeamTable
-from mlbatch.lidar import Evidence, SensorModel
+from mlbatch.errors import RigError
+from mlbatch.geometry import BeamTable, Projection
+from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
+from mlbatch.sensors._options import check_options
 from mlbatch.sensors._ouster_describe import describe
 from mlbatch.sensors._ouster_document import read_document
 from mlbatch.sensors._ouster_imu import (
@@ -35,7 +37,7 @@ from mlbatch.sensors._ouster_pixels import PixelReader
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
 
-__all__ = ["MAKER", "MODELS", "OusterCalibration", "OusterLidar", "describe", "read_calibration"]
+__all__ = ["BUILT_IN", "MAKER", "MODELS", "OusterCalibration", "OusterLidar", "describe", "read_calibration"]
 
 MAKER = "Ouster"
 _REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
@@ -59,9 +61,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
     for beams in counts
 )
 
-# Options of --decode; the values this maker knows. The others' options have no meaning here.
-_OPTIONS = {"crc": ("check",)}
-_OPTIONS_OF_OTHERS = ("firing_azimuth", "optical_centre", "vertical_offset")
+BUILT_IN: tuple[Calibration, ...] = ()
 
 # How sure a match is: a serial number decides, then the configuration, then the ports.
 _FITS_SERIAL = 1000
@@ -82,13 +82,14 @@ def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
 class OusterCalibration:
     """A metadata file; `Calibration` of lidar.py."""
 
-    __slots__ = ("_headers", "metadata", "model", "path", "serial")
+    __slots__ = ("_headers", "is_shared", "metadata", "model", "path", "serial")
 
     def __init__(self, described: Metadata) -> None:
         self.metadata = described
         self.path: Path | None = described.path
         self.model = described.product or f"Ouster {described.layout.beams}-beam"
         self.serial = str(described.serial) if described.serial else ""
+        self.is_shared = False
         self._headers = _headers(described, check_crc=False)
 
     def fit(self, evidence: Evidence) -> int:
@@ -103,10 +104,9 @@ class OusterCalibration:
             return 0
         return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
 
-    def lidar(self, options: dict[str, str]) -> OusterLidar:
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> OusterLidar:
         """The sensor."""
-        for key, value in options.items():
-            _check_option(key, value)
+        check_options(options)
         if self.metadata.layout.profile.returns == 0:
             raise RigError(
                 f"{self.path}: Ouster metadata, udp_profile_lidar: wanted a profile with pixels, "
@@ -124,7 +124,7 @@ class OusterCalibration:
         on_port = evidence.stream.port != 0 and evidence.stream.port == self.metadata.lidar_port
         imu_seen = any(
             port == self.metadata.imu_port and _is_imu(self.metadata, size)
-            for port, size in evidence.sizes
+            for port, size in ((one.stream.port, one.size) for one in evidence.beside)
         )
         return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
 
@@ -132,8 +132,7 @@ class OusterCalibration:
 class OusterLidar:
     """One sensor; `Lidar` of lidar.py.
 
-    Beyond the protocol: `strongest_first` (two returns, in the default order), `lidar_port`,
-    `imu_port`, `init_id`. `sequence` is negative for packets outside the column window of the
+    Beyond the protocol: `lidar_port`, `init_id`. `sequence` is negative for packets outside the column window of the
     metadata: they stand outside the sensor's count, whose modulus is frames x packets per frame.
     """
 
@@ -150,12 +149,15 @@ class OusterLidar:
         self.has_reflectivity = True
         self.packet_size = layout.packet_size
         self.columns_per_packet = layout.columns
-        self.record_start = layout.record_start
-        self.record_size = layout.record_size
+        self.records = Records(layout.record_start, layout.record_size, layout.record_size)
         self.pixel_layout = (MAKER, layout.profile.name, layout.beams, described.strongest_first)
         # Which of two returns is the strongest depends on their order: the decoder sorts them out.
         self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
-        self.strongest_first = self.returns == 2 and described.strongest_first
+        self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""
+        self.sends_twice = False
+        self.channel = np.arange(self.channels)
+        # The pixels of a column fire together.
+        self.firing_ns = np.zeros((1, self.channels), np.int64)
         self.beams = beam_table(described)
         self.extrinsics = described.extrinsics
         self.sensor_from_lidar: F64Array | None = described.lidar_to_sensor
@@ -190,7 +192,7 @@ class OusterLidar:
         outside = -1 - (frame * len(self._rank) + block)
         return np.where(rank >= 0, frame * self._packets_per_frame + rank, outside)
 
-    def heads(self, packets: U8Array) -> Heads:
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
         """Stamps, measurement ids and validity of all columns."""
         return self._headers.heads(packets)
 
@@ -211,6 +213,10 @@ class OusterLidar:
         """Pose of the IMU in the sensor frame, metres."""
         pose: F64Array = self._metadata.imu_to_sensor.copy()
         return pose
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """The vectors of the beams suffice."""
+        return None
 
 
 def beam_table(described: Metadata) -> BeamTable:
@@ -269,14 +275,3 @@ def _is_imu(described: Metadata, size: int) -> bool:
     if described.imu_samples:
         return size in (imu_size(described.imu_samples), imu_size(described.imu_samples) + 1)
     return sample_count(size) > 0
-
-
-def _check_option(key: str, value: str) -> None:
-    if key in _OPTIONS_OF_OTHERS:
-        return
-    if key not in _OPTIONS:
-        known = ", ".join(sorted((*_OPTIONS, *_OPTIONS_OF_OTHERS)))
-        raise UsageError(f"--decode {key}={value}: wanted one of {known}, got {key}")
-    if value not in _OPTIONS[key]:
-        wanted = " or ".join(f"{key}={choice}" for choice in _OPTIONS[key])
-        raise UsageError(f"--decode {key}={value}: wanted {wanted}, got {value}")

@@ -1,0 +1,92 @@
+"""What lidars have in common whose packets carry an azimuth: defaults of the protocol `Lidar`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.geometry import BeamTable, Projection
+from mlbatch.lidar import Records
+from mlbatch.types import BoolArray, F64Array, I64Array, ImuSamples, U8Array
+
+
+class TurningLidar:
+    """Base of the makers' lidars: no serial number in the packets, no IMU, no mounting known.
+
+    A maker's class sets what is only declared here, and gives `faults`, `heads` and `read`.
+    """
+
+    maker: str
+    model: str
+    mode: str
+    channels: int
+    returns: int
+    packet_size: int
+    columns_per_packet: int
+    records: Records
+    pixel_layout: tuple[str | int | bool, ...]
+    return_types: tuple[int, ...]
+    channel: I64Array
+    firing_ns: I64Array
+    beams: BeamTable
+    calibration: str
+
+    serial: str = ""
+    carries_serial: bool = False
+    has_reflectivity: bool = False
+    sequence_modulus: int = 0
+    imu_port: int = 0
+    typed_by: str = "level"
+    sends_twice: bool = True
+    extrinsics: F64Array | None = None
+    sensor_from_lidar: F64Array | None = None
+    timestamp_mode: str = ""
+    notes: tuple[str, ...] = ()
+
+    def owns(self, packets: U8Array) -> BoolArray:
+        """All: nothing in the packets tells units apart."""
+        return np.ones(len(packets), np.bool_)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """A number that only packets of equal content share."""
+        return content_keys(packets)
+
+    def is_imu(self, size: int) -> bool:
+        """No IMU packets."""
+        return False
+
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """No samples."""
+        nothing = np.empty((0, 3))
+        return ImuSamples(sensor, np.empty(0, np.int64), nothing, nothing)
+
+    def sensor_from_imu(self) -> F64Array:
+        """Unknown: identity."""
+        return np.eye(4)
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """The vectors of the beams suffice."""
+        return None
+
+
+def content_keys(packets: U8Array) -> I64Array:
+    """(P,) numbers >= 0 that packets (P, size) of equal content share; others hardly ever do.
+
+    A sum of the packet's words times odd numbers, modulo 2**64: one wrong bit changes it.
+    """
+    size = packets.shape[1]
+    words = size // 8
+    whole = np.ascontiguousarray(packets[:, : words * 8]).view("<u8")
+    keys = (whole * _odd_numbers(words)).sum(axis=1, dtype=np.uint64)
+    for at in range(words * 8, size):
+        keys = keys * _ODD + packets[:, at]
+    keys ^= keys >> np.uint64(29)
+    return (keys * _ODD >> np.uint64(1)).astype(np.int64)
+
+
+# The golden ratio of 2**64, made odd (Knuth, multiplicative hashing).
+_ODD = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _odd_numbers(count: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    numbers = np.arange(1, count + 1, dtype=np.uint64) * _ODD
+    return (numbers ^ numbers >> np.uint64(31)) | np.uint64(1)
