@@ -1,0 +1,255 @@
+"""Angle files of HESAI lidars: what is read, what is left to others, what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.errors import RigError
+from mlbatch.sensors._hesai_corrections import HesaiAngles, read_angles, read_at128
+
+HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
+NAME = Path("unit.csv")
+needs_recordings = pytest.mark.skipif(
+    not HESAI.is_dir(), reason="the recordings are not beside the repository"
+)
+# First and last line of the files, as a text editor shows them: elevation, azimuth in deg.
+FILES = {
+    "pandar40p/Pandar40P.csv": (40, (14.794, -1.042), (-24.985, -1.042)),
+    "pandar64/Pandar64.csv": (64, (14.9, -1.042), (-24.879, -1.042)),
+    "pandarqt64/PandarQT64.csv": (64, (-52.121, 8.736), (52.133, -7.892)),
+    "pandarxt16/PandarXT16.csv": (16, (15, 0), (-15, 0)),
+    "pandarxt32/PandarXT32.csv": (32, (14.972363, 0.082385), (-16.023602, -0.129679)),
+    "calibration-without-recording/Pandar128E4X.csv": (128, (15.139, 0.157), (-24.71, 0.302)),
+    "calibration-without-recording/PandarAT128.csv": (128, (12.93, 2.4), (-12.47, 0.65)),
+}
+
+
+def rows(count: int = 16) -> list[str]:
+    """Lines of a good file; channel c has elevation c / 2 and azimuth -c deg."""
+    return ["Laser id,Elevation,Azimuth", *(f"{c},{c / 2},{-c}" for c in range(1, count + 1))]
+
+
+def text(lines: list[str], end: str = "\n") -> bytes:
+    return "".join(line + end for line in lines).encode()
+
+
+def read(lines: list[str], end: str = "\n") -> HesaiAngles:
+    found = read_angles(NAME, text(lines, end))
+    assert found is not None
+    return found
+
+
+def refusal(lines: list[str]) -> str:
+    with pytest.raises(RigError) as caught:
+        read_angles(NAME, text(lines))
+    message = str(caught.value)
+    assert message.startswith("unit.csv: HESAI angles, line ")
+    assert message.endswith("; read the correction file from the lidar again")
+    assert "\n" not in message
+    return message.removeprefix("unit.csv: HESAI angles, ").partition("; ")[0]
+
+
+@needs_recordings
+@pytest.mark.parametrize("name", FILES)
+def test_files_beside_recordings(name: str) -> None:
+    channels, first, last = FILES[name]
+    found = read_angles(HESAI / name, (HESAI / name).read_bytes())
+    assert found is not None
+    assert found.path == HESAI / name
+    assert found.azimuth_rad.shape == found.elevation_rad.shape == (channels,)
+    for at, (elevation, azimuth) in ((0, first), (-1, last)):
+        assert found.elevation_rad[at] == pytest.approx(math.radians(elevation), abs=1e-15)
+        assert found.azimuth_rad[at] == pytest.approx(math.radians(azimuth), abs=1e-15)
+
+
+def test_angles_are_in_rad_by_channel() -> None:
+    found = read(rows())
+    assert found.elevation_rad[3] == pytest.approx(2 * math.pi / 180)
+    assert found.azimuth_rad[15] == pytest.approx(-16 * math.pi / 180)
+    np.testing.assert_allclose(found.azimuth_rad, -2 * found.elevation_rad)
+
+
+@pytest.mark.parametrize(
+    "title",
+    ["Channel,Elevation,Azimuth", "LaserID,Elevation,Azimuth", "laser id, elevation, azimuth,,"],
+)
+def test_titles_that_are_in_use(title: str) -> None:
+    np.testing.assert_array_equal(
+        read([title, *rows()[1:]]).elevation_rad, read(rows()).elevation_rad
+    )
+
+
+def test_columns_are_found_by_their_titles() -> None:
+    swapped = [
+        "Channel,Azimuth,Elevation",
+        *(f"{c},{-c},{c / 2}" for c in range(1, 17)),
+    ]
+    np.testing.assert_array_equal(read(swapped).azimuth_rad, read(rows()).azimuth_rad)
+
+
+def test_what_stands_around_the_rows_does_not_matter() -> None:
+    first, *others = rows()
+    dressed = [
+        "\ufeffEEFF,1,1",
+        "# angles of a unit",
+        first,
+        "",
+        others[1],
+        "# 2 before 1",
+        others[0],
+        *(line + ",," for line in others[2:]),
+        ",,",
+    ]
+    for end in ("\n", "\r\n"):
+        found = read(dressed, end)
+        np.testing.assert_array_equal(found.azimuth_rad, read(rows()).azimuth_rad)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{}",
+        b"\xee\xff\x01\x05\x80" + bytes(300),
+        b"elevation,azimuth\n1.0,2.0\n",
+        b"15.0,2.0\n13.0,2.0\n",
+        b"Channel,fire time(us)\n1,2.31\n",
+        b"EEFF,1,1\nChannel,fire time(us),Channel,fire time(us)\n1,0,2,1\n",
+        b"index,start_ns,end_ns\n0,1,2\n",
+        b"Laser id\n1\n",
+        b"Channel,Azimuth,Azimuth\n1,2,3\n",
+        "körper: größe\n".encode("latin-1"),
+        b"x,y,z\n" * 40 + text(rows()),
+    ],
+)
+def test_other_files_are_left_to_others(content: bytes) -> None:
+    assert read_angles(NAME, content) is None
+
+
+BROKEN = {
+    "twice": (2, ["1,0,0"], "line 3: wanted every channel once, got channel 1 again"),
+    "missing": (9, [], "line 16: wanted channels 1 to 16, got no channel 9"),
+    "nan": (4, ["4,nan,0"], "line 5: wanted elevation from -90 to 90 deg, got nan"),
+    "high": (4, ["4,90.5,0"], "line 5: wanted elevation from -90 to 90 deg, got 90.5"),
+    "far": (4, ["4,0,-361"], "line 5: wanted azimuth from -360 to 360 deg, got -361"),
+    "infinite": (4, ["4,0,inf"], "line 5: wanted azimuth from -360 to 360 deg, got inf"),
+    "word": (4, ["4,abc,0"], "line 5: wanted elevation from -90 to 90 deg, got abc"),
+    "zero": (1, ["0,0,0"], "line 2: wanted a channel from 1 to 128, got 0"),
+    "many": (1, ["129,0,0"], "line 2: wanted a channel from 1 to 128, got 129"),
+    "name": (1, ["one,0,0"], "line 2: wanted a channel from 1 to 128, got one"),
+    "two cells": (16, ["16,8.0"], "line 17: wanted channel, elevation, azimuth, got 16, 8.0"),
+    "empty cell": (16, ["16,,3"], "line 17: wanted elevation from -90 to 90 deg, got nothing"),
+    "long": (1, ["1" + "x" * 99], "line 2: wanted channel, elevation, azimuth, got 1" + "x" * 56),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_rows_are_refused(name: str) -> None:
+    at, instead, message = BROKEN[name]
+    lines = rows()
+    lines[at : at + 1] = instead
+    assert refusal(lines).startswith(message)
+
+
+def test_files_that_end_early_are_refused() -> None:
+    wanted = "16, 20, 32, 40, 64, 90 or 128 channels in all"
+    assert refusal(rows()[:12]) == f"line 12: wanted {wanted}, got 11"
+    assert refusal(rows()[:1]) == f"line 1: wanted {wanted}, got 0"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_digest_counts_lines_with_crlf_ends(end: str, mark: bytes) -> None:
+    digest = hashlib.sha256(text(rows(), "\r\n")).hexdigest()
+    content = mark + text([*rows(), f"{digest},,"], end)
+    assert read_angles(NAME, content) is not None
+
+
+def test_digest_finds_a_changed_angle() -> None:
+    digest = hashlib.sha256(text(rows(), "\r\n")).hexdigest()
+    lines = [*rows(), f"{digest},,"]
+    lines[3] = "3,1.6,-3"
+    wanted = "wanted lines that agree with this SHA-256, got lines that were changed"
+    assert refusal(lines) == f"line 18: {wanted}"
+
+
+def at128_content(resolution: int = 2) -> bytes:
+    """Frames at 20, 140, 260 deg, 120 deg wide; azimuth 1 deg, elevation channel / 10 deg, from 0.
+
+    Adjust of channel 1 at 4 deg: azimuth 0.06, elevation -0.02 deg; elsewhere 0.
+    """
+    per_deg = 25600 // resolution
+    adjust = bytearray(2 * 128 * 180)
+    adjust[180 + 2], adjust[128 * 180 + 180 + 2] = 6 // resolution, 256 - 2 // resolution
+    body = b"\xee\xff\x01\x05\x80\x03\x03" + bytes(8) + bytes([resolution])
+    body += struct.pack("<3I", *(deg * per_deg for deg in (20, 140, 260)))
+    body += struct.pack("<3I", *(deg * per_deg for deg in (140, 260, 20)))
+    body += struct.pack("<128i", *([per_deg] * 128))
+    body += struct.pack("<128i", *(per_deg * channel // 10 for channel in range(128)))
+    body += bytes(adjust)
+    return body + hashlib.sha256(body).digest()
+
+
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_at128_units(resolution: int) -> None:
+    content = at128_content(resolution)
+    assert len(content) == 47176
+    found = read_at128(Path("at.dat"), content)
+    assert found is not None
+    degrees = 180 / math.pi
+    assert found.start_rad * degrees == pytest.approx([20, 140, 260])
+    assert found.end_rad * degrees == pytest.approx([140, 260, 20])
+    assert found.azimuth_rad * degrees == pytest.approx(np.ones(128))
+    assert found.elevation_rad[120] * degrees == pytest.approx(12)
+    assert found.azimuth_adjust_rad[1, 2] * degrees == pytest.approx(0.06)
+    assert found.elevation_adjust_rad[1, 2] * degrees == pytest.approx(-0.02)
+    assert np.count_nonzero(found.azimuth_adjust_rad) == 1
+
+
+@needs_recordings
+def test_at128_file_beside_recordings() -> None:
+    path = HESAI / "calibration-without-recording" / "PandarAT128.dat"
+    found = read_at128(path, path.read_bytes())
+    assert found is not None
+    degrees = 180 / math.pi
+    # From the sheet, rounded there to 0.01 deg.
+    assert found.start_rad * degrees == pytest.approx([23.33, 143.21, 263.15], abs=0.005)
+    assert np.abs(found.azimuth_rad).max() * degrees == pytest.approx(2.4, abs=0.005)
+    assert found.elevation_rad.min() * degrees == pytest.approx(-12.46, abs=0.011)
+    assert found.elevation_rad.max() * degrees == pytest.approx(12.92, abs=0.011)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xee\xff", bytes(47176), text(rows())])
+def test_files_that_are_no_at128_files(content: bytes) -> None:
+    assert read_at128(Path("at.dat"), content) is None
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (3, 3, "wanted version 1.5, got 1.3"),
+        (4, 64, "wanted channels 128, got 64"),
+        (5, 4, "wanted mirrors 3, got 4"),
+        (6, 1, "wanted frames 3, got 1"),
+        (9000, 1, "wanted content that agrees with its SHA-256, got content that was changed"),
+    ],
+)
+def test_damaged_at128_files_are_refused(at: int, value: int, message: str) -> None:
+    content = bytearray(at128_content())
+    content[at] = value
+    with pytest.raises(RigError) as caught:
+        read_at128(Path("at.dat"), bytes(content))
+    assert str(caught.value) == (
+        f"at.dat: HESAI AT128 angles: {message}; read the correction file from the lidar again"
+    )
+
+
+def test_at128_file_that_ends_early_is_refused() -> None:
+    with pytest.raises(RigError, match="wanted 47176 bytes, got 400 bytes"):
+        read_at128(Path("at.dat"), at128_content()[:400])
