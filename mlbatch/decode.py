@@ -56,14 +56,13 @@ class _Buffer:
         self.range_m = np.empty(shape, np.float32)
         self.reflectivity = np.empty(shape, np.uint16)
         self.label = np.empty(shape, LABEL)
-        self.time_ns = np.empty(shape, np.uint32)
         self.column = np.empty(rows if slots is None else 0, np.uint32)
 
     def clear(self, rows: slice) -> None:
         """Empty slots: NaN for what is measured in metres or as a level, else 0."""
         for real in (self.point, self.range_m):
             real[rows] = _NAN
-        for whole in (self.reflectivity, self.label.view(np.uint32), self.time_ns):
+        for whole in (self.reflectivity, self.label.view(np.uint64)):
             whole[rows] = 0
 
 
@@ -71,13 +70,16 @@ class _Buffer:
 class _Laid:
     """Columns of a tile that are decoded together.
 
-    wanted: points of each; rows: in the tile's order; begin: first element in its planes.
+    wanted: points of each; rows: in the tile's order; begin: first element in its planes;
+    encoder: of each.
     """
 
+    projector: Projector
     part: Part
     wanted: npt.NDArray[np.uint16]
     rows: I64Array | slice
     begin: int
+    encoder: I64Array
 
 
 class Decoder:
@@ -113,6 +115,7 @@ class Decoder:
             self._seat[group] = [(which, member) for member in range(len(group))]
         self._tile = Tile(self._columns * self._slots)
         self._keep = np.zeros((self._columns, self._slots), np.bool_)
+        self._element = np.empty(self._columns * self._slots, np.int64)
         self._organized = info.layout == "organized"
         self._has_reflectivity = "reflectivity" in extras and any(
             source.lidar.has_reflectivity for source in sources
@@ -132,19 +135,20 @@ class Decoder:
         points = 0
         for begin in range(0, len(due), self._columns):
             tile = slice(begin, min(begin + self._columns, len(due)))
-            laid = self._project(due, tile)
+            laid = self._project(due, tile, label.start_ns)
             if self._organized:
-                points += self._place(laid, due, tile, label.start_ns)
+                points += self._place(laid, due, tile)
             else:
-                points += self._compress(laid, due, tile, points, label.start_ns)
+                points += self._compress(laid, tile, points)
         return self._scan(due, label, points)
 
     def _new_buffer(self, rows: int) -> _Buffer:
         return _Buffer(rows, self._slots if self._organized else None)
 
-    def _project(self, due: Due, tile: slice) -> list[_Laid]:
+    def _project(self, due: Due, tile: slice, start_ns: int) -> list[_Laid]:
         """Decode the columns of one tile, kind by kind."""
         place, encoder = due.place[tile], due.encoder[tile]
+        offset_ns = due.stamp_ns[tile] - start_ns
         which, member = self._seat[due.sensor[tile]].T
         laid: list[_Laid] = []
         begin = 0
@@ -155,11 +159,12 @@ class Decoder:
                 continue
             part = self._tile.part(begin, count, projector.slots)
             if count == len(place):
-                wanted = projector.project(member, place, encoder, part)
-                return [_Laid(part, wanted, slice(0, count), begin)]
+                wanted = projector.project(member, place, encoder, offset_ns, part)
+                return [_Laid(projector, part, wanted, slice(0, count), begin, encoder)]
             rows = (which == number).nonzero()[0]
-            wanted = projector.project(member[rows], place[rows], encoder[rows], part)
-            laid.append(_Laid(part, wanted, rows, begin))
+            words = encoder[rows]
+            wanted = projector.project(member[rows], place[rows], words, offset_ns[rows], part)
+            laid.append(_Laid(projector, part, wanted, rows, begin, words))
             begin += count * projector.slots
         return laid
 
@@ -168,37 +173,41 @@ class Decoder:
     ) -> tuple[I64Array, npt.NDArray[np.uint16]]:
         """Elements of the tile's planes in the order of the scan, and how many of each column."""
         if len(laid) == 1:
-            return laid[0].part.keep.reshape(-1).nonzero()[0], laid[0].wanted
-        keep = self._keep[:columns]
+            keep, element = laid[0].projector.in_firing_order(laid[0].part.keep, laid[0].encoder)
+            index = keep.reshape(-1).nonzero()[0]
+            return index if element is None else element.take(index), laid[0].wanted
+        wide = self._keep[:columns]
         shift, counts = np.empty(columns, np.int64), np.empty(columns, np.uint16)
+        is_ordered = False
         for one in laid:
             count, slots = one.part.keep.shape
-            keep[one.rows, :slots] = one.part.keep
-            keep[one.rows, slots:] = False
+            keep, element = one.projector.in_firing_order(one.part.keep, one.encoder)
+            own = slice(one.begin, one.begin + count * slots)
+            is_ordered |= element is not None
+            elements = np.arange(count * slots) if element is None else element
+            np.add(elements, one.begin, out=self._element[own])
+            wide[one.rows, :slots] = keep
+            wide[one.rows, slots:] = False
             shift[one.rows] = one.begin + np.arange(count) * slots
             counts[one.rows] = one.wanted
         shift -= np.arange(columns) * self._slots
-        index = keep.reshape(-1).nonzero()[0]
+        index = wide.reshape(-1).nonzero()[0]
         index += shift.repeat(counts)
-        return index, counts
+        return self._element.take(index) if is_ordered else index, counts
 
-    def _compress(
-        self, laid: Sequence[_Laid], due: Due, columns: slice, at: int, start_ns: int
-    ) -> int:
+    def _compress(self, laid: Sequence[_Laid], columns: slice, at: int) -> int:
         """Move the wanted points of a tile to their final rows; gives their number."""
         tile, buffer = self._tile, self._buffer
         index, counts = self._index(laid, columns.stop - columns.start)
         rows = slice(at, at + len(index))
         whole = tile.point.view(np.complex128).reshape(-1)
         whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="clip")
-        words = tile.label.view(np.uint32)
-        words.take(index, out=buffer.label[rows].view(np.uint32), mode="clip")
+        words = tile.label.view(np.uint64)
+        words.take(index, out=buffer.label[rows].view(np.uint64), mode="clip")
         if "range_m" in self._extras:
             tile.range_m.take(index, out=buffer.range_m[rows], mode="clip")
         if self._has_reflectivity:
             tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
-        offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
-        buffer.time_ns[rows] = offset.repeat(counts)
         if "column" in self._extras:
             number = np.arange(columns.start, columns.stop, dtype=np.uint32)
             buffer.column[rows] = number.repeat(counts)
@@ -210,23 +219,21 @@ class Decoder:
             return np.full(len(sensor), self._only, np.uint8)
         return sensor.astype(np.uint8)
 
-    def _place(self, laid: Sequence[_Laid], due: Due, columns: slice, start_ns: int) -> int:
+    def _place(self, laid: Sequence[_Laid], due: Due, columns: slice) -> int:
         """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points."""
         buffer, points = self._buffer, 0
         buffer.clear(columns)
-        offset = (due.stamp_ns[columns] - start_ns).astype(np.uint32)
         buffer.label["lidar_id"][columns] = self._lidar_id(due, columns)[:, None]
         for one in laid:
             part, keep = one.part, one.part.keep
             points += int(np.count_nonzero(keep))
             row, slot = np.nonzero(keep)
             order = np.arange(columns.start, columns.stop)[one.rows]
-            at = (order[row], slot)
+            at = (order[row], one.projector.number[slot])
             buffer.point[at] = part.point[keep]
             buffer.range_m[at] = part.range_m[keep]
             buffer.label[at] = part.label[keep]
             buffer.reflectivity[at] = part.reflectivity[keep]
-            buffer.time_ns[at] = offset[one.rows][row]
         return points
 
     def _scan(self, due: Due, label: Label, points: int) -> Scan:
@@ -245,7 +252,7 @@ class Decoder:
             intensity=buffer.point[rows, ..., 3],
             reflectivity=buffer.reflectivity[rows] if self._has_reflectivity else None,
             range_m=buffer.range_m[rows] if "range_m" in self._extras else None,
-            time_ns=buffer.time_ns[rows],
+            time_ns=buffer.label["time_ns"][rows],
             ring=buffer.label["ring"][rows],
             return_type=buffer.label["return_type"][rows],
             lidar_id=buffer.label["lidar_id"][rows],
@@ -267,8 +274,12 @@ class Decoder:
 
 
 def _alike(sources: Sequence[Source]) -> list[list[int]]:
-    """Numbers of the sensors, grouped by what their pixels look like."""
+    """Numbers of the sensors, grouped by what their pixels look like.
+
+    Those that say their angle themselves stay alone: their directions are made, not looked up.
+    """
     groups: dict[tuple[str | int | bool, ...], list[int]] = {}
     for number, source in enumerate(sources):
-        groups.setdefault(source.lidar.pixel_layout, []).append(number)
+        own = source.lidar.beams.angle_rad is None
+        groups.setdefault((number,) if own else source.lidar.pixel_layout, []).append(number)
     return list(groups.values())

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from mlbatch import sensors
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
-from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
+from mlbatch.looking import calibrations_for, look, read_given
+from mlbatch.matching import Matched, Wanted, match, match_rig
 from mlbatch.mounting import Mounted, in_words, mount
-from mlbatch.readers import merge
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
-from mlbatch.streams import Found, Kind, Router, Sampler, Wanted, match, match_rig, split_by_kind
-from mlbatch.types import PacketBatch, Recording, StreamTable
-from mlbatch.units import NS_PER_S
+from mlbatch.streams import Found, Kind, Router, Sampler
+from mlbatch.types import Recording, StreamTable
 
-LOOK_NS = 10 * NS_PER_S
-# Metadata is searched beside the recording under these suffixes, and told by content.
-SIDECAR_SUFFIXES = (".json",)
 _NO_SUPPORTED = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
 
 
@@ -63,84 +57,6 @@ class Setup:
     ignored: set[Kind] = field(default_factory=set)
 
 
-def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:
-    """Look at the first 10 s of a session: its packets, and the messages that tell of sensors."""
-    sampler, learner = Sampler(table), Learner()
-    listen(recordings)
-    for batch in first_seconds(recordings):
-        sampler.add(batch)
-        learner.add(batch)
-    for recording in recordings:
-        recording.keep = frozenset()
-    return sampler, learner
-
-
-def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
-    """The packets up to 10 s after the first lidar packet, whatever the size of the batches.
-
-    A capture is often started long before the lidars are.
-    """
-    until_ns: int | None = None
-    known: set[Kind] = set()
-    for batch in merge(recordings):
-        if until_ns is None:
-            began_ns = _lidars_begin_ns(batch, known)
-            until_ns = None if began_ns is None else began_ns + LOOK_NS
-        if until_ns is None:
-            yield batch
-            continue
-        over = np.flatnonzero(batch.host_ns > until_ns)
-        if len(over):
-            yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
-            return
-        yield batch
-
-
-def _lidars_begin_ns(batch: PacketBatch, known: set[Kind]) -> int | None:
-    """Arrival of the first packet that looks like a lidar's; kinds already looked at are known."""
-    begins_ns = []
-    for kind, index in split_by_kind(batch):
-        if kind in known:
-            continue
-        known.add(kind)
-        begin = int(batch.start[index[0]])
-        text = sensors.describe(kind[1], batch.data[begin : begin + kind[1]][None])
-        if text is not None and "lidar" in text:
-            begins_ns.append(int(batch.host_ns[index[0]]))
-    return min(begins_ns, default=None)
-
-
-def calibrations_for(
-    recordings: Sequence[Path], given: Sequence[Path]
-) -> tuple[list[Calibration], list[Path]]:
-    """Calibrations that were given, else those beside the recordings; and the files looked at."""
-    if given:
-        return [_read_given(path) for path in given], list(given)
-    looked: list[Path] = []
-    for folder in dict.fromkeys(recording.parent for recording in recordings):
-        looked += sorted(p for p in folder.iterdir() if p.suffix.lower() in SIDECAR_SUFFIXES)
-    found = []
-    for path in looked:
-        # A file beside the recording was never named by the user, so a foreign one is no error.
-        try:
-            calibration = sensors.read_calibration(path)
-        except RigError:
-            continue
-        if calibration is not None:
-            found.append(calibration)
-    return found, looked
-
-
-def _read_given(path: Path) -> Calibration:
-    calibration = sensors.read_calibration(path)
-    if calibration is None:
-        raise RigError(
-            f"{path}: wanted the metadata or calibration of a lidar, got another kind of file; "
-            "give the file that the sensor's driver or recorder saved"
-        )
-    return calibration
-
-
 def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes) -> Setup:
     """Find the sensors of a session; errors name what is missing and the ways to give it."""
     rig = None if wishes.rig is None else read_rig(wishes.rig)
@@ -151,16 +67,17 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     calibrations += recorded
     looked = [path.name for path in files] + [str(one.path) for one in recorded]
     if rig is None or wishes.rig is None:
-        found, unknown = match(sampler, calibrations, wishes.decode)
-        rigged: list[RigSensor | None] = [None] * len(found)
+        matched = match(sampler, calibrations, wishes.decode)
+        rigged: list[RigSensor | None] = [None] * len(matched.sensors)
     else:
         rigged = list(rig.sensors)
-        found, unknown = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
-    lidar_kinds = [kind for kind in unknown if _is_lidar(sampler, kind)]
+        matched = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
+    found = matched.sensors
+    lidar_kinds = [kind for kind in matched.unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
-        reason = _nothing_found(sampler, recordings, lidar_kinds, looked)
+        reason = _nothing_found(sampler, recordings, lidar_kinds, looked, matched.failures)
         raise RecordingError(f"{reason}{_hints(recordings, learner.faults)}")
-    notes = [] if rig is not None else [_unmatched(sampler, kind, looked) for kind in lidar_kinds]
+    notes = [] if rig is not None else _unmatched(sampler, lidar_kinds, looked, matched.failures)
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
@@ -182,7 +99,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         setup.rig = rig
         setup.not_in_rig = set(lidar_kinds)
     for sensor in mounted:
-        notes += [Note("calibration", sensor.name, text) for text in sensor.found.lidar.notes]
+        texts = (*sensor.found.notes, *sensor.found.lidar.notes)
+        notes += [Note("calibration", sensor.name, text) for text in texts]
         if not sensor.found.kinds:
             notes.append(
                 Note("not_seen_yet", sensor.name, "no packet of it in the first 10 seconds")
@@ -192,26 +110,29 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
 
 def _find_rigged(
     sampler: Sampler, rig: Rig, origin: Path, calibrations: Sequence[Calibration], wishes: Wishes
-) -> tuple[list[Found], list[Kind]]:
+) -> Matched:
     for sensor in rig.sensors:
         _refuse_undecodable(sampler, sensor, origin)
+        _refuse_unknown_model(sensor, origin)
+    every = [*calibrations, *sensors.built_in()]
     wanted = [
         Wanted(
             sensor.name,
             sensor.stream or StreamSelector(),
-            calibrations if sensor.metadata is None else [_read_given(sensor.metadata)],
+            every if sensor.metadata is None else [read_given(sensor.metadata)],
             wishes.decode | sensor.decode,
+            sensor.model,
         )
         for sensor in rig.sensors
     ]
     try:
-        found, unknown = match_rig(sampler, wanted, origin)
+        matched = match_rig(sampler, wanted, origin)
     except UsageError as err:
         raise RigError(f"{origin}: {err}") from err
-    for sensor, one in zip(rig.sensors, found, strict=True):
+    for sensor, one in zip(rig.sensors, matched.sensors, strict=True):
         if sensor.model is not None:
             _check_model(sensor.name, sensor.model, one.lidar.model, origin)
-    return found, unknown
+    return matched
 
 
 def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:
@@ -228,15 +149,19 @@ def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> No
         )
 
 
-def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
-    """A model named in the rig must exist, and be the one that the calibration describes."""
+def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
     known = [model.name for model in sensors.models()]
-    if wanted not in known:
-        near = difflib.get_close_matches(wanted, known, 1)
+    if sensor.model is not None and sensor.model not in known:
+        near = difflib.get_close_matches(sensor.model, known, 1)
         advice = f"did you mean {near[0]}?" if near else "see `mlbatch sensors`, or write auto"
         raise RigError(
-            f"{origin}: sensor {name}: wanted a supported model, got {wanted!r}; {advice}"
+            f"{origin}: sensor {sensor.name}: wanted a supported model, got {sensor.model!r}; "
+            f"{advice}"
         )
+
+
+def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
+    """A model named in the rig must be the one that the calibration or the packets describe."""
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
     if not got.replace("-", "").startswith(wanted.replace("-", "")):
         raise RigError(
@@ -274,13 +199,22 @@ def lacks_decoder(what: str) -> bool:
     return "lidar" in what and "no decoder" in what
 
 
-def _unmatched(sampler: Sampler, kind: Kind, looked: Sequence[str]) -> Note:
-    stream, what = sampler.table.streams[kind[0]], describe(sampler, kind) or ""
-    unassigned = "its packets are counted as unassigned"
-    if lacks_decoder(what):
-        return Note("no_decoder", "", f"{stream}: {what}; {unassigned}; {_NO_SUPPORTED}")
-    text = f"{stream}: {what}; wanted metadata that fits, got {_known(looked)}; {unassigned}"
-    return Note("no_metadata", "", f"{text}; give --metadata FILE")
+def _unmatched(
+    sampler: Sampler, kinds: Sequence[Kind], looked: Sequence[str], failures: Mapping[Kind, str]
+) -> list[Note]:
+    notes = []
+    for kind in kinds:
+        stream, what = sampler.table.streams[kind[0]], describe(sampler, kind) or ""
+        unassigned = "its packets are counted as unassigned"
+        if lacks_decoder(what):
+            text = f"{stream}: {what}; {unassigned}; {_NO_SUPPORTED}"
+            notes.append(Note("no_decoder", "", text))
+            continue
+        why = f"wanted metadata that fits, got {_known(looked)}; {unassigned}; give --metadata FILE"
+        if kind in failures:
+            why = f"{failures[kind]}; {unassigned}"
+        notes.append(Note("no_metadata", "", f"{stream}: {what}; {why}"))
+    return notes
 
 
 def _nothing_found(
@@ -288,9 +222,12 @@ def _nothing_found(
     recordings: Sequence[Recording],
     lidar_kinds: Sequence[Kind],
     looked: Sequence[str],
+    failures: Mapping[Kind, str],
 ) -> RecordingError:
     where = ", ".join(str(recording.path) for recording in recordings)
     table, types = sampler.table, packet_types(recordings)
+    for kind, why in failures.items():
+        return RecordingError(f"{where}: {table.streams[kind[0]]}: {why}")
     carried = [(table.streams[kind[0]], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
         if not lacks_decoder(what):

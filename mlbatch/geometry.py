@@ -103,10 +103,11 @@ def rotor_words(turns: F64Array, turns_per_s: F64Array, table: I64Array | int = 
 
 def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:
     """Angle in rad, speed in rad/ns and firing table of rotor words (n,)."""
-    angle = (words & ((1 << _ANGLE_BITS) - 1)) * (2 * np.pi / _TURN)
+    angle = ((words & ((1 << _ANGLE_BITS) - 1)) * (2 * np.pi / _TURN)).astype(np.float64)
     field = (words >> _ANGLE_BITS) & ((1 << _SPEED_BITS) - 1)
-    speed = ((field ^ (1 << (_SPEED_BITS - 1))) - (1 << (_SPEED_BITS - 1))) * 2.0**-48
-    return angle, speed * (2 * np.pi), words >> (_ANGLE_BITS + _SPEED_BITS)
+    steps = (field ^ (1 << (_SPEED_BITS - 1))) - (1 << (_SPEED_BITS - 1))
+    speed = (steps * (2.0**-48 * 2 * np.pi)).astype(np.float64)
+    return angle, speed, words >> (_ANGLE_BITS + _SPEED_BITS)
 
 
 class Projection(Protocol):
@@ -193,7 +194,11 @@ class Turning:
             wide = self._origin.shape[2] > 1
             first = slice(None) if wide else slice(0, 1)
             self._combine(
-                self._origin, cosine[:, first], sine[:, first], self._from, np.empty_like(self._from)
+                self._origin,
+                cosine[:, first],
+                sine[:, first],
+                self._from,
+                np.empty_like(self._from),
             )
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
@@ -208,9 +213,10 @@ class Turning:
     def _turned_on(
         self, cosine: F32Array, sine: F32Array, speed: F64Array, table: I64Array
     ) -> tuple[F32Array, F32Array]:
-        """Cosine and sine (n, B) after d = speed * firing: c - d (s + d c / 2), s + d (c - d s / 2).
+        """Cosine and sine (n, B) of the angle plus d = speed * firing, without trigonometry.
 
-        The rest of the series is below d**3 / 6: 1e-7 rad at 600 rpm and 137 us.
+        c - d (s + d c / 2) and s + d (c - d s / 2); what is left out of the series is below
+        d**3 / 6: 1e-7 rad at 600 rpm and 137 us.
         """
         count = len(speed)
         turned, half, turned_cosine, turned_sine = self._angles[:, :count]

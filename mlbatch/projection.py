@@ -1,6 +1,6 @@
 """Raw columns of sensors of one kind to points in the body frame: every pixel is read once.
 
-Work is done in tiles of columns, whose planes are few and reused. The formula is that of
+Work is done in tiles of columns, whose planes are few and reused. The formulas are those of
 `geometry.py`; what a pixel holds is the sensor's own business (`Lidar.read`).
 """
 
@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.geometry import Projection, Tabled, Turning, read_rotor_words
 from mlbatch.ledger import PointCounts
 from mlbatch.lidar import Lidar
 from mlbatch.ring import RawRing
@@ -28,8 +29,10 @@ from mlbatch.types import (
 
 # Enough work for a call to be cheap, little enough for the planes to stay in the caches.
 TILE_SLOTS = 1 << 16
-# What a point is, in the bytes of one word, so that it moves as one.
-LABEL = np.dtype([("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
+# What a point is, in the bytes of one word, so that it moves as one: its time (ns after the start
+# of the scan, added as a number to the low half), ring, return type and sensor.
+LABEL = np.dtype([("time_ns", "<u4"), ("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
+_ONLY, _FIRST_STRONG, _BOTH = np.uint8(7), np.uint8(3), np.uint8(9)
 Extras: TypeAlias = frozenset[str]
 Labels: TypeAlias = npt.NDArray[np.void]
 
@@ -44,6 +47,7 @@ class Source:
     ring_base: int
     min_range_m: float = 0.0
     max_range_m: float = float("inf")
+    keep_repeated: bool = False
 
     @property
     def slots(self) -> int:
@@ -96,68 +100,94 @@ class Part:
 class Projector:
     """Sensors whose pixels decode alike: from places in their rings to points in the body frame.
 
-    They are decoded together, in the order of the scan; `counts` has one ledger for each.
-    columns: the most that are projected at once.
+    They are decoded together, in the order of the scan; `counts` has one ledger for each. Slots of
+    a column are beams, in the order of the wire, times returns; `firing_order` and `number` tell
+    where they belong.
     """
 
     def __init__(
         self, members: Sequence[tuple[int, Source]], columns: int, boxes_m: F64Array, extras: Extras
     ) -> None:
-        """members: number of each sensor in the scan, and how to read it."""
+        """members: number of each sensor in the scan, and how to read it.
+
+        columns: the most that are projected at once.
+        """
         sources = [source for _, source in members]
         self.counts = [PointCounts() for _ in sources]
         self.slots = sources[0].slots
         self._sources = sources
         self._lidar = lidar = sources[0].lidar
         self._boxes_m = boxes_m.astype(np.float32)
-        tables = [source.lidar.beams.moved(source.body_from_sensor) for source in sources]
-        self._direction = _stacked([table.directions() for table in tables])
-        self._origin = _stacked([table.origins() for table in tables])
-        turns = np.cumsum([0, *(len(table.angle_rad) for table in tables[:-1])])
-        self._first_position = turns.astype(np.int64)
-        reaches = np.broadcast_arrays(*(table.reach_m for table in tables))
-        self._reach_m = np.stack(reaches).astype(np.float32)
-        self._label = np.stack([_labels(source, number) for number, source in members])
+        self._projection = _projection(sources, columns)
+        # A row for each sensor, or for each firing table of the only one.
+        labels = [_labels(source, number) for number, source in members]
+        self._label = np.concatenate(labels).view(np.uint64)
+        self._tables = len(lidar.firing_ns)
+        self._order = _firing_order(lidar)
+        self._elements = np.arange(columns * self.slots)
+        if self._order is not None and self._tables == 1:
+            self._elements = self._ordered(np.zeros(columns, np.int64)).reshape(-1)
+        number = lidar.channel[:, None] * lidar.returns + np.arange(lidar.returns)
+        self.number: I64Array = number.reshape(-1)
         limits = [(source.min_range_m, source.max_range_m) for source in sources]
         self._limits_m = np.array(limits, np.float32)
         self._is_limited = any(low > 0 or high < float("inf") for low, high in limits)
-        self._records = np.empty((2, columns, lidar.record_size), np.uint8)
-        shape = (columns, lidar.channels)
-        self._towards = np.empty((columns, 3, lidar.channels), np.float32)
-        self._moved = np.empty_like(self._towards)
-        self._range_m = np.empty((lidar.returns, *shape), np.float32)
-        self._reached_m = np.empty(shape, np.float32)
+        self._drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
+        self._records = np.empty((2, columns, lidar.records.size), np.uint8)
+        self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
     def project(
-        self, member: I64Array, place: I64Array, encoder: I64Array, part: Part
+        self, member: I64Array, place: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part
     ) -> npt.NDArray[np.uint16]:
         """Decode the columns at `place` into `part`; gives the wanted points of each column.
 
-        member: (n,) which of the sensors each column is of; place, encoder: as in Columns.
+        member: (n,) which of the sensors each column is of; place, encoder: as in Columns;
+        offset_ns: (n,) stamp minus start of the scan.
         """
-        lidar, count = self._lidar, len(place)
+        lidar = self._lidar
         records = self._gathered(member, place)
-        towards, origin = self._geometry(encoder + self._first_position[member])
-        reach_m = self._reach_m[0] if len(self._sources) == 1 else self._reach_m[member]
+        self._projection.aim(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
             # One return fills its plane in one piece; of several, each is every n-th slot.
-            range_m = part.range_m if lidar.returns == 1 else self._range_m[which, :count]
+            range_m = part.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
             reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
-            reached_m = np.add(range_m, reach_m, out=self._reached_m[:count])
-            moved = np.multiply(reached_m[:, None, :], towards, out=self._moved[:count])
-            np.add(moved, origin, out=part.point[:, slots, :3].transpose(0, 2, 1))
+            self._projection.points(range_m, part.point[:, slots, :3])
             if lidar.returns > 1:
                 part.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
-        words = part.label.view(np.uint32)
-        self._label.view(np.uint32).take(member, axis=0, out=words, mode="clip")
-        if lidar.returns == 2 and lidar.strongest_first:
-            self._type_returns(part.label["return_type"])
+        words = part.label.view(np.uint64)
+        self._label.take(self._row(member, encoder), axis=0, out=words, mode="clip")
+        words += offset_ns.astype(np.uint64)[:, None]
+        if lidar.returns == 2:
+            self._type_returns(part)
         return self._keep(member, part)
+
+    def in_firing_order(
+        self, keep: BoolArray, encoder: I64Array
+    ) -> tuple[BoolArray, I64Array | None]:
+        """Wanted slots (n, slots) in the order of firing, and the elements where they lie.
+
+        (n * slots,); None where the order of the wire is that of firing.
+        """
+        if self._order is None:
+            return keep, None
+        if self._tables == 1:
+            return keep.take(self._order[0], axis=1), self._elements[: keep.size]
+        _, _, table = read_rotor_words(encoder)
+        order = self._order[table]
+        return np.take_along_axis(keep, order, axis=1), self._ordered(table).reshape(-1)
+
+    def _ordered(self, table: I64Array) -> I64Array:
+        """Elements of a tile of these columns, each column in the order of firing."""
+        order = np.arange(self.slots)[None] if self._order is None else self._order[table]
+        return order + np.arange(len(table))[:, None] * self.slots
+
+    def _row(self, member: I64Array, encoder: I64Array) -> I64Array:
+        return member if self._tables == 1 else read_rotor_words(encoder)[2]
 
     def _gathered(self, member: I64Array, place: I64Array) -> U8Array:
         """Records of all columns, in their order."""
@@ -175,21 +205,26 @@ class Projector:
         self._records[1].take(order, axis=0, out=self._records[0, :count], mode="clip")
         return self._records[0, :count]
 
-    def _geometry(self, position: I64Array) -> tuple[F32Array, F32Array]:
-        """Directions (n, 3, channels) and origins (n, 3, channels or 1) at rotor positions."""
-        first, count = int(position[0]), len(position)
-        if bool((position[1:] - position[:-1] == 1).all()):
-            turn = slice(first, first + count)
-            return self._direction[turn], self._origin[turn]
-        towards = self._towards[:count]
-        self._direction.take(position, axis=0, out=towards, mode="clip")
-        return towards, self._origin.take(position, axis=0, mode="clip")
+    def _type_returns(self, part: Part) -> None:
+        """Numbering of facts/outputs.md section 3, by which of two returns is nearer and stronger.
 
-    def _type_returns(self, types: U8Array) -> None:
-        """Which of two returns is nearer: numbering of facts/outputs.md section 3."""
-        strong, weak = self._range_m[:, : len(types)]
-        types[:, 0::2] = np.where(weak == 0, 7, np.where(strong < weak, 3, 4))
-        types[:, 1::2] = np.where(strong < weak, 6, 5)
+        3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: there is only one.
+        """
+        lidar = self._lidar
+        if not lidar.typed_by:
+            return
+        types = part.label["return_type"]
+        first, second = self._range_m[:, : len(types)]
+        # The types of two returns that differ add up to 9.
+        kind = np.add(first > second, _FIRST_STRONG, dtype=np.uint8)
+        if lidar.typed_by == "level":
+            weaker = part.point[:, 0::2, 3] < part.point[:, 1::2, 3]
+            kind += np.left_shift(weaker.view(np.uint8), np.uint8(1))
+        alone = (first == 0) | (second == 0)
+        if lidar.sends_twice:
+            alone |= first == second
+        types[:, 0::2] = np.where(alone, _ONLY, kind)
+        types[:, 1::2] = np.where(alone, _ONLY, _BOTH - kind)
 
     def _keep(self, member: I64Array, part: Part) -> npt.NDArray[np.uint16]:
         """Mark the points that are wanted, and count the others under their reason."""
@@ -200,6 +235,8 @@ class Projector:
         for counts, number, points in zip(self.counts, columns.tolist(), left, strict=True):
             counts.slots += number * self.slots
             counts.no_return += number * self.slots - points
+        if self._drops_repeated and self._cut_repeated(keep):
+            wanted, left = self._drop("repeated", member, keep, left)
         if self._is_limited:
             limits_m = self._limits_m[member]
             keep &= range_m >= limits_m[:, :1]
@@ -227,24 +264,54 @@ class Projector:
             setattr(counts, reason, getattr(counts, reason) + had - has)
         return wanted, left
 
+    def _cut_repeated(self, keep: BoolArray) -> bool:
+        """Leave out returns that an earlier one of the same shot equals; whether there were any."""
+        returns, any_cut = self._lidar.returns, False
+        ranges_m = self._range_m[:, : len(keep)]
+        for which in range(1, returns):
+            own = keep[:, which::returns]
+            again = np.zeros(own.shape, np.bool_)
+            for earlier in range(which):
+                again |= ranges_m[which] == ranges_m[earlier]
+            again &= own
+            own ^= again
+            any_cut = any_cut or bool(again.any())
+        return any_cut
+
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self._boxes_m:
             inside = (xyz >= box[:3]) & (xyz <= box[3:])
             keep &= ~inside.all(axis=2)
 
 
-def _stacked(planes: Sequence[F32Array]) -> F32Array:
-    """Tables (3, W, B) of several sensors, one after the other, as (sum of W, 3, B)."""
-    widest = max(plane.shape[2] for plane in planes)
-    same = [np.broadcast_to(plane, (*plane.shape[:2], widest)) for plane in planes]
-    return np.ascontiguousarray(np.concatenate(same, axis=1).transpose(1, 0, 2))
+def _projection(sources: Sequence[Source], columns: int) -> Projection:
+    """How the ranges of these sensors become points in the body frame."""
+    lidar, pose = sources[0].lidar, sources[0].body_from_sensor
+    own = lidar.projection(pose, columns)
+    if own is not None:
+        return own
+    if lidar.beams.angle_rad is None:
+        return Turning(lidar.beams.moved(pose), np.maximum(lidar.firing_ns, 0), columns)
+    tables = [source.lidar.beams.moved(source.body_from_sensor) for source in sources]
+    return Tabled(tables, columns)
+
+
+def _firing_order(lidar: Lidar) -> I64Array | None:
+    """Slots in the order of firing, channel, return: (T, slots); None if it is that of the wire."""
+    beams = [np.lexsort((lidar.channel, firing)) for firing in np.maximum(lidar.firing_ns, 0)]
+    order = np.stack(beams)[:, :, None] * lidar.returns + np.arange(lidar.returns)
+    order = order.reshape(len(beams), -1)
+    return None if bool((order == np.arange(order.shape[1])).all()) else order
 
 
 def _labels(source: Source, lidar_id: int) -> Labels:
-    """What the points of a column are, (slots,)."""
-    slot, lidar = np.arange(source.slots), source.lidar
-    label = np.zeros(source.slots, LABEL)
-    label["ring"] = source.ring_base + slot // lidar.returns
+    """What the points of a column are, apart from its own time: (T, slots)."""
+    lidar = source.lidar
+    slot = np.arange(source.slots)
+    beam = slot // lidar.returns
+    label = np.zeros((len(lidar.firing_ns), source.slots), LABEL)
+    label["time_ns"] = np.maximum(lidar.firing_ns, 0)[:, beam]
+    label["ring"] = source.ring_base + lidar.channel[beam]
     label["return_type"] = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
     label["lidar_id"] = lidar_id
     return label

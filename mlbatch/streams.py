@@ -1,23 +1,20 @@
 """Which stream is which sensor: by what the packets say, never by file name.
 
 A *kind* is a stream together with a payload size. At the start the kinds of the first seconds are
-matched with calibrations (or the rig's selectors); later kinds join a sensor only if their packets
-prove to be its own.
+matched with calibrations or the rig's selectors (`matching.py`); later kinds join a sensor only if
+their packets prove to be its own.
 """
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from pathlib import Path
 
 import numpy as np
 
-from mlbatch.errors import RecordingError, RigError
-from mlbatch.frames import GENERIC, namespace, same_namespace
-from mlbatch.lidar import Calibration, Evidence, Lidar
+from mlbatch.frames import same_namespace
+from mlbatch.lidar import Beside, Evidence, Lidar
 from mlbatch.rig import StreamSelector
 from mlbatch.types import I64Array, PacketBatch, Stream, StreamTable, U8Array
 from mlbatch.units import NS_PER_S
@@ -25,6 +22,9 @@ from mlbatch.units import NS_PER_S
 Kind = tuple[int, int]  # (number of the stream, payload size)
 SAMPLES_PER_KIND = 16
 SAMPLE_EVERY_NS = NS_PER_S // 4
+# Different first words of a kind that are looked out for; most makers change them in every packet.
+MOST_BEGINNINGS = 8
+_WORD = 4
 
 
 class Role(Enum):
@@ -44,6 +44,7 @@ class Found:
     lidar: Lidar
     selector: StreamSelector = field(default_factory=StreamSelector)
     kinds: set[Kind] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +65,14 @@ class Sampler:
     sample_host_ns: dict[Kind, list[int]] = field(default_factory=dict)
     packets: dict[Kind, int] = field(default_factory=dict)
     span_ns: dict[Kind, tuple[int, int]] = field(default_factory=dict)
+    beginnings: dict[Kind, set[int]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
         """Look at a batch."""
         for kind, index in split_by_kind(batch):
             kept = self.samples.setdefault(kind, [])
             hosts_ns = self.sample_host_ns.setdefault(kind, [])
-            for at in self._telling(kind, index, batch.host_ns[index]):
+            for at in self._telling(kind, index, batch):
                 begin = int(batch.start[at])
                 kept.append(batch.data[begin : begin + kind[1]].tobytes())
                 hosts_ns.append(int(batch.host_ns[at]))
@@ -78,17 +80,28 @@ class Sampler:
             first_ns, last_ns = int(batch.host_ns[index[0]]), int(batch.host_ns[index[-1]])
             self.span_ns[kind] = self.span_ns.get(kind, (first_ns, 0))[0], last_ns
 
-    def _telling(self, kind: Kind, index: I64Array, host_ns: I64Array) -> list[int]:
+    def _telling(self, kind: Kind, index: I64Array, batch: PacketBatch) -> list[int]:
         """Which packets of a kind to keep: the first ones, then two of every quarter of a second.
 
         Several sensors may share a kind, and one of them may start later than the others. The
-        choice follows arrival times, so that it does not depend on the size of batches.
+        choice follows arrival times, so that it does not depend on the size of batches. Kept too
+        are the first packets that begin differently: on a topic, device packets may hide among
+        many times as many others.
         """
         first = SAMPLES_PER_KIND - min(SAMPLES_PER_KIND, self.packets.get(kind, 0))
+        host_ns = batch.host_ns[index]
         tick = np.concatenate([[self.span_ns.get(kind, (0, 0))[1]], host_ns]) // SAMPLE_EVERY_NS
         fresh = tick[1:] != tick[:-1]
         fresh[1:] |= fresh[:-1]
         fresh[:first] = True
+        beginnings = self.beginnings.setdefault(kind, set())
+        if kind[1] >= _WORD and len(beginnings) < MOST_BEGINNINGS:
+            words = batch.data[batch.start[index, None] + np.arange(_WORD)].view("<u4")[:, 0]
+            values, at = np.unique(words, return_index=True)
+            for value, row in sorted(zip(values.tolist(), at.tolist(), strict=True), key=_second):
+                if value not in beginnings and len(beginnings) < MOST_BEGINNINGS:
+                    beginnings.add(value)
+                    fresh[row] = True
         chosen: list[int] = index[fresh].tolist()
         return chosen
 
@@ -97,7 +110,8 @@ class Sampler:
         firsts = []
         for kind in sensor.kinds:
             packets = as_rows(self.samples[kind], kind[1])[:, : sensor.lidar.packet_size]
-            heads = sensor.lidar.heads(packets)
+            hosts_ns = np.array(self.sample_host_ns[kind], np.int64)
+            heads = sensor.lidar.heads(packets, hosts_ns)
             good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
             rows = (heads.valid.any(axis=1) & good).nonzero()[0]
             if len(rows):
@@ -110,12 +124,20 @@ class Sampler:
     def evidence(self, kind: Kind) -> Evidence:
         """What is known of a kind."""
         stream = self.table.streams[kind[0]]
-        beside = frozenset(
-            (self.table.streams[other].port, size)
-            for other, size in self.samples
-            if self.table.streams[other].source_ip == stream.source_ip
+        beside = tuple(
+            Beside(self.table.streams[other[0]], other[1], *self._sample(other))
+            for other in self.samples
+            if other != kind and is_beside(self.table.streams[other[0]], stream)
         )
-        return Evidence(stream, kind[1], as_rows(self.samples[kind], kind[1]), beside)
+        return Evidence(stream, kind[1], *self._sample(kind), beside)
+
+    def _sample(self, kind: Kind) -> tuple[U8Array, I64Array]:
+        rows = as_rows(self.samples[kind], kind[1])
+        return rows, np.array(self.sample_host_ns[kind], np.int64)
+
+
+def _second(pair: tuple[int, int]) -> int:
+    return pair[1]
 
 
 def as_rows(payloads: Sequence[bytes], size: int) -> U8Array:
@@ -207,181 +229,13 @@ class Router:
             number
             for number, sensor in enumerate(self._found)
             if sensor.lidar.is_imu(size)
-            and any(_beside(self._table.streams[other], stream) for other, _ in sensor.kinds)
+            and any(is_beside(self._table.streams[other], stream) for other, _ in sensor.kinds)
         ]
         if len(near) > 1 and not stream.topic:
             near = [n for n in near if self._found[n].lidar.imu_port == stream.port]
         return near[0] if len(near) == 1 else None
 
 
-def _beside(one: Stream, other: Stream) -> bool:
+def is_beside(one: Stream, other: Stream) -> bool:
     """Whether two streams may be of one sensor: same source IP, or topics of one namespace."""
     return one.source_ip == other.source_ip and same_namespace(one.topic, other.topic)
-
-
-def match(
-    sampler: Sampler, calibrations: Sequence[Calibration], options: dict[str, str]
-) -> tuple[list[Found], list[Kind]]:
-    """Sensors of a recording without a rig, and the kinds that no calibration fits.
-
-    Raises RecordingError where the packets do not tell which of several calibrations is theirs.
-    """
-    usable, lidars = _readable(calibrations, options)
-    found: dict[int, Found] = {}
-    unknown = []
-    for kind in sampler.samples:
-        best = _best_fits(sampler.evidence(kind), usable, lidars)
-        if not best:
-            unknown.append(kind)
-        for number in best:
-            sensor = found.setdefault(number, Found("", lidars[number]))
-            sensor.kinds.add(kind)
-    calibrations = usable
-    _refuse_shared(sampler.table, found, calibrations)
-    sensors = sorted(found.values(), key=lambda sensor: _order(sampler.table, sensor))
-    for count, sensor in enumerate(sensors):
-        sensor.name = _name(sampler.table, sensor, count)
-    return sensors, unknown
-
-
-def _name(table: StreamTable, sensor: Found, count: int) -> str:
-    """After the namespace of its topics if that tells a place, else maker and serial number."""
-    topic = min((table.streams[stream].topic for stream, _ in sensor.kinds), default="")
-    place = "_".join(part for part in namespace(topic) if part not in GENERIC)
-    if place and place[0].isalpha() and place.replace("_", "").isalnum():
-        return place
-    return f"{sensor.lidar.maker.lower()}_{sensor.lidar.serial or count + 1}"
-
-
-def _readable(
-    calibrations: Sequence[Calibration], options: dict[str, str]
-) -> tuple[list[Calibration], list[Lidar]]:
-    """The calibrations of lidars that send; one that is switched off sends nothing."""
-    usable, lidars = [], []
-    for calibration in calibrations:
-        try:
-            lidars.append(calibration.lidar(options))
-        except RigError:
-            continue
-        usable.append(calibration)
-    return usable, lidars
-
-
-def _best_fits(
-    evidence: Evidence, calibrations: Sequence[Calibration], lidars: Sequence[Lidar]
-) -> list[int]:
-    """Calibrations of the sensors that sent a kind; several when their packets are mixed in it."""
-    fits: dict[bytes, list[tuple[int, int]]] = {}
-    for number, (calibration, lidar) in enumerate(zip(calibrations, lidars, strict=True)):
-        if evidence.size not in (lidar.packet_size, lidar.packet_size + 1):
-            continue
-        own = lidar.owns(evidence.sample[:, : lidar.packet_size])
-        if not own.any():
-            continue
-        part = Evidence(evidence.stream, evidence.size, evidence.sample[own], evidence.sizes)
-        score = calibration.fit(part)
-        if score > 0:
-            fits.setdefault(own.tobytes(), []).append((score, number))
-    best = []
-    for group in fits.values():
-        top = max(score for score, _ in group)
-        first = [number for score, number in group if score == top]
-        serials = {calibrations[number].serial for number in first}
-        if len(serials) > 1:
-            names = ", ".join(str(calibrations[number].path) for number in first)
-            raise RecordingError(
-                f"packets of {evidence.stream} ({evidence.size} bytes) carry no serial number and "
-                f"fit {len(first)} metadata files: {names}; wanted one; name the sensor of each "
-                "source with stream.source_ip in a rig file (--rig), or give only its --metadata"
-            )
-        best.append(first[0])
-    return best
-
-
-def _refuse_shared(
-    table: StreamTable, found: dict[int, Found], calibrations: Sequence[Calibration]
-) -> None:
-    """One unit sends from one place, unless its serial number says that it moved."""
-    for number, sensor in found.items():
-        streams = sorted({str(table.streams[stream]) for stream, _ in sensor.kinds})
-        if len(streams) > 1 and not sensor.lidar.carries_serial:
-            raise RecordingError(
-                f"metadata {calibrations[number].path} fits the packets of {len(streams)} "
-                f"streams ({'; '.join(streams)}), which carry no serial number; wanted a metadata "
-                "file each; name them in a rig file (--rig) with stream.source_ip"
-            )
-
-
-def _order(table: StreamTable, sensor: Found) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
-    """By serial number, else source IP and port, else topic."""
-    streams = (table.streams[number] for number, _ in sensor.kinds)
-    places = tuple(sorted((_ip_number(s.source_ip), s.port, s.topic) for s in streams))
-    if sensor.lidar.serial.isdigit():
-        return (0, int(sensor.lidar.serial), places)
-    return (1, 0, places)
-
-
-def _ip_number(text: str) -> int:
-    return int(ipaddress.ip_address(text)) if text else 0
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """A sensor of the rig: where it sends from, and the calibrations it may have."""
-
-    name: str
-    selector: StreamSelector
-    calibrations: Sequence[Calibration]
-    decode: dict[str, str]
-
-
-def match_rig(
-    sampler: Sampler, sensors: Sequence[Wanted], origin: Path
-) -> tuple[list[Found], list[Kind]]:
-    """Sensors of a rig, in its order, and the kinds that it does not mention.
-
-    origin: the rig file. Raises RigError where a sensor has no calibration.
-    """
-    found = [_find(sampler, wanted, origin) for wanted in sensors]
-    taken = {kind for sensor in found for kind in sensor.kinds}
-    return found, [kind for kind in sampler.samples if kind not in taken]
-
-
-def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found:
-    serial = wanted.selector.serial
-    usable = [c for c in wanted.calibrations if not serial or c.serial in ("", serial)]
-    if not usable:
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: no metadata"
-            + (f" with serial number {serial}" if serial else "")
-            + f" among {_paths(wanted.calibrations)}; give it as `metadata:` of the sensor, or "
-            "with --metadata"
-        )
-    lidars = [calibration.lidar(wanted.decode) for calibration in usable]
-    scored: dict[int, tuple[int, set[Kind]]] = {}
-    for kind in sampler.samples:
-        if not wanted.selector.selects(sampler.table.streams[kind[0]]):
-            continue
-        evidence = sampler.evidence(kind)
-        for number in _best_fits(evidence, usable, lidars):
-            before, kinds = scored.setdefault(number, (0, set()))
-            scored[number] = (max(before, usable[number].fit(evidence)), kinds | {kind})
-    best = max(scored, key=lambda number: scored[number][0], default=None)
-    if best is None:
-        _refuse_guess(wanted, usable, origin)
-        return Found(wanted.name, lidars[0], wanted.selector)
-    return Found(wanted.name, lidars[best], wanted.selector, scored[best][1])
-
-
-def _refuse_guess(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> None:
-    """A sensor that is silent at first needs metadata that are surely its own."""
-    if len(usable) > 1:
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted a packet of it ({wanted.selector}) in the "
-            f"first 10 seconds, got none to tell which of {_paths(usable)} is its metadata; "
-            "correct its stream, or give `metadata:`"
-        )
-
-
-def _paths(calibrations: Sequence[Calibration]) -> str:
-    return ", ".join(str(calibration.path) for calibration in calibrations) or "the files given"

@@ -11,22 +11,16 @@ import numpy as np
 
 from mlbatch.batching.loss import Loss
 from mlbatch.clock import timescale
-from mlbatch.discover import (
-    calibrations_for,
-    describe,
-    first_seconds,
-    lacks_decoder,
-    look,
-    named,
-    packet_types,
-)
+from mlbatch.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
+from mlbatch.looking import calibrations_for, first_seconds, look
+from mlbatch.matching import match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import open_recording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
-from mlbatch.streams import Found, Kind, Role, Router, Sampler, match, split_by_kind
+from mlbatch.streams import Found, Kind, Role, Router, Sampler, split_by_kind
 from mlbatch.transforms import from_rpy_deg
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -164,7 +158,8 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     calibrations, looked = calibrations_for(recordings, metadata)
     files = {str(one.path): one.path for one in calibrations if one.path is not None}
     calibrations += learner.calibrations()
-    found, _ = match(sampler, calibrations, {})
+    matched = match(sampler, calibrations, {})
+    found = matched.sensors
     mounted, mounting = mount(
         table,
         found,

@@ -14,7 +14,8 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("assembly",),),
     (("feeding",), ("job",)),
     (("inertial",), ("passing",), ("discover",)),
-    (("learning",), ("mounting",)),
+    (("looking",), ("mounting",), ("matching",)),
+    (("learning",),),
     (
         ("readers",),
         ("sensors",),

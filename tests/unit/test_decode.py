@@ -52,11 +52,11 @@ class Bench:
     def __post_init__(self) -> None:
         calibration = read_calibration(write_metadata(self.folder / "lidar.json", self.spec))
         assert calibration is not None
-        lidar = calibration.lidar({})
+        lidar = calibration.lidar({}, None)
         mids = np.arange(TURN)
         payloads = encode_packets(self.spec, mids, mids, np.zeros(TURN, np.int64), self.fields)
         data = np.frombuffer(b"".join(payloads), np.uint8)
-        ring = RawRing(lidar.packet_size, lidar.record_start, lidar.record_size)
+        ring = RawRing(lidar.packet_size, lidar.records)
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
         _, first = ring.store(data.copy(), start, None)
         self.place = (first[:, None] + np.arange(16)).ravel()

@@ -8,16 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discover import (
-    Setup,
-    Wishes,
-    calibrations_for,
-    describe,
-    discover,
-    first_seconds,
-    look,
-)
+from mlbatch.discover import Setup, Wishes, describe, discover
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.looking import calibrations_for, first_seconds, look
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.unit.sessions import (

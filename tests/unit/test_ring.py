@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mlbatch.lidar import Records
 from mlbatch.ring import RawRing
 from mlbatch.types import U8Array
 
@@ -26,7 +27,9 @@ class Stored:
     count: int = 0
 
     def __post_init__(self) -> None:
-        self.ring = RawRing(self.packet_size, self.record_start, self.record_size)
+        self.ring = RawRing(
+            self.packet_size, Records(self.record_start, self.record_size, self.record_size)
+        )
 
     def store(self, count: int, gap: int = 0) -> U8Array:
         """Store packets that lie `gap` bytes apart in a batch; give what the ring shows of them."""
@@ -88,7 +91,7 @@ def test_a_ring_that_is_emptied_does_not_grow() -> None:
 
 
 def test_places_never_come_twice() -> None:
-    ring, seen = RawRing(36, 0, 12), set[int]()
+    ring, seen = RawRing(36, Records(0, 12, 12)), set[int]()
     for count in (3, 64, 1, 70, 5, 64):
         data = np.zeros(count * 36, np.uint8)
         _, place = ring.store(data, np.arange(count, dtype=np.int64) * 36, None)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.lidar import Evidence
+from mlbatch.lidar import Beside, Evidence
 from mlbatch.types import Stream, U8Array
 
 OUSTER = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "ouster"
@@ -125,9 +125,17 @@ def evidence(capture: Path, size: int, source: str = "") -> Evidence:
     """What a discovery would gather on the payloads of one size."""
     found = [entry for entry in datagrams(capture) if source in ("", entry[0])]
     sample = [entry for entry in found if len(entry[2]) == size][:4]
+    others = {(entry[0], entry[1], len(entry[2])): entry for entry in found}
     return Evidence(
         Stream(sample[0][0], sample[0][1]),
         size,
         np.array([np.frombuffer(data, np.uint8) for _, _, data in sample]),
-        frozenset((port, len(data)) for _, port, data in found),
+        np.zeros(len(sample), np.int64),
+        tuple(beside(Stream(ip, port), data) for (ip, port, _), (_, _, data) in others.items()),
     )
+
+
+def beside(stream: Stream, payload: bytes) -> Beside:
+    """One packet from the same source."""
+    sample = np.frombuffer(payload, np.uint8)[None]
+    return Beside(stream, len(payload), sample, np.zeros(1, np.int64))

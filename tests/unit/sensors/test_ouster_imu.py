@@ -22,7 +22,7 @@ ACCEL32 = "ACCEL32_GYRO32_NMEA"
 def lidar_of(spec: OusterSpec) -> OusterLidar:
     found = read_calibration(Path("a.json"), json.dumps(metadata_json(spec)).encode())
     assert found is not None
-    return found.lidar({})
+    return found.lidar({}, None)
 
 
 def payload_of(data: bytes) -> U8Array:
@@ -95,7 +95,7 @@ def test_real_packets_equal_the_reference() -> None:
     reference = case.arrays()
     calibration = read_file(case.metadata_path)
     assert calibration is not None
-    lidar = calibration.lidar({})
+    lidar = calibration.lidar({}, None)
     assert lidar.notes == ("the metadata say that the lidar output was off",)
     assert not lidar.is_imu(680)
     assert lidar.is_imu(452)
@@ -116,11 +116,13 @@ def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) 
     case = CASES[number]
     calibration = read_file(case.metadata_path)
     assert calibration is not None
-    lidar = calibration.lidar({})
+    lidar = calibration.lidar({}, None)
     assert lidar.is_imu(48)
     samples = [lidar.imu(payload[None], 0) for payload in case.payloads(48)]
     stamps = np.concatenate([sample.stamp_ns for sample in samples])
-    first, last = np.sort(lidar.heads(case.payloads(lidar.packet_size)).stamp_ns.ravel())[[0, -1]]
+    packets = case.payloads(lidar.packet_size)
+    stamp_ns = lidar.heads(packets, np.zeros(len(packets), np.int64)).stamp_ns
+    first, last = np.sort(stamp_ns.ravel())[[0, -1]]
     assert len(stamps) >= 10
     assert (np.diff(stamps) > 0).all()
     # A turn to either side, since one lidar measures half of its turn only.

@@ -19,6 +19,7 @@ from tests.unit.sensors.captures import (
     CASES,
     OUSTER,
     Case,
+    beside,
     datagrams,
     evidence,
     needs_recordings,
@@ -48,7 +49,9 @@ def packets_of(spec: OusterSpec, columns: int = 32) -> U8Array:
 
 def seen(packets: U8Array, port: int = 7502, *sizes: tuple[int, int]) -> Evidence:
     size = packets.shape[1]
-    return Evidence(Stream("192.0.2.7", port), size, packets, frozenset({(port, size), *sizes}))
+    others = tuple(beside(Stream("192.0.2.7", at), bytes(length)) for at, length in sizes)
+    host_ns = np.zeros(len(packets), np.int64)
+    return Evidence(Stream("192.0.2.7", port), size, packets, host_ns, others)
 
 
 @needs_recordings
@@ -70,11 +73,11 @@ def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> Non
 @needs_recordings
 def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
     found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
-    assert (7502, 48) in found.sizes
+    assert (7502, 48) in {(one.stream.port, one.size) for one in found.beside}
     shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
     apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
     assert shared.fit(found) > apart.fit(found) > 0
-    moved = replace(found, sizes=frozenset({(7502, 16640), (7503, 48)}))
+    moved = replace(found, beside=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
     assert apart.fit(moved) > shared.fit(moved) > 0
 
 

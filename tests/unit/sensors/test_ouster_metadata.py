@@ -48,7 +48,7 @@ def test_nested_and_flat_files_say_the_same() -> None:
 
 def test_a_reduced_file_is_filled_up_with_defaults() -> None:
     calibration = read(reduced())
-    described, lidar = calibration.metadata, calibration.lidar({})
+    described, lidar = calibration.metadata, calibration.lidar({}, None)
     assert (lidar.packet_size, lidar.columns_per_packet, lidar.channels) == (12608, 16, 64)
     assert (described.lidar_port, described.imu_port, described.imu_profile) == (
         7502,
@@ -87,18 +87,18 @@ def test_the_beam_origin_by_product_line(product: str, offset_mm: float) -> None
 def test_columns_per_frame_from_the_mode(mode: str) -> None:
     calibration = read(reduced(mode=mode))
     assert calibration.metadata.columns_per_frame == int(mode.split("x")[0])
-    assert len(calibration.lidar({}).beams.angle_rad) == int(mode.split("x")[0])
+    assert len(calibration.lidar({}, None).beams.angle_rad) == int(mode.split("x")[0])
 
 
 def test_error_texts_of_old_firmware_count_as_absent() -> None:
     document = reduced("OS-1-64")
     document["lidar_data_format"] = "error: Command not recognized"
     document["calibration_status"] = "error: Command not recognized"
-    assert read(document).lidar({}).mode == "1024x10 LEGACY"
+    assert read(document).lidar({}, None).mode == "1024x10 LEGACY"
 
 
 def test_old_firmware_sends_64_beams_for_16() -> None:
-    lidar = read(reduced("OS-1-16-A0")).lidar({})
+    lidar = read(reduced("OS-1-16-A0")).lidar({}, None)
     assert (lidar.channels, lidar.packet_size) == (64, 12608)
     assert "OS-1-16-A0 has 64 beam angles: packets of 64 beams" in lidar.notes
 
@@ -116,25 +116,27 @@ def test_header_type_follows_the_profile_unless_told() -> None:
 
 def test_extrinsics_are_metres_and_identity_means_none() -> None:
     pose = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -2.0, 0.0, 0.0, 1.0, 0.25, 0.0, 0.0, 0.0, 1.0]
-    told = read(metadata_json(OusterSpec(beams=64, extrinsic_m=pose))).lidar({})
+    told = read(metadata_json(OusterSpec(beams=64, extrinsic_m=pose))).lidar({}, None)
     assert told.extrinsics is not None
     assert told.extrinsics.ravel().tolist() == pose
     unknown = OusterSpec(beams=64, extrinsic_m=np.eye(4).ravel().tolist())
-    assert read(metadata_json(unknown)).lidar({}).extrinsics is None
+    assert read(metadata_json(unknown)).lidar({}, None).extrinsics is None
 
 
 def test_a_lidar_that_was_off_is_noted_and_the_file_stays_usable() -> None:
     for key, value in (("udp_port_lidar", 0), ("udp_dest", "")):
         document = metadata_json(SPEC)
         document["config_params"][key] = value
-        assert read(document).lidar({}).notes == ("the metadata say that the lidar output was off",)
+        assert read(document).lidar({}, None).notes == (
+            "the metadata say that the lidar output was off",
+        )
 
 
 def test_the_profile_off_has_no_packets() -> None:
     document = metadata_json(SPEC)
     document["lidar_data_format"]["udp_profile_lidar"] = "OFF"
     with pytest.raises(RigError, match=r"front\.json: .*udp_profile_lidar: wanted .*got OFF"):
-        read(document).lidar({})
+        read(document).lidar({}, None)
 
 
 @pytest.mark.parametrize(
@@ -144,10 +146,10 @@ def test_the_profile_off_has_no_packets() -> None:
 def test_the_order_of_two_returns(order: str | None, first: bool) -> None:
     document = metadata_json(OusterSpec(profile="RNG19_RFL8_SIG16_NIR16_DUAL", beams=64))
     document["config_params"]["return_order"] = order
-    lidar = read(document).lidar({})
+    lidar = read(document).lidar({}, None)
     assert (lidar.returns, lidar.strongest_first) == (2, first)
     assert len(lidar.return_types) == 2
-    single = read(metadata_json(SPEC)).lidar({})
+    single = read(metadata_json(SPEC)).lidar({}, None)
     assert (single.strongest_first, single.return_types) == (False, (1,))
 
 
@@ -162,7 +164,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
         # A quarter turn about z, then 100 mm up.
         lidar_to_sensor_mm=[0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 100, 0, 0, 0, 1],
     )
-    table = read(metadata_json(spec)).lidar({}).beams
+    table = read(metadata_json(spec)).lidar({}, None).beams
     n_m = 5**0.5 / 1000
     assert table.reach_m.tolist() == [pytest.approx(-n_m, abs=1e-15)]
     angle = table.angle_rad[128]
@@ -182,13 +184,14 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
 def test_options_of_this_and_other_makers() -> None:
     calibration = read(metadata_json(SPEC))
     calibration.lidar(
-        {"crc": "check", "firing_azimuth": "on", "vertical_offset": "off", "optical_centre": "on"}
+        {"crc": "check", "firing_azimuth": "on", "vertical_offset": "off", "optical_centre": "on"},
+        None,
     )
-    known = "crc, firing_azimuth, optical_centre, vertical_offset"
+    known = "crc, firing_azimuth, optical_centre, packet_stamp, vertical_offset"
     with pytest.raises(UsageError, match=f"--decode colour=red: wanted one of {known}, got colour"):
-        calibration.lidar({"colour": "red"})
+        calibration.lidar({"colour": "red"}, None)
     with pytest.raises(UsageError, match="wanted crc=check, got never"):
-        calibration.lidar({"crc": "never"})
+        calibration.lidar({"crc": "never"}, None)
 
 
 def test_a_serial_number_may_be_a_number_or_absent() -> None:

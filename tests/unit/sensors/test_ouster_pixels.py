@@ -68,7 +68,7 @@ def lidar_of(spec: OusterSpec) -> OusterLidar:
     content = json.dumps(metadata_json(spec)).encode()
     found = read_calibration(Path("sensor.json"), content)
     assert found is not None
-    return found.lidar({"crc": "check"})
+    return found.lidar({"crc": "check"}, None)
 
 
 def stacked(packets: list[bytes]) -> U8Array:
@@ -76,9 +76,9 @@ def stacked(packets: list[bytes]) -> U8Array:
 
 
 def records_of(lidar: OusterLidar, packets: U8Array) -> U8Array:
-    size = lidar.columns_per_packet * lidar.record_size
-    body = packets[:, lidar.record_start : lidar.record_start + size]
-    return np.ascontiguousarray(body.reshape(-1, lidar.record_size))
+    size = lidar.columns_per_packet * lidar.records.size
+    body = packets[:, lidar.records.start : lidar.records.start + size]
+    return np.ascontiguousarray(body.reshape(-1, lidar.records.size))
 
 
 def blank(shape: tuple[int, int]) -> Pixels:
@@ -181,7 +181,7 @@ def test_encode_then_decode_is_identity(
     assert lidar.faults(packets).tolist() == [0, 0]
     assert lidar.owns(packets).all()
     assert lidar.sequence(packets).tolist() == [frame * 64 + block, frame * 64 + block + 1]
-    heads = lidar.heads(packets)
+    heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
     assert np.array_equal(heads.stamp_ns.ravel(), stamps)
     assert np.array_equal(heads.encoder.ravel(), mids)
     assert np.array_equal(heads.valid.ravel(), valid)
@@ -201,7 +201,7 @@ def two_packets(spec: OusterSpec, frame: int = 7, first: int = 0) -> U8Array:
 
 def test_columns_beyond_the_frame_are_not_valid() -> None:
     spec = OusterSpec(beams=16, columns_per_frame=512)
-    valid = lidar_of(spec).heads(two_packets(spec, first=496)).valid
+    valid = lidar_of(spec).heads(two_packets(spec, first=496), np.zeros(2, np.int64)).valid
     assert valid.tolist() == [[True] * 16, [False] * 16]
 
 

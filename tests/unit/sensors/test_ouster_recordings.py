@@ -29,14 +29,14 @@ def calibration_of(case: Case) -> OusterCalibration:
 @lru_cache(maxsize=1)
 def loaded(case: Case) -> tuple[OusterCalibration, OusterLidar, U8Array, Reference]:
     calibration = calibration_of(case)
-    lidar = calibration.lidar({"crc": "check"})
+    lidar = calibration.lidar({"crc": "check"}, None)
     return calibration, lidar, case.payloads(lidar.packet_size), case.arrays()
 
 
 def records_of(lidar: OusterLidar, packets: U8Array) -> U8Array:
-    size = lidar.columns_per_packet * lidar.record_size
-    body = packets[:, lidar.record_start : lidar.record_start + size]
-    return np.ascontiguousarray(body.reshape(-1, lidar.record_size))
+    size = lidar.columns_per_packet * lidar.records.size
+    body = packets[:, lidar.records.start : lidar.records.start + size]
+    return np.ascontiguousarray(body.reshape(-1, lidar.records.size))
 
 
 def decoded(
@@ -60,7 +60,7 @@ def frames_of(lidar: OusterLidar, packets: U8Array, reference: Reference) -> tup
 class TestEveryRecording:
     def test_stamps_ids_and_validity_of_every_column(self, case: Case) -> None:
         _, lidar, packets, reference = loaded(case)
-        heads = lidar.heads(packets)
+        heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
         frames, _ = frames_of(lidar, packets, reference)
         assert len(packets)
         for frame, stamp_ns, mid, valid in zip(
@@ -76,7 +76,7 @@ class TestEveryRecording:
 
     def test_ranges_signal_and_reflectivity_of_every_pixel(self, case: Case) -> None:
         _, lidar, packets, reference = loaded(case)
-        heads = lidar.heads(packets)
+        heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
         frames, _ = frames_of(lidar, packets, reference)
         frame = np.repeat(frames, lidar.columns_per_packet)[heads.valid.ravel()]
         mid = heads.encoder[heads.valid]
@@ -135,7 +135,9 @@ class TestEveryRecording:
 
     def test_the_metadata_fit_their_packets(self, case: Case) -> None:
         calibration, lidar, packets, _ = loaded(case)
-        assert calibration.fit(Evidence(Stream("", 1), lidar.packet_size, packets[:4])) >= 1
+        host_ns = np.zeros(4, np.int64)
+        seen = Evidence(Stream("", 1), lidar.packet_size, packets[:4], host_ns[: len(packets)])
+        assert calibration.fit(seen) >= 1
 
 
 def in_mm(pose: F64Array) -> F64Array:
@@ -194,8 +196,11 @@ def test_a_changed_packet_is_told_by_its_checksum_only_if_asked() -> None:
     calibration = calibration_of(CASES[0])
     packets = CASES[0].payloads(calibration.metadata.layout.packet_size)
     packets[3, 777] ^= 4
-    assert calibration.lidar({"crc": "check"}).faults(packets).tolist() == [0] * 3 + [3] + [0] * 30
-    assert not calibration.lidar({}).faults(packets).any()
+    assert (
+        calibration.lidar({"crc": "check"}, None).faults(packets).tolist()
+        == [0] * 3 + [3] + [0] * 30
+    )
+    assert not calibration.lidar({}, None).faults(packets).any()
 
 
 def test_foreign_json_beside_the_recordings_is_no_calibration() -> None:

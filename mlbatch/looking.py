@@ -1,0 +1,118 @@
+"""A first look at a session: its first seconds, and the calibrations that lie beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch import sensors
+from mlbatch.errors import RigError
+from mlbatch.learning import Learner, listen
+from mlbatch.lidar import Calibration
+from mlbatch.readers import merge
+from mlbatch.streams import Kind, Sampler, split_by_kind
+from mlbatch.types import PacketBatch, Recording, StreamTable
+from mlbatch.units import NS_PER_S
+
+LOOK_NS = 10 * NS_PER_S
+# Calibrations are searched beside the recording under these suffixes, and told by content.
+SIDECAR_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
+METADATA_SUFFIX = ".json"
+# No calibration of one sensor comes near; tables and documents of a dataset are not opened.
+MAX_SIDECAR_BYTES = 2_000_000
+BAG_METADATA = "metadata.yaml"
+
+
+def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:
+    """Look at the first 10 s of a session: its packets, and the messages that tell of sensors."""
+    sampler, learner = Sampler(table), Learner()
+    listen(recordings)
+    for batch in first_seconds(recordings):
+        sampler.add(batch)
+        learner.add(batch)
+    for recording in recordings:
+        recording.keep = frozenset()
+    return sampler, learner
+
+
+def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
+    """The packets up to 10 s after the first lidar packet, whatever the size of the batches.
+
+    A capture is often started long before the lidars are.
+    """
+    until_ns: int | None = None
+    known: set[Kind] = set()
+    for batch in merge(recordings):
+        if until_ns is None:
+            began_ns = _lidars_begin_ns(batch, known)
+            until_ns = None if began_ns is None else began_ns + LOOK_NS
+        if until_ns is None:
+            yield batch
+            continue
+        over = np.flatnonzero(batch.host_ns > until_ns)
+        if len(over):
+            yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
+            return
+        yield batch
+
+
+def _lidars_begin_ns(batch: PacketBatch, known: set[Kind]) -> int | None:
+    """Arrival of the first packet that looks like a lidar's; kinds already looked at are known."""
+    begins_ns = []
+    for kind, index in split_by_kind(batch):
+        if kind in known:
+            continue
+        known.add(kind)
+        begin = int(batch.start[index[0]])
+        text = sensors.describe(kind[1], batch.data[begin : begin + kind[1]][None])
+        if text is not None and "lidar" in text:
+            begins_ns.append(int(batch.host_ns[index[0]]))
+    return min(begins_ns, default=None)
+
+
+def calibrations_for(
+    recordings: Sequence[Path], given: Sequence[Path]
+) -> tuple[list[Calibration], list[Path]]:
+    """Calibrations that were given, else those beside the recordings; and the files looked at."""
+    if given:
+        return [read_given(path) for path in given], list(given)
+    looked: list[Path] = []
+    found = []
+    for folder in dict.fromkeys(map(_folder_of, recordings)):
+        for path in sorted(path for path in folder.iterdir() if _may_be_calibration(path)):
+            # A file beside the recording was never named by the user: a foreign one is no error.
+            try:
+                calibration = sensors.read_calibration(path)
+            except RigError:
+                looked.append(path)
+                continue
+            if calibration is not None:
+                found.append(calibration)
+            if calibration is not None or path.suffix.lower() == METADATA_SUFFIX:
+                looked.append(path)
+    return found, looked
+
+
+def _folder_of(recording: Path) -> Path:
+    """Where calibrations of a recording lie: beside it, or beside the folder of a ROS 2 bag."""
+    folder = recording.parent
+    return folder.parent if (folder / BAG_METADATA).is_file() else folder
+
+
+def _may_be_calibration(path: Path) -> bool:
+    is_one = path.suffix.lower() in SIDECAR_SUFFIXES and path.name != BAG_METADATA
+    return is_one and path.is_file() and path.stat().st_size <= MAX_SIDECAR_BYTES
+
+
+def read_given(path: Path) -> Calibration:
+    """The calibration in a file that the user named; RigError if it is none."""
+    calibration = sensors.read_calibration(path)
+    if calibration is None:
+        raise RigError(
+            f"{path}: wanted the metadata or calibration of a lidar, got another kind of file; "
+            "give the file that the sensor's driver or recorder saved"
+        )
+    return calibration
