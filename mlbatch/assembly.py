@@ -38,7 +38,15 @@ def source_of(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
     rig = sensor.rig
     low = [job.min_range_m, 0.0 if rig is None else rig.min_range_m or 0.0]
     high = [job.max_range_m, float("inf") if rig is None else rig.max_range_m or float("inf")]
-    return Source(feed.lidar, feed.ring, sensor.body_from_sensor, ring_base, max(low), min(high))
+    return Source(
+        feed.lidar,
+        feed.ring,
+        sensor.body_from_sensor,
+        ring_base,
+        max(low),
+        min(high),
+        job.keep_repeated,
+    )
 
 
 def boxes_of(setup: Setup, job: Job) -> F64Array:

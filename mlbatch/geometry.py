@@ -176,6 +176,7 @@ class Turning:
         self._angles = np.empty((4, columns, beams), np.float32)
         self._towards = np.empty((columns, 3, beams), np.float32)
         self._from: F32Array = self._origin[2][None]
+        self._origins = np.empty_like(self._towards if self._origin_turns else self._towards[:0])
         self._moved = np.empty_like(self._towards)
         self._reached_m = np.empty((columns, beams), np.float32)
 
@@ -190,16 +191,8 @@ class Turning:
         towards, scratch = self._towards[:count], self._moved[:count]
         self._combine(self._direction, cosine, sine, towards, scratch)
         if self._origin_turns:
-            self._from = np.empty((count, 3, self._origin.shape[2]), np.float32)
-            wide = self._origin.shape[2] > 1
-            first = slice(None) if wide else slice(0, 1)
-            self._combine(
-                self._origin,
-                cosine[:, first],
-                sine[:, first],
-                self._from,
-                np.empty_like(self._from),
-            )
+            self._from = self._origins[:count]
+            self._combine(self._origin, cosine, sine, self._from, scratch)
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""

@@ -141,16 +141,16 @@ def test_the_profile_off_has_no_packets() -> None:
 
 @pytest.mark.parametrize(
     ("order", "first"),
-    [(None, True), ("STRONGEST_TO_WEAKEST", True), ("NEAREST_TO_FARTHEST", False)],
+    [(None, "order"), ("STRONGEST_TO_WEAKEST", "order"), ("NEAREST_TO_FARTHEST", "")],
 )
-def test_the_order_of_two_returns(order: str | None, first: bool) -> None:
+def test_the_order_of_two_returns(order: str | None, first: str) -> None:
     document = metadata_json(OusterSpec(profile="RNG19_RFL8_SIG16_NIR16_DUAL", beams=64))
     document["config_params"]["return_order"] = order
     lidar = read(document).lidar({}, None)
-    assert (lidar.returns, lidar.strongest_first) == (2, first)
+    assert (lidar.returns, lidar.typed_by) == (2, first)
     assert len(lidar.return_types) == 2
     single = read(metadata_json(SPEC)).lidar({}, None)
-    assert (single.strongest_first, single.return_types) == (False, (1,))
+    assert (single.typed_by, single.return_types) == ("", (1,))
 
 
 def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
