@@ -1,0 +1,296 @@
+"""The encoder of ROBOSENSE packets, by bytes worked out by hand from facts/robosense.md.
+
+At 600 rpm the rotor turns 0.0036 degrees in a microsecond. Readings count up from 1 in the order
+(column, return, channel), levels likewise modulo 251.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mlbatch.types import I64Array
+from tests.builders.robosense import (
+    Angles,
+    RobosenseSpec,
+    angles_csv,
+    azimuths_deg,
+    difop,
+    directions,
+    fan,
+    firing_times_ns,
+    msop,
+    origins,
+    rounds,
+)
+from tests.builders.robosense_models import DUAL, LAST, MODELS, NEAREST, STRONGEST
+
+# 2023-11-14 22:13:20 UTC; 1 700 000 000 s are 0x6553F100; 7 us, 12 ms and 999 ns after it.
+START_NS = 1_700_000_000_012_007_999
+CALENDAR = "170b0e160d14 000c 0007"  # 23, 11, 14, 22, 13, 20; 12 ms, 7 us
+SECONDS = "00006553f100 00002ee7"  # 12007 us
+COLUMNS = {"RS-16": 24, "Helios 16": 24, "Helios 1615": 24, "Airy 96": 4, "Airy 48": 8}
+COLUMNS |= {"Ruby 128": 3, "Ruby Plus 128": 3, "Ruby 80": 4, "Ruby Plus 80": 4}
+COLUMNS |= {"Ruby Plus 80v": 4, "Ruby 48": 8, "Ruby Plus 48": 8}
+
+
+def counted(columns: int, channels: int, returns: int) -> tuple[I64Array, I64Array]:
+    """Raw ranges and levels (columns, channels, returns) that count up in the order of the wire."""
+    shape = (columns, returns, channels)
+    number = np.arange(1, columns * returns * channels + 1).reshape(shape).transpose(0, 2, 1)
+    return number, number % 251
+
+
+def packets(
+    model: str, mode: str = STRONGEST, count: int = 1, start_deg: float = 90.0
+) -> list[bytes]:
+    """Packets of counted readings."""
+    spec = RobosenseSpec(model, mode, start_deg=start_deg, start_ns=START_NS, first_counter=258)
+    columns = COLUMNS.get(model, 12) * count // spec.returns
+    return [
+        payload for _, payload in msop(spec, *counted(columns, spec.row.channels, spec.returns))
+    ]
+
+
+# Azimuths of blocks: 90 degrees, and what the rotor turns in the rounds before them.
+@pytest.mark.parametrize(
+    ("model", "size", "places"),
+    [
+        # Second block: round 2, 111 us, 0.3996 degrees: 9040; its first reading is the 33rd.
+        ("RS-16", 1248, {0: "55aa050a5aa550a0", 20: CALENDAR, 30: "01", 42: "ffee 2328 0001 01",
+                         142: "ffee 2350 0021 21", 1246: "00ff"}),
+        # 55.52 us, 0.1999 degrees: 9020.
+        ("RS-32", 1248, {0: "55aa050a5aa550a0", 20: CALENDAR, 30: "02", 142: "ffee 233c 0021 21"}),
+        ("Bpearl v3", 1248, {12: "00000102", 20: CALENDAR, 30: "03 00 00", 139: "0020 20"}),
+        ("Bpearl v4", 1248, {12: "00000102", 20: SECONDS, 30: "00 03 04", 142: "ffee 233c"}),
+        ("Helios 32", 1248, {0: "55aa055a", 17: "01", 20: SECONDS, 30: "00 06 01", 1246: "00ff"}),
+        ("Helios 32-31", 1248, {31: "06 02", 42: "ffee 2328", 142: "ffee 233c 0021"}),
+        ("Helios 32-26", 1248, {31: "06 04", 42: "ffee 2328", 142: "ffee 233c 0021"}),
+        # 2 x 55.56 us, 0.4 degrees: 9040.
+        ("Helios 16", 1248, {31: "06 03", 20: SECONDS, 142: "ffee 2350 0021"}),
+        ("Helios 1615", 1248, {31: "07 00", 20: SECONDS, 142: "ffee 2350 0021"}),
+        # Two blocks a column, 111.08 us a column: 9040.
+        ("Airy 96", 1248, {16: "00 00", 31: "31 02", 42: "ffee 2328 0001", 190: "ffee 2328 0031",
+                           338: "ffee 2350 0061", 1246: "0000"}),
+        ("Airy 48", 1248, {16: "00 00", 31: "31 01", 190: "ffee 2350 0031"}),
+        ("Ruby 128", 1248, {0: "55aa055a", 7: "01", 10: SECONDS, 31: "04", 80: "fe01 2328 0001",
+                            468: "fe01 233c 0081"}),
+        ("Ruby Plus 128", 1248, {7: "01", 10: SECONDS, 31: "05", 468: "fe01 233c 0081"}),
+        ("Ruby 80", 1248, {7: "01", 31: "04", 324: "fe01 233c 0051", 1056: "0000"}),
+        ("Ruby Plus 80", 1248, {7: "01", 31: "05 02", 324: "fe01 233c 0051"}),
+        ("Ruby Plus 80v", 1248, {7: "01", 31: "05 03", 324: "fe01 233c 0051"}),
+        ("Ruby 48", 1268, {7: "01", 31: "04", 228: "fe01 233c 0031"}),
+        ("Ruby Plus 48", 1268, {7: "01", 31: "05", 228: "fe01 233c 0031"}),
+    ],
+)  # fmt: skip
+def test_bytes_of_single_return_packets(model: str, size: int, places: dict[int, str]) -> None:
+    (payload,) = packets(model)
+    assert len(payload) == size
+    for at, wanted in places.items():
+        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+
+
+@pytest.mark.parametrize(
+    ("model", "places"),
+    [
+        # One round a block, 0.1998 degrees a round; 17th reading: second return of channel 1.
+        ("RS-16", {42: "ffee 2328 0001", 94: "0011 11", 142: "ffee 233c 0021"}),
+        ("Helios 16", {42: "ffee 2328 0001", 94: "0011 11", 142: "ffee 233c 0021"}),
+        # Pairs of blocks of one azimuth.
+        ("RS-32", {42: "ffee 2328 0001", 142: "ffee 2328 0021", 242: "ffee 233c 0041"}),
+        ("Bpearl v4", {42: "ffee 2328 0001", 142: "ffee 2328 0021", 242: "ffee 233c 0041"}),
+        # Two blocks a return: 48 + 48 channels; 193rd reading: the next column.
+        ("Airy 96", {17: "03", 338: "ffee 2328 0061", 634: "ffee 2350 00c1"}),
+        ("Airy 48", {17: "03", 190: "ffee 2328 0031", 338: "ffee 2350 0061"}),
+        ("Ruby 80", {7: "03", 80: "fe01 2328", 324: "fe02 2328 0051", 568: "fe01 233c 00a1"}),
+        ("Ruby Plus 48", {7: "03", 80: "fe01 2328", 228: "fe02 2328 0031", 376: "fe01 233c 0061"}),
+    ],
+)
+def test_bytes_of_dual_return_packets(model: str, places: dict[int, str]) -> None:
+    (payload,) = packets(model, DUAL)
+    for at, wanted in places.items():
+        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+
+
+def test_dual_packets_of_128_lines_share_a_column() -> None:
+    """Blocks: column 0 twice, column 1 | column 1, column 2 twice; times of columns 0 and 1."""
+    first, second = packets("Ruby 128", DUAL, count=2)
+    heads = [[payload[at : at + 4].hex() for at in (80, 468, 856)] for payload in (first, second)]
+    assert heads == [["fe012328", "fe022328", "fe01233c"], ["fe02233c", "fe012350", "fe022350"]]
+    # 12007.999 + 55.55 us = 12063.549 us.
+    assert (first[16:20].hex(), second[16:20].hex()) == ("00002ee7", "00002f1f")
+    # The 385th reading begins the second packet.
+    assert second[84:86].hex() == "0181"
+
+
+def test_second_packet_follows_after_all_columns_of_the_first() -> None:
+    """24 rounds of 55.5 us: 1332 us later, 4.7952 degrees on."""
+    _, second = packets("RS-16", count=2)
+    assert second[20:30] == bytes.fromhex("170b0e160d14 000d 0153")  # 13 ms, 339 us
+    assert second[44:46] == bytes.fromhex("2508")  # 94.7952: 9480
+
+
+def test_azimuth_starts_over_after_a_turn() -> None:
+    (payload,) = packets("RS-32", start_deg=359.9)
+    assert payload[44:46] == (35990).to_bytes(2, "big")
+    assert payload[144:146] == (10).to_bytes(2, "big")  # 360.0999 degrees
+
+
+def test_packets_arrive_after_their_last_round() -> None:
+    spec = RobosenseSpec("RS-32", start_ns=START_NS, latency_ns=1000)
+    ((host_ns, _),) = msop(spec, *counted(12, 32, 1))
+    assert host_ns == START_NS + 12 * 55_520 + 1000
+
+
+def test_columns_have_to_fill_packets() -> None:
+    with pytest.raises(ValueError, match="no whole packets"):
+        msop(RobosenseSpec("RS-32"), *counted(13, 32, 1))
+    with pytest.raises(ValueError, match="no whole packets"):
+        msop(RobosenseSpec("RS-32", DUAL), *counted(12, 32, 1))
+
+
+# Channels (from 1) and their us after the round, worked by section 5.
+@pytest.mark.parametrize(
+    ("model", "wanted_us"),
+    [
+        ("RS-16", {1: 0, 2: 2.8, 16: 42.0}),
+        ("RS-32", {1: 0, 15: 40.32, 16: 44.64, 17: 1.44, 32: 46.08}),
+        ("Bpearl v3", {1: 0, 9: 25.68, 17: 1.28, 25: 26.96, 32: 44.88}),
+        ("Bpearl v4", {1: 0, 4: 5.0, 32: 51.71}),
+        ("Helios 32", {1: 0, 2: 1.73, 32: 53.63}),
+        ("Helios 16", {1: 27.68, 2: 29.41, 16: 53.63}),
+        ("Airy 96", {8: 0, 9: 5.712, 96: 93.296}),
+        ("Airy 48", {4: 0, 5: 7.616, 48: 97.104}),
+        ("Ruby 128", {4: 0, 5: 3.236, 64: 48.54, 65: 0, 128: 48.54}),
+        ("Ruby Plus 128", {4: 0, 5: 1.13, 65: 21.14, 66: 23.31, 127: 50.53, 128: 53.771}),
+        ("Ruby 80", {3: 0, 4: 3.236, 40: 48.54, 41: 0, 76: 45.304}),
+        ("Ruby Plus 80", {4: 0, 5: 1.217, 33: 16.941, 74: 42.683, 75: 50.603, 80: 53.771}),
+        ("Ruby Plus 80v", {4: 0, 13: 3.652, 80: 31.963}),
+        ("Ruby 48", {1: 0, 5: 12.944, 6: 12.944, 13: 25.888, 24: 48.54, 25: 0}),
+        ("Ruby Plus 48", {2: 0, 3: 1.217, 32: 23.127, 48: 40.666}),
+    ],
+)
+def test_times_of_channels(model: str, wanted_us: dict[int, float]) -> None:
+    spec = RobosenseSpec(model, start_ns=START_NS)
+    after_ns = firing_times_ns(spec, np.arange(1))[0] - START_NS // 1000 * 1000
+    found = {channel: after_ns[channel - 1] / 1000 for channel in wanted_us}
+    assert found == pytest.approx(wanted_us)
+
+
+def test_times_are_those_that_packets_tell() -> None:
+    """Column 13 of RS-32: second packet, cut to us, one round of 55.52 us."""
+    spec = RobosenseSpec("RS-32", start_ns=START_NS)
+    times = firing_times_ns(spec, np.array([0, 1, 13]))
+    told_ns = (START_NS + 12 * 55_520) // 1000 * 1000
+    assert times[:, 0].tolist() == [START_NS - 999, START_NS - 999 + 55_520, told_ns + 55_520]
+
+
+def test_view_leaves_rounds_out() -> None:
+    """RS-32 turns 0.199872 degrees a round; outside 90..100 degrees nothing is sent.
+
+    100 degrees are passed in round 501 (100.136), 90 degrees a turn later in round 2252 (450.112).
+    """
+    spec = RobosenseSpec("RS-32", start_deg=0.0, view_deg=(90.0, 100.0))
+    found = rounds(spec, np.arange(52))
+    assert found[:2].tolist() == [451, 452]
+    assert found[49:].tolist() == [500, 2252, 2253]
+
+
+def test_a_beam_points_where_the_formula_says() -> None:
+    """Channel 2 of RS-16: 2.8 us after 90 degrees it is 0.01008 degrees on; 10 degrees up."""
+    spec = RobosenseSpec("RS-16", start_deg=90.0)
+    angles = Angles(np.full(16, 10.0), np.full(16, 3.0))
+    azimuth, elevation = math.radians(93.01008), math.radians(10)
+    wanted = [
+        math.cos(elevation) * math.cos(azimuth),
+        -math.cos(elevation) * math.sin(azimuth),
+        math.sin(elevation),
+    ]
+    assert directions(spec, angles, np.arange(1))[0, 1] == pytest.approx(wanted)
+    lens = math.radians(90.01008)
+    wanted = [0.03825 * math.cos(lens), -0.03825 * math.sin(lens), 0.0]
+    assert origins(spec, np.arange(1))[0, 1] == pytest.approx(wanted)
+
+
+def test_reversed_rotor_turns_counterclockwise() -> None:
+    spec = RobosenseSpec("Bpearl v4", start_deg=30.0, is_reversed=True)
+    angles = Angles(np.zeros(32), np.zeros(32))
+    first = directions(spec, angles, np.arange(1))[0, 0]
+    assert first == pytest.approx([math.cos(math.radians(30)), math.sin(math.radians(30)), 0.0])
+    assert azimuths_deg(spec, np.arange(2))[1, 0] == pytest.approx(-30.200016)
+    assert difop(spec, angles)[337] == 1
+    assert origins(spec, np.arange(1))[0, 0, 2] == 0.09571
+
+
+@pytest.mark.parametrize(
+    ("model", "places"),
+    [
+        # -15 degrees = 150000 counts = 0x0249F0, without a sign.
+        ("RS-16", {1165: "0249f0 0249f0", 1189: "0249f0"}),
+        # -10.281 and 2.5 degrees (MAN's example); 0.001 degree a count.
+        ("RS-32", {468: "01 2829", 471: "00 09c4", 564: "01 0bb8", 567: "00 01f4"}),
+        # 89.50 degrees, MAN's example.
+        ("Bpearl v3", {468: "00 22f6", 471: "01 00fa", 564: "01 012c"}),
+        ("Helios 16", {468: "00 22f6", 513: "00 03e8", 516: "ffffff", 612: "ffffff"}),
+        # 3.69 degrees, MAN's example.
+        ("Airy 96", {468: "00 0171", 753: "00 03e8", 756: "01 012c", 1044: "000000"}),
+        ("Ruby 80", {468: "00 0171", 705: "00 03e8", 708: "ffffff", 1092: "ffffff"}),
+        ("Ruby Plus 128", {468: "00 0171", 849: "00 03e8", 852: "01 012c", 1233: "00 03e8"}),
+    ],
+)  # fmt: skip
+def test_angles_of_device_packets(model: str, places: dict[int, str]) -> None:
+    """Channels 1 and 2 as in `places`, 10 degrees for all others; azimuths -3, 0.5 and 10."""
+    first = {"RS-16": (-15.0, -15.0), "RS-32": (-10.281, 2.5), "Bpearl v3": (89.5, -2.5)}
+    first |= {"Helios 16": (89.5, -2.5)}
+    row = MODELS[model]
+    angles = Angles(np.full(row.channels, 10.0), np.full(row.channels, 10.0))
+    angles.elevation_deg[:2] = first.get(model, (3.69, -2.5))
+    if model == "RS-16":
+        angles.elevation_deg[2:8], angles.elevation_deg[8] = -10.0, 15.0
+    angles.azimuth_deg[:2] = -3.0, 0.5
+    payload = difop(RobosenseSpec(model), angles)
+    for at, wanted in places.items():
+        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+
+
+@pytest.mark.parametrize(
+    ("model", "mode", "code"),
+    [
+        ("RS-16", DUAL, 0), ("RS-32", STRONGEST, 1), ("Bpearl v3", LAST, 2),
+        ("Bpearl v4", NEAREST, 6), ("Helios 32", LAST, 5), ("Helios 16", STRONGEST, 4),
+        ("Ruby 128", DUAL, 3), ("Ruby 48", STRONGEST, 1), ("Ruby Plus 128", STRONGEST, 0),
+        ("Ruby Plus 80", DUAL, 3), ("Airy 96", NEAREST, 1),
+    ],
+)  # fmt: skip
+def test_device_packet(model: str, mode: str, code: int) -> None:
+    spec = RobosenseSpec(model, mode, rpm=1200, start_ns=START_NS, view_deg=(10.0, 350.0))
+    payload = difop(spec, fan(spec), sync=(1, 0))
+    assert len(payload) == 1248
+    assert payload[:10] == bytes.fromhex("a5ff005a11115555 04b0")
+    assert payload[32:36] == bytes.fromhex("03e8 88b8")
+    assert payload[292:298] == bytes.fromhex("0a1b2c3d4e5f")
+    assert payload[300:303] == bytes((code, 1, 0))
+    time = CALENDAR if MODELS[model].is_calendar else SECONDS
+    assert payload[303:313] == bytes.fromhex(time)
+    assert payload[1246:] == b"\x0f\xf0"
+
+
+def test_bytes_put_into_a_device_packet_and_the_mount_of_an_airy() -> None:
+    spec = RobosenseSpec("Airy 96", mount="side")
+    payload = difop(spec, fan(spec), parts={41: b"\x01\x02\x03"})
+    assert (payload[41:44], payload[289]) == (b"\x01\x02\x03", 1)
+    times = firing_times_ns(spec, np.arange(1))[0]
+    assert (times[8] - times[0], times[95] - times[0]) == (11_424, 99_008)
+
+
+def test_step_of_ranges_in_the_header_of_helios() -> None:
+    spec = RobosenseSpec("Helios 32", unit_m=0.005)
+    ((_, payload),) = msop(spec, *counted(12, 32, 1))
+    assert payload[17] == 0
+
+
+def test_file_of_angles() -> None:
+    angles = Angles(np.array([-15.0, 0.25]), np.array([0.0, -3.5]))
+    assert angles_csv(angles) == "-15.0000,0.0000\n0.2500,-3.5000\n"
