@@ -1,4 +1,4 @@
-"""Names of HESAI packets by content: lengths, header versions, return modes in the tail.
+"""What HESAI packets are, by their content: lengths, header versions, return modes in the tail.
 
 Source: facts/hesai.md sections 1 to 4; facts/messages.md section 2 (correction); HesaiTechnology/
 HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC).
@@ -7,96 +7,96 @@ HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mlbatch.sensors import _hesai_models as rows
+from mlbatch.sensors._hesai_layout import (
+    AMBIENT,
+    ONLY_RETURN,
+    PREFIX_SIZE,
+    RETURN_MODES,
+    SEQUENCE,
+    Layout,
+    ReturnMode,
+    least_size,
+    tail_at,
+    unit_mm,
+)
+from mlbatch.sensors._hesai_models import Model
 from mlbatch.sensors._recognise_bytes import NO_DECODER, mostly, number, starts, usual
 from mlbatch.types import BoolArray, U8Array
 
 _SOP = b"\xee\xff"
 _BLOCK_FLAG = b"\xff\xee"
 _HEADER_SIZE = 12
-# Automotive models may put a SOME/IP header in front.
-_PREFIX_SIZE = 21
-_RETURNS = {
-    0x33: "first return",
-    0x34: "second return",
-    0x37: "strongest return",
-    0x38: "last return",
-    0x39: "dual return, last and strongest",
-    0x3A: "dual return, first and second",
-    0x3B: "dual return, first and last",
-    0x3C: "dual return, first and strongest",
-    0x3D: "triple return, first, last and strongest",
-    0x3E: "dual return, strongest and second strongest",
-}
 _OTHERS = (
     (512, _BLOCK_FLAG, "GPS packet"),
     (99, b"\xcd\xdc", "fault packet"),
     (0, bytes.fromhex("47740500"), "correction"),
 )
-_SAFETY, _CONFIDENCE, _WEIGHT, _AMBIENT = 0x04, 0x10, 0x20, 0x40
-_CRC_SIZE, _SAFETY_SIZE = 4, 17
+_SEQUENCE_SIZE = 4
+# Bytes of a header that stay the same: marker, version, lasers, blocks, distance unit, flags.
+_FIXED = (0, 1, 2, 3, 6, 7, 9, 11)
+_FIXED_64 = (0, 1, 2, 3, 5)
+_FIXED_JT16 = (0, 1, 2, 3, 5)
+_PANDAR40_BLOCKS, _PANDAR40_STRIDE = 10, 124
+# Payloads without sequence number, and the blocks that they hold.
+_PANDAR64_BLOCKS = {1194: 6, 1388: 7}
+_PANDAR40_SIZE, _PANDAR40_UNDATED_SIZE = 1262, 1256
+_PANDAR20_MAGIC = _SOP + bytes((20, 20))
+_JT16_IMU_SIZE, _JT16_SIZE = 34, 80
 
 
 @dataclass(frozen=True, slots=True)
-class _Sized:
-    """A model told by its sizes and first bytes; mode_at: byte of the return mode, 0 unknown."""
+class Identity:
+    """What packets of a stream are; layout: None where no decoder can read them.
 
-    name: str
-    sizes: tuple[int, ...]
-    magic: bytes
-    mode_at: int
-
-
-_PANDAR40_BLOCKS = 10
-_PANDAR40_STRIDE = 124
-_PANDAR40 = (
-    _Sized("Pandar40", (1256,), _BLOCK_FLAG, 1254),
-    _Sized("Pandar40P or Pandar40M", (1262, 1266), _BLOCK_FLAG, 1254),
-)
-_PANDAR64 = (
-    _Sized("Pandar64", (1194, 1198), _SOP + bytes((64, 6)), 1186),
-    _Sized("Pandar64", (1388, 1392), _SOP, 1380),
-)
-_PANDAR20 = _Sized("Pandar20", (), _SOP + bytes((20, 20)), 0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Version:
-    """A family by its protocol version.
-
-    mode_at: return mode in the tail, 0 unknown; unit: bytes per channel, with those that flags add;
-    lead: bytes of a block before its channels; checked: body CRC and, if flagged, safety bytes.
+    mode: None where the packets do not say how many returns they hold.
     """
 
     name: str
-    mode_at: int = 0
-    unit: int = 4
-    lead: int = 2
-    checked: bool = False
-    flagged: bool = False
+    mode: ReturnMode | None = None
+    layout: Layout | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Family:
+    """Models of a protocol version, told apart by lasers and blocks; the first one stands for all.
+
+    name: of those that are not in the list; turns: all but automotive models, which alone may
+    have a prefix.
+    """
+
+    name: str
+    models: tuple[Model, ...] = ()
     turns: bool = True
 
 
-_VERSIONS: Mapping[tuple[int, int], _Version] = {
-    (1, 3): _Version("Pandar128", 16, unit=3),
-    (1, 4): _Version("", 12, unit=3, checked=True, flagged=True),
-    (1, 8): _Version("JT16"),
-    (3, 1): _Version("PandarQT", 16),
-    (3, 2): _Version("QT128C2X", 12, checked=True),
-    (4, 1): _Version("AT128", 24, lead=3, checked=True, turns=False),
-    (4, 3): _Version("AT128", 24, lead=3, checked=True, turns=False),
-    (4, 7): _Version("ATX", turns=False),
-    (6, 1): _Version("", 10),
-    (7, 2): _Version("FT120", turns=False),
+# Early firmware, known by the manual's text alone: named, not decoded.
+_PANDAR128 = replace(
+    rows.PANDAR128E3X,
+    name="Pandar128",
+    tail=rows.Tail(24, date_at=18, us_at=12, mode_at=16),
+    has_flagged_units=False,
+    has_checks=False,
+)
+_FAMILIES: Mapping[tuple[int, int], _Family] = {
+    (1, 3): _Family("Pandar128", (_PANDAR128,)),
+    (1, 8): _Family("JT16", (rows.JT16,)),
+    (3, 1): _Family("PandarQT{}", (rows.PANDARQT64,)),
+    (3, 2): _Family("QT128C2X", (rows.QT128,)),
+    (4, 1): _Family("AT128", (rows.AT128,), turns=False),
+    (4, 3): _Family("AT128", (rows.AT128,), turns=False),
+    (4, 7): _Family("ATX", turns=False),
+    (6, 1): _Family("PandarXT of {} channels", (rows.XT16, rows.XT32, rows.XT32M2X)),
+    (7, 2): _Family("FT120", turns=False),
 }
-# Protocol 6.1 by lasers and blocks.
-_XT = {(16, 8): "PandarXT-16", (32, 8): "PandarXT-32", (32, 6): "XT32M2X"}
+_UNDECODED = frozenset({"Pandar128"})
 # Protocol 1.4 by the version of the status info: the first one at or below it.
-_STATUS_VERSIONS = ((137, "JT128"), (128, "OT128"), (0, "Pandar128 family"))
-_IMU_SIZE = 34
+_STATUS_VERSION = (1, 4)
+_STATUS_VERSIONS = ((137, rows.JT128), (128, rows.OT128), (0, rows.PANDAR128E3X))
 
 
 def hesai(size: int, packets: U8Array) -> str | None:
@@ -107,10 +107,22 @@ def hesai(size: int, packets: U8Array) -> str | None:
             good &= _digits(packets, 2, 14)
         if wanted in (0, size) and mostly(packets, good) is not None:
             return f"HESAI {name}"
+    if size == _JT16_IMU_SIZE and mostly(packets, starts(packets, _SOP + b"\x01\x08")) is not None:
+        return "HESAI IMU packet, JT16"
+    found = identify(size, packets)
+    if found is None:
+        return None
+    name = "Pandar40P or Pandar40M" if found.name == rows.PANDAR40P.name else found.name
+    mode = "" if found.mode is None else f", {found.mode.text}"
+    return f"HESAI lidar {name}{mode}{'' if found.layout else NO_DECODER}"
+
+
+def identify(size: int, packets: U8Array) -> Identity | None:
+    """What payloads (k, size) of a stream are, or None where they are not of a HESAI lidar."""
     return (
-        _describe_sized(size, packets)
-        or _describe_version(size, packets, prefixed=False)
-        or _describe_version(size - _PREFIX_SIZE, packets[:, _PREFIX_SIZE:], prefixed=True)
+        _identify_sized(size, packets)
+        or _identify_version(size, 0, packets)
+        or _identify_version(size, PREFIX_SIZE, packets[:, PREFIX_SIZE:])
     )
 
 
@@ -120,63 +132,98 @@ def _digits(packets: U8Array, begin: int, end: int) -> BoolArray:
     return np.asarray(((text >= ord("0")) & (text <= ord("9"))).all(axis=1))
 
 
-def _describe_sized(size: int, packets: U8Array) -> str | None:
-    for model in (*_PANDAR40, *_PANDAR64, _PANDAR20):
-        if model.sizes and size not in model.sizes:
-            continue
-        good = starts(packets, model.magic)
-        if model in _PANDAR40:
-            for block in range(1, _PANDAR40_BLOCKS):
-                good &= starts(packets, model.magic, _PANDAR40_STRIDE * block)
-        chosen = mostly(packets, good)
-        if chosen is not None:
-            return _lidar(model.name, chosen, model.mode_at)
+def _identify_sized(size: int, packets: U8Array) -> Identity | None:
+    """Models whose headers bear no protocol version."""
+    flagged = np.ones(len(packets), np.bool_)
+    for block in range(_PANDAR40_BLOCKS):
+        flagged &= starts(packets, _BLOCK_FLAG, _PANDAR40_STRIDE * block)
+    chosen = mostly(packets, flagged)
+    if chosen is not None:
+        if size == _PANDAR40_UNDATED_SIZE:
+            return Identity("Pandar40", RETURN_MODES.get(usual(number(chosen, 1254, 1))))
+        if size in (_PANDAR40_SIZE, _PANDAR40_SIZE + _SEQUENCE_SIZE):
+            flags = SEQUENCE if size > _PANDAR40_SIZE else 0
+            return _identity(rows.PANDAR40P, size, 0, chosen, _PANDAR40_BLOCKS, flags, ())
+    for least, blocks in _PANDAR64_BLOCKS.items():
+        marked = starts(packets, _SOP + bytes((64, blocks)))
+        chosen = mostly(packets, marked)
+        if chosen is not None and size in (least, least + _SEQUENCE_SIZE):
+            flags = SEQUENCE if size > least else 0
+            return _identity(rows.PANDAR64, size, 0, chosen, blocks, flags, _FIXED_64)
+    if mostly(packets, starts(packets, _PANDAR20_MAGIC)) is not None:
+        return Identity("Pandar20")
     return None
 
 
-def _describe_version(size: int, packets: U8Array, *, prefixed: bool) -> str | None:
+def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | None:
     """Models whose header has a protocol version; their size must hold the blocks announced."""
-    if size < _HEADER_SIZE:
+    if packets.shape[1] < _HEADER_SIZE:
         return None
     chosen = mostly(packets, starts(packets, _SOP))
     if chosen is None:
         return None
     head = [usual(number(chosen, at, 1)) for at in range(_HEADER_SIZE)]
-    version = _VERSIONS.get((head[2], head[3]))
-    same = mostly(packets, starts(packets, bytes((*_SOP, head[2], head[3]))))
-    if version is None or same is None or (prefixed and version.turns):
+    version = head[2], head[3]
+    same = mostly(packets, starts(packets, bytes((*_SOP, *version))))
+    family = _family(version, head[4])
+    if family is None or same is None or (prefix and family.turns):
         return None
-    if not version.mode_at:
-        if version.name == "JT16" and size == _IMU_SIZE:
-            return "HESAI IMU packet, JT16"
-        return _lidar(version.name, same, 0)
-    tail = _tail_at(version, head)
-    if tail + version.mode_at >= size:
-        return None
-    return _lidar(_name(version, head), same, tail + version.mode_at)
-
-
-def _name(version: _Version, head: list[int]) -> str:
-    if (head[2], head[3]) == (6, 1):
-        return _XT.get((head[6], head[7]), f"PandarXT of {head[6]} channels")
-    if (head[2], head[3]) == (1, 4):
-        family = next(name for least, name in _STATUS_VERSIONS if head[4] >= least)
-        return family if head[6] == 128 else f"{family}, {head[6]} channels"
-    return f"{version.name}{head[6]}" if version.name == "PandarQT" else version.name
-
-
-def _tail_at(version: _Version, head: list[int]) -> int:
-    """Byte at which the tail begins, by lasers, blocks and flags of the header."""
+    if not family.models:
+        return Identity(family.name)
     lasers, blocks, flags = head[6], head[7], head[11]
-    unit = version.unit
-    if version.flagged:
-        unit += sum(bool(flags & flag) for flag in (_CONFIDENCE, _WEIGHT, _AMBIENT))
-    body = blocks * (version.lead + lasers * unit)
-    checks = _CRC_SIZE + (_SAFETY_SIZE if flags & _SAFETY else 0) if version.checked else 0
-    return _HEADER_SIZE + body + checks
+    fixed: tuple[int, ...] = _FIXED
+    if family.models == (rows.JT16,):
+        # It has no lasers, blocks or flags in its header, but always a sequence number.
+        lasers, blocks, flags, fixed = rows.JT16.channels, 1, SEQUENCE, _FIXED_JT16
+        if size != _JT16_SIZE or head[5] != 0:
+            return None
+    return _identity(_model(family, lasers, blocks), size, prefix, same, blocks, flags, fixed)
 
 
-def _lidar(model: str, packets: U8Array, mode_at: int) -> str:
-    mode = _RETURNS.get(usual(number(packets, mode_at, 1))) if mode_at else None
-    named = f"HESAI lidar {model}" if mode is None else f"HESAI lidar {model}, {mode}"
-    return f"{named}{NO_DECODER}"
+def _family(version: tuple[int, int], status: int) -> _Family | None:
+    if version != _STATUS_VERSION:
+        return _FAMILIES.get(version)
+    model = next(model for least, model in _STATUS_VERSIONS if status >= least)
+    return _Family(model.name + ", {} channels", (model,))
+
+
+def _model(family: _Family, lasers: int, blocks: int) -> Model:
+    """The row with these lasers and blocks, or one that is like the family's, to be named only."""
+    for model in family.models:
+        if model.channels == lasers and blocks in model.blocks:
+            return model
+    first, name = family.models[0], family.name.format(lasers)
+    return replace(first, name=name, channels=lasers, blocks=(), most_returns=0)
+
+
+def _identity(
+    model: Model,
+    size: int,
+    prefix: int,
+    packets: U8Array,
+    blocks: int,
+    flags: int,
+    fixed: tuple[int, ...],
+) -> Identity | None:
+    """What packets of a model are; packets: without their prefix."""
+    tail = tail_at(model, blocks, flags)
+    if prefix + least_size(model, blocks, flags) > size:
+        return None
+    mode: ReturnMode | None = ONLY_RETURN
+    if model.tail.mode_at is not None:
+        mode = RETURN_MODES.get(usual(number(packets, tail + model.tail.mode_at, 1)))
+    # What a header says once may be damaged: the usual value counts.
+    head = {at: usual(number(packets, at, 1)) for at in fixed}
+    chooses = model is rows.QT128 and bool(flags & AMBIENT)
+    millimetres = unit_mm(model, head)
+    if (
+        mode is None
+        or model.name in _UNDECODED
+        or chooses
+        or not millimetres
+        or mode.returns > model.most_returns
+        or blocks % mode.returns
+    ):
+        return Identity(model.name, mode)
+    layout = Layout(model, size, prefix, blocks, flags, millimetres, mode, head)
+    return Identity(model.name, mode, layout)

@@ -1,6 +1,6 @@
 """Streams of makers that this version only knows by name: no model, no calibration.
 
-Source: facts/velodyne.md, facts/hesai.md, facts/robosense.md, facts/others.md. A stream of lidar
+Source: facts/velodyne.md, facts/robosense.md, facts/others.md. A stream of lidar
 packets is told by the word "lidar"; packets that only accompany one go without it.
 """
 
@@ -11,17 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.lidar import Calibration, SensorModel
-from mlbatch.sensors._recognise_hesai import hesai
 from mlbatch.sensors._recognise_livox import livox
 from mlbatch.sensors._recognise_robosense import robosense
-from mlbatch.sensors._recognise_velodyne import velodyne
 from mlbatch.types import U8Array
 
 MAKER = ""
 MODELS: tuple[SensorModel, ...] = ()
 BUILT_IN: tuple[Calibration, ...] = ()
 # The surest first: magic bytes and repeated flags before lengths.
-_MAKERS = (velodyne, hesai, robosense, livox)
+_MAKERS = (robosense, livox)
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:
