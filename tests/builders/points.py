@@ -1,0 +1,112 @@
+"""Messages of decoded clouds from values: PointCloud2 of any fields, Livox CustomMsg.
+
+Layouts: facts/messages.md, sections 1, 4 and 8; written here once more, apart from the package.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tests.builders.bags import Body, Recorded
+
+CLOUD, CUSTOM, CUSTOM2 = (
+    "sensor_msgs/PointCloud2",
+    "livox_ros_driver/CustomMsg",
+    "livox_ros_driver2/CustomMsg",
+)
+# Number and code of `struct` of the types of a PointField.
+TYPES = {
+    "int8": (1, "b"),
+    "uint8": (2, "B"),
+    "int16": (3, "h"),
+    "uint16": (4, "H"),
+    "int32": (5, "i"),
+    "uint32": (6, "I"),
+    "float32": (7, "f"),
+    "float64": (8, "d"),
+}
+XYZ = (("x", "float32"), ("y", "float32"), ("z", "float32"))
+# Fields of drivers, by section 8: name and type in their order, without gaps.
+OUSTER = (*XYZ, ("intensity", "float32"), ("t", "uint32"), ("ring", "uint16"))
+VELODYNE = (*XYZ, ("intensity", "float32"), ("ring", "uint16"), ("time", "float32"))
+HESAI = (*XYZ, ("intensity", "float32"), ("ring", "uint16"), ("timestamp", "float64"))
+LIVOX = (*XYZ, ("intensity", "float32"), ("tag", "uint8"), ("line", "uint8"))
+LIVOX = (*LIVOX, ("timestamp", "float64"))
+AUTOWARE = (*XYZ, ("intensity", "uint8"), ("return_type", "uint8"), ("channel", "uint16"))
+AUTOWARE = (*AUTOWARE, ("time_stamp", "uint32"))
+STAMP_NS = 1_700_000_000_000_000_000
+
+Point = Sequence[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How a PointCloud2 is written; None: as it should be.
+
+    gap: bytes behind each point; row_gap: behind each row; count: of every field.
+    """
+
+    encoding: str = "cdr"
+    frame: str = "lidar"
+    height: int = 1
+    gap: int = 0
+    row_gap: int = 0
+    count: int = 1
+    bigendian: bool = False
+    width: int | None = None
+    point_step: int | None = None
+    row_step: int | None = None
+
+
+def cloud_message(
+    fields: Sequence[tuple[str, str]],
+    points: Sequence[Point],
+    stamp_ns: int = STAMP_NS,
+    form: Form | None = None,
+) -> bytes:
+    """A sensor_msgs/PointCloud2; points: values in the order of the fields."""
+    form = form or Form()
+    code = "<" + "".join(TYPES[kind][1] for _, kind in fields)
+    step = struct.calcsize(code) + form.gap
+    width = len(points) // form.height
+    rows = [
+        b"".join(
+            struct.pack(code, *point) + bytes(form.gap)
+            for point in points[row * width : (row + 1) * width]
+        )
+        + bytes(form.row_gap)
+        for row in range(form.height)
+    ]
+    body = Body(form.encoding).header(stamp_ns, form.frame)
+    body.put("I", form.height, width if form.width is None else form.width, len(fields))
+    offset = 0
+    for name, kind in fields:
+        body.text(name).put("I", offset).put("B", TYPES[kind][0]).put("I", form.count)
+        offset += struct.calcsize(TYPES[kind][1])
+    body.put("B", form.bigendian)
+    body.put("I", step if form.point_step is None else form.point_step)
+    body.put("I", step * width + form.row_gap if form.row_step is None else form.row_step)
+    return body.blob(b"".join(rows)).put("B", 1).done()
+
+
+def custom_message(
+    points: Sequence[Point], timebase_ns: int = STAMP_NS, stamp_ns: int = 0, encoding: str = "cdr"
+) -> bytes:
+    """A CustomMsg; points: offset_time, x, y, z, reflectivity, tag, line."""
+    body = Body(encoding).header(stamp_ns, "livox_frame").put("Q", timebase_ns)
+    body.put("I", len(points)).put("B", 1, 0, 0, 0).put("I", len(points))
+    for offset_ns, x, y, z, level, tag, line in points:
+        body.put("I", int(offset_ns)).put("f", x, y, z).put("B", int(level), int(tag), int(line))
+    return body.done()
+
+
+def write_points(
+    topic: str, messages: Sequence[bytes], kind: str = CLOUD, step_ns: int = 100_000_000
+) -> list[Recorded]:
+    """Messages of a topic as a recorder gets them, each `step_ns` after the one before."""
+    return [
+        Recorded(topic, kind, STAMP_NS + (number + 1) * step_ns, data)
+        for number, data in enumerate(messages)
+    ]
