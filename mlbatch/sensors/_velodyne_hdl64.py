@@ -26,8 +26,9 @@ class _Corrected:
         self, file: VelodyneFile, firing_ns: I64Array, body_from_sensor: F64Array, columns: int
     ) -> None:
         # Where a beam does not fire there is nothing to place.
-        self._firing_ns = np.maximum(firing_ns, 0).astype(np.float64)
-        self._azimuth_rad = file.azimuth_rad
+        self._firing_ns = np.maximum(firing_ns, 0).astype(np.float32)
+        self._cosine_rot = np.cos(file.azimuth_rad).astype(np.float32)
+        self._sine_rot = np.sin(file.azimuth_rad).astype(np.float32)
         self._flat = np.cos(file.elevation_rad).astype(np.float32)
         self._up = np.sin(file.elevation_rad).astype(np.float32)
         self._aside_m = file.horiz_offset_m.astype(np.float32)
@@ -43,15 +44,26 @@ class _Corrected:
         self._sine = np.empty_like(self._cosine)
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
-        """Cosine and sine of every beam's azimuth as it fires; `member` is always 0."""
+        """Cosine and sine of every beam's azimuth as it fires; `member` is always 0.
+
+        The rotor's angle, back by rot_correction, on by d = speed * firing: c - d (s + d c / 2).
+        The rest of that series is below d**3 / 6: 5e-8 rad at 1200 rpm and 57 us.
+        """
         angle, speed, table = read_rotor_words(encoder)
+        cosine = np.cos(angle).astype(np.float32)[:, None]
+        sine = np.sin(angle).astype(np.float32)[:, None]
+        first_cosine = cosine * self._cosine_rot + sine * self._sine_rot
+        first_sine = sine * self._cosine_rot - cosine * self._sine_rot
         firing_ns = self._firing_ns[0] if len(self._firing_ns) == 1 else self._firing_ns[table]
-        azimuth = speed[:, None] * firing_ns
-        azimuth += angle[:, None]
-        azimuth -= self._azimuth_rad
+        turned = speed.astype(np.float32)[:, None] * firing_ns
+        half = turned * np.float32(0.5)
         count = len(encoder)
-        self._cosine[:count] = np.cos(azimuth)
-        self._sine[:count] = np.sin(azimuth)
+        np.subtract(
+            first_cosine,
+            turned * (first_sine + half * first_cosine),
+            out=self._cosine[:count],
+        )
+        np.add(first_sine, turned * (first_cosine - half * first_sine), out=self._sine[:count])
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """Corrected along right, forward and up, then moved into the body frame."""
