@@ -10,11 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mlbatch.ledger import PointCounts
-from mlbatch.projection import LABEL, Extras, Part, Projector, Source, Tile, tile_columns
-from mlbatch.types import EXTRAS, F64Array, I64Array, RunInfo, Scan, U8Array
+from mlbatch.projection import (
+    LABEL,
+    Extras,
+    Part,
+    Projector,
+    Source,
+    Tile,
+    tile_columns,
+    wanted_points,
+)
+from mlbatch.types import EXTRAS, BoolArray, F64Array, I64Array, RunInfo, Scan, U8Array
 
 __all__ = ["Decoder", "Due", "Label", "Source"]
 
@@ -70,13 +78,11 @@ class _Buffer:
 class _Laid:
     """Columns of a tile that are decoded together.
 
-    wanted: points of each; rows: in the tile's order; begin: first element in its planes;
-    encoder: of each.
+    rows: in the tile's order; begin: first element in its planes; encoder: of each.
     """
 
     projector: Projector
     part: Part
-    wanted: npt.NDArray[np.uint16]
     rows: I64Array | slice
     begin: int
     encoder: I64Array
@@ -159,25 +165,23 @@ class Decoder:
                 continue
             part = self._tile.part(begin, count, projector.slots)
             if count == len(place):
-                wanted = projector.project(member, place, encoder, offset_ns, part)
-                return [_Laid(projector, part, wanted, slice(0, count), begin, encoder)]
+                projector.project(member, place, encoder, offset_ns, part)
+                return [_Laid(projector, part, slice(0, count), begin, encoder)]
             rows = (which == number).nonzero()[0]
             words = encoder[rows]
-            wanted = projector.project(member[rows], place[rows], words, offset_ns[rows], part)
-            laid.append(_Laid(projector, part, wanted, rows, begin, words))
+            projector.project(member[rows], place[rows], words, offset_ns[rows], part)
+            laid.append(_Laid(projector, part, rows, begin, words))
             begin += count * projector.slots
         return laid
 
-    def _index(
-        self, laid: Sequence[_Laid], columns: int
-    ) -> tuple[I64Array, npt.NDArray[np.uint16]]:
-        """Elements of the tile's planes in the order of the scan, and how many of each column."""
+    def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, BoolArray]:
+        """Elements of the tile's planes in the order of the scan; wanted slots (columns, slots)."""
         if len(laid) == 1:
             keep, element = laid[0].projector.in_firing_order(laid[0].part.keep, laid[0].encoder)
             index = keep.reshape(-1).nonzero()[0]
-            return index if element is None else element.take(index), laid[0].wanted
+            return index if element is None else element.take(index), keep
         wide = self._keep[:columns]
-        shift, counts = np.empty(columns, np.int64), np.empty(columns, np.uint16)
+        shift = np.empty(columns, np.int64)
         is_ordered = False
         for one in laid:
             count, slots = one.part.keep.shape
@@ -189,16 +193,15 @@ class Decoder:
             wide[one.rows, :slots] = keep
             wide[one.rows, slots:] = False
             shift[one.rows] = one.begin + np.arange(count) * slots
-            counts[one.rows] = one.wanted
         shift -= np.arange(columns) * self._slots
         index = wide.reshape(-1).nonzero()[0]
-        index += shift.repeat(counts)
-        return self._element.take(index) if is_ordered else index, counts
+        index += shift.repeat(wanted_points(wide))
+        return self._element.take(index) if is_ordered else index, wide
 
     def _compress(self, laid: Sequence[_Laid], columns: slice, at: int) -> int:
         """Move the wanted points of a tile to their final rows; gives their number."""
         tile, buffer = self._tile, self._buffer
-        index, counts = self._index(laid, columns.stop - columns.start)
+        index, keep = self._index(laid, columns.stop - columns.start)
         rows = slice(at, at + len(index))
         whole = tile.point.view(np.complex128).reshape(-1)
         whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="clip")
@@ -210,7 +213,7 @@ class Decoder:
             tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
         if "column" in self._extras:
             number = np.arange(columns.start, columns.stop, dtype=np.uint32)
-            buffer.column[rows] = number.repeat(counts)
+            buffer.column[rows] = number.repeat(wanted_points(keep))
         return len(index)
 
     def _lidar_id(self, due: Due, columns: slice) -> U8Array:
@@ -231,7 +234,8 @@ class Decoder:
             order = np.arange(columns.start, columns.stop)[one.rows]
             at = (order[row], one.projector.number[slot])
             buffer.point[at] = part.point[keep]
-            buffer.range_m[at] = part.range_m[keep]
+            if "range_m" in self._extras:
+                buffer.range_m[at] = part.range_m[keep]
             buffer.label[at] = part.label[keep]
             buffer.reflectivity[at] = part.reflectivity[keep]
         return points

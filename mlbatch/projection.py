@@ -132,6 +132,7 @@ class Projector:
         limits = [(source.min_range_m, source.max_range_m) for source in sources]
         self._limits_m = np.array(limits, np.float32)
         self._is_limited = any(low > 0 or high < float("inf") for low, high in limits)
+        self._needs_range = "range_m" in extras or self._is_limited
         self._drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
         self._records = np.empty((2, columns, lidar.records.size), np.uint8)
         self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
@@ -139,8 +140,8 @@ class Projector:
 
     def project(
         self, member: I64Array, place: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part
-    ) -> npt.NDArray[np.uint16]:
-        """Decode the columns at `place` into `part`; gives the wanted points of each column.
+    ) -> None:
+        """Decode the columns at `place` into `part`, and mark the wanted points.
 
         member: (n,) which of the sensors each column is of; place, encoder: as in Columns;
         offset_ns: (n,) stamp minus start of the scan.
@@ -156,7 +157,11 @@ class Projector:
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
             self._projection.points(range_m, part.point[:, slots, :3])
             if lidar.returns > 1:
-                part.range_m[:, slots] = range_m
+                np.greater(range_m, 0, out=part.keep[:, slots])
+                if self._needs_range:
+                    part.range_m[:, slots] = range_m
+        if lidar.returns == 1:
+            np.greater(part.range_m, 0, out=part.keep)
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
         words = part.label.view(np.uint64)
@@ -164,7 +169,7 @@ class Projector:
         words += offset_ns.astype(np.uint64)[:, None]
         if lidar.returns == 2:
             self._type_returns(part)
-        return self._keep(member, part)
+        self._keep(member, part)
 
     def in_firing_order(
         self, keep: BoolArray, encoder: I64Array
@@ -226,62 +231,58 @@ class Projector:
         types[:, 0::2] = np.where(alone, _ONLY, kind)
         types[:, 1::2] = np.where(alone, _ONLY, _BOTH - kind)
 
-    def _keep(self, member: I64Array, part: Part) -> npt.NDArray[np.uint16]:
-        """Mark the points that are wanted, and count the others under their reason."""
-        range_m, keep = part.range_m, part.keep
-        np.greater(range_m, 0, out=keep)
+    def _keep(self, member: I64Array, part: Part) -> None:
+        """Unmark the points that are not wanted, and count them under their reason."""
+        keep = part.keep
         columns = np.bincount(member, minlength=len(self._sources))
-        wanted, left = self._left(member, keep)
+        left = self._left(member, keep)
         for counts, number, points in zip(self.counts, columns.tolist(), left, strict=True):
             counts.slots += number * self.slots
             counts.no_return += number * self.slots - points
-        if self._drops_repeated and self._cut_repeated(keep):
-            wanted, left = self._drop("repeated", member, keep, left)
+        if self._drops_repeated:
+            self._cut_repeated(keep)
+            left = self._drop("repeated", member, keep, left)
         if self._is_limited:
             limits_m = self._limits_m[member]
-            keep &= range_m >= limits_m[:, :1]
-            keep &= range_m <= limits_m[:, 1:]
-            wanted, left = self._drop("range", member, keep, left)
+            keep &= part.range_m >= limits_m[:, :1]
+            keep &= part.range_m <= limits_m[:, 1:]
+            left = self._drop("range", member, keep, left)
         if len(self._boxes_m):
             self._cut_boxes(part.point[..., :3], keep)
-            wanted, left = self._drop("box", member, keep, left)
+            left = self._drop("box", member, keep, left)
         for counts, points in zip(self.counts, left, strict=True):
             counts.written += points
-        return wanted
 
-    def _left(self, member: I64Array, keep: BoolArray) -> tuple[npt.NDArray[np.uint16], list[int]]:
-        """Points that are still wanted, of each column and of each sensor."""
-        wanted = np.add.reduce(keep, axis=1, dtype=np.uint16)
+    def _left(self, member: I64Array, keep: BoolArray) -> list[int]:
+        """Points that are still wanted, of each sensor."""
+        if len(self._sources) == 1:
+            return [int(np.count_nonzero(keep))]
         # Sums of whole numbers far below 2**53 are exact in a float64.
-        left = np.bincount(member, weights=wanted, minlength=len(self._sources))
-        return wanted, left.astype(np.int64).tolist()
+        left = np.bincount(member, weights=wanted_points(keep), minlength=len(self._sources))
+        return [int(count) for count in left]
 
-    def _drop(
-        self, reason: str, member: I64Array, keep: BoolArray, before: list[int]
-    ) -> tuple[npt.NDArray[np.uint16], list[int]]:
-        wanted, left = self._left(member, keep)
+    def _drop(self, reason: str, member: I64Array, keep: BoolArray, before: list[int]) -> list[int]:
+        left = self._left(member, keep)
         for counts, had, has in zip(self.counts, before, left, strict=True):
             setattr(counts, reason, getattr(counts, reason) + had - has)
-        return wanted, left
+        return left
 
-    def _cut_repeated(self, keep: BoolArray) -> bool:
-        """Leave out returns that an earlier one of the same shot equals; whether there were any."""
-        returns, any_cut = self._lidar.returns, False
-        ranges_m = self._range_m[:, : len(keep)]
+    def _cut_repeated(self, keep: BoolArray) -> None:
+        """Leave out returns that an earlier one of the same shot equals."""
+        returns, ranges_m = self._lidar.returns, self._range_m[:, : len(keep)]
         for which in range(1, returns):
-            own = keep[:, which::returns]
-            again = np.zeros(own.shape, np.bool_)
             for earlier in range(which):
-                again |= ranges_m[which] == ranges_m[earlier]
-            again &= own
-            own ^= again
-            any_cut = any_cut or bool(again.any())
-        return any_cut
+                keep[:, which::returns] &= ranges_m[which] != ranges_m[earlier]
 
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self._boxes_m:
             inside = (xyz >= box[:3]) & (xyz <= box[3:])
             keep &= ~inside.all(axis=2)
+
+
+def wanted_points(keep: BoolArray) -> npt.NDArray[np.uint16]:
+    """How many points of each column (n, slots) are wanted: (n,)."""
+    return np.asarray(np.add.reduce(keep, axis=1, dtype=np.uint16))
 
 
 def _projection(sources: Sequence[Source], columns: int) -> Projection:
