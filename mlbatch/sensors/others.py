@@ -12,14 +12,13 @@ import numpy as np
 
 from mlbatch.lidar import Calibration, SensorModel
 from mlbatch.sensors._recognise_livox import livox
-from mlbatch.sensors._recognise_robosense import robosense
 from mlbatch.types import U8Array
 
 MAKER = ""
 MODELS: tuple[SensorModel, ...] = ()
 BUILT_IN: tuple[Calibration, ...] = ()
 # The surest first: magic bytes and repeated flags before lengths.
-_MAKERS = (robosense, livox)
+_MAKERS = (livox,)
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:

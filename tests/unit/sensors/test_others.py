@@ -17,7 +17,6 @@ from mlbatch.types import StreamTable
 from tests.builders.others import (
     filled,
     livox2_packets,
-    robosense_packets,
     rows,
     velodyne_packets,
 )
@@ -117,11 +116,9 @@ def test_real_packets_of_ouster_are_not_theirs() -> None:
 
 def test_a_damaged_packet_does_not_hide_a_stream() -> None:
     xt16 = filled(568, {0: bytes.fromhex("eeff06010000100801040201"), 550: b"\x37"})
-    rs32 = {0: bytes.fromhex("55aa050a5aa550a0"), 30: b"\x02"}
     streams = [
         velodyne_packets(b"\x37\x22", 110.592),
         rows([xt16] * 2),
-        robosense_packets(rs32, calendar=True),
         livox2_packets(1, 14, 96),
     ]
     for packets in streams:
