@@ -138,8 +138,6 @@ def _text(path: Path, content: bytes) -> str:
 
 def _read_yaml(path: Path, text: str) -> VelodyneFile:
     root = _yaml_root(path, text)
-    if not isinstance(root, dict):
-        raise _error(path, "", "a mapping with the key lasers", "none")
     items = root.get("lasers")
     if not isinstance(items, list) or not items:
         raise _error(path, "lasers", "a list of lasers", "none")
@@ -160,8 +158,8 @@ def _read_yaml(path: Path, text: str) -> VelodyneFile:
     return _file(path, _YAML, entries, np.ones(len(items), np.bool_), unit_m)
 
 
-def _yaml_root(path: Path, text: str) -> object:
-    """The document with all scalars as text: 1e-3 is a number for us, but not for YAML 1.1."""
+def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
+    """The document, scalars as text: 1e-3 is a number for us, but not for YAML 1.1."""
     import yaml
 
     loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
@@ -180,7 +178,7 @@ def _yaml_root(path: Path, text: str) -> object:
         mark = getattr(err, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else ""
         raise _error(path, place, "YAML", getattr(err, "problem", "") or str(err)) from err
-    return root
+    return root if isinstance(root, dict) else {}
 
 
 def _read_xml(path: Path, text: str) -> VelodyneFile | None:

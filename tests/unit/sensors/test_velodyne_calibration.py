@@ -1,0 +1,218 @@
+"""Velodyne calibration files: real ones, written ones, and what may be wrong with them.
+
+Those of XML are in test_velodyne_calibration_xml.py."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from mlbatch.errors import RigError
+from mlbatch.sensors._velodyne_calibration import MAX_BYTES, VelodyneFile, read_velodyne
+from tests.builders.velodyne_tables import MODELS, calibration_yaml
+
+RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"
+PATH = Path("drive/unit.yaml")
+
+
+def read(content: str | bytes, path: Path = PATH) -> VelodyneFile:
+    data = content.encode() if isinstance(content, str) else content
+    found = read_velodyne(path, data)
+    assert found is not None
+    return found
+
+
+def fault(content: str | bytes, path: Path = PATH) -> str:
+    with pytest.raises(RigError) as caught:
+        read(content, path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert re.fullmatch(rf"{path}: .*wanted .+, got .+; .+", message)
+    assert len(message) < 250
+    return message
+
+
+# Real files: the first lines, read by eye; angles of facts/velodyne.md section 6.
+REAL = {
+    "vlp16_ros2_dual/VLP16.yaml": (16, 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
+    "vlp32c_ros2/VLP32.yaml": (32, 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
+    "calibration-without-recording/HDL32.yaml": (32, 0.002, {0: -30.67, 1: -9.33, 31: 10.67}),
+    "calibration-without-recording/VLP16_hires.yaml": (16, 0.002, {0: -10.0, 1: 0.667, 15: 10.0}),
+    "calibration-without-recording/HDL64e_s2.yaml": (64, 0.002, {}),
+    "calibration-without-recording/HDL64e_s3.yaml": (64, 0.002, {}),
+}
+
+
+def real(name: str) -> VelodyneFile:
+    path = RECORDINGS / name
+    if not path.exists():
+        pytest.skip(f"recording {name} is not here")
+    return read(path.read_bytes(), path)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_files(name: str) -> None:
+    lasers, unit_m, elevation_deg = REAL[name]
+    file = real(name)
+    assert (file.lasers, file.unit_m, file.notes) == (lasers, unit_m, ())
+    assert file.enabled.all()
+    for laser, angle_deg in elevation_deg.items():
+        assert math.degrees(file.elevation_rad[laser]) == pytest.approx(angle_deg, abs=4e-4)
+
+
+def test_a_real_vlp_32c_has_azimuths() -> None:
+    # rot_correction is minus the manual's offset: +1.4, -4.2 degrees.
+    rot_deg = [math.degrees(angle) for angle in real("vlp32c_ros2/VLP32.yaml").azimuth_rad[:2]]
+    assert rot_deg == pytest.approx([-1.4, 4.2])
+
+
+def test_a_real_hdl_64e_has_all_corrections() -> None:
+    file = real("calibration-without-recording/HDL64e_s2.yaml")
+    assert file.azimuth_rad[0] == -0.1248942899601548
+    assert file.elevation_rad[:2].tolist() == [-0.15304134919741974, -0.1458455539136526]
+    assert file.dist_correction_m[:2].tolist() == [1.5195264000000002, 1.5145139]
+    assert file.dist_correction_x_m[0] == 1.5500304
+    assert file.dist_correction_y_m[1] == 1.5491043
+    assert file.vert_offset_m[0] == 0.19548199
+    assert file.horiz_offset_m[:2].tolist() == [0.025999999, -0.025999999]
+
+
+def yaml_of(lasers: Sequence[Mapping[str, object]], end: str = "") -> str:
+    """A YAML in the flow form of old ROS drivers."""
+    rows = (", ".join(f"{key}: {value}" for key, value in laser.items()) for laser in lasers)
+    return "lasers:\n" + "".join(f"- {{{row}}}\n" for row in rows) + end
+
+
+def sixteen(**changes: object) -> list[dict[str, object]]:
+    """Lasers of a VLP-16; changes are to laser 3."""
+    lasers: list[dict[str, object]] = [
+        {"laser_id": laser, "vert_correction": 0.01 * laser} for laser in range(16)
+    ]
+    lasers[3].update(changes)
+    return lasers
+
+
+def test_lasers_are_ordered_by_id_and_missing_values_are_zero() -> None:
+    file = read(yaml_of(sixteen(dist_correction="1e-1", rot_correction=-0.5)[::-1]))
+    assert file.elevation_rad.tolist() == [0.01 * laser for laser in range(16)]
+    assert file.dist_correction_m.tolist() == [0.0] * 3 + [0.1] + [0.0] * 12
+    assert file.azimuth_rad[3] == -0.5
+    assert not file.vert_offset_m.any()
+    assert file.unit_m is None
+    assert file.path == PATH
+
+
+def test_unused_keys_and_orders_of_the_file_do_not_matter() -> None:
+    lasers = sixteen(two_pt_correction_available="true", focal_slope=1.4)
+    text = "# made by hand\ndistance_resolution: 0.007\nnum_lasers: 16\n" + yaml_of(lasers)
+    # The 7 mm of VLS-128 files are for the decoder to weigh.
+    assert read(b"\xef\xbb\xbf" + text.encode()).unit_m == 0.007
+    assert read(text.replace("\n", "\r\n")).lasers == 16
+    assert (
+        read(
+            "{"
+            + "lasers: ["
+            + ", ".join(f"{{laser_id: {n}, vert_correction: 0}}" for n in range(16))
+            + "]}"
+        ).lasers
+        == 16
+    )
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_files_of_the_encoder_are_read(model: str) -> None:
+    table = MODELS[model]
+    file = read(calibration_yaml(model))
+    assert file.unit_m == table.unit_m
+    degrees = [math.degrees(angle) for angle in file.elevation_rad]
+    assert degrees == pytest.approx(table.elevation_deg)
+    assert [-math.degrees(one) for one in file.azimuth_rad] == pytest.approx(table.azimuth_deg)
+    assert tuple(file.dist_correction_m) == table.dist_m
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (yaml_of(sixteen()[:15]), "lasers: wanted 16, 32, 64, 128 lasers, got 15"),
+        (yaml_of([], "num_lasers: 16\nlaser_id: 1\n"), "lasers: wanted a list of lasers, got none"),
+        ("num_lasers: 64\ndistance_resolution: 0.002\n", "lasers: wanted a list of lasers"),
+        ("lasers: many\nnum_lasers: 1\nlaser_id: 3", "lasers: wanted a list of lasers"),
+        ("[\nlasers: 16, laser_id: 3]\n", "lasers: wanted a list of lasers, got none"),
+        ("lasers:\n" + "- laser_id\n" * 16, "lasers[0]: wanted a mapping with laser_id"),
+        (
+            yaml_of(sixteen(laser_id=16)),
+            "lasers[3].laser_id: wanted a laser id from 0 to 15, got 16",
+        ),
+        (yaml_of(sixteen(laser_id=-1)), "lasers[3].laser_id: wanted a laser id from 0 to 15"),
+        (yaml_of(sixteen(laser_id="x")), "lasers[3].laser_id: wanted a laser id"),
+        (yaml_of(sixteen(laser_id=2)), "lasers[3].laser_id: wanted each id once, got 2 again"),
+        (yaml_of(sixteen(vert_correction=".nan")), "lasers[3].vert_correction: wanted a finite"),
+        (yaml_of(sixteen(rot_correction=".inf")), "lasers[3].rot_correction: wanted a finite"),
+        (yaml_of(sixteen(rot_correction="nan")), "got nan"),
+        (yaml_of(sixteen(vert_correction="")), "lasers[3].vert_correction: wanted a finite number"),
+        (yaml_of(sixteen(vert_correction="[1]")), "got ['1']"),
+        # Degrees instead of radians.
+        (yaml_of(sixteen(vert_correction=-15)), "wanted at most 1.5708 rad either way, got -15"),
+        (yaml_of(sixteen(rot_correction=1.6)), "lasers[3].rot_correction: wanted at most 1.5708"),
+        # Centimetres instead of metres.
+        (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: wanted at most 5 m"),
+        (yaml_of(sixteen(vert_offset_correction=19.5)), "wanted at most 1 m either way, got 19.5"),
+        (yaml_of(sixteen(horiz_offset_correction=-2.6)), "wanted at most 1 m either way"),
+        (
+            yaml_of(sixteen(), "num_lasers: 32\n"),
+            "num_lasers: wanted 16, the lasers listed, got 32",
+        ),
+        (
+            yaml_of(sixteen(), "distance_resolution: 2\n"),
+            "distance_resolution: wanted 0.0005 to 0.02 m",
+        ),
+        (yaml_of(sixteen(), "distance_resolution: fine\n"), "distance_resolution: wanted a finite"),
+        (yaml_of(sixteen())[:-30], ": wanted YAML, got did not find"),
+        (yaml_of(sixteen(), "a: &a [1]\nb: *a\n"), "wanted values written out, got the alias *a"),
+        (yaml_of(sixteen(), "a: " + "[" * 50_000), "wanted at most 8 levels, got more"),
+        (yaml_of(sixteen(), "a: \x07"), "wanted YAML, got"),
+        (yaml_of(sixteen(), "---\nb: 1\n"), "wanted YAML, got"),
+        (yaml_of(sixteen(), "#" * MAX_BYTES), f"wanted at most {MAX_BYTES} bytes, got 100"),
+        (yaml_of(sixteen()).encode() + b"# \xff", "wanted UTF-8 text, got the byte 0xff"),
+    ],
+)
+def test_broken_yaml(text: str | bytes, told: str) -> None:
+    assert told in fault(text)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{}",
+        b"\x00" * 100,
+        b"\xff\xd8\xff\xe0lasers: vert_correction",
+        b"Laser id,Elevation,Azimuth\n1,14.436,-1.042\n",
+        b'{"beam_intrinsics": {"beam_altitude_angles": [1, 2]}, "lasers": 3}',
+        b"rate: 10\nsensors:\n- name: top\n  model: VLP-16\n",
+        b"lasers: 16\n",
+        b"- lasers: 16\n- laser_id: 3\n",
+        b"<robot name='a'><joint name='b'/></robot>",
+        b"<boost_serialization><other>1</other></boost_serialization>",
+        b"<a><rotCorrection_>1</rotCorrection_></a>",
+        b"#ROSBAG V2.0\nlasers:\nlaser_id: 1\x00",
+        "num_lasers: 16\nlaser_id: 3".encode("utf-16"),
+    ],
+)
+def test_other_files_are_none_of_ours(content: bytes) -> None:
+    assert read_velodyne(PATH, content) is None
+
+
+@pytest.mark.parametrize(
+    "piece", [b'{"a": 1},\n', b"<a>\n", b"lasers 1, 2\n", b"\t {, \n", b"- [\n"]
+)
+def test_large_foreign_files_are_left_quickly(piece: bytes) -> None:
+    content = piece * (16_000_000 // len(piece))
+    begin = time.process_time()
+    assert read_velodyne(PATH, content) is None
+    assert time.process_time() - begin < 2.0
