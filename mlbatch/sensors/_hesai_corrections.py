@@ -61,6 +61,8 @@ _AT128_BODY = np.dtype(
     ]
 )
 _AT128_EXPECTED = {"version": [1, 5], "channels": [128], "mirrors": [3], "frames": [3]}
+# Angles count in resolution / 25600 deg; 2 in the files that are known.
+_RESOLUTIONS = (1, 8)
 _ANGLE_UNITS_PER_DEG = 25600
 _ADJUST_UNITS_PER_DEG = 100
 
@@ -129,14 +131,18 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
         got = np.ravel(head[name]).tolist()
         if got != wanted:
             _fail_at128(path, f"{name} {_dotted(wanted)}", _dotted(got))
+    low, high = _RESOLUTIONS
+    resolution = int(head["resolution"])
+    if not low <= resolution <= high:
+        _fail_at128(path, f"a resolution from {low} to {high}", str(resolution))
     if len(content) != _AT128_SIZE:
         _fail_at128(path, f"{_AT128_SIZE} bytes", f"{len(content)} bytes")
     body = content[: _AT128_BODY.itemsize]
     if hashlib.sha256(body).digest() != content[_AT128_BODY.itemsize :]:
         _fail_at128(path, "content that agrees with its SHA-256", "content that was changed")
     values = np.frombuffer(body, _AT128_BODY)[0]
-    angle = int(head["resolution"]) * RAD_PER_DEG / _ANGLE_UNITS_PER_DEG
-    adjust = int(head["resolution"]) * RAD_PER_DEG / _ADJUST_UNITS_PER_DEG
+    angle = resolution * RAD_PER_DEG / _ANGLE_UNITS_PER_DEG
+    adjust = resolution * RAD_PER_DEG / _ADJUST_UNITS_PER_DEG
     return At128File(
         path,
         values["start"] * angle,

@@ -237,6 +237,7 @@ def test_files_that_are_no_at128_files(content: bytes) -> None:
         (4, 64, "wanted channels 128, got 64"),
         (5, 4, "wanted mirrors 3, got 4"),
         (6, 1, "wanted frames 3, got 1"),
+        (15, 0, "wanted a resolution from 1 to 8, got 0"),
         (9000, 1, "wanted content that agrees with its SHA-256, got content that was changed"),
     ],
 )
