@@ -47,13 +47,13 @@ class RawRing:
         oldest = self._next if oldest_place is None else oldest_place // self._places
         slot = self._reserve(count, oldest)
         stride, size = self._rows_per_packet * self._records.stride, self._packet_size
-        at = (slot % self._capacity) * stride
-        target, source = self._bytes.data, data.data
-        for begin in start.tolist():
-            target[at : at + size] = source[begin : begin + size]
-            at += stride
         first = (slot % self._capacity) * stride
         packets = self._bytes[first : first + count * stride].reshape(count, stride)[:, :size]
+        if not _copy_evenly(data, start, packets):
+            target, source, at = self._bytes.data, data.data, first
+            for begin in start.tolist():
+                target[at : at + size] = source[begin : begin + size]
+                at += stride
         self._next = slot + count
         return packets, np.arange(slot, slot + count) * self._places
 
@@ -101,3 +101,15 @@ class RawRing:
         before = old[: capacity * stride].reshape(capacity, stride)
         after = self._bytes[: self._capacity * stride].reshape(self._capacity, stride)
         after[live % self._capacity] = before[live % capacity]
+
+
+def _copy_evenly(data: U8Array, start: I64Array, packets: U8Array) -> bool:
+    """Copy payloads to the rows of `packets` (n, size) at once, if they are evenly spaced.
+
+    As in the capture of a single lidar; else nothing is done.
+    """
+    step = int(start[1] - start[0]) if len(start) > 1 else 0
+    if step <= 0 or not bool((start[1:] - start[:-1] == step).all()):
+        return False
+    packets[:] = np.ndarray(packets.shape, np.uint8, data.data, int(start[0]), (step, 1))
+    return True

@@ -34,6 +34,9 @@ _MODIFIED = (b"\x34\xcd\xb2\xa1", b"\xa1\xb2\xcd\x34")
 _FILE_HEADER_BYTES = 24
 _LINK_AT = 20
 _RECORD_BYTES = 16
+_LENGTH_AT = 8
+# So many frames of one length in a row make it likely that more follow.
+_ALIKE = 16
 
 
 def recognises(head: bytes) -> bool:
@@ -100,9 +103,29 @@ class _Walker:
     def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
         """Where records begin whose headers are whole; the last one's frame may be cut off."""
         view, length_at = data.data, self.length.unpack_from
-        starts = []
-        at = begin
+        parts: list[I64Array] = []
+        starts: list[int] = []
+        at, before, alike = begin, -1, 0
         while at <= end - _RECORD_BYTES:
             starts.append(at)
-            at += _RECORD_BYTES + length_at(view, at + 8)[0]
-        return np.array(starts, np.int64)
+            length = length_at(view, at + _LENGTH_AT)[0]
+            alike = alike + 1 if length == before else 0
+            before = length
+            at += _RECORD_BYTES + length
+            if alike >= _ALIKE:
+                run = self._alike(data, at, end, length)
+                parts += [np.array(starts, np.int64), run]
+                at += len(run) * (_RECORD_BYTES + length)
+                starts, alike = [], 0
+        return np.concatenate([*parts, np.array(starts, np.int64)])
+
+    def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
+        """Where records begin that follow each other with frames of one length; none to many."""
+        step = _RECORD_BYTES + length
+        count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
+        lengths = np.ndarray(
+            count, self.layout["captured"], data.data, begin + _LENGTH_AT, (step,)
+        )
+        others = (lengths != length).nonzero()[0]
+        run = int(others[0]) if len(others) else count
+        return begin + step * np.arange(run)
