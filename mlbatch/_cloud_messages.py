@@ -9,18 +9,19 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch._cloud_packets import CloudError, Points
 from mlbatch._cloud_times import Zero, stamps
-from mlbatch.types import Message
+from mlbatch.types import F32Array, Message
 from mlbatch.units import NS_PER_S
 
 # A structured array; numpy has no type for the fields of a dtype.
 Rows: TypeAlias = npt.NDArray[Any]
+_Whole = TypeVar("_Whole", np.uint8, np.uint16)
 
 # sensor_msgs/PointField: type by its number.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -129,36 +130,47 @@ class _Cursor:
 def read_cloud(message: Message) -> Cloud:
     """The points of a message; CloudError where they cannot be told."""
     raw = _READERS[message.topic.type](message)
-    rows = raw.rows
-    xyz = np.stack([rows[axis].astype(np.float32) for axis in _AXES])
+    rows, time = raw.rows, raw.rows["time"]
+    reals = _reals(rows)
+    x, y, z, _ = reals
     with np.errstate(over="ignore", invalid="ignore"):
-        squared = xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2]
+        squared = x * x + y * y + z * z
     placed = (squared > 0) & (squared < np.inf)
-    time = rows["time"]
     keep = placed & np.isfinite(time) if time.dtype.kind == "f" else placed
     rows, count = rows[keep], int(np.count_nonzero(keep))
     stamp_ns, verdict = stamps(rows["time"], raw.zero) if count else (np.empty(0, np.int64), "")
-    names = rows.dtype.names or ()
-    nothing = np.zeros(count, np.float32)
-    level = rows["intensity"].astype(np.float32) if "intensity" in names else nothing
-    ring = rows["ring"] if "ring" in names else None
-    if ring is not None and (ring.dtype.kind == "f" or (ring < 0).any() or (ring >= 1 << 16).any()):
-        ring = None
     points = Points(
         stamp_ns,
-        np.concatenate([xyz[:, keep], level[None]]),
-        None if ring is None else ring.astype(np.uint16),
-        *(_bytes(rows, name, count) for name in ("return_type", "tag")),
+        reals[:, keep],
+        _whole(rows, "ring", np.uint16),
+        *(
+            np.zeros(count, np.uint8) if one is None else one
+            for one in (_whole(rows, "return_type", np.uint8), _whole(rows, "tag", np.uint8))
+        ),
     )
     placeless = len(keep) - int(np.count_nonzero(placed))
     return Cloud(points, verdict, raw.frame, placeless, len(keep) - count - placeless)
 
 
-def _bytes(rows: Rows, name: str, count: int) -> npt.NDArray[np.uint8]:
-    """A field of whole numbers below 256; zeros where there is none."""
-    if name not in (rows.dtype.names or ()) or rows[name].dtype.kind == "f":
-        return np.zeros(count, np.uint8)
-    return rows[name].astype(np.uint8)
+def _reals(rows: Rows) -> F32Array:
+    """x, y, z and intensity, (4, n); intensity 0 where there is none."""
+    reals = np.zeros((4, len(rows)), np.float32)
+    # A place beyond all float32 is infinite, and is left out as such.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for plane, name in zip(reals, (*_AXES, "intensity"), strict=True):
+            if name in (rows.dtype.names or ()):
+                plane[:] = rows[name]
+    return reals
+
+
+def _whole(rows: Rows, name: str, kind: type[_Whole]) -> npt.NDArray[_Whole] | None:
+    """A field of whole numbers that fit `kind`; None where there is none."""
+    if name not in (rows.dtype.names or ()):
+        return None
+    values = rows[name]
+    if values.dtype.kind == "f" or (values < 0).any() or (values > np.iinfo(kind).max).any():
+        return None
+    return values.astype(kind)
 
 
 def _custom(message: Message) -> _Raw:

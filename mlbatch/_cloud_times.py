@@ -55,9 +55,8 @@ _FLOAT_TIMES = (
 def stamps(time: Times, zero: Zero) -> tuple[I64Array, str]:
     """Stamps (ns) of points by their finite times (n > 0,); and what the times were taken for."""
     if time.dtype.kind != "f":
-        offset_ns = time.astype(np.int64)
-        _refuse_span(zero, (int(offset_ns.max()) - int(offset_ns.min())) / NS_PER_S)
-        return _after(zero, offset_ns), f"{zero.field}, ns after {zero.base}"
+        # At most 32 bits, hence 4.3 s.
+        return _after(zero, time.astype(np.int64)), f"{zero.field}, ns after {zero.base}"
     value = time.astype(np.float64)
     low, high = float(value.min()), float(value.max())
     meant = next((one for one in _FLOAT_TIMES if one.above < high < one.below), None)
@@ -66,7 +65,12 @@ def stamps(time: Times, zero: Zero) -> tuple[I64Array, str]:
             f"field {zero.field}: wanted s after {zero.base} (below 1000), or float64 s or ns "
             f"since 1970, got {high:g}; its unit is not known, record the raw packets"
         )
-    _refuse_span(zero, (high - low) * meant.ns / NS_PER_S)
+    span_s = (high - low) * (meant.ns / NS_PER_S)
+    if span_s > _LONGEST_S:
+        raise CloudError(
+            f"field {zero.field}: wanted times of one cloud within {_LONGEST_S} s, got "
+            f"{span_s:g} s; its unit is not known, record the raw packets"
+        )
     # Part by part: a float64 of nanoseconds since 1970 has a step of 256.
     whole = np.floor(value)
     ns = whole.astype(np.int64) * meant.ns
@@ -84,11 +88,3 @@ def _after(zero: Zero, offset_ns: I64Array) -> I64Array:
             "set the clock of its driver and record again"
         )
     return zero.base_ns + offset_ns
-
-
-def _refuse_span(zero: Zero, span_s: float) -> None:
-    if not span_s <= _LONGEST_S:
-        raise CloudError(
-            f"field {zero.field}: wanted times of one cloud within {_LONGEST_S} s, got "
-            f"{span_s:g} s; its unit is not known, record the raw packets"
-        )

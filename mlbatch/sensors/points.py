@@ -135,8 +135,9 @@ class PointsLidar(TurningLidar):
     def faults(self, packets: U8Array) -> U8Array:
         """Packets of another layout."""
         head = np.ascontiguousarray(packets[:, :_SHARED_BYTES]).view("<u8")[:, 0]
-        other: U8Array = (head != self._shared).astype(np.uint8)
-        return other * np.uint8(_BAD_HEADER)
+        faults = np.zeros(len(packets), np.uint8)
+        faults[head != self._shared] = _BAD_HEADER
+        return faults
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
         """The stamp that the points of a column share."""

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mlbatch.types import U8Array
 from tests.builders.bags import Body, Recorded
 
 CLOUD, CUSTOM, CUSTOM2 = (
@@ -32,10 +33,10 @@ XYZ = (("x", "float32"), ("y", "float32"), ("z", "float32"))
 OUSTER = (*XYZ, ("intensity", "float32"), ("t", "uint32"), ("ring", "uint16"))
 VELODYNE = (*XYZ, ("intensity", "float32"), ("ring", "uint16"), ("time", "float32"))
 HESAI = (*XYZ, ("intensity", "float32"), ("ring", "uint16"), ("timestamp", "float64"))
-LIVOX = (*XYZ, ("intensity", "float32"), ("tag", "uint8"), ("line", "uint8"))
-LIVOX = (*LIVOX, ("timestamp", "float64"))
-AUTOWARE = (*XYZ, ("intensity", "uint8"), ("return_type", "uint8"), ("channel", "uint16"))
-AUTOWARE = (*AUTOWARE, ("time_stamp", "uint32"))
+_XYZI = (*XYZ, ("intensity", "float32"))
+LIVOX = (*_XYZI, ("tag", "uint8"), ("line", "uint8"), ("timestamp", "float64"))
+_XYZIRC = (*XYZ, ("intensity", "uint8"), ("return_type", "uint8"), ("channel", "uint16"))
+AUTOWARE = (*_XYZIRC, ("time_stamp", "uint32"))
 STAMP_NS = 1_700_000_000_000_000_000
 
 Point = Sequence[float]
@@ -110,3 +111,48 @@ def write_points(
         Recorded(topic, kind, STAMP_NS + (number + 1) * step_ns, data)
         for number, data in enumerate(messages)
     ]
+
+
+HEAD_BYTES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A packet of our own making, read field by field."""
+
+    magic: bytes
+    version: int
+    kind: int
+    slots: int
+    stamp_ns: int
+    number: int
+    count: int
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    z: tuple[float, ...]
+    level: tuple[float, ...]
+    ring: tuple[int, ...]
+    return_type: bytes
+    tag: bytes
+
+
+def read_packets(packets: U8Array) -> list[Column]:
+    """What packets (P, size) hold, by the layout that `_cloud_packets` states."""
+    found = []
+    for packet in packets:
+        data = packet.tobytes()
+        magic, version, kind, slots, stamp_ns, number, count, *_ = struct.unpack_from(
+            "<4sBBHqIHBB", data
+        )
+        reals = struct.unpack_from(f"<{4 * slots}f", data, HEAD_BYTES)
+        planes = [reals[axis * slots : (axis + 1) * slots] for axis in range(4)]
+        ring = struct.unpack_from(f"<{slots}H", data, HEAD_BYTES + 16 * slots)
+        rest = data[HEAD_BYTES + 18 * slots :]
+        found.append(
+            Column(
+                *(magic, version, kind, slots, stamp_ns, number, count),
+                *(planes[0], planes[1], planes[2], planes[3], ring),
+                *(rest[:slots], rest[slots : 2 * slots]),
+            )
+        )
+    return found

@@ -1,0 +1,191 @@
+"""Clouds as drivers write them: what their times mean, and where their fields lie."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from mlbatch._cloud_messages import Cloud, read_cloud
+from mlbatch.types import Message, Topic
+from tests.builders.points import (
+    AUTOWARE,
+    CLOUD,
+    CUSTOM,
+    CUSTOM2,
+    HESAI,
+    LIVOX,
+    OUSTER,
+    STAMP_NS,
+    VELODYNE,
+    XYZ,
+    Form,
+    Point,
+    cloud_message,
+    custom_message,
+)
+
+ENCODINGS = ("cdr", "ros1")
+HEADER = "the header's stamp"
+# Values of two points by the fields of a driver, their stamps, and the verdict.
+DRIVERS: dict[str, tuple[Sequence[tuple[str, str]], list[Point], list[int], str]] = {
+    "ouster": (
+        OUSTER,
+        [(1, 2, 3, 9, 0, 4), (4, 5, 6, 9, 99_902_343, 5)],
+        [STAMP_NS, STAMP_NS + 99_902_343],
+        f"t (uint32), ns after {HEADER}",
+    ),
+    # Halves, quarters and eighths are exact in every float; the driver counts back from the end.
+    "velodyne": (
+        VELODYNE,
+        [(1, 2, 3, 9, 4, -0.0625), (4, 5, 6, 9, 5, -0.03125)],
+        [STAMP_NS - 62_500_000, STAMP_NS - 31_250_000],
+        f"time (float32), s up to {HEADER}",
+    ),
+    "velodyne, from the first packet on": (
+        VELODYNE,
+        [(1, 2, 3, 9, 4, 0.0), (4, 5, 6, 9, 5, 0.0625)],
+        [STAMP_NS, STAMP_NS + 62_500_000],
+        f"time (float32), s after {HEADER}",
+    ),
+    "hesai": (
+        HESAI,
+        [(1, 2, 3, 9, 4, 1_650_000_000.25), (4, 5, 6, 9, 5, 1_650_000_000.3125)],
+        [1_650_000_000_250_000_000, 1_650_000_000_312_500_000],
+        "timestamp (float64), s since 1970",
+    ),
+    # A float64 holds multiples of 256 ns there.
+    "livox": (
+        LIVOX,
+        [(1, 2, 3, 9, 16, 4, 1.7e18), (4, 5, 6, 9, 0, 5, 1.7e18 + 25_600)],
+        [1_700_000_000_000_000_000, 1_700_000_000_000_025_600],
+        "timestamp (float64), ns since 1970",
+    ),
+    "autoware": (
+        AUTOWARE,
+        [(1, 2, 3, 9, 1, 4, 7), (4, 5, 6, 9, 1, 5, 70_000_000)],
+        [STAMP_NS + 7, STAMP_NS + 70_000_000],
+        f"time_stamp (uint32), ns after {HEADER}",
+    ),
+}
+
+
+def _read(data: bytes, kind: str = CLOUD, encoding: str = "cdr") -> Cloud:
+    return read_cloud(Message(Topic("/points", kind, encoding), STAMP_NS, data))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_times_of_drivers(driver: str, encoding: str) -> None:
+    fields, points, stamps_ns, verdict = DRIVERS[driver]
+    cloud = _read(cloud_message(fields, points, form=Form(encoding)), encoding=encoding)
+    assert cloud.points.stamp_ns.tolist() == stamps_ns
+    assert (cloud.verdict, cloud.frame) == (verdict, "lidar")
+    assert cloud.points.reals.tolist() == [[1, 4], [2, 5], [3, 6], [9, 9]]
+    ring = cloud.points.ring
+    assert ring is not None
+    assert ring.tolist() == [4, 5]
+
+
+def test_return_types_and_tags_are_kept() -> None:
+    autoware = _read(cloud_message(AUTOWARE, DRIVERS["autoware"][1]))
+    assert autoware.points.return_type.tolist() == [1, 1]
+    livox = _read(cloud_message(LIVOX, DRIVERS["livox"][1]))
+    assert livox.points.tag.tolist() == [16, 0]
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen"),
+    [
+        (("ts", "time"), "time"),
+        (("time", "t"), "t"),
+        (("offset_time", "timestamps"), "timestamps"),
+        (("time_stamp", "timestamp"), "timestamp"),
+    ],
+)
+def test_of_several_times_the_first_of_the_list_counts(names: tuple[str, ...], chosen: str) -> None:
+    fields = (*XYZ, *((name, "uint32") for name in names))
+    point = (1, 0, 0, *(5 if name == chosen else 6 for name in names))
+    assert _read(cloud_message(fields, [point])).points.stamp_ns.tolist() == [STAMP_NS + 5]
+
+
+@pytest.mark.parametrize("kind", [CUSTOM, CUSTOM2])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_custom_messages_count_from_their_timebase(kind: str, encoding: str) -> None:
+    points = [(0, 1, 2, 3, 7, 16, 0), (4167, 4, 5, 6, 8, 0, 3), (8334, 0, 0, 0, 0, 0, 1)]
+    data = custom_message(points, timebase_ns=STAMP_NS, encoding=encoding)
+    cloud = _read(data, kind, encoding)
+    assert cloud.points.stamp_ns.tolist() == [STAMP_NS, STAMP_NS + 4167]
+    assert cloud.points.reals.tolist() == [[1, 4], [2, 5], [3, 6], [7, 8]]
+    assert cloud.points.ring is not None
+    assert cloud.points.ring.tolist() == [0, 3]
+    assert cloud.points.tag.tolist() == [16, 0]
+    assert (cloud.verdict, cloud.placeless) == ("offset_time (uint32), ns after timebase", 1)
+
+
+def test_a_custom_message_without_timebase_counts_from_its_header() -> None:
+    cloud = _read(custom_message([(5, 1, 2, 3, 7, 16, 0)], 0, STAMP_NS), CUSTOM)
+    assert cloud.points.stamp_ns.tolist() == [STAMP_NS + 5]
+    assert cloud.verdict.endswith(HEADER)
+
+
+def test_points_without_place_or_time_are_counted() -> None:
+    nan, inf = float("nan"), float("inf")
+    points: list[Point] = [(1, 2, 3, 9, 4, 0.5), (0, 0, 0, 9, 4, 0.5), (nan, 2, 3, 9, 4, 0.5)]
+    points += [(1, inf, 3, 9, 4, 0.5), (1, 2, 3, 9, 4, nan), (1e30, 2, 3, 9, 4, 0.5)]
+    cloud = _read(cloud_message(VELODYNE, points))
+    assert (len(cloud.points), cloud.placeless, cloud.timeless) == (1, 4, 1)
+
+
+def test_rows_and_points_may_have_gaps() -> None:
+    form = Form(height=2, gap=5, row_gap=3)
+    points = [(row, column, 1, 9, column, row) for row in range(2) for column in range(3)]
+    cloud = _read(cloud_message(OUSTER, points, form=form))
+    assert cloud.points.reals[:2].tolist() == [[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2]]
+    assert (cloud.points.stamp_ns - STAMP_NS).tolist() == [0, 1, 2, 0, 1, 2]
+
+
+def test_places_may_be_float64_and_levels_whole_numbers() -> None:
+    fields = (*((axis, "float64") for axis in "xyz"), ("reflectivity", "uint16"), ("t", "int32"))
+    cloud = _read(cloud_message(fields, [(0.5, -1, 2, 60_000, -5)]))
+    assert cloud.points.reals[:, 0].tolist() == [0.5, -1, 2, 60_000]
+    assert cloud.points.stamp_ns.tolist() == [STAMP_NS - 5]
+    assert cloud.points.ring is None
+
+
+def test_a_message_of_the_reference_library_is_read_alike() -> None:
+    """rosbags serialises by the definitions of ROS itself."""
+    for encoding, store in (("cdr", Stores.ROS2_HUMBLE), ("ros1", Stores.ROS1_NOETIC)):
+        points = DRIVERS["ouster"][1]
+        types = get_typestore(store)
+        data = bytes(_by_rosbags(types, encoding, points))
+        assert data == cloud_message(OUSTER, points, form=Form(encoding))
+
+
+def _by_rosbags(types: Any, encoding: str, points: Sequence[Point]) -> memoryview:
+    kinds = types.types
+    stamp = kinds["builtin_interfaces/msg/Time"](sec=STAMP_NS // 10**9, nanosec=0)
+    words = {"seq": 7} if encoding == "ros1" else {}
+    header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="lidar", **words)
+    field = kinds["sensor_msgs/msg/PointField"]
+    named = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("t", 16, 6)]
+    fields = [field(name=n, offset=o, datatype=t, count=1) for n, o, t in [*named, ("ring", 20, 4)]]
+    data = b"".join(struct.pack("<ffffIH", *point) for point in points)
+    cloud = kinds["sensor_msgs/msg/PointCloud2"](
+        header=header,
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=22,
+        row_step=22 * len(points),
+        data=np.frombuffer(data, np.uint8),
+        is_dense=True,
+    )
+    serialize = types.serialize_ros1 if encoding == "ros1" else types.serialize_cdr
+    serialized: memoryview = serialize(cloud, "sensor_msgs/msg/PointCloud2")
+    return serialized
