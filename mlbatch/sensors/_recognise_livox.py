@@ -1,9 +1,13 @@
 """Names of Livox packets by content: lengths, data types, and stamps that step.
 
-Source: facts/others.md (Livox SDK2 and SDK1).
+Source: facts/others.md (Livox SDK2 and SDK1); time type 5 (NTP): Livox communication protocol of
+the Avia2, v1.0.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,18 +15,32 @@ from mlbatch.sensors._recognise_bytes import NO_DECODER, mostly, number, usual
 from mlbatch.types import U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
-_HEADER2_SIZE, _HEADER1_SIZE = 36, 18
-_MOST_TIME_TYPE2 = 2
+HEADER_SIZE, _HEADER1_SIZE = 36, 18
+_TIME_TYPES2 = (0, 1, 2, 5)
 _TIME_TYPES1 = (0, 1, 3, 4)
 _GPS_TIME = 3
-_IMU2, _IMU1 = 0, 6
-# SDK2, by data type: bytes per point, and what they are.
-_TYPES2 = {
-    _IMU2: (24, "IMU"),
-    1: (14, "Cartesian 32 bit, single return"),
-    2: (8, "Cartesian 16 bit, single return"),
-    3: (10, "spherical, single return"),
-    0x11: (28, "Cartesian 32 bit, dual return"),
+IMU, _IMU1 = 0, 6
+
+
+@dataclass(frozen=True, slots=True)
+class PointKind:
+    """What SDK2 packets of a data type hold: bytes and returns of a point, and its coordinates."""
+
+    data_type: int
+    size: int
+    returns: int
+    what: str
+
+
+KINDS: Mapping[int, PointKind] = {
+    kind.data_type: kind
+    for kind in (
+        PointKind(IMU, 24, 0, "IMU"),
+        PointKind(1, 14, 1, "Cartesian 32 bit, single return"),
+        PointKind(2, 8, 1, "Cartesian 16 bit, single return"),
+        PointKind(3, 10, 1, "spherical, single return"),
+        PointKind(0x11, 28, 2, "Cartesian 32 bit, dual return"),
+    )
 }
 # SDK1, by data type: bytes of the payload, and what they are.
 _TYPES1 = {
@@ -43,20 +61,28 @@ def livox(size: int, packets: U8Array) -> str | None:
     return _describe_sdk2(size, packets) or _describe_sdk1(size, packets)
 
 
-def _describe_sdk2(size: int, packets: U8Array) -> str | None:
-    """The header announces the size twice: as a length, and by points of a type."""
-    if size <= _HEADER2_SIZE:
+def identify(size: int, packets: U8Array) -> PointKind | None:
+    """What SDK2 packets (k, size) hold; None if they are none.
+
+    The header announces the size twice: as a length, and by points of a type.
+    """
+    if size <= HEADER_SIZE or not len(packets):
         return None
-    kind = usual(number(packets, 10, 1))
-    point_size, what = _TYPES2.get(kind, (0, ""))
-    if not point_size:
+    data_type = usual(number(packets, 10, 1))
+    kind = KINDS.get(data_type)
+    if kind is None:
         return None
-    good = (packets[:, 10] == kind) & (packets[:, 11] <= _MOST_TIME_TYPE2)
+    good = (packets[:, 10] == data_type) & np.isin(packets[:, 11], _TIME_TYPES2)
     good &= number(packets, 1, 2) == size
-    good &= number(packets, 5, 2) * point_size == size - _HEADER2_SIZE
-    if mostly(packets, good) is None:
+    good &= number(packets, 5, 2) * kind.size == size - HEADER_SIZE
+    return kind if mostly(packets, good) is not None else None
+
+
+def _describe_sdk2(size: int, packets: U8Array) -> str | None:
+    kind = identify(size, packets)
+    if kind is None:
         return None
-    return "Livox IMU packet" if kind == _IMU2 else f"Livox lidar (SDK2), {what}{NO_DECODER}"
+    return f"Livox lidar (SDK2), {kind.what}" if kind.returns else "Livox IMU packet"
 
 
 def _describe_sdk1(size: int, packets: U8Array) -> str | None:

@@ -1,24 +1,24 @@
 """Streams of makers that this version only knows by name: no model, no calibration.
 
-Source: facts/velodyne.md, facts/robosense.md, facts/others.md. A stream of lidar
-packets is told by the word "lidar"; packets that only accompany one go without it.
+Source: facts/others.md. A stream of lidar packets is told by the word "lidar"; packets that only
+accompany one go without it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch.lidar import Calibration, SensorModel
-from mlbatch.sensors._recognise_livox import livox
 from mlbatch.types import U8Array
 
 MAKER = ""
 MODELS: tuple[SensorModel, ...] = ()
 BUILT_IN: tuple[Calibration, ...] = ()
 # The surest first: magic bytes and repeated flags before lengths.
-_MAKERS = (livox,)
+_MAKERS: tuple[Callable[[int, U8Array], str | None], ...] = ()
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:

@@ -1,15 +1,13 @@
-"""Livox packets by facts/others.md."""
+"""What Livox packets are called, by facts/others.md."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tests.builders.others import (
-    livox1_packets,
-    livox2_packets,
-)
-from tests.unit.sensors.naming import lidar, named
+from mlbatch.sensors import livox
+from mlbatch.sensors._recognise_bytes import NO_DECODER
+from tests.builders.others import livox1_packets, livox2_packets
 
 
 @pytest.mark.parametrize(
@@ -21,10 +19,13 @@ from tests.unit.sensors.naming import lidar, named
         (0x11, 28, "Cartesian 32 bit, dual return"),
     ],
 )
-def test_livox_of_the_second_kind(kind: int, size: int, what: str) -> None:
+def test_names_of_the_second_kind(kind: int, size: int, what: str) -> None:
     packets = livox2_packets(kind, size, 96)
-    assert lidar(packets) == f"Livox lidar (SDK2), {what}"
-    assert named(np.hstack([packets, packets[:, :1]])) is None
+    assert livox.describe(packets.shape[1], packets) == f"Livox lidar (SDK2), {what}"
+    longer = np.hstack([packets, packets[:, :1]])
+    assert livox.describe(longer.shape[1], longer) is None
+    assert livox.describe(packets.shape[1] + 1, packets) is None
+    assert livox.describe(packets.shape[1], packets[:0]) is None
 
 
 @pytest.mark.parametrize(
@@ -41,15 +42,15 @@ def test_livox_of_the_second_kind(kind: int, size: int, what: str) -> None:
     ],
 )
 @pytest.mark.parametrize(("time_type", "step"), [(0, 400_000), (1, 400_000), (3, 400), (4, 400)])
-def test_livox_of_the_first_kind(
+def test_names_of_the_first_kind(
     kind: int, size: int, what: str, time_type: int, step: int
 ) -> None:
     packets = livox1_packets(kind, size, time_type, step)
-    assert lidar(packets) == f"Livox lidar (SDK1), {what}"
-    assert named(packets[:1]) is None
-    assert named(packets[[0, 0, 0]]) is None
+    assert livox.describe(size, packets) == f"Livox lidar (SDK1), {what}{NO_DECODER}"
+    assert livox.describe(size, packets[:1]) is None
+    assert livox.describe(size, packets[[0, 0, 0]]) is None
 
 
-def test_imu_packets_of_livox() -> None:
-    assert named(livox2_packets(0, 24, 1)) == "Livox IMU packet"
-    assert named(livox1_packets(6, 42)) == "Livox IMU packet"
+def test_names_of_imu_packets() -> None:
+    assert livox.describe(60, livox2_packets(0, 24, 1)) == "Livox IMU packet"
+    assert livox.describe(42, livox1_packets(6, 42)) == "Livox IMU packet"
