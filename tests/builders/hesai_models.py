@@ -150,7 +150,7 @@ MODELS: Mapping[str, HesaiModel] = {
     # Its cadence is not known: that of the XT.
     "JT16": HesaiModel(16, 1, "", _XT, 0, Fraction(50000), 3),
 }
-# JT128's table is not known, JT16 has none: all at once.
+# JT16 has none: all at once.
 TABLES: Mapping[str, I64Array] = {
     "Pandar40P": firing.P40,
     "Pandar64": firing.P64,
@@ -161,7 +161,7 @@ TABLES: Mapping[str, I64Array] = {
     "PandarXT-32": firing.XT32,
     "XT32M2X": firing.XT32M2X,
     "AT128": firing.AT128,
-    "JT128": np.zeros(128, np.int64),
+    "JT128": firing.JT128,
     "JT16": np.zeros(16, np.int64),
 }
 # Models whose packets say which table holds, by operation mode and azimuth state.
