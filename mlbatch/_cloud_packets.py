@@ -88,6 +88,11 @@ class Layout:
     slots: int
     by_ring: bool = False
 
+    def __str__(self) -> str:
+        if self.slots == 1:
+            return "every point is a column"
+        return f"up to {self.slots} points a column {'by ring' if self.by_ring else 'in turn'}"
+
     @property
     def size(self) -> int:
         """Bytes of a packet."""

@@ -87,7 +87,6 @@ class _Tally:
     def notes(self, layout: Layout | None) -> Iterator[str]:
         """What is to be told of a topic, a line each."""
         if layout is not None and self.clouds:
-            slots = "by ring" if layout.by_ring else "in their order"
             left_out = [
                 f"{count} {why}"
                 for count, why in (
@@ -98,8 +97,8 @@ class _Tally:
                 if count
             ]
             yield (
-                f"times of points from {self.verdict}; columns of up to {layout.slots} points "
-                f"{slots}; left out of {self.points} points: {', '.join(left_out) or 'none'}"
+                f"times of points from {self.verdict}; {layout}; left out of {self.points} "
+                f"points: {', '.join(left_out) or 'none'}"
             )
         if self.faults:
             yield f"{self.faults} clouds could not be read; the first: {self.first_fault}"

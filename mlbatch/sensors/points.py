@@ -98,12 +98,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 def describe(size: int, sample: U8Array) -> str | None:
     """What packets (k, size) are, None where they are none of ours."""
     layout = _layout(np.atleast_2d(sample)[:, :size])
-    return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {_mode(layout)}"
-
-
-def _mode(layout: Layout) -> str:
-    order = "by ring" if layout.by_ring else "in their order"
-    return f"up to {layout.slots} a column {order}" if layout.slots > 1 else "one a column"
+    return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {layout}"
 
 
 class PointsLidar(TurningLidar):
@@ -116,7 +111,7 @@ class PointsLidar(TurningLidar):
         slots = layout.slots
         self.model = KINDS[layout.kind]
         self.maker = MODELS[layout.kind].maker
-        self.mode = _mode(layout)
+        self.mode = str(layout)
         self.channels, self.returns, self.return_types = slots, 1, (0,)
         self.packet_size = layout.size
         self.columns_per_packet = 1

@@ -80,8 +80,8 @@ def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
         assert stamps_ns == [0, 1000, 10**8, 10**8 + 1000]
         assert (recording.counts.frames, recording.counts.datagrams) == (4, 4)
         assert recording.notes == [
-            "/left/points: times of points from t (uint32), ns after the header's stamp; columns "
-            "of up to 2 points in their order; left out of 8 points: none"
+            "/left/points: times of points from t (uint32), ns after the header's stamp; up to 2 "
+            "points a column in turn; left out of 8 points: none"
         ]
     assert table.streams == [Stream(topic="/left/points")]
     assert table.untimed == {0}

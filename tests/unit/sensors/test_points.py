@@ -82,10 +82,13 @@ def test_one_damaged_packet_hides_no_stream() -> None:
 
 def test_streams_are_told_in_words() -> None:
     packets, _ = _packets()
-    words = "lidar points of a PointCloud2, up to 2 a column in their order"
+    words = "lidar points of a PointCloud2, up to 2 points a column in turn"
     assert sensors.describe(packets.shape[1], packets) == words
     alone = pack(_points(PLACES, [0, 1, 2, 3, 4]), Layout(1, 1), 0)
-    assert sensors.describe(alone.shape[1], alone) == "lidar points of a CustomMsg, one a column"
+    assert (
+        sensors.describe(alone.shape[1], alone)
+        == "lidar points of a CustomMsg, every point is a column"
+    )
 
 
 @pytest.mark.parametrize("by_ring", [False, True])
@@ -195,4 +198,4 @@ def test_columns_by_ring_are_named_so() -> None:
     points = Points(stamp_ns, reals, np.arange(16, dtype=np.uint16), nothing, nothing)
     layout = layout_of(points, 0)
     lidar = CLOUD.lidar({}, _evidence(pack(points, layout, 0)))
-    assert lidar.mode == "up to 16 a column by ring"
+    assert lidar.mode == "up to 16 points a column by ring"
