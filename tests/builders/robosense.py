@@ -7,7 +7,6 @@ turns meanwhile. Rounds inside the field of view are columns. Nothing here is sh
 
 from __future__ import annotations
 
-import ipaddress
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -193,10 +192,10 @@ def difop(
     fields = {
         0: DIFOP_MAGIC,
         8: struct.pack(">H", spec.rpm),
-        10: ipaddress.IPv4Address("192.168.1.200").packed,
-        14: ipaddress.IPv4Address("192.168.1.102").packed,
+        10: bytes((192, 168, 1, 200, 192, 168, 1, 102)),
         24: struct.pack(">4H", 6699, 6699, 7788, 7788),
         32: struct.pack(">2H", *view),
+        40: bytes((0, 6, 23, 1, 8)),
         292: bytes.fromhex(spec.serial),
         300: bytes((row.modes[spec.mode], *sync)),
         303: _time(spec, spec.start_ns if time_ns is None else time_ns),
