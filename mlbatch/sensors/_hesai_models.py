@@ -1,8 +1,7 @@
 """What differs between HESAI models: where bytes lie in a packet, and when its beams fire.
 
 Source: facts/hesai.md sections 2 (layout), 3 (tails), 5 (times), 6 (optical centres), 8 (JT16) and
-12; times of the JT128: HesaiTechnology/HesaiLidar_SDK_2.0 `correction/firetime_correction`. The
-vertical fields of view are those of the makers' data sheets. The Pandar128E3X fires a few of its
+12; the vertical fields of view are those of the data sheets. The Pandar128E3X fires a few of its
 channels at other times at targets nearer than 2.85 m; the times of the far field are used for all
 (up to 55 us apart, `_hesai_firing.E128_NEAR`).
 """
@@ -119,19 +118,6 @@ def _by_state(times: Mapping[tuple[str, int], I64Array]) -> tuple[I64Array, I64A
             rows[operation, state] = names.index((known, told))
     return np.stack([times[name] for name in names]), rows
 
-
-# SDK, `JT128_Firetime Correction File.csv`, channels 1 to 128, in units of 10 ns.
-_JT128 = """
-9518 2324 9822 2020 10126 1716 10430 1412 7728 9214 7424 8910 7120 8606 6816 8302
-5026 1108 4722 804 4418 500 4114 196 6512 10582 6208 10278 5904 9974 5600 9670
-3810 2476 3506 2172 3202 1868 2898 1564 7880 9366 7576 9062 7272 8758 6968 8454
-5178 1260 4874 956 4570 652 4266 348 6664 10354 6360 10050 6056 9746 5752 9442
-3962 2248 3658 1944 3354 1640 3050 1336 7652 9138 7348 8834 7044 8530 6740 8226
-4950 1032 4646 728 4342 424 4038 120 6436 10506 6132 10202 5828 9898 5524 9594
-3734 2400 3430 2096 3126 1792 2822 1488 7804 9290 7500 8986 7196 8682 6892 8378
-5102 1184 4798 880 4494 576 4190 272 6588 6284 5980 5676 3886 3582 3278 2974
-"""
-_JT128_NS = 10 * np.array([int(word) for word in _JT128.split()], np.int64)
 
 _TAIL_40P = Tail(22, date_at=16, us_at=10, mode_at=14, rpm_at=8)
 _TAIL_QT64 = Tail(24, date_at=18, us_at=12, mode_at=16, rpm_at=10)
@@ -253,7 +239,7 @@ JT128 = replace(
     name="JT128",
     tail=_TAIL_JT128,
     timing=Timing(-1888000, 111000),
-    firing_ns=_JT128_NS[None],
+    firing_ns=firing.JT128[None],
     tables=np.zeros_like(_e128_tables),
     centre_mm=(-7.6, 13.67, 12.74),
     elevation_deg=None,
