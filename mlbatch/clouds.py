@@ -65,10 +65,9 @@ def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
 
 @dataclass(slots=True)
 class _Tally:
-    """What became of the clouds of a topic: in messages, and in points."""
+    """What became of the clouds of a topic; points: of all that were read."""
 
     verdict: str = ""
-    clouds: int = 0
     points: int = 0
     placeless: int = 0
     timeless: int = 0
@@ -79,27 +78,24 @@ class _Tally:
     def add(self, cloud: Cloud) -> None:
         """Count a cloud that was read."""
         self.verdict = self.verdict or cloud.verdict
-        self.clouds += 1
         self.points += len(cloud.points) + cloud.placeless + cloud.timeless
         self.placeless += cloud.placeless
         self.timeless += cloud.timeless
 
     def notes(self, layout: Layout | None) -> Iterator[str]:
         """What is to be told of a topic, a line each."""
-        if layout is not None and self.clouds:
+        if self.points:
             left_out = [
                 f"{count} {why}"
                 for count, why in (
                     (self.placeless, "without a place (NaN or zero)"),
                     (self.timeless, "without a time"),
-                    (self.ringless, f"on rings from {layout.slots} on"),
+                    (self.ringless, "on rings beyond those of the first cloud"),
                 )
                 if count
             ]
-            yield (
-                f"times of points from {self.verdict}; {layout}; left out of {self.points} "
-                f"points: {', '.join(left_out) or 'none'}"
-            )
+            verdict = f"times of points from {self.verdict}; {layout}; " if self.verdict else ""
+            yield f"{verdict}left out of {self.points} points: {', '.join(left_out) or 'none'}"
         if self.faults:
             yield f"{self.faults} clouds could not be read; the first: {self.first_fault}"
 
@@ -207,22 +203,22 @@ class CloudRecording:
         tally, counts = self._tallies[name], self.inner.counts
         try:
             cloud = read_cloud(message)
-            tally.add(cloud)
-            self.frames.setdefault(name, cloud.frame)
-            if not len(cloud.points):
-                return None
-            packets = self._packed(message, cloud.points)
+            packets = self._packed(message, cloud.points) if len(cloud.points) else None
         except CloudError as err:
             tally.faults += 1
             tally.first_fault = tally.first_fault or str(err)
             counts.frames += 1
             counts.skip("truncated")
             return None
-        counts.frames += len(packets)
-        counts.datagrams += len(packets)
+        tally.add(cloud)
+        self.frames.setdefault(name, cloud.frame)
+        if packets is not None:
+            counts.frames += len(packets)
+            counts.datagrams += len(packets)
         return packets
 
-    def _packed(self, message: Message, points: Points) -> U8Array:
+    def _packed(self, message: Message, points: Points) -> U8Array | None:
+        """The packets of points that all have a place and a time."""
         name = message.topic.name
         layout = self.layouts.get(name)
         if layout is None:
@@ -233,9 +229,7 @@ class CloudRecording:
             known = points.ring < layout.slots
             self._tallies[name].ringless += len(points) - int(np.count_nonzero(known))
             points = points.take(known)
-        if not len(points):
-            return np.zeros((0, layout.size), np.uint8)
-        return pack(points, layout, len(message.data))
+        return pack(points, layout, len(message.data)) if len(points) else None
 
     def _joined(self, batch: PacketBatch, made: Sequence[_Made]) -> PacketBatch:
         """Packets of a recording and those made of clouds, in the order of their arrival."""

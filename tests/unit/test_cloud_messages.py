@@ -157,6 +157,14 @@ def test_places_may_be_float64_and_levels_whole_numbers() -> None:
     assert cloud.points.ring is None
 
 
+@pytest.mark.parametrize(("kind", "ring"), [("int8", -1), ("float32", 3), ("int32", 1 << 16)])
+def test_a_ring_is_a_small_whole_number_or_none(kind: str, ring: float) -> None:
+    fields = (*XYZ, ("t", "uint32"), ("ring", kind), ("tag", kind))
+    cloud = _read(cloud_message(fields, [(1, 2, 3, 5, ring, ring), (1, 2, 3, 6, 2, 2)]))
+    assert cloud.points.ring is None
+    assert cloud.points.tag.tolist() == [0, 0]
+
+
 def test_a_message_of_the_reference_library_is_read_alike() -> None:
     """rosbags serialises by the definitions of ROS itself."""
     for encoding, store in (("cdr", Stores.ROS2_HUMBLE), ("ros1", Stores.ROS1_NOETIC)):

@@ -101,17 +101,26 @@ def test_what_is_left_out_is_told(tmp_path: Path) -> None:
     assert not check_capture(recording.counts)
 
 
+def test_clouds_without_a_place_are_told_and_nothing_else(tmp_path: Path) -> None:
+    empty = cloud_message(OUSTER, [(0, 0, 0, 9, 5, 1)] * 3)
+    messages = write_points("/points", [empty, cloud_message(OUSTER, [])])
+    recording, _ = _open(_bag(tmp_path, messages))
+    assert list(recording.packets()) == []
+    assert recording.notes == ["/points: left out of 3 points: 3 without a place (NaN or zero)"]
+    assert recording.counts.frames == 0
+
+
 def test_rings_beyond_those_of_the_first_cloud_are_told(tmp_path: Path) -> None:
     turns = [
         cloud_message(OUSTER, [(1, 1, 1, 9, 0, ring) for ring in range(first, first + 16)], stamp)
-        for first, stamp in ((0, STAMP_NS), (8, STAMP_NS + 10**8))
+        for first, stamp in ((0, STAMP_NS), (8, STAMP_NS + 10**8), (16, STAMP_NS + 2 * 10**8))
     ]
     turns.append(cloud_message((*XYZ, ("t", "uint32")), [(1, 1, 1, 0)]))
     recording, _ = _open(_bag(tmp_path, write_points("/points", turns)))
     packets = _payloads(recording.packets())
     assert len(packets) == 2
     left_out, fault = recording.notes
-    assert left_out.endswith("left out of 33 points: 8 on rings from 16 on")
+    assert left_out.endswith("left out of 48 points: 24 on rings beyond those of the first cloud")
     assert fault.endswith("the first: wanted rings as in the first cloud, got none")
 
 
