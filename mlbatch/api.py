@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -37,6 +37,8 @@ def scans(
     only: Sequence[str] = (),
     ignore: Sequence[str] = (),
     identity_extrinsics: bool = False,
+    keep_repeated: bool = False,
+    decode: Mapping[str, str] | None = None,
     strict: bool = False,
 ) -> Iterator[Scan]:
     """Yield the merged scans of one session, each with arrays of its own.
@@ -59,12 +61,14 @@ def scans(
             ignore=tuple(ignore),
             identity_extrinsics=identity_extrinsics,
             host_clock=clock == "host",
+            decode=dict(decode or {}),
         ),
         # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
         slices=slices,
         layout=layout,
         keep_partial=keep_partial,
+        keep_repeated=keep_repeated,
         max_wait_ns=None if math.isinf(max_wait) else round(max_wait * NS_PER_S),
         min_range_m=min_range,
         max_range_m=max_range,

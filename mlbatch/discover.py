@@ -11,7 +11,7 @@ from mlbatch import sensors
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.lidar import Calibration
-from mlbatch.looking import calibrations_for, look, read_given
+from mlbatch.looking import calibrations_for, look, read_given, with_clouds
 from mlbatch.matching import Matched, Wanted, match, match_rig
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
@@ -45,13 +45,17 @@ class Note:
 
 @dataclass(slots=True)
 class Setup:
-    """All sensors of a session, ready to convert."""
+    """All sensors of a session, ready to convert.
+
+    recordings: those to read, with the clouds that stand for packets.
+    """
 
     sensors: list[Mounted]
     frame_id: str
     router: Router
     sampler: Sampler
     notes: list[Note]
+    recordings: Sequence[Recording]
     rig: Rig | None = None
     not_in_rig: set[Kind] = field(default_factory=set)
     ignored: set[Kind] = field(default_factory=set)
@@ -60,6 +64,8 @@ class Setup:
 def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes) -> Setup:
     """Find the sensors of a session; errors name what is missing and the ways to give it."""
     rig = None if wishes.rig is None else read_rig(wishes.rig)
+    streams = [] if rig is None else [one.stream for one in rig.sensors if one.stream is not None]
+    recordings = with_clouds(recordings, table, {stream.topic for stream in streams} - {""})
     sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations, files = calibrations_for(paths, wishes.metadata)
@@ -92,7 +98,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         metadata_topics=learner.metadata_topics,
         identity_extrinsics=wishes.identity_extrinsics,
     )
-    setup = Setup(mounted, mounting.body_frame, router, sampler, notes, ignored=ignored)
+    setup = Setup(mounted, mounting.body_frame, router, sampler, notes, recordings, ignored=ignored)
     notes += [Note("message", "", fault) for fault in learner.faults]
     notes += [Note(one.code, one.sensor, in_words(one)) for one in mounting.findings]
     if rig is not None:

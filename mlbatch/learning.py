@@ -13,12 +13,21 @@ from mlbatch.errors import MlbatchError
 from mlbatch.frames import nearest_topic
 from mlbatch.knowledge import Knowledge
 from mlbatch.lidar import Calibration, Evidence, Lidar
-from mlbatch.readers import decode_string, decode_transforms
+from mlbatch.readers import (
+    CORRECTION_TYPE,
+    decode_bytes,
+    decode_string,
+    decode_transforms,
+    holds_corrections,
+)
 from mlbatch.types import Message, PacketBatch, Recording, Topic
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 TEXT_TYPE = "std_msgs/String"
+BYTES_TYPE = "std_msgs/UInt8MultiArray"
 METADATA, DESCRIPTION, STATIC = "metadata", "robot_description", "tf_static"
+# HESAI ROS_2.0 publishes the angle file of the lidar there.
+CORRECTIONS = "lidar_corrections"
 # A calibration that was recorded with the packets beats one that lies beside the recording.
 _FITS_TOPIC = 10_000
 
@@ -27,7 +36,9 @@ def teaches(topic: Topic) -> bool:
     """Whether the messages of a topic say something of sensors."""
     if topic.type == TEXT_TYPE:
         return _tail(topic) in (METADATA, DESCRIPTION)
-    return topic.type in TRANSFORM_TYPES
+    if topic.type == BYTES_TYPE:
+        return _tail(topic) == CORRECTIONS
+    return topic.type in TRANSFORM_TYPES or holds_corrections(topic)
 
 
 def listen(recordings: Iterable[Recording]) -> None:
@@ -42,7 +53,7 @@ class Learner:
     def __init__(self) -> None:
         self.knowledge = Knowledge()
         self.faults: list[str] = []
-        self._texts: dict[str, str] = {}
+        self._texts: dict[str, bytes] = {}
 
     def add(self, batch: PacketBatch) -> None:
         """Learn from the messages of a batch; one that cannot be read is a fault, told once."""
@@ -63,7 +74,11 @@ class Learner:
             self.knowledge.add_transforms("tf_static" if _tail(topic) == STATIC else "tf", stated)
         elif topic.type == TEXT_TYPE and _tail(topic) == METADATA:
             # Of several, the first: it is the one under which the recording began.
-            self._texts.setdefault(topic.name, decode_string(topic, message.data))
+            self._texts.setdefault(topic.name, decode_string(topic, message.data).encode())
+        elif topic.type == BYTES_TYPE and _tail(topic) == CORRECTIONS:
+            self._texts.setdefault(topic.name, decode_bytes(topic, message.data))
+        elif topic.type == CORRECTION_TYPE:
+            self._texts.setdefault(topic.name, message.data)
         elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
             self.knowledge.add_urdf(decode_string(topic, message.data))
 
@@ -77,7 +92,7 @@ class Learner:
         found: list[Calibration] = []
         for topic, text in self._texts.items():
             try:
-                calibration = sensors.parse_calibration(Path(topic), text.encode())
+                calibration = sensors.parse_calibration(Path(topic), text)
             except MlbatchError as err:
                 self.faults.append(str(err))
                 continue

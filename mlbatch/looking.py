@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch import sensors
+from mlbatch.clouds import CloudRecording, Layout, cloud_topics
 from mlbatch.errors import RigError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
-from mlbatch.readers import merge
+from mlbatch.readers import holds_packets, merge
 from mlbatch.streams import Kind, Sampler, split_by_kind
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
@@ -24,6 +25,24 @@ METADATA_SUFFIX = ".json"
 # No calibration of one sensor comes near; tables and documents of a dataset are not opened.
 MAX_SIDECAR_BYTES = 2_000_000
 BAG_METADATA = "metadata.yaml"
+
+
+def with_clouds(
+    recordings: Sequence[Recording], table: StreamTable, named: Collection[str]
+) -> list[Recording]:
+    """The recordings, with decoded clouds as packets: of the topics named (in the rig).
+
+    Where nothing is named and the session holds no raw packets, all its clouds are taken.
+    """
+    topics = [topic for recording in recordings for topic in recording.topics]
+    clouds = {topic.name: topic for topic in cloud_topics(topics)}
+    # A capture has no topics, and nothing but packets.
+    raw = any(not recording.topics for recording in recordings) or any(map(holds_packets, topics))
+    chosen = [topic for name, topic in clouds.items() if name in named or (not raw and not named)]
+    if not chosen:
+        return list(recordings)
+    layouts: dict[str, Layout] = {}
+    return [CloudRecording(recording, table, chosen, layouts) for recording in recordings]
 
 
 def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:

@@ -62,14 +62,14 @@ class Conversion:
         self.stages = Stages()
         self.table: ScanTable | None = None
         self.info: RunInfo | None = None
-        self.recordings: list[Recording] = []
         self.delivered = 0
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
         streams = StreamTable()
-        self.recordings = [open_recording(path, streams) for path in job.recordings]
-        self.setup: Setup = discover(self.recordings, streams, job.wishes)
+        opened = [open_recording(path, streams) for path in job.recordings]
+        self.setup: Setup = discover(opened, streams, job.wishes)
+        self.recordings: Sequence[Recording] = self.setup.recordings
         self._prepare()
         for note in self.setup.notes:
             self.warn(note)

@@ -14,7 +14,7 @@ from mlbatch.clock import timescale
 from mlbatch.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
-from mlbatch.looking import calibrations_for, first_seconds, look
+from mlbatch.looking import calibrations_for, first_seconds, look, with_clouds
 from mlbatch.matching import match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import open_recording
@@ -153,7 +153,7 @@ def _is_placed(sensor: Mounted) -> bool:
 def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     """Look at the first 10 s of recordings, with the metadata given or found beside them."""
     table = StreamTable()
-    opened = [open_recording(path, table) for path in recordings]
+    opened = with_clouds([open_recording(path, table) for path in recordings], table, ())
     sampler, learner = look(opened, table)
     calibrations, looked = calibrations_for(recordings, metadata)
     files = {str(one.path): one.path for one in calibrations if one.path is not None}

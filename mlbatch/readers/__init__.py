@@ -13,17 +13,23 @@ from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
 from mlbatch.errors import RecordingError
+from mlbatch.readers._definitions import type_key
+from mlbatch.readers._envelopes import CORRECTION_TYPE
 from mlbatch.readers._folder import bag_folder
 from mlbatch.readers._knowledge import decode_bytes, decode_string, decode_transforms
 from mlbatch.readers._merge import merge
+from mlbatch.readers._packet_types import PACKET_TYPES
 from mlbatch.readers._source import read_head
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import Recording, StreamTable, Topic
 
 __all__ = [
+    "CORRECTION_TYPE",
     "Reader",
     "decode_bytes",
     "decode_string",
     "decode_transforms",
+    "holds_corrections",
+    "holds_packets",
     "merge",
     "open_recording",
     "readers",
@@ -55,6 +61,16 @@ class FolderReader(Reader, Protocol):
     ) -> Recording:
         """Open the files of a bag as one recording; notes: what is wrong with the folder."""
         ...
+
+
+def holds_packets(topic: Topic) -> bool:
+    """Whether the messages of a topic hold raw packets of lidars."""
+    return type_key(topic.type) in PACKET_TYPES
+
+
+def holds_corrections(topic: Topic) -> bool:
+    """Whether calibrations may stand among the packets of a topic, as CORRECTION_TYPE."""
+    return holds_packets(topic) and PACKET_TYPES[type_key(topic.type)].corrections
 
 
 def readers() -> list[Reader]:

@@ -25,7 +25,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("report",),
         ("streams",),
     ),
-    (("knowledge",),),
+    (("knowledge",), ("clouds", "_cloud_messages", "_cloud_packets", "_cloud_times")),
     (
         ("rig", "_rig_values", "_yaml"),
         ("frames",),
