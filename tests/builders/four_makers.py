@@ -1,0 +1,274 @@
+"""Make `fixtures/four_makers`: a rig of four makers in the hall, recorded over the full hour.
+
+    python -m tests.builders.four_makers [FOLDER]
+
+The same bytes every time; `SOURCE.md` there tells what is in them.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.types import F64Array
+from tests.builders import hesai, robosense, two_lidars, velodyne
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.hesai_angles import Angles, angles_csv
+from tests.builders.scene import hall
+from tests.builders.seen import (
+    Eye,
+    Payloads,
+    Seen,
+    hesai_sees,
+    ouster_sees,
+    pose,
+    robosense_sees,
+    velodyne_sees,
+)
+
+FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "four_makers"
+HOST_IP = "192.168.1.10"
+NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
+HOUR_NS = int(datetime(2026, 5, 4, 8, 0, 0, tzinfo=timezone.utc).timestamp()) * NS_PER_S
+# The sensors are measuring from here on, each from another ms, until the recorder stops.
+START_NS, END_NS = HOUR_NS - 170 * NS_PER_MS, HOUR_NS + 130 * NS_PER_MS
+MTU = 1500
+# A switch of 1 Gbit/s; the recorder gets one frame after the other.
+NS_PER_BYTE = 8
+DIFOP_STEP_NS, POSITION_STEP_NS = 100 * NS_PER_MS, 100 * NS_PER_MS
+
+Records = list[tuple[int, bytes]]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """How a lidar is mounted and connected; port: of its data; delay_ns: of its network."""
+
+    name: str
+    model: str
+    ip: str
+    port: int
+    translation_m: tuple[float, float, float]
+    rpy_deg: tuple[float, float, float]
+    delay_ns: int
+    metadata: str = ""
+
+    @property
+    def body_from_sensor(self) -> F64Array:
+        """Extrinsics (4, 4), metres."""
+        return pose(self.translation_m, self.rpy_deg)
+
+    @property
+    def eye(self) -> Eye:
+        """What it looks at."""
+        return Eye(hall(), self.body_from_sensor)
+
+
+# In the order of the rig. The mounts keep the machine out of most of the view.
+OUSTER = Place(
+    *("left", "OS-1-32-U1", "192.168.1.87", 7502),
+    *((0.3, 0.95, 2.45), (0.4, 22.0, 80.0)),
+    *(210_000, "left.json"),
+)
+VELODYNE = Place(
+    *("roof", "VLP-16", "192.168.1.201", 2368),
+    *((-0.1, 0.05, 2.6), (0.3, 4.0, -1.5)),
+    130_000,
+)
+HESAI = Place(
+    *("right", "PandarXT-16", "192.168.1.202", 2368),
+    *((0.28, -0.9, 2.4), (-20.5, 1.2, -150.0)),
+    *(260_000, "right.csv"),
+)
+ROBOSENSE = Place(
+    *("rear", "Helios 16", "192.168.1.200", 6699),
+    *((-1.5, 0.1, 2.2), (0.0, -6.0, 178.0)),
+    90_000,
+)
+PLACES = (OUSTER, VELODYNE, HESAI, ROBOSENSE)
+POSITION_PORT, DIFOP_PORT = 8308, 7788
+
+OUSTER_LIDAR = replace(
+    two_lidars.RIGHT,
+    name=OUSTER.name,
+    ip=OUSTER.ip,
+    zero_ms=-170,
+    translation_m=OUSTER.translation_m,
+    rpy_deg=OUSTER.rpy_deg,
+)
+# Past 07:00: its stamps begin anew at 08:00, within the recording.
+VELODYNE_SPEC = velodyne.VelodyneSpec(
+    "VLP-16",
+    "dual",
+    rpm=600.0,
+    start_azimuth_deg=211.37,
+    start_us=(3600 * NS_PER_MS * 1000 - 166_303_000) / 1000,
+    hour=HOUR_NS // NS_PER_S // 3600 - 1,
+)
+HESAI_SPEC = hesai.HesaiSpec(
+    "PandarXT-16", rpm=750, start_deg=83.21, start_ns=START_NS + 1_640_000, sequence=2**32 - 300
+)
+HESAI_ANGLES = Angles(
+    [round(15.0 - 2 * beam + 0.013 * (beam * 5 % 7 - 3), 3) for beam in range(16)],
+    [round(0.9 * (beam % 2) - 0.45 + 0.017 * (beam * 3 % 5), 3) for beam in range(16)],
+)
+ROBOSENSE_SPEC = robosense.RobosenseSpec(
+    "Helios 16", rpm=597, start_deg=301.66, start_ns=START_NS + 6_200_500, first_counter=41
+)
+ROBOSENSE_ANGLES = robosense.fan(ROBOSENSE_SPEC)
+
+RIG = """\
+# A machine with lidars of four makers; see SOURCE.md.
+body_frame: base_link
+rate_hz: 20
+sensors:
+"""
+RIG_SENSOR = """\
+  - name: {name}
+    stream: {{source_ip: {ip}, port: {port}}}
+    extrinsics: {{translation_m: {translation}, rotation_rpy_deg: {rotation}}}
+"""
+
+
+@functools.cache
+def seen() -> dict[str, Seen]:
+    """What each sensor sent while the recorder ran, by its name in the rig."""
+    sights = {
+        OUSTER.name: ouster_sees(OUSTER_LIDAR, OUSTER.eye, HOUR_NS, 4),
+        VELODYNE.name: velodyne_sees(VELODYNE_SPEC, VELODYNE.eye, 470),
+        HESAI.name: hesai_sees(HESAI_SPEC, HESAI_ANGLES, HESAI.eye, 760),
+        ROBOSENSE.name: robosense_sees(ROBOSENSE_SPEC, ROBOSENSE_ANGLES, ROBOSENSE.eye, 230),
+    }
+    return {name: _recorded(sight) for name, sight in sights.items()}
+
+
+def arrivals() -> list[tuple[int, str, int]]:
+    """Arrival (of its last frame), sensor and number of every lidar packet, as recorded."""
+    return [(sent.last_ns, sent.name, sent.number) for sent in _network() if sent.number >= 0]
+
+
+def main(folder: Path) -> None:
+    """Write the pcap, the calibration files and the rig."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = [record for sent in _network() for record in sent.records]
+    write_pcap(folder / "four_makers.pcap", records)
+    document = json.dumps(two_lidars.metadata(OUSTER_LIDAR), indent=2)
+    (folder / OUSTER.metadata).write_bytes(document.encode() + b"\n")
+    csv = angles_csv(HESAI_ANGLES.elevation_deg, HESAI_ANGLES.azimuth_deg)
+    (folder / HESAI.metadata).write_bytes(csv)
+    (folder / "rig.yaml").write_bytes(rig_text().encode())
+
+
+def rig_text() -> str:
+    """The rig (CONTRACT.md section 5)."""
+    text = RIG
+    for place in PLACES:
+        text += RIG_SENSOR.format(
+            name=place.name,
+            ip=place.ip,
+            port=place.port,
+            translation=list(place.translation_m),
+            rotation=list(place.rpy_deg),
+        )
+        text += f"    metadata: {place.metadata}\n" if place.metadata else ""
+    return text
+
+
+def _recorded(sight: Seen) -> Seen:
+    """Whole packets that were measured before the recorder stopped."""
+    packets = int((sight.packet_stamps[:, -1] < END_NS).sum())
+    columns = packets * sight.columns_per_packet
+    if packets == len(sight.payloads):
+        raise ValueError("wanted more packets than the recorder sees")
+    return replace(
+        sight,
+        stamp_ns=sight.stamp_ns[:columns],
+        firing_ns=sight.firing_ns[:columns],
+        counts=sight.counts[:columns],
+        level=sight.level[:columns],
+        payloads=sight.payloads[:packets],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Datagram:
+    """number: of a lidar packet in its stream, -1 for other packets."""
+
+    ready_ns: int
+    name: str
+    number: int
+    frames: list[bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    name: str
+    number: int
+    records: Records
+
+    @property
+    def last_ns(self) -> int:
+        """Arrival of the frame that completes it."""
+        return self.records[-1][0]
+
+
+@functools.cache
+def _network() -> tuple[_Sent, ...]:
+    """All datagrams in the order in which the switch lets them through."""
+    waiting = [one for place in PLACES for one in _datagrams(place)]
+    waiting.sort(key=lambda one: (one.ready_ns, one.name, one.number))
+    sent, free_ns = [], 0
+    for one in waiting:
+        records = []
+        for frame in one.frames:
+            free_ns = max(free_ns, one.ready_ns) + len(frame) * NS_PER_BYTE
+            records.append((free_ns, frame))
+        sent.append(_Sent(one.name, one.number, records))
+    return tuple(sent)
+
+
+def _datagrams(place: Place) -> list[_Datagram]:
+    lidar = [
+        (ready_ns, place.port, number, payload)
+        for number, (ready_ns, payload) in enumerate(seen()[place.name].payloads)
+    ]
+    beside = [(ready_ns, port, -1, payload) for ready_ns, port, payload in _beside(place)]
+    found, before_ns = [], 0
+    for ident, (ready_ns, port, number, payload) in enumerate(sorted(lidar + beside)):
+        # The network's delay varies by up to 0.1 ms, but packets of a sensor stay in order.
+        before_ns = max(before_ns, ready_ns + place.delay_ns + ident * 37 % 11 * 10_000)
+        frames = udp_frame(payload, place.ip, HOST_IP, port, port, ident=ident, mtu=MTU)
+        found.append(_Datagram(before_ns, place.name, number, frames))
+    return found
+
+
+def _beside(place: Place) -> list[tuple[int, int, bytes]]:
+    """Arrival, port and payload of what sensors send besides points."""
+    if place is VELODYNE:
+        times_us = np.arange(2_000, (END_NS - START_NS) // 1000 - 5_000, 1e-3 * POSITION_STEP_NS)
+        sent = velodyne.position_packets(VELODYNE_SPEC, times_us)
+        rows: Payloads = [
+            (int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)
+        ]
+        return [(at, POSITION_PORT, row) for at, row in rows]
+    if place is ROBOSENSE:
+        times_ns = range(START_NS + 9 * NS_PER_MS, END_NS, DIFOP_STEP_NS)
+        return [
+            (
+                time_ns,
+                DIFOP_PORT,
+                robosense.difop(ROBOSENSE_SPEC, ROBOSENSE_ANGLES, time_ns=time_ns),
+            )
+            for time_ns in times_ns
+        ]
+    return []
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER)

@@ -1,0 +1,236 @@
+"""What lidars of all makers see of a scene: their packets, and what a conversion must make of them.
+
+The encoders (`velodyne.py`, `hesai.py`, `robosense.py`, `two_lidars.py`) lay out bytes; here their
+rays meet the scene, and times are what their packets tell. Nothing of a decoder is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from mlbatch.types import F64Array, I64Array
+from tests.builders import hesai, robosense, two_lidars, velodyne
+from tests.builders.hesai_angles import Beams
+from tests.builders.scene import Scene
+
+# Arrival in ns, and payload.
+Payloads: TypeAlias = list[tuple[int, bytes]]
+# Behind a near surface every third column sees another one, as a beam does that an edge cuts.
+_EDGE_EVERY, _EDGE_M = 3, 7.0
+_PAST_M = 1e-6
+_HOUR_NS = 3_600_000_000_000
+_AIRY_FLAG = 0x4000
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one lidar sent, and what it means.
+
+    stamp_ns: (n,) of its columns, in their order; firing_ns: (n, channels), as `stamp_ns` by the
+    sensor's clock; counts, level: (n, channels, returns), counts of `unit_m`, 0 where nothing came
+    back. Channels are in the order of the output.
+    """
+
+    stamp_ns: I64Array
+    firing_ns: I64Array
+    counts: I64Array
+    level: I64Array
+    unit_m: float
+    payloads: Payloads
+    columns_per_packet: int
+
+    @property
+    def channels(self) -> int:
+        """Of a column."""
+        return int(self.counts.shape[1])
+
+    @property
+    def returns(self) -> int:
+        """Of a shot."""
+        return int(self.counts.shape[2])
+
+    @property
+    def packet_stamps(self) -> I64Array:
+        """(P, columns of a packet)."""
+        return self.stamp_ns.reshape(-1, self.columns_per_packet)
+
+
+@dataclass(frozen=True, slots=True)
+class Eye:
+    """A scene as seen from a pose, body_from_sensor (4, 4), metres."""
+
+    scene: Scene
+    pose: F64Array
+
+    def look(
+        self, origin: F64Array, direction: F64Array, returns: int = 1
+    ) -> tuple[F64Array, F64Array]:
+        """Distances in m (inf: none) and levels, (n, channels, returns), of rays (n, channels, 3).
+
+        Of several returns the first is the last on the way, the second the strongest.
+        """
+        shape = direction.shape[:2]
+        start: F64Array = np.broadcast_to(origin, direction.shape).reshape(-1, 3)
+        start = start @ self.pose[:3, :3].T + self.pose[:3, 3]
+        ray = direction.reshape(-1, 3) @ self.pose[:3, :3].T
+        first_m, level = self._cast(start, ray)
+        if returns == 1:
+            return first_m.reshape(*shape, 1), level.reshape(*shape, 1)
+        last_m, last_level = first_m.copy(), level.copy()
+        column = np.arange(len(ray)) // shape[1]
+        cut = np.flatnonzero((column % _EDGE_EVERY == 0) & (first_m < _EDGE_M))
+        reached_m = first_m[cut] + _PAST_M
+        behind_m, behind_level = self._cast(start[cut] + reached_m[:, None] * ray[cut], ray[cut])
+        further = np.isfinite(behind_m)
+        last_m[cut[further]] = (reached_m + behind_m)[further]
+        last_level[cut[further]] = behind_level[further]
+        pairs = [(last_m, last_level), (first_m, level), (last_m, last_level)][:returns]
+        distance_m, levels = (
+            np.stack([pair[part].reshape(shape) for pair in pairs], axis=-1) for part in (0, 1)
+        )
+        return distance_m, levels
+
+    def _cast(self, start: F64Array, ray: F64Array) -> tuple[F64Array, F64Array]:
+        brightness = [surface.reflectivity for surface in self.scene.surfaces] + [0]
+        surface = self.scene.surface_hit(start, ray)
+        return self.scene.cast(start, ray), np.array(brightness, np.float64)[surface]
+
+
+def pose(
+    translation_m: tuple[float, float, float], rpy_deg: tuple[float, float, float]
+) -> F64Array:
+    """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (CONTRACT.md section 5)."""
+    matrix = np.eye(4)
+    for (one, other), angle in zip(((1, 2), (2, 0), (0, 1)), np.radians(rpy_deg), strict=True):
+        turn = np.eye(4)
+        turn[one, one] = turn[other, other] = np.cos(angle)
+        turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
+        matrix = turn @ matrix
+    matrix[:3, 3] = translation_m
+    return matrix
+
+
+def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
+    """A Velodyne's stamps are whole us, each of the first firing of a packet (sheet, section 2)."""
+    table, columns = spec.table, np.arange(packets * spec.columns_per_packet)
+    distance_m, bright = eye.look(
+        velodyne.origins(spec, columns), velodyne.directions(spec, columns), spec.returns
+    )
+    reach_m = np.array(table.dist_m)[:, None]
+    counts, level = _counted(distance_m - reach_m, bright, table.unit_m)
+    sent = velodyne.encode(spec, counts, level)
+    fires_ns = velodyne.firing_times_ns(spec, columns)
+    # What the packets say, against the true times.
+    said_us = sent.payloads[:, 1200:1204].copy().view("<u4")[:, 0].astype(np.int64)
+    first_ns = fires_ns[:: spec.columns_per_packet].min(axis=1)
+    off_ns = said_us * 1000 - round(table.stamp_after_us * 1000) - first_ns
+    off_ns = (off_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
+    fires_ns += off_ns.repeat(spec.columns_per_packet)[:, None]
+    # Channel 0 is the lowest beam (CONTRACT.md section 3).
+    order = np.argsort(np.array(table.elevation_deg), kind="stable")
+    return Seen(
+        fires_ns.min(axis=1),
+        fires_ns[:, order],
+        counts[:, order],
+        level[:, order],
+        table.unit_m,
+        [(int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)],
+        spec.columns_per_packet,
+    )
+
+
+def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> Seen:
+    """A HESAI's beams leave from the axis unless the optical centre is asked for."""
+    columns, unit_m = packets * spec.groups, spec.row.unit_mm / 1000
+    direction = hesai.directions(spec, beams, columns)
+    counts, level = _counted(*eye.look(np.zeros(3), direction, spec.returns), unit_m)
+    fires = hesai.fires(spec, columns)
+    counts *= fires[:, :, None]
+    level *= fires[:, :, None]
+    fires_ns = hesai.firing_times_ns(spec, columns)
+    never = np.iinfo(np.int64).max
+    payloads = hesai.encode_packets(spec, counts, level)
+    arrivals = hesai.host_times_ns(spec, packets).tolist()
+    return Seen(
+        np.where(fires, fires_ns, never).min(axis=1),
+        fires_ns,
+        counts,
+        level,
+        unit_m,
+        list(zip(arrivals, payloads, strict=True)),
+        spec.groups,
+    )
+
+
+def robosense_sees(
+    spec: robosense.RobosenseSpec, angles: robosense.Angles, eye: Eye, packets: int
+) -> Seen:
+    """Ranges count from the lens (sheet, section 8)."""
+    count = round(packets * spec.columns_per_packet)
+    columns = np.arange(count)
+    distance_m, bright = eye.look(
+        robosense.origins(spec, columns),
+        robosense.directions(spec, angles, columns),
+        spec.returns,
+    )
+    counts, level = _counted(distance_m, bright, spec.range_unit_m)
+    flag = _AIRY_FLAG if spec.model.startswith("Airy") else 0
+    fires_ns = robosense.firing_times_ns(spec, columns)
+    per_packet = spec.columns_per_packet
+    payloads = robosense.msop(spec, counts + flag, level)
+    if per_packet % 1:
+        # Three blocks do not divide by two: each return is a column of its own.
+        fires_ns, counts, level = _split(spec, fires_ns, counts, level)
+        per_packet *= spec.returns
+    return Seen(
+        fires_ns.min(axis=1), fires_ns, counts, level, spec.range_unit_m, payloads, int(per_packet)
+    )
+
+
+def ouster_sees(lidar: two_lidars.FixtureLidar, eye: Eye, first_ns: int, turns: int) -> Seen:
+    """An Ouster: its encoder casts the rays itself, from its own pose."""
+    pixels = two_lidars.turn_pixels(lidar, eye.scene)
+    stamps = two_lidars.column_stamps(lidar, first_ns, turns)
+    raw = two_lidars.packets(lidar, pixels, stamps)
+    column = np.arange(len(stamps)) % two_lidars.COLUMNS_PER_TURN
+    last_ns = stamps.reshape(-1, two_lidars.COLUMNS_PER_PACKET)[:, -1]
+    return Seen(
+        stamps,
+        np.repeat(stamps[:, None], two_lidars.BEAMS, axis=1),
+        pixels["range"][column].astype(np.int64)[:, :, None],
+        pixels["reflectivity"][column].astype(np.int64)[:, :, None],
+        lidar.range_step_mm / 1000,
+        [(int(at), row.tobytes()) for at, row in zip(last_ns, raw, strict=True)],
+        two_lidars.COLUMNS_PER_PACKET,
+    )
+
+
+def _counted(distance_m: F64Array, level: F64Array, unit_m: float) -> tuple[I64Array, I64Array]:
+    """Whole counts of 16 bits, and levels; 0 where nothing comes back."""
+    with np.errstate(invalid="ignore"):
+        counts = distance_m / unit_m
+        fits = (counts >= 0.5) & (counts < 65535.5)
+    whole = np.rint(np.where(fits, counts, 0)).astype(np.int64)
+    return whole, np.where(whole > 0, np.rint(level), 0).astype(np.int64)
+
+
+def _split(
+    spec: robosense.RobosenseSpec, fires_ns: I64Array, counts: I64Array, level: I64Array
+) -> tuple[I64Array, I64Array, I64Array]:
+    """Both returns of a column as columns: the second may lie in the next packet.
+
+    There it has that packet's time, which is cut to whole us anew.
+    """
+    blocks = np.arange(len(counts) * spec.returns)
+    rounds = robosense.rounds(spec, blocks // spec.returns)
+    first = rounds[blocks // spec.row.blocks * spec.row.blocks]
+    said_ns = (spec.start_ns + first * spec.round_ns) // 1000 * 1000
+    begin_ns = said_ns + (rounds - first) * spec.round_ns
+    apart = [
+        np.ascontiguousarray(part.transpose(0, 2, 1)).reshape(len(blocks), -1, 1)
+        for part in (counts, level)
+    ]
+    return begin_ns[:, None] + spec.firing_ns, apart[0], apart[1]

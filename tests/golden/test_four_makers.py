@@ -1,0 +1,287 @@
+"""A rig of four makers, converted by one command: against the paper's loop, its scene and itself.
+
+Nothing expected comes from a decoder: stamps, ranges and firing times are those that the encoders
+put into the packets (`tests/builders/seen.py`); windows are those of `batching/reference.py`.
+Times within a packet are whole ns for these models; what Velodyne and ROBOSENSE packets say of
+themselves is cut to whole us, and that is the time that counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window, reference_scans
+from mlbatch.types import BoolArray, F64Array, I64Array
+from tests.builders.four_makers import FOLDER, HOUR_NS, PLACES, VELODYNE, arrivals, main, seen
+from tests.builders.run import Cloud, command, load, scan_files
+from tests.builders.scene import hall
+from tests.builders.seen import Seen
+from tests.builders.seen_points import Expected, Points, pair_types, repeated
+
+PCAP, RIG = FOLDER / "four_makers.pcap", FOLDER / "rig.yaml"
+SENSORS = [seen()[place.name] for place in PLACES]
+NAMES = [place.name for place in PLACES]
+ROOF = PLACES.index(VELODYNE)
+# Packets count the azimuth in 0.01 degrees: half of that is 8.7e-5 m per metre.
+ASIDE_PER_M = 1e-4
+FLOAT32_AT_20_M = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A conversion and what the loop makes of the same packets."""
+
+    folder: Path
+    outcome: Outcome
+
+    @property
+    def report(self) -> Any:
+        """What the command says of itself."""
+        return json.loads((self.folder / "report.json").read_text(encoding="utf-8"))
+
+
+def reference(rate: str, slices: int, *, keep_partial: bool) -> Outcome:
+    """The paper's loop over the packets in the order of their arrival."""
+    feed = []
+    for host_ns, name, number in arrivals():
+        stamps = tuple(seen()[name].packet_stamps[number].tolist())
+        valid = (True,) * len(stamps)
+        feed.append(FeedPacket(NAMES.index(name), host_ns, -1, stamps, valid))
+    return reference_scans(
+        feed, Settings(Fraction(rate), len(NAMES), slices, keep_partial=keep_partial)
+    )
+
+
+def run(folder: Path, rate: str, slices: int, *words: str) -> Run:
+    """`mlbatch convert` beside the loop."""
+    said = ["--rig", str(RIG), "--rate", rate, "--slices", str(slices), "--quiet", *words]
+    told = command("convert", PCAP, "-o", folder, *said)
+    assert (told.code, told.err) == (0, "")
+    return Run(folder, reference(rate, slices, keep_partial="--keep-partial" in words))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Everything in the recording, at 20 Hz."""
+    return run(tmp_path_factory.mktemp("makers") / "out", "20", 1, "--keep-partial")
+
+
+def columns_of(window: Window) -> tuple[I64Array, I64Array]:
+    """Sensor of each column of a window, and its number among the sensor's."""
+    sensor, packet, column = np.array(window.columns, np.int64).T
+    per_packet = np.array([sight.columns_per_packet for sight in SENSORS])
+    return sensor, packet * per_packet[sensor] + column
+
+
+def check_windows(converted: Run) -> None:
+    files, windows = scan_files(converted.folder), converted.outcome.windows
+    assert len(files) == len(windows)
+    for path, window in zip(files, windows, strict=True):
+        scan, (sensor, column) = load(path), columns_of(window)
+        for key in ("index", "slice", "start_ns", "end_ns", "complete"):
+            assert scan[key] == getattr(window, key), key
+        stamps = np.choose(
+            sensor, [sight.stamp_ns[column % len(sight.stamp_ns)] for sight in SENSORS]
+        )
+        assert np.array_equal(scan["column_lidar_id"], sensor)
+        assert np.array_equal(scan["column_stamp_ns"], stamps)
+
+
+def check_points(converted: Run, *, keep_repeated: bool = False) -> None:
+    """All but the places: what each point is, when it was measured, and the order of points."""
+    expected = Expected(SENSORS, keep_repeated=keep_repeated)
+    for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
+        check_cloud(Cloud.of(path), expected.points(*columns_of(window)))
+
+
+def check_cloud(cloud: Cloud, wanted: Points) -> None:
+    assert np.array_equal(cloud.column, wanted.column)
+    assert np.array_equal(cloud.lidar_id, wanted.lidar_id)
+    assert np.array_equal(cloud.ring, wanted.ring)
+    assert np.array_equal(cloud.at_ns, wanted.at_ns)
+    assert np.array_equal(cloud.intensity, wanted.level)
+    np.testing.assert_array_max_ulp(cloud.range_m, wanted.range_m.astype(np.float32), 1)
+
+
+def check_places(cloud: Cloud) -> None:
+    """Every point is finite, lies on a surface, and as far away as measured, but for the lens."""
+    assert np.isfinite(cloud.xyz).all()
+    assert np.isfinite(cloud.intensity).all()
+    for number, (place, sight) in enumerate(zip(PLACES, SENSORS, strict=True)):
+        own = cloud.of_sensor(number)
+        xyz_m, range_m = own.xyz.astype(np.float64), own.range_m.astype(np.float64)
+        allowed_m = sight.unit_m / 2 + ASIDE_PER_M * range_m + FLOAT32_AT_20_M
+        assert (hall().distance_to_surfaces(xyz_m) - allowed_m).max() < 0, place.name
+        straight_m: F64Array = np.linalg.norm(xyz_m - place.body_from_sensor[:3, 3], axis=1)
+        assert np.abs(straight_m - range_m).max() < 0.06, place.name
+
+
+@pytest.mark.parametrize("words", [(), ("--keep-partial",)], ids=["whole", "partial"])
+@pytest.mark.parametrize("slices", [1, 3])
+@pytest.mark.parametrize("rate", ["10", "20", "15"])
+def test_scans_are_those_of_the_loop(
+    rate: str, slices: int, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    converted = run(tmp_path / "out", rate, slices, *words)
+    check_windows(converted)
+    check_points(converted)
+    report = converted.report
+    columns = [sensor["columns"] for sensor in report["sensors"]]
+    outcome = converted.outcome
+    assert [one["written"] for one in columns] == outcome.written
+    assert [one["dropped"] for one in columns] == outcome.dropped
+    assert report["scans"]["written"] == len(outcome.windows)
+    assert report["scans"]["incomplete"] == outcome.incomplete
+    assert int(report["grid"]["t_init_ns"]) == outcome.t_init_ns
+
+
+def test_windows_close_with_the_packets_of_the_loop(whole: Run) -> None:
+    lines = (whole.folder / "scans.csv").read_text(encoding="utf-8").splitlines()
+    place = lines[0].split(",").index("ready_host_ns")
+    ready = [int(line.split(",")[place]) for line in lines[1:]]
+    assert ready == [window.ready_host_ns for window in whole.outcome.windows]
+
+
+def test_every_point_lies_on_a_surface_of_the_scene(whole: Run) -> None:
+    check_places(Cloud.of_all(whole.folder))
+
+
+def test_without_the_motion_of_the_rotor_points_are_off(whole: Run, tmp_path: Path) -> None:
+    """The firing times move points by more than the check allows; all else stays."""
+    moved = run(tmp_path / "out", "20", 1, "--keep-partial", "--decode", "firing_azimuth=off")
+    check_points(moved)
+    for number in range(1, len(PLACES)):
+        one = Cloud.of_all(whole.folder).of_sensor(number)
+        other = Cloud.of_all(moved.folder).of_sensor(number)
+        step_m: F64Array = np.linalg.norm(one.xyz.astype(np.float64) - other.xyz, axis=1)
+        assert (step_m > 2 * ASIDE_PER_M * one.range_m).any(), NAMES[number]
+        # Within a firing sequence a rotor of 12.5 Hz turns by a quarter of a degree at most.
+        assert (step_m < 0.005 * one.range_m).all(), NAMES[number]
+
+
+def test_the_hour_passes_within_the_recording(whole: Run) -> None:
+    for sight in SENSORS:
+        assert sight.stamp_ns[0] < HOUR_NS < sight.stamp_ns[-1]
+    stamps = Cloud.of_all(whole.folder).column_stamp_ns
+    assert (np.diff(stamps) >= 0).all()
+    assert int(stamps[-1] - stamps[0]) < 300_000_000
+
+
+def test_returns_that_are_sent_twice_are_counted(whole: Run, tmp_path: Path) -> None:
+    twice = run(tmp_path / "out", "20", 1, "--keep-partial", "--keep-repeated")
+    check_points(twice, keep_repeated=True)
+    check_places(Cloud.of_all(twice.folder))
+    for converted, is_kept in ((whole, False), (twice, True)):
+        for sensor, sight in zip(converted.report["sensors"], SENSORS, strict=True):
+            again = int(repeated(sight.counts).sum())
+            points = sensor["points"]
+            assert points["repeated"] == (0 if is_kept else again)
+            assert points["slots"] == sight.counts.size
+            assert points["no_return"] == np.count_nonzero(sight.counts == 0)
+            left = np.count_nonzero(sight.counts) - (0 if is_kept else again)
+            assert points["written"] == left
+            assert points["range"] == points["box"] == 0
+    # Pairs that differ are there as well.
+    roof = SENSORS[ROOF].counts
+    assert 500 < np.count_nonzero(roof[..., 0] != roof[..., 1]) < roof.size / 4
+
+
+def test_returns_have_their_types(tmp_path: Path) -> None:
+    grid = organized(tmp_path)
+    roof = SENSORS[ROOF]
+    types = grid["return_type"][grid["column_lidar_id"] == ROOF]
+    wanted = pair_types(roof.counts, roof.level)
+    wanted[roof.counts == 0] = 0
+    # Equal returns are one, and the second of them is left out.
+    wanted[repeated(roof.counts)] = 0
+    assert np.array_equal(types.reshape(wanted.shape), wanted)
+
+
+def organized(folder: Path, *words: str) -> dict[str, Any]:
+    """The whole recording as arrays of slots."""
+    made = run(folder / "grid", "20", 1, "--keep-partial", "--layout", "organized", *words)
+    scans = [load(path) for path in scan_files(made.folder)]
+    keys = [key for key, value in scans[0].items() if value.ndim]
+    start_ns = np.repeat(
+        [scan["start_ns"] for scan in scans], [len(scan["time_ns"]) for scan in scans]
+    )
+    grid = {key: np.concatenate([scan[key] for scan in scans]) for key in keys if key != "sensors"}
+    return {**grid, "at_ns": grid["time_ns"] + start_ns[:, None]}
+
+
+@pytest.mark.parametrize("keep_repeated", [False, True])
+def test_organized_scans_hold_what_was_sent(
+    whole: Run, keep_repeated: bool, tmp_path: Path
+) -> None:
+    grid = organized(tmp_path, *(["--keep-repeated"] if keep_repeated else []))
+    widest = max(sight.channels * sight.returns for sight in SENSORS)
+    assert grid["range_m"].shape == (sum(len(sight.stamp_ns) for sight in SENSORS), widest)
+    filled: BoolArray = ~np.isnan(grid["range_m"])
+    for number, sight in enumerate(SENSORS):
+        rows = grid["column_lidar_id"] == number
+        check_slots({key: value[rows] for key, value in grid.items()}, sight, keep_repeated)
+    for key, empty in (("xyz", np.nan), ("intensity", np.nan), ("time_ns", 0), ("ring", 0)):
+        assert np.array_equal(
+            grid[key][~filled], np.full_like(grid[key][~filled], empty), equal_nan=key[0] in "xi"
+        )
+    if not keep_repeated:
+        dense = Cloud.of_all(whole.folder)
+        assert as_set(dense.xyz, dense.at_ns, dense.ring) == as_set(
+            grid["xyz"][filled], grid["at_ns"][filled], grid["ring"][filled]
+        )
+
+
+def check_slots(own: dict[str, Any], sight: Seen, keep_repeated: bool) -> None:
+    used = sight.channels * sight.returns
+    counts = sight.counts.copy()
+    if not keep_repeated:
+        counts[repeated(sight.counts)] = 0
+    range_m: F64Array = np.nan_to_num(own["range_m"]).astype(np.float64)
+    assert np.array_equal(np.rint(range_m[:, :used] / sight.unit_m), counts.reshape(-1, used))
+    assert not range_m[:, used:].any()
+    assert np.array_equal(own["column_stamp_ns"], sight.stamp_ns)
+    fires_ns = np.repeat(sight.firing_ns, sight.returns, axis=1)
+    kept = counts.reshape(-1, used) > 0
+    assert np.array_equal(own["at_ns"][:, :used][kept], fires_ns[kept])
+
+
+def as_set(*arrays: Any) -> list[bytes]:
+    """Rows of several arrays, in an order of their own."""
+    rows = np.column_stack([np.asarray(array, np.float64) for array in arrays])
+    return sorted(row.tobytes() for row in rows)
+
+
+def test_ledgers_balance(whole: Run) -> None:
+    report = whole.report
+    assert report["capture"]["frames"] == report["capture"]["datagrams"] + sum(
+        report["capture"]["skipped"].values()
+    )
+    for sensor, sight in zip(report["sensors"], SENSORS, strict=True):
+        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        assert packets["read"] == packets["accepted"] == len(sight.payloads)
+        assert (packets["rejected"], packets["lost"], packets["reordered"]) == ({}, 0, 0)
+        assert columns["decoded"] == columns["written"] == len(sight.stamp_ns)
+        assert points.pop("slots") == sum(points.values())
+
+
+def test_streams_are_recognised_without_a_rig() -> None:
+    told = command("inspect", PCAP, "--json")
+    assert told.code == 0, told.err
+    streams = json.loads(told.out)["streams"]
+    models = {one["stream"]: one["model"] for one in streams if one["sensor"]}
+    assert models == {f"{place.ip} > port {place.port}": place.model for place in PLACES}
+
+
+def test_fixture_is_made_again_to_the_byte(tmp_path: Path) -> None:
+    main(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        made, kept = path.read_bytes(), (FOLDER / path.name).read_bytes()
+        assert hashlib.sha256(made).hexdigest() == hashlib.sha256(kept).hexdigest(), path.name
