@@ -180,7 +180,7 @@ def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:
     good = (_block_words(packets, 0, used) == flags).all(axis=1)
     good &= (_block_words(packets, _AZIMUTH_AT, used) < TURN_CDEG).all(axis=1)
     good &= top_of_hour_ns(packets) < HOUR_NS
-    if model.banks != 2:  # HDL-64E has its status there.
+    if model.banks == 1:  # Elsewhere the flags tell, and HDL-64E has its status there.
         others = [code for code, mode in MODES.items() if (mode == DUAL) != (returns == 2)]
         good &= ~np.isin(packets[:, MODE_AT], others)
     return np.asarray(good)

@@ -103,8 +103,8 @@ class VelodyneCalibration:
         chosen = {**_OPTIONS, **options}
         if self.row.needs_file and self.file is None:
             raise RigError(
-                f"{self.model}: wanted its calibration, got none; give the YAML or db.xml of the "
-                "unit with --metadata or as `metadata:` in the rig"
+                f"{self.row.seen_as}: wanted its calibration, got none; give the unit's YAML or "
+                "db.xml with --metadata or as `metadata:` in the rig"
             )
         measured, notes = _measure(self.row, evidence)
         if self.file is not None:
@@ -122,9 +122,8 @@ class VelodyneCalibration:
         )
 
 
-BUILT_IN: tuple[Calibration, ...] = tuple(
-    VelodyneCalibration(model) for model in ALL if not model.needs_file
-)
+# The HDL-64E is among them to say what it lacks.
+BUILT_IN: tuple[Calibration, ...] = tuple(VelodyneCalibration(model) for model in ALL)
 
 
 def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
@@ -133,12 +132,6 @@ def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
     if file is None:
         return None
     rows = [row for row in ALL if row.lasers == file.lasers]
-    if not rows:
-        counts = ", ".join(map(str, sorted({row.lasers for row in ALL})))
-        raise RigError(
-            f"{path}: Velodyne calibration: wanted {counts} lasers, got {file.lasers}; "
-            "give the file of a supported model"
-        )
     away_deg, row = min(((_away_deg(row, file), row) for row in rows), key=lambda pair: pair[0])
     if away_deg > _ANGLE_TOLERANCE_DEG:
         raise RigError(

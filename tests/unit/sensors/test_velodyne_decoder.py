@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mlbatch.errors import RigError, UsageError
+from mlbatch.errors import UsageError
 from mlbatch.geometry import read_rotor_words
 from mlbatch.lidar import FAULTS, READABLE, Evidence
 from mlbatch.sensors import velodyne
-from mlbatch.sensors._velodyne_packets import VelodyneLidar
-from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
 from tests.builders.velodyne import (
-    Sent,
     VelodyneSpec,
     directions,
     encode,
@@ -24,103 +21,20 @@ from tests.builders.velodyne import (
     origins,
 )
 from tests.builders.velodyne_tables import MODELS, calibration_yaml
-
-PLAIN = ("VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "VLS-128")
-MODES = ("strongest", "last", "dual")
-STREAM = Stream("192.168.1.201", 2368)
-# Stamps are whole us; azimuths whole hundredths of a degree.
-TIME_NS, ANGLE_DEG = 800, 0.012
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A stream, what was encoded into it, and its decoder."""
-
-    spec: VelodyneSpec
-    sent: Sent
-    counts: I64Array
-    level: I64Array
-    lidar: VelodyneLidar
-
-    @property
-    def columns(self) -> I64Array:
-        return np.arange(len(self.counts))
-
-
-def made_of(spec: VelodyneSpec, packets: int = 24, options: dict[str, str] | None = None) -> Seen:
-    """A stream of random readings."""
-    rng = np.random.default_rng(7)
-    lasers = len(spec.table.elevation_deg)
-    shape = (packets * spec.columns_per_packet, lasers, spec.returns)
-    counts = np.where(rng.random(shape) < 0.2, 0, rng.integers(1, 65536, shape))
-    level = rng.integers(0, 256, shape)
-    sent = encode(spec, counts, level)
-    lidar = calibration(spec.model).lidar(options or {}, evidence(sent))
-    return Seen(spec, sent, counts, level, lidar)
-
-
-def evidence(sent: Sent) -> Evidence:
-    return Evidence(STREAM, 1206, sent.payloads[:16], sent.host_ns[:16])
-
-
-def calibration(model: str) -> velodyne.VelodyneCalibration:
-    if model in PLAIN:
-        built_in = [one for one in velodyne.BUILT_IN if one.model == model]
-        assert isinstance(built_in[0], velodyne.VelodyneCalibration)
-        return built_in[0]
-    read = velodyne.read_calibration(Path("unit.yaml"), calibration_yaml(model).encode())
-    assert read is not None
-    named = read.for_model(model)
-    assert named is not None
-    return named
-
-
-def records_of(lidar: VelodyneLidar, packets: U8Array) -> U8Array:
-    """The columns of packets one after the other, as `lidar.records` says."""
-    place = lidar.records
-    at = [
-        place.start + c // place.per_row * place.stride + c % place.per_row * place.step
-        for c in range(lidar.columns_per_packet)
-    ]
-    parts = [packets[:, begin : begin + place.size] for begin in at]
-    return np.stack(parts, axis=1).reshape(-1, place.size)
-
-
-def pixels(lidar: VelodyneLidar, packets: U8Array) -> tuple[F32Array, F32Array]:
-    """Ranges and levels, (columns, lasers, returns)."""
-    records = records_of(lidar, packets)
-    shape = (len(records), lidar.channels, lidar.returns)
-    ranges, levels = np.full(shape, -1, np.float32), np.full(shape, -1, np.float32)
-    for which in range(lidar.returns):
-        plane = np.full(shape[:2], -1, np.float32)
-        lidar.read(records, which, Pixels(plane, levels[..., which], None))
-        ranges[..., which] = plane
-    return ranges, levels
-
-
-def fired(lidar: VelodyneLidar, sent: Sent) -> tuple[I64Array, F64Array]:
-    """(columns, lasers): when each beam fires, ns, and the angle of the rotor then, rad."""
-    heads = lidar.heads(sent.payloads, sent.host_ns)
-    assert heads.valid.all()
-    angle, speed, table = read_rotor_words(heads.encoder.reshape(-1))
-    assert not table.any()
-    time_ns = heads.stamp_ns.reshape(-1)[:, None] + lidar.firing_ns
-    return time_ns, angle[:, None] + speed[:, None] * lidar.firing_ns
-
-
-def pointing(lidar: VelodyneLidar, angle: F64Array) -> tuple[F64Array, F64Array]:
-    """Directions and origins of beams at these angles, (columns, lasers, 3), in float64."""
-    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
-    direction, origin = (
-        cosine * vectors[0] + sine * vectors[1] + vectors[2]
-        for vectors in (lidar.beams.direction, lidar.beams.origin)
-    )
-    return direction, origin
-
-
-def apart_deg(one: F64Array, other: F64Array) -> float:
-    """Largest angle between unit vectors."""
-    return float(np.degrees(2 * np.arcsin(np.linalg.norm(one - other, axis=-1) / 2)).max())
+from tests.unit.sensors.velodyne_streams import (
+    ANGLE_DEG,
+    MODES,
+    PLAIN,
+    STREAM,
+    TIME_NS,
+    apart_deg,
+    calibration,
+    evidence,
+    fired,
+    made_of,
+    pixels,
+    pointing,
+)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -272,7 +186,8 @@ def test_a_rig_may_name_what_packets_do_not() -> None:
     sent = made_of(VelodyneSpec("VLP-16")).sent
     fits = {one.model: one.fit(evidence(sent)) for one in velodyne.BUILT_IN}
     readable = dict.fromkeys(("Puck LITE", "Puck Hi-Res", "HDL-32E", "VLP-32C"), READABLE)
-    assert fits == {"VLP-16": 100, "VLS-128": 0, **readable}
+    others = dict.fromkeys(("VLS-128", "HDL-64E S2", "HDL-64E S3"), 0)
+    assert fits == {"VLP-16": 100, **others, **readable}
     lite = next(one for one in velodyne.BUILT_IN if one.model == "Puck LITE")
     assert lite.lidar({}, evidence(sent)).model == "Puck LITE"
 
@@ -333,78 +248,44 @@ def test_options_are_checked() -> None:
         calibration("VLP-16").lidar({"vertical_offset": "up"}, None)
 
 
-class TestFiles:
-    def test_the_model_is_the_one_with_the_nearest_angles(self) -> None:
-        for model in PLAIN:
-            read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml(model).encode())
-            assert read is not None
-            assert (read.model, read.is_shared, read.serial) == (model, True, "")
-            assert read.path == Path("a.yaml")
+@pytest.mark.parametrize("mode", ["strongest", "dual"])
+@pytest.mark.parametrize("model", ["HDL-64E S2", "HDL-64E S3"])
+def test_points_of_a_hdl_64e(model: str, mode: str) -> None:
+    """Every ray ends where it met something, corrections and all; counts are 2 mm."""
+    spec = VelodyneSpec(model, mode, start_azimuth_deg=200.0)
+    seen = made_of(spec, packets=20)
+    met_m = seen.counts[..., 0] * 0.002 + np.array(spec.table.dist_m)
+    wanted = origins(spec, seen.columns)
+    wanted = wanted + met_m[..., None] * directions(spec, seen.columns)
+    ranges, _ = pixels(seen.lidar, seen.sent.payloads)
+    heads = seen.lidar.heads(seen.sent.payloads, seen.sent.host_ns)
+    for height, options in ((0.0, {}), (1.0, {"vertical_offset": "off"})):
+        lidar = calibration(model).lidar(options, evidence(seen.sent))
+        projection = lidar.projection(np.eye(4), len(ranges))
+        assert projection is not None
+        points = np.empty((*met_m.shape, 3), np.float32)
+        projection.aim(np.zeros(len(ranges), np.int64), heads.encoder.reshape(-1))
+        projection.points(np.ascontiguousarray(ranges[..., 0]), points)
+        lowered = wanted - [0, 0, height] * np.array(spec.table.vertical_m)[:, None]
+        away_m = np.linalg.norm(points - lowered, axis=-1)
+        assert (away_m / met_m).max() < np.radians(ANGLE_DEG)
 
-    def test_a_file_beats_the_table_of_its_model(self) -> None:
-        seen = made_of(VelodyneSpec("VLP-16"))
-        for model, fit in (("VLP-16", 200), ("Puck Hi-Res", READABLE), ("VLS-128", 0)):
-            read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml(model).encode())
-            assert read is not None
-            assert read.fit(evidence(seen.sent)) == fit
 
-    def test_its_angles_and_offsets_are_used(self) -> None:
-        table = MODELS["VLP-16"]
-        text = calibration_yaml("VLP-16").replace(
-            "- laser_id: 3\n  rot_correction: -0.0\n", "- laser_id: 3\n  rot_correction: -0.01\n"
-        )
-        lines = text.splitlines()
-        at = lines.index("- laser_id: 3")
-        lines[at + 3] = "  dist_correction: 0.05"
-        lines[at + 5] = "  horiz_offset_correction: 0.02"
-        read = velodyne.read_calibration(Path("a.yaml"), "\n".join(lines).encode())
-        assert read is not None
-        lidar = read.lidar({}, evidence(made_of(VelodyneSpec("VLP-16")).sent))
-        # Section 5: alpha = azimuth - rot, so rotor at zero looks 0.01 rad to the right (-y); the
-        # side offset of section 10 shifts it by h (sin, cos) of alpha.
-        assert lidar.beams.reach_m.tolist() == [0.05 if laser == 3 else 0.0 for laser in range(16)]
-        direction, origin = pointing(lidar, np.zeros((1, 16)))
-        flat = math.cos(math.radians(table.elevation_deg[3]))
-        assert direction[0, 3, 0] == pytest.approx(flat * math.cos(0.01))
-        assert direction[0, 3, 1] == pytest.approx(-flat * math.sin(0.01))
-        assert origin[0, 3] == pytest.approx(
-            [0.02 * math.sin(0.01), 0.02 * math.cos(0.01), table.vertical_m[3]]
-        )
+def test_other_models_need_no_projection_of_their_own() -> None:
+    lidar = made_of(VelodyneSpec("VLP-16")).lidar
+    assert lidar.projection(np.eye(4), 16) is None
 
-    def test_another_unit_of_range_is_named_and_not_used(self) -> None:
-        text = calibration_yaml("VLS-128").replace("resolution: 0.004", "resolution: 0.007")
-        read = velodyne.read_calibration(Path("alpha.yaml"), text.encode())
-        assert read is not None
-        lidar = read.lidar({}, evidence(made_of(VelodyneSpec("VLS-128")).sent))
-        assert lidar.notes == (
-            "alpha.yaml: distance_resolution is 0.007 m, but a VLS-128 counts in 0.004 m, which is "
-            "used",
-        )
 
-    def test_a_file_of_no_model(self) -> None:
-        spec = replace(MODELS["VLP-16"], elevation_deg=tuple(np.linspace(-60, 60, 16)))
-        text = calibration_yaml("VLP-16")
-        for old, new in zip(MODELS["VLP-16"].elevation_deg, spec.elevation_deg, strict=True):
-            text = text.replace(
-                f"vert_correction: {math.radians(old)!r}\n",
-                f"vert_correction: {math.radians(new)!r} \n",
-            )
-        with pytest.raises(RigError, match=r"odd\.yaml: .*wanted vertical angles of .*got some"):
-            velodyne.read_calibration(Path("odd.yaml"), text.encode())
-
-    def test_a_hdl_64e_is_an_s3_until_the_rig_says_s2(self) -> None:
-        read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml("HDL-64E S2").encode())
-        assert read is not None
-        sent = made_of(VelodyneSpec("HDL-64E S3")).sent
-        assert read.model == "HDL-64E S3"
-        assert read.fit(evidence(sent)) == 200
-        (note,) = read.lidar({}, evidence(sent)).notes
-        assert note == "taken for an HDL-64E S3; if it is an HDL-64E S2, name its model in the rig"
-        other = read.for_model("HDL-64E S2")
-        assert other is not None
-        assert other.lidar({}, evidence(sent)).notes == ()
-        assert read.for_model("VLP-16") is None
-
-    def test_a_hdl_64e_needs_one(self) -> None:
-        sent = made_of(VelodyneSpec("HDL-64E S3")).sent
-        assert {one.fit(evidence(sent)) for one in velodyne.BUILT_IN} == {0}
+def test_a_laser_that_a_file_disables_sees_nothing() -> None:
+    seen = made_of(VelodyneSpec("VLP-16"))
+    read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml("VLP-16").encode())
+    assert read is not None
+    assert read.file is not None
+    enabled = np.arange(16) != 5
+    dark = velodyne.VelodyneCalibration(read.row, replace(read.file, enabled=enabled))
+    lidar = dark.lidar({}, evidence(seen.sent))
+    ranges, _ = pixels(lidar, seen.sent.payloads)
+    assert not ranges[:, 5].any()
+    assert (ranges[:, enabled] == pixels(seen.lidar, seen.sent.payloads)[0][:, enabled]).all()
+    assert lidar.firing_ns[0, 5] == -1
+    assert lidar.pixel_layout != seen.lidar.pixel_layout

@@ -23,7 +23,7 @@ from mlbatch.sensors._velodyne_packets import VelodyneLidar
 from mlbatch.streams import Sampler
 from mlbatch.types import BoolArray, F64Array, I64Array, StreamTable, U8Array
 from tests.builders.velodyne import Sent
-from tests.unit.sensors.test_velodyne_decoder import fired, pixels, pointing
+from tests.unit.sensors.velodyne_streams import fired, pixels, pointing
 
 RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"
 pytestmark = pytest.mark.skipif(
@@ -47,10 +47,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Points:
-    """Returns of a recording in the order column, laser (as they lie on the wire), return.
-
-    xyz: (n, 3) m; time_ns: (n,); column, ring, which: (n,); all: repeated returns left out.
-    """
+    """Returns of a recording, in the order of the wire, without repeated ones; xyz: (n, 3) m."""
 
     xyz: F64Array
     level: F64Array
@@ -116,7 +113,6 @@ def columns_of(told: dict[str, npt.NDArray[Any]]) -> dict[str, F64Array]:
 
 
 def heading_deg(x: F64Array, y: F64Array) -> F64Array:
-    """Clockwise from x."""
     return np.degrees(np.arctan2(-y, x))
 
 
