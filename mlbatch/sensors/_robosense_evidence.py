@@ -81,7 +81,7 @@ def doubts(points: U8Array, row: Model, difop: Difop | None) -> tuple[str, ...]:
     if found is not None and found.other is not None:
         texts.append(
             f"packets do not surely tell {found.name} apart: decoded as {row.name}; name the "
-            "sensor's model in the rig if it is the other (times differ by up to 30 us)"
+            "sensor's model in the rig if it is the other (times differ by up to 34 us)"
         )
     if row in (RS16, RS32) and difop is not None and difop.firmware == 0:
         texts.append(
