@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import discover, sensors
+from mlbatch.clouds import CloudRecording
 from mlbatch.discover import Note
 from mlbatch.ledger import PointCounts, ordered
 from mlbatch.passing import PASS_REASONS
@@ -57,12 +58,22 @@ def report_inputs(run: Conversion) -> ReportInputs:
     )
 
 
+# A note, not a fault: what the times of clouds were taken for.
+CLOUDS = "clouds"
+
+
 def late_notes(run: Conversion) -> list[Note]:
     """Warnings that only the end of a run knows: damaged recordings, lidars that came late."""
     notes = [
         Note("recording", "", f"{recording.path.name}: {text}")
         for recording in run.recordings
         for text in recording.notes
+    ]
+    notes += [
+        Note(CLOUDS, "", f"{recording.path.name}: {text}")
+        for recording in run.recordings
+        if isinstance(recording, CloudRecording)
+        for text in recording.verdicts
     ]
     table, seen = run.setup.sampler.table, run.setup.sampler.samples
     for kind in sorted(run.feeder.samples):

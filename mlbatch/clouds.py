@@ -82,8 +82,8 @@ class _Tally:
         self.placeless += cloud.placeless
         self.timeless += cloud.timeless
 
-    def notes(self, layout: Layout | None) -> Iterator[str]:
-        """What is to be told of a topic, a line each."""
+    def verdicts(self, layout: Layout | None) -> Iterator[str]:
+        """What the times of a topic were taken for, and what had no place."""
         if self.points:
             left_out = [
                 f"{count} {why}"
@@ -96,6 +96,9 @@ class _Tally:
             ]
             verdict = f"times of points from {self.verdict}; {layout}; " if self.verdict else ""
             yield f"{verdict}left out of {self.points} points: {', '.join(left_out) or 'none'}"
+
+    def notes(self) -> Iterator[str]:
+        """What is wrong with the clouds of a topic."""
         if self.faults:
             yield f"{self.faults} clouds could not be read; the first: {self.first_fault}"
 
@@ -125,6 +128,7 @@ class CloudRecording:
     frames: dict[str, str] = field(default_factory=dict)
     keep: frozenset[str] = frozenset()
     notes: list[str] = field(default_factory=list)
+    verdicts: list[str] = field(default_factory=list)
     counts: CaptureCounts = field(default_factory=CaptureCounts)
     topics: tuple[Topic, ...] = ()
     path: Path = Path()
@@ -170,10 +174,14 @@ class CloudRecording:
         inner = self.inner
         self.topics, self.counts = inner.topics, inner.counts
         self.position_bytes = inner.position_bytes
+        tallies = self._tallies.items()
         self.notes = inner.notes + [
-            f"{name}: {note}"
-            for name, tally in self._tallies.items()
-            for note in tally.notes(self.layouts.get(name))
+            f"{name}: {n}" for name, tally in tallies for n in tally.notes()
+        ]
+        self.verdicts = [
+            f"{name}: {verdict}"
+            for name, tally in tallies
+            for verdict in tally.verdicts(self.layouts.get(name))
         ]
 
     def _parts(self, batch: PacketBatch) -> Iterator[PacketBatch]:

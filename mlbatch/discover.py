@@ -10,7 +10,7 @@ from pathlib import Path
 from mlbatch import sensors
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
-from mlbatch.lidar import Calibration
+from mlbatch.lidar import Calibration, ModelFile
 from mlbatch.looking import calibrations_for, look, read_given, with_clouds
 from mlbatch.matching import Matched, Wanted, match, match_rig
 from mlbatch.mounting import Mounted, in_words, mount
@@ -125,7 +125,9 @@ def _find_rigged(
         Wanted(
             sensor.name,
             sensor.stream or StreamSelector(),
-            every if sensor.metadata is None else [read_given(sensor.metadata)],
+            _of_model(
+                every if sensor.metadata is None else [read_given(sensor.metadata)], sensor.model
+            ),
             wishes.decode | sensor.decode,
             sensor.model,
         )
@@ -139,6 +141,15 @@ def _find_rigged(
         if sensor.model is not None:
             _check_model(sensor.name, sensor.model, one.lidar.model, origin)
     return matched
+
+
+def _of_model(calibrations: Sequence[Calibration], model: str | None) -> list[Calibration]:
+    """The calibrations, where files leave it open as those of the model that the rig names."""
+    named = [
+        one.for_model(model) if model is not None and isinstance(one, ModelFile) else None
+        for one in calibrations
+    ]
+    return [own or one for own, one in zip(named, calibrations, strict=True)]
 
 
 def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:
@@ -168,8 +179,9 @@ def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
 
 def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
     """A model named in the rig must be the one that the calibration or the packets describe."""
+    alike = {model.like for model in sensors.models() if model.name == wanted}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
-    if not got.replace("-", "").startswith(wanted.replace("-", "")):
+    if got not in alike and not got.replace("-", "").startswith(wanted.replace("-", "")):
         raise RigError(
             f"{origin}: sensor {name}: wanted a {wanted}, got the metadata of a {got}; "
             "correct model or metadata"

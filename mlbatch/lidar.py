@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, Stream, U8Array
@@ -16,7 +16,10 @@ FAULTS = ("", "bad_size", "bad_header", "bad_crc")
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """A row of `mlbatch sensors`: what is supported, and how it was verified."""
+    """A row of `mlbatch sensors`: what is supported, and how it was verified.
+
+    like: the model under whose name this one is found, where packets cannot tell them apart.
+    """
 
     name: str
     maker: str
@@ -25,6 +28,7 @@ class SensorModel:
     clock: str
     calibration: str
     verified: str
+    like: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,15 @@ class Calibration(Protocol):
 
         Raises RigError where the file cannot be used, or packets are needed to say more.
         """
+        ...
+
+
+@runtime_checkable
+class ModelFile(Calibration, Protocol):
+    """A calibration file that does not say exactly which model it is of."""
+
+    def for_model(self, name: str) -> Calibration | None:
+        """The same as one of the model that the rig names; None if it cannot be one."""
         ...
 
 

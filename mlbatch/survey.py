@@ -11,6 +11,7 @@ import numpy as np
 
 from mlbatch.batching.loss import Loss
 from mlbatch.clock import timescale
+from mlbatch.clouds import CloudRecording
 from mlbatch.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
@@ -180,6 +181,12 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         for kind in sampler.samples
     )
     notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
+    notes += [
+        f"{recording.path.name}: {text}"
+        for recording in opened
+        if isinstance(recording, CloudRecording)
+        for text in recording.verdicts
+    ]
     notes += [*learner.faults, *map(in_words, mounting.findings)]
     if not sampler.samples:
         notes.append("no UDP packet in the first 10 seconds")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Records
@@ -80,13 +81,13 @@ def content_keys(packets: U8Array) -> I64Array:
     for at in range(words * 8, size):
         keys = keys * _ODD + packets[:, at]
     keys ^= keys >> np.uint64(29)
-    return (keys * _ODD >> np.uint64(1)).astype(np.int64)
+    return np.asarray(keys * _ODD >> np.uint64(1), np.int64)
 
 
 # The golden ratio of 2**64, made odd (Knuth, multiplicative hashing).
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
-def _odd_numbers(count: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+def _odd_numbers(count: int) -> npt.NDArray[np.uint64]:
     numbers = np.arange(1, count + 1, dtype=np.uint64) * _ODD
-    return (numbers ^ numbers >> np.uint64(31)) | np.uint64(1)
+    return np.asarray((numbers ^ numbers >> np.uint64(31)) | np.uint64(1), np.uint64)

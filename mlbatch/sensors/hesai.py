@@ -65,6 +65,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
         clock="free-running, GPS or PTP; date and us in every packet",
         calibration=_DAT if name == rows.AT128.name else _CSV,
         verified=verified,
+        like=_LIKE.get(name, ""),
     )
     for name, verified in _VERIFIED.items()
 )

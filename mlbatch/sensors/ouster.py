@@ -55,7 +55,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
         returns=(1, 2),
         clock="internal oscillator, sync pulse or PTP; ns in every column",
         calibration="metadata JSON of the sensor, required",
-        verified="real recording" if f"{line}-{beams}" in _REAL else "encoder only",
+        verified="real recording" if f"{line}-{beams}" in _REAL else "one source",
     )
     for line, counts in _BEAMS.items()
     for beams in counts

@@ -79,7 +79,8 @@ def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
         stamps_ns = [column.stamp_ns - STAMP_NS for column in columns]
         assert stamps_ns == [0, 1000, 10**8, 10**8 + 1000]
         assert (recording.counts.frames, recording.counts.datagrams) == (4, 4)
-        assert recording.notes == [
+        assert recording.notes == []
+        assert recording.verdicts == [
             "/left/points: times of points from t (uint32), ns after the header's stamp; up to 2 "
             "points a column in turn; left out of 8 points: none"
         ]
@@ -93,7 +94,7 @@ def test_what_is_left_out_is_told(tmp_path: Path) -> None:
     messages = write_points("/points", [_turn(0), b"\0\1\0\0", _turn(1), _turn(2)[:-40]])
     recording, _ = _open(_bag(tmp_path, messages))
     assert len(_payloads(recording.packets())) == 6
-    first, second = recording.notes
+    (first,), (second,) = recording.verdicts, recording.notes
     assert first.endswith("left out of 12 points: 2 without a place (NaN or zero)")
     assert second.startswith("/points: 2 clouds could not be read; the first: wanted 4 bytes")
     assert (recording.counts.frames, recording.counts.datagrams) == (8, 6)
@@ -106,7 +107,7 @@ def test_clouds_without_a_place_are_told_and_nothing_else(tmp_path: Path) -> Non
     messages = write_points("/points", [empty, cloud_message(OUSTER, [])])
     recording, _ = _open(_bag(tmp_path, messages))
     assert list(recording.packets()) == []
-    assert recording.notes == ["/points: left out of 3 points: 3 without a place (NaN or zero)"]
+    assert recording.verdicts == ["/points: left out of 3 points: 3 without a place (NaN or zero)"]
     assert recording.counts.frames == 0
 
 
@@ -119,7 +120,7 @@ def test_rings_beyond_those_of_the_first_cloud_are_told(tmp_path: Path) -> None:
     recording, _ = _open(_bag(tmp_path, write_points("/points", turns)))
     packets = _payloads(recording.packets())
     assert len(packets) == 2
-    left_out, fault = recording.notes
+    (left_out,), (fault,) = recording.verdicts, recording.notes
     assert left_out.endswith("left out of 48 points: 24 on rings beyond those of the first cloud")
     assert fault.endswith("the first: wanted rings as in the first cloud, got none")
 
