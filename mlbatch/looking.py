@@ -14,11 +14,12 @@ from mlbatch.errors import RigError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
 from mlbatch.readers import holds_packets, merge
-from mlbatch.streams import Kind, Sampler, split_by_kind
+from mlbatch.streams import Sampler, split_by_kind
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
 LOOK_NS = 10 * NS_PER_S
+_ASKED = 16
 # Calibrations are searched beside the recording under these suffixes, and told by content.
 SIDECAR_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
 METADATA_SUFFIX = ".json"
@@ -63,10 +64,9 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
     A capture is often started long before the lidars are.
     """
     until_ns: int | None = None
-    known: set[Kind] = set()
     for batch in merge(recordings):
         if until_ns is None:
-            began_ns = _lidars_begin_ns(batch, known)
+            began_ns = _lidars_begin_ns(batch)
             until_ns = None if began_ns is None else began_ns + LOOK_NS
         if until_ns is None:
             yield batch
@@ -78,15 +78,15 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
         yield batch
 
 
-def _lidars_begin_ns(batch: PacketBatch, known: set[Kind]) -> int | None:
-    """Arrival of the first packet that looks like a lidar's; kinds already looked at are known."""
+def _lidars_begin_ns(batch: PacketBatch) -> int | None:
+    """Arrival of the first packet of a kind that looks like a lidar's.
+
+    A few packets are asked: device packets may come first on the topic of the others.
+    """
     begins_ns = []
-    for kind, index in split_by_kind(batch):
-        if kind in known:
-            continue
-        known.add(kind)
-        begin = int(batch.start[index[0]])
-        text = sensors.describe(kind[1], batch.data[begin : begin + kind[1]][None])
+    for (_, size), index in split_by_kind(batch):
+        asked = batch.start[index[:_ASKED], None] + np.arange(size)
+        text = sensors.describe(size, batch.data[asked])
         if text is not None and "lidar" in text:
             begins_ns.append(int(batch.host_ns[index[0]]))
     return min(begins_ns, default=None)

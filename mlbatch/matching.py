@@ -7,7 +7,7 @@ every stream is a sensor of its own.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -102,7 +102,8 @@ def _best_fits(
     best, failure = [], ""
     for group in fits.values():
         if model is not None:
-            group = [one for one in group if calibrations[one[1]].model == model] or group
+            # A file of the unit knows more than what is built in for a model.
+            group = [one for one in group if _is_of(calibrations[one[1]], model)] or group
         top = max(score for score, _, _ in group)
         first = [(number, part) for score, number, part in group if score == top]
         _refuse_ambiguous(evidence, [calibrations[number] for number, _ in first])
@@ -112,6 +113,10 @@ def _best_fits(
         except RigError as err:
             failure = str(err)
     return best, failure
+
+
+def _is_of(calibration: Calibration, model: str) -> bool:
+    return calibration.model == model or not calibration.is_shared
 
 
 def _parts(
@@ -200,7 +205,7 @@ def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found:
     usable = [one for one in wanted.calibrations if not serial or one.serial in ("", serial)]
     _refuse_none(wanted, usable, origin)
     scored: dict[int, tuple[_Fit, set[Kind]]] = {}
-    failures = []
+    failures, others = [], set[str]()
     for kind in sampler.samples:
         if not wanted.selector.selects(sampler.table.streams[kind[0]]):
             continue
@@ -208,13 +213,17 @@ def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found:
         failures += [failure] if failure else []
         for fit in fits:
             if serial and fit.lidar.serial != serial:
+                others.add(fit.lidar.serial)
                 continue
             before, kinds = scored.get(fit.number, (fit, set[Kind]()))
             scored[fit.number] = max(before, fit, key=_score), kinds | {kind}
     best = max(scored.values(), key=lambda one: one[0].score, default=None)
     if best is None:
-        if failures:
+        own = any(one.serial == serial for one in usable)
+        if failures and not (serial and own):
             raise RigError(f"{origin}: sensor {wanted.name}: {failures[0]}")
+        if serial and not own:
+            _refuse_serial(wanted, others - {""}, origin)
         return Found(wanted.name, _unseen(wanted, usable, origin), wanted.selector)
     fit, kinds = best
     found = Found(wanted.name, fit.lidar, wanted.selector, kinds)
@@ -242,6 +251,16 @@ def _refuse_none(wanted: Wanted, usable: Sequence[Calibration], origin: Path) ->
             + f" among {_paths(wanted.calibrations)}; give it as `metadata:` of the sensor, or "
             "with --metadata"
         )
+
+
+def _refuse_serial(wanted: Wanted, others: Collection[str], origin: Path) -> None:
+    """A serial number that neither packets nor files bear; others: those of the packets."""
+    if not others:
+        _refuse_none(wanted, (), origin)
+    raise RigError(
+        f"{origin}: sensor {wanted.name}: wanted packets of serial number "
+        f"{wanted.selector.serial}, got those of {', '.join(sorted(others))}; correct the serial"
+    )
 
 
 def _unseen(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> Lidar:

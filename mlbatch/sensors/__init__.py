@@ -25,7 +25,7 @@ class Plugin(Protocol):
 
     MAKER: str
     MODELS: tuple[SensorModel, ...]
-    # Calibrations that need no file: one for each model whose beams do not differ from unit to unit.
+    # Calibrations that need no file: of models whose beams do not differ from unit to unit.
     BUILT_IN: tuple[Calibration, ...]
 
     def read_calibration(self, path: Path, content: bytes) -> Calibration | None:

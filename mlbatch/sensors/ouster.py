@@ -37,7 +37,15 @@ from mlbatch.sensors._ouster_pixels import PixelReader
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
 
-__all__ = ["BUILT_IN", "MAKER", "MODELS", "OusterCalibration", "OusterLidar", "describe", "read_calibration"]
+__all__ = [
+    "BUILT_IN",
+    "MAKER",
+    "MODELS",
+    "OusterCalibration",
+    "OusterLidar",
+    "describe",
+    "read_calibration",
+]
 
 MAKER = "Ouster"
 _REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
@@ -132,8 +140,9 @@ class OusterCalibration:
 class OusterLidar:
     """One sensor; `Lidar` of lidar.py.
 
-    Beyond the protocol: `lidar_port`, `init_id`. `sequence` is negative for packets outside the column window of the
-    metadata: they stand outside the sensor's count, whose modulus is frames x packets per frame.
+    Beyond the protocol: `lidar_port`, `init_id`. `sequence` is negative for packets outside the
+    column window of the metadata: they stand outside the sensor's count, whose modulus is frames x
+    packets per frame.
     """
 
     def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:

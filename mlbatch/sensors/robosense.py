@@ -131,19 +131,32 @@ class BuiltIn:
 
 
 class AnglesFile:
-    """A csv file with the angles of one unit; `Calibration` of lidar.py."""
+    """A csv file with the angles of one unit; `Calibration` of lidar.py.
 
-    __slots__ = ("_angles", "is_shared", "model", "path", "serial")
+    named: the model, where the rig says it.
+    """
 
-    def __init__(self, path: Path, angles: Angles) -> None:
+    __slots__ = ("_angles", "_named", "is_shared", "model", "path", "serial")
+
+    def __init__(self, path: Path, angles: Angles, named: Model | None = None) -> None:
         self._angles = angles
+        self._named = named
         self.path: Path | None = path
-        self.model = f"{MAKER} {len(angles.elevation_deg)}-line"
+        lines = f"{MAKER} {len(angles.elevation_deg)}-line"
+        self.model = lines if named is None else named.name
         self.serial = ""
         self.is_shared = False
 
+    def for_model(self, name: str) -> AnglesFile | None:
+        """The same for a model of as many channels; packets may not tell which one it is."""
+        count = len(self._angles.elevation_deg)
+        rows = [row for row in ROWS if row.name == name and row.channels == count]
+        return AnglesFile(self.path or Path(), self._angles, rows[0]) if rows else None
+
     def fit(self, evidence: Evidence) -> int:
-        """Whether the point packets name a model of as many channels."""
+        """Whether the point packets name a model of as many channels, or can be read as it."""
+        if self._named is not None and BuiltIn(self._named).fit(evidence) == READABLE:
+            return READABLE
         return _FITS_FILE if self._row(evidence) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
@@ -162,6 +175,8 @@ class AnglesFile:
         return lidar
 
     def _row(self, evidence: Evidence) -> Model | None:
+        if self._named is not None:
+            return self._named if BuiltIn(self._named).fit(evidence) else None
         found = identify(point_packets(evidence.sample))
         row = None if found is None else found.model
         return row if row and row.channels == len(self._angles.elevation_deg) else None
