@@ -1,4 +1,4 @@
-"""Packets of makers that are only named: what facts/*.md say of their bytes, all else zero."""
+"""Packets to be named by their bytes: what facts/*.md say of them, all else zero."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What packets of makers without a decoder are called, in the tests."""
+"""What packets are called, in the tests."""
 
 from __future__ import annotations
 
@@ -6,18 +6,10 @@ from mlbatch.sensors import plugins
 from mlbatch.types import U8Array
 
 LACKING = ": no decoder in this version"
-(OTHERS,) = (plugin for plugin in plugins() if not plugin.MODELS)
 
 
 def named(packets: U8Array) -> str | None:
-    """The description of payloads (k, size)."""
-    return OTHERS.describe(packets.shape[1], packets)
-
-
-def lidar(packets: U8Array) -> str:
-    """The name of lidar packets, without what all of them end with."""
-    text = named(packets)
-    assert text is not None
-    assert " lidar " in text
-    assert text.endswith(LACKING)
-    return text[: -len(LACKING)]
+    """What the makers but Ouster, which names packets by their sizes, call payloads (k, size)."""
+    makers = (plugin for plugin in plugins() if plugin.MAKER != "Ouster")
+    names = (maker.describe(packets.shape[1], packets) for maker in makers)
+    return next((name for name in names if name is not None), None)

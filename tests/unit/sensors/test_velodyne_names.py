@@ -7,8 +7,6 @@ import struct
 import numpy as np
 import pytest
 
-from mlbatch.sensors.velodyne import describe
-from mlbatch.types import U8Array
 from tests.builders.others import (
     BB,
     CC,
@@ -18,16 +16,12 @@ from tests.builders.others import (
     rows,
     velodyne_packets,
 )
+from tests.unit.sensors.naming import LACKING, named
 
-LACKING = ": no decoder in this version"
 # facts/velodyne.md sections 1 and 2: time between the azimuths of a model, us.
 VLP_16_US, HDL_32E_US, VLP_32C_US = 110.592, 46.080, 55.296
 # Section 1: models that the sheet has no beams or no layout of.
 REFUSED = {"VLP-32A/B", "Velarray"}
-
-
-def named(packets: U8Array) -> str | None:
-    return describe(packets.shape[1], packets)
 
 
 def with_lack(model: str, text: str) -> str:
@@ -114,7 +108,7 @@ def test_look_alikes_of_1212_bytes_are_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("size", [1206, 1212])
-def test_device_packets_of_lsnamed(size: int) -> None:
+def test_device_packets_of_lslidar(size: int) -> None:
     assert named(rows([filled(size, {0: bytes.fromhex("a5ff005a")})])) == "LSLIDAR device packet"
 
 
@@ -126,11 +120,6 @@ def test_position_packets() -> None:
     beyond = {198: struct.pack("<I", 3_600_000_000), 206: b"$GPRMC"}
     assert named(rows([filled(512, beyond)])) is None
     assert named(rows([filled(512, {})])) is None
-
-
-def test_nothing_and_half_a_packet_have_no_name() -> None:
-    assert describe(1206, np.zeros((0, 1206), np.uint8)) is None
-    assert describe(1206, np.zeros((1, 100), np.uint8)) is None
 
 
 def test_the_mode_byte_of_a_vls_128_may_be_unset() -> None:

@@ -1,4 +1,4 @@
-"""Names of makers without a decoder: every row of the sheets, real recordings, and no others."""
+"""Names of packets: those of real recordings, and none for bytes that are no lidar's."""
 
 from __future__ import annotations
 
@@ -21,46 +21,42 @@ from tests.builders.others import (
     velodyne_packets,
 )
 from tests.builders.ouster import OusterSpec, encode_frame, imu_packet
-from tests.unit.sensors.naming import LACKING, OTHERS, named
+from tests.unit.sensors.naming import named
 
 RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings"
 # By recordings/MANIFEST.md: path, {payload size: description}.
 POSITION = {512: "Velodyne position packet"}
 REAL: dict[str, dict[int, str]] = {
     "hesai/pandar40p/1673400149412331409": {
-        1262: f"HESAI lidar Pandar40P or Pandar40M, dual return, last and strongest{LACKING}"
+        1262: "HESAI lidar Pandar40P or Pandar40M, dual return, last and strongest"
     },
     "hesai/pandar64/1673403880599376836": {
-        1198: f"HESAI lidar Pandar64, dual return, last and strongest{LACKING}"
+        1198: "HESAI lidar Pandar64, dual return, last and strongest"
     },
     "hesai/pandar64_all-points/all_points": {
-        1198: f"HESAI lidar Pandar64, dual return, last and strongest{LACKING}"
+        1198: "HESAI lidar Pandar64, dual return, last and strongest"
     },
     "hesai/pandarqt64/1673401195788312575": {
-        1072: f"HESAI lidar PandarQT64, dual return, first and last{LACKING}"
+        1072: "HESAI lidar PandarQT64, dual return, first and last"
     },
     "hesai/pandarxt16/1732848127890747768": {
-        568: f"HESAI lidar PandarXT-16, dual return, last and strongest{LACKING}"
+        568: "HESAI lidar PandarXT-16, dual return, last and strongest"
     },
     "hesai/pandarxt32/1673400677802009732": {
-        1080: f"HESAI lidar PandarXT-32, dual return, last and strongest{LACKING}"
+        1080: "HESAI lidar PandarXT-32, dual return, last and strongest"
     },
-    "velodyne/vlp16_ros2_dual/1673400471837873222": {
-        1206: f"Velodyne lidar VLP-16, dual return{LACKING}"
-    },
-    "velodyne/vlp32c_ros2/1713492677464078412": {
-        1206: f"Velodyne lidar VLP-32C, strongest return{LACKING}"
-    },
+    "velodyne/vlp16_ros2_dual/1673400471837873222": {1206: "Velodyne lidar VLP-16, dual return"},
+    "velodyne/vlp32c_ros2/1713492677464078412": {1206: "Velodyne lidar VLP-32C, strongest return"},
     "velodyne/vlp16_gps/sample_velodyne_vlp16_gps.pcap": {
-        1206: f"Velodyne lidar VLP-16, strongest return{LACKING}",
+        1206: "Velodyne lidar VLP-16, strongest return",
         **POSITION,
     },
     "velodyne/vlp16_wrong-product-byte/velodyne_vlp16.pcap": {
-        1206: "Velodyne lidar VLP-16 (its product byte says HDL-32E), strongest return" + LACKING,
+        1206: "Velodyne lidar VLP-16 (its product byte says HDL-32E), strongest return",
         **POSITION,
     },
     "velodyne/hdl32e_named-vlp32/velodyne_vlp32.pcap": {
-        1206: f"Velodyne lidar HDL-32E, strongest return{LACKING}",
+        1206: "Velodyne lidar HDL-32E, strongest return",
         **POSITION,
     },
     "other/lslidar-1212-byte-lookalike/VLI-16-one-packet.pcap": {
@@ -170,9 +166,7 @@ def test_bytes_that_are_all_the_same_are_nobodys(fill: int) -> None:
 
 
 def test_nothing_is_nobodys() -> None:
-    assert OTHERS.describe(0, np.zeros((0, 0), np.uint8)) is None
-    assert OTHERS.describe(1206, np.zeros((1, 100), np.uint8)) is None
-
-
-def test_they_have_no_calibration_files() -> None:
-    assert OTHERS.read_calibration(Path("VLP16.yaml"), b"lasers:") is None
+    for plugin in sensors.plugins():
+        assert plugin.describe(0, np.zeros((0, 0), np.uint8)) is None
+        assert plugin.describe(1206, np.zeros((0, 1206), np.uint8)) is None
+        assert plugin.describe(1206, np.zeros((1, 100), np.uint8)) is None

@@ -6,19 +6,13 @@ import struct
 
 import pytest
 
-from mlbatch.sensors import hesai as plugin
 from mlbatch.types import U8Array
 from tests.builders.others import (
     EE,
     filled,
     rows,
 )
-from tests.unit.sensors.naming import LACKING
-
-
-def named(packets: U8Array) -> str | None:
-    """The description of payloads (k, size)."""
-    return plugin.describe(packets.shape[1], packets)
+from tests.unit.sensors.naming import LACKING, named
 
 
 def hesai(size: int, head: str, mode_at: int = 0, mode: int = 0x37) -> U8Array:
