@@ -1,7 +1,7 @@
 """YAML as a tree of places: each value knows its file, key path and line, for errors that help.
 
-Built from parser events, so nothing is constructed from tags and aliases cannot multiply. Scalars
-keep their text: 29.97 is exactly 2997/100, `on` stays `on`, and 0012 stays a serial number.
+Scalars keep their text: 29.97 is exactly 2997/100, `on` stays `on`, and 0012 stays a serial number.
+`_yaml_tree.py` builds the tree.
 """
 
 from __future__ import annotations
@@ -9,12 +9,10 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-
-import yaml
 
 from mlbatch.errors import RigError
 
@@ -22,7 +20,7 @@ MAX_BYTES = 1_000_000
 MAX_DEPTH = 16
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _MAX_DIGITS = 100
-_KEY = re.compile(r"\w{1,40}", re.ASCII)
+KEY = re.compile(r"\w{1,40}", re.ASCII)
 # The spellings of YAML 1.1, which people know.
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _NOTHING = ("", "~", "null", "Null", "NULL")
@@ -50,7 +48,7 @@ class Node:
 
     def fault(self, message: str) -> RigError:
         """An error that says where this value stands."""
-        return _fault(self.file, self.line, self.path, message)
+        return fault(self.file, self.line, self.path, message)
 
     @property
     def shown(self) -> str:
@@ -136,121 +134,12 @@ class Node:
         return [item.number() for item in items]
 
 
-def read_yaml(file: Path) -> Node:
-    """The tree of a YAML file; RigError for anything that is not one plain document."""
-    text = _text(file)
-    composer = _Composer(file, yaml.parse(text, Loader=yaml.SafeLoader))
-    try:
-        return composer.document()
-    except yaml.MarkedYAMLError as err:
-        line = err.problem_mark.line + 1 if err.problem_mark else 1
-        remedy = "check indentation, colons and brackets here and one line above"
-        raise _fault(file, line, "", f"wanted YAML, got {err.problem}; {remedy}") from err
-    except yaml.reader.ReaderError as err:
-        line = text.count("\n", 0, int(err.position)) + 1
-        got = f"the control character {ord(text[int(err.position)]):#04x}"
-        raise _fault(file, line, "", f"wanted YAML, got {got}; remove it") from err
-
-
 def short(text: str) -> str:
     """Text in quotes, on one line and not too long."""
     return repr(text if len(text) <= 40 else text[:40] + "...")
 
 
-def _fault(file: Path, line: int, path: str, message: str) -> RigError:
+def fault(file: Path, line: int, path: str, message: str) -> RigError:
+    """The error about a place in a file."""
     place = f"{file}:{line}: {path}: " if path else f"{file}:{line}: "
     return RigError(place + message)
-
-
-def _text(file: Path) -> str:
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as err:
-        reason = (getattr(err, "strerror", None) or str(err)).lower()
-        raise RigError(f"{file}: wanted a readable file, got {reason}; check the path") from err
-    if len(data) > MAX_BYTES:
-        raise RigError(
-            f"{file}: wanted at most {MAX_BYTES} bytes, got more; "
-            "check that this is a rig file and not a recording"
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as err:
-        line = data.count(b"\n", 0, err.start) + 1
-        got = f"the byte {data[err.start]:#04x}"
-        raise _fault(file, line, "", f"wanted UTF-8 text, got {got}; save it as UTF-8") from err
-
-
-def _line(event: yaml.Event) -> int:
-    return event.start_mark.line + 1 if event.start_mark else 1
-
-
-class _Composer:
-    """Builds the tree from parser events."""
-
-    def __init__(self, file: Path, events: Iterator[yaml.Event]) -> None:
-        self.file = file
-        self.events = events
-
-    def document(self) -> Node:
-        """The only document of the stream; an empty file is a scalar without text."""
-        root = Node(self.file, "", 1, "scalar", plain=True)
-        documents = 0
-        for event in self.events:
-            if not isinstance(event, yaml.DocumentStartEvent):
-                continue
-            documents += 1
-            if documents > 1:
-                message = "wanted one document, got a second one; remove what follows `---`"
-                raise _fault(self.file, _line(event), "", message)
-            root = self.node(next(self.events), "", 0)
-        return root
-
-    def node(self, event: yaml.Event, path: str, depth: int) -> Node:
-        """The value that begins with `event`."""
-        line = _line(event)
-        self._check(event, path, line, depth)
-        if isinstance(event, yaml.ScalarEvent):
-            plain = event.style is None
-            return Node(self.file, path, line, "scalar", text=str(event.value), plain=plain)
-        if isinstance(event, yaml.SequenceStartEvent):
-            return Node(self.file, path, line, "list", items=tuple(self._items(path, depth)))
-        return Node(self.file, path, line, "mapping", entries=self._entries(path, depth))
-
-    def _check(self, event: yaml.Event, path: str, line: int, depth: int) -> None:
-        message = ""
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            message = "wanted plain values, got an anchor or alias; write the value out"
-        elif (tag := getattr(event, "tag", None)) is not None:
-            message = f"wanted plain values, got the tag {short(tag)}; remove it"
-        elif depth > MAX_DEPTH:
-            message = f"wanted at most {MAX_DEPTH} levels, got more; remove brackets"
-        if message:
-            raise _fault(self.file, line, path, message)
-
-    def _items(self, path: str, depth: int) -> Iterator[Node]:
-        for index, event in enumerate(self.events):
-            if isinstance(event, yaml.SequenceEndEvent):
-                return
-            yield self.node(event, f"{path}[{index}]", depth + 1)
-
-    def _entries(self, path: str, depth: int) -> Mapping[str, Node]:
-        entries: dict[str, Node] = {}
-        for event in self.events:
-            if isinstance(event, yaml.MappingEndEvent):
-                break
-            line = _line(event)
-            self._check(event, path, line, depth)
-            if not isinstance(event, yaml.ScalarEvent):
-                message = "wanted a word as key, got brackets; put the brackets after the colon"
-                raise _fault(self.file, line, path, message)
-            name = str(event.value)
-            key = name if _KEY.fullmatch(name) else short(name)
-            here = f"{path}.{key}" if path else key
-            if name in entries:
-                message = f"wanted each key once, got it again (first on line {entries[name].line})"
-                raise _fault(self.file, line, here, message + "; remove one of the two")
-            # The line of the key: that of the value is one further down where it is a block.
-            entries[name] = replace(self.node(next(self.events), here, depth + 1), line=line)
-        return entries

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch import _rig_values as values
-from mlbatch._yaml import Node, read_yaml
+from mlbatch._yaml import Node
 from mlbatch.errors import RigError
 from mlbatch.rate import rate_text
 from mlbatch.transforms import from_rpy_deg, rpy_deg
@@ -113,6 +113,9 @@ class Rig:
 
 def read_rig(path: Path) -> Rig:
     """Read a rig file; RigError names file, line and key of the first thing that is wrong."""
+    # Most runs have no rig, and need no parser.
+    from mlbatch._yaml_tree import read_yaml
+
     root = read_yaml(Path(path))
     fields = root.fields(RIG_KEYS, required=("sensors",))
     rig = Rig(

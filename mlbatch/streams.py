@@ -150,6 +150,8 @@ def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
     if not len(batch):
         return []
     key = batch.stream << 17 | batch.size
+    if bool((key == key[0]).all()):
+        return [((int(batch.stream[0]), int(batch.size[0])), np.arange(len(batch)))]
     kinds, inverse = np.unique(key, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(inverse, minlength=len(kinds)))[:-1])

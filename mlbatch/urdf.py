@@ -9,7 +9,6 @@ document types (and thus no entities), no more than 16 MB, and no tree of elemen
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -46,6 +45,9 @@ def joints(text: str) -> list[Joint]:
     """All joints of a URDF, in its order; RigError names what cannot be used."""
     if len(text) > MAX_BYTES or len(text.encode("utf-8", "replace")) > MAX_BYTES:
         raise _error(f"at most {MAX_BYTES} bytes", "more")
+    # Hardly any recording holds a description.
+    import xml.etree.ElementTree as ET
+
     collector = _Collector()
     parser = ET.XMLParser(target=collector)
     try:

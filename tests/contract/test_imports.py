@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     ),
     (("knowledge",), ("clouds", "_cloud_messages", "_cloud_packets", "_cloud_times")),
     (
-        ("rig", "_rig_values", "_yaml"),
+        ("rig", "_rig_values", "_yaml", "_yaml_tree"),
         ("frames",),
         ("urdf",),
         ("ring",),
