@@ -192,6 +192,7 @@ def _recorded(sight: Seen) -> Seen:
         firing_ns=sight.firing_ns[:columns],
         counts=sight.counts[:columns],
         level=sight.level[:columns],
+        xyz_m=sight.xyz_m[:columns],
         payloads=sight.payloads[:packets],
     )
 

@@ -6,7 +6,7 @@ rays meet the scene, and times are what their packets tell. Nothing of a decoder
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -22,6 +22,9 @@ Payloads: TypeAlias = list[tuple[int, bytes]]
 _EDGE_EVERY, _EDGE_M = 3, 7.0
 _PAST_M = 1e-6
 _HOUR_NS = 3_600_000_000_000
+# Packets count the azimuth in 0.01 degrees. Half of that is its own rounding; as much again may be
+# what the few azimuths of a packet get wrong of the speed at which the rotor goes on from there.
+ASIDE_PER_M = 1.75e-4
 _AIRY_FLAG = 0x4000
 
 
@@ -31,13 +34,15 @@ class Seen:
 
     stamp_ns: (n,) of its columns, in their order; firing_ns: (n, channels), as `stamp_ns` by the
     sensor's clock; counts, level: (n, channels, returns), counts of `unit_m`, 0 where nothing came
-    back. Channels are in the order of the output.
+    back; xyz_m: (n, channels, returns, 3), where those counts lie on the rays, body frame. Channels
+    are in the order of the output.
     """
 
     stamp_ns: I64Array
     firing_ns: I64Array
     counts: I64Array
     level: I64Array
+    xyz_m: F64Array
     unit_m: float
     payloads: Payloads
     columns_per_packet: int
@@ -93,6 +98,12 @@ class Eye:
         )
         return distance_m, levels
 
+    def points(self, origin: F64Array, direction: F64Array, distance_m: F64Array) -> F64Array:
+        """(n, channels, returns, 3), m, of distances (n, channels, returns) along the rays."""
+        reached = origin[..., None, :] + distance_m[..., None] * direction[..., None, :]
+        moved: F64Array = reached @ self.pose[:3, :3].T + self.pose[:3, 3]
+        return moved
+
     def _cast(self, start: F64Array, ray: F64Array) -> tuple[F64Array, F64Array]:
         brightness = [surface.reflectivity for surface in self.scene.surfaces] + [0]
         surface = self.scene.surface_hit(start, ray)
@@ -116,9 +127,8 @@ def pose(
 def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     """A Velodyne's stamps are whole us, each of the first firing of a packet (sheet, section 2)."""
     table, columns = spec.table, np.arange(packets * spec.columns_per_packet)
-    distance_m, bright = eye.look(
-        velodyne.origins(spec, columns), velodyne.directions(spec, columns), spec.returns
-    )
+    origin, direction = velodyne.origins(spec, columns), velodyne.directions(spec, columns)
+    distance_m, bright = eye.look(origin, direction, spec.returns)
     reach_m = np.array(table.dist_m)[:, None]
     counts, level = _counted(distance_m - reach_m, bright, table.unit_m)
     sent = velodyne.encode(spec, counts, level)
@@ -131,11 +141,13 @@ def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     fires_ns += off_ns.repeat(spec.columns_per_packet)[:, None]
     # Channel 0 is the lowest beam (CONTRACT.md section 3).
     order = np.argsort(np.array(table.elevation_deg), kind="stable")
+    xyz_m = eye.points(origin, direction, np.asarray(counts * table.unit_m + reach_m))
     return Seen(
         fires_ns.min(axis=1),
         fires_ns[:, order],
         counts[:, order],
         level[:, order],
+        xyz_m[:, order],
         table.unit_m,
         [(int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)],
         spec.columns_per_packet,
@@ -146,7 +158,8 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
     """A HESAI's beams leave from the axis unless the optical centre is asked for."""
     columns, unit_m = packets * spec.groups, spec.row.unit_mm / 1000
     direction = hesai.directions(spec, beams, columns)
-    counts, level = _counted(*eye.look(np.zeros(3), direction, spec.returns), unit_m)
+    origin = np.zeros_like(direction)
+    counts, level = _counted(*eye.look(origin, direction, spec.returns), unit_m)
     fires = hesai.fires(spec, columns)
     counts *= fires[:, :, None]
     level *= fires[:, :, None]
@@ -159,6 +172,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
         fires_ns,
         counts,
         level,
+        eye.points(origin, direction, np.multiply(counts, unit_m, dtype=np.float64)),
         unit_m,
         list(zip(arrivals, payloads, strict=True)),
         spec.groups,
@@ -171,23 +185,24 @@ def robosense_sees(
     """Ranges count from the lens (sheet, section 8)."""
     count = round(packets * spec.columns_per_packet)
     columns = np.arange(count)
-    distance_m, bright = eye.look(
-        robosense.origins(spec, columns),
-        robosense.directions(spec, angles, columns),
-        spec.returns,
-    )
+    origin = robosense.origins(spec, columns)
+    direction = robosense.directions(spec, angles, columns)
+    distance_m, bright = eye.look(origin, direction, spec.returns)
     counts, level = _counted(distance_m, bright, spec.range_unit_m)
     flag = _AIRY_FLAG if spec.model.startswith("Airy") else 0
-    fires_ns = robosense.firing_times_ns(spec, columns)
-    per_packet = spec.columns_per_packet
-    payloads = robosense.msop(spec, counts + flag, level)
-    if per_packet % 1:
-        # Three blocks do not divide by two: each return is a column of its own.
-        fires_ns, counts, level = _split(spec, fires_ns, counts, level)
-        per_packet *= spec.returns
-    return Seen(
-        fires_ns.min(axis=1), fires_ns, counts, level, spec.range_unit_m, payloads, int(per_packet)
+    seen = Seen(
+        np.empty(0, np.int64),
+        robosense.firing_times_ns(spec, columns),
+        counts,
+        level,
+        eye.points(origin, direction, counts * spec.range_unit_m),
+        spec.range_unit_m,
+        robosense.msop(spec, counts + flag, level),
+        int(spec.columns_per_packet),
     )
+    if spec.columns_per_packet % 1:
+        seen = _split(spec, seen)
+    return replace(seen, stamp_ns=seen.firing_ns.min(axis=1))
 
 
 def ouster_sees(lidar: two_lidars.FixtureLidar, eye: Eye, first_ns: int, turns: int) -> Seen:
@@ -197,12 +212,18 @@ def ouster_sees(lidar: two_lidars.FixtureLidar, eye: Eye, first_ns: int, turns: 
     raw = two_lidars.packets(lidar, pixels, stamps)
     column = np.arange(len(stamps)) % two_lidars.COLUMNS_PER_TURN
     last_ns = stamps.reshape(-1, two_lidars.COLUMNS_PER_PACKET)[:, -1]
+    counts, unit_m = pixels["range"].astype(np.int64), lidar.range_step_mm / 1000
+    # Ranges count from the rotor's axis, along the beam.
+    origin, direction = two_lidars.rays(lidar)
+    reached_m = counts.reshape(-1, 1) * unit_m - lidar.offset_mm / 1000
+    xyz_m = (origin + reached_m * direction).reshape(*pixels.shape, 1, 3)
     return Seen(
         stamps,
         np.repeat(stamps[:, None], two_lidars.BEAMS, axis=1),
-        pixels["range"][column].astype(np.int64)[:, :, None],
+        counts[column][:, :, None],
         pixels["reflectivity"][column].astype(np.int64)[:, :, None],
-        lidar.range_step_mm / 1000,
+        xyz_m[column],
+        unit_m,
         [(int(at), row.tobytes()) for at, row in zip(last_ns, raw, strict=True)],
         two_lidars.COLUMNS_PER_PACKET,
     )
@@ -217,20 +238,22 @@ def _counted(distance_m: F64Array, level: F64Array, unit_m: float) -> tuple[I64A
     return whole, np.where(whole > 0, np.rint(level), 0).astype(np.int64)
 
 
-def _split(
-    spec: robosense.RobosenseSpec, fires_ns: I64Array, counts: I64Array, level: I64Array
-) -> tuple[I64Array, I64Array, I64Array]:
-    """Both returns of a column as columns: the second may lie in the next packet.
+def _split(spec: robosense.RobosenseSpec, seen: Seen) -> Seen:
+    """Three blocks do not divide by two: each return is a column of its own.
 
-    There it has that packet's time, which is cut to whole us anew.
+    The second may lie in the next packet; there it has that packet's time, cut to whole us anew.
     """
-    blocks = np.arange(len(counts) * spec.returns)
+    blocks = np.arange(seen.counts.shape[0] * spec.returns)
     rounds = robosense.rounds(spec, blocks // spec.returns)
     first = rounds[blocks // spec.row.blocks * spec.row.blocks]
     said_ns = (spec.start_ns + first * spec.round_ns) // 1000 * 1000
     begin_ns = said_ns + (rounds - first) * spec.round_ns
-    apart = [
-        np.ascontiguousarray(part.transpose(0, 2, 1)).reshape(len(blocks), -1, 1)
-        for part in (counts, level)
-    ]
-    return begin_ns[:, None] + spec.firing_ns, apart[0], apart[1]
+    shape = (len(blocks), seen.channels, 1)
+    return replace(
+        seen,
+        firing_ns=begin_ns[:, None] + spec.firing_ns,
+        counts=seen.counts.transpose(0, 2, 1).reshape(shape),
+        level=seen.level.transpose(0, 2, 1).reshape(shape),
+        xyz_m=seen.xyz_m.transpose(0, 2, 1, 3).reshape(*shape, 3),
+        columns_per_packet=spec.row.blocks,
+    )

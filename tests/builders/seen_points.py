@@ -17,7 +17,7 @@ STRONGEST_FIRST, STRONGEST_LAST, WEAK_FIRST, WEAK_LAST, ONLY = 3, 4, 5, 6, 7
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Points of a dense scan, in its order; (p,) each, times in ns."""
+    """Points of a dense scan, in its order; (p,) each, xyz_m (p, 3), body frame; times in ns."""
 
     column: I64Array
     lidar_id: I64Array
@@ -25,6 +25,7 @@ class Points:
     at_ns: I64Array
     range_m: F64Array
     level: I64Array
+    xyz_m: F64Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,7 @@ class _Sorted:
     counts: I64Array
     level: I64Array
     keep: BoolArray
+    xyz_m: F64Array
     unit_m: float
 
 
@@ -63,13 +65,14 @@ class Expected:
                     slots.at_ns[own][keep],
                     slots.counts[own][keep].astype(np.float64) * slots.unit_m,
                     slots.level[own][keep],
+                    slots.xyz_m[own][keep],
                 )
             )
         order = np.argsort(np.concatenate([part.column for part in parts]), kind="stable")
         return Points(
             *(
                 np.concatenate([getattr(part, name) for part in parts])[order]
-                for name in ("column", "lidar_id", "ring", "at_ns", "range_m", "level")
+                for name in ("column", "lidar_id", "ring", "at_ns", "range_m", "level", "xyz_m")
             )
         )
 
@@ -117,5 +120,6 @@ def _sorted(sight: Seen, ring_base: int, keep_repeated: bool) -> _Sorted:
         in_order(sight.counts),
         in_order(sight.level),
         in_order(keep.astype(np.int64)) > 0,
+        np.take_along_axis(sight.xyz_m.reshape(*order.shape, 3), order[..., None], axis=1),
         sight.unit_m,
     )

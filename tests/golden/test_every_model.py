@@ -17,13 +17,14 @@ import pytest
 
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
-from mlbatch.types import BoolArray, F64Array, I64Array, Scan
+from mlbatch.types import F64Array, I64Array, Scan
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv
 from tests.builders.run import Result, in_memory
 from tests.builders.scene import hall
 from tests.builders.seen import (
+    ASIDE_PER_M,
     Eye,
     Payloads,
     Seen,
@@ -40,8 +41,7 @@ PACKETS = 12
 SOURCE, HOST = "192.168.1.201", "192.168.1.10"
 # Beams that point up see walls as well.
 EYE = Eye(hall(), pose((3.1, 1.3, 1.5), (9.0, 31.0, -41.0)))
-# Half a step of 0.01 degrees is 8.7e-5 m per metre.
-ASIDE_PER_M, FLOAT32_M = 1e-4, 1e-5
+FLOAT32_M = 1e-5
 # Its firing sequence changes with the firmware and is measured: 12 stamps in whole us tell it to
 # 1 us / 33, and the last of three sequences in a packet begins two of them after the stamp.
 MEASURED_NS = {"VLS-128": 61}
@@ -204,7 +204,7 @@ def test_all_comes_back(make: Callable[..., Sent], words: tuple[str, ...], tmp_p
     # Of two returns in different packets the second may be told to be earlier.
     order = np.argsort(sent.seen.stamp_ns, kind="stable")
     check_readings(sent, whole.scans, order)
-    check_places(sent, whole.scans)
+    check_places(sent, whole.scans, order)
     check_dense(sent, dense, order)
 
 
@@ -241,15 +241,19 @@ def check_types(sent: Sent, types: F64Array, order: I64Array) -> None:
     assert np.array_equal(types[there], wanted[there])
 
 
-def check_places(sent: Sent, scans: Sequence[Scan]) -> None:
-    """Every point lies on a surface: half a range step, and what the azimuth leaves open."""
-    range_m = joined(scans, "range_m")
-    there: BoolArray = ~np.isnan(range_m)
-    xyz_m = np.concatenate([scan.xyz for scan in scans])[there].astype(np.float64)
-    assert np.isfinite(xyz_m).all()
-    xyz_m = xyz_m @ EYE.pose[:3, :3].T + EYE.pose[:3, 3]
-    allowed_m = sent.seen.unit_m / 2 + ASIDE_PER_M * range_m[there] + FLOAT32_M
-    assert (EYE.scene.distance_to_surfaces(xyz_m) - allowed_m).max() < 0
+def check_places(sent: Sent, scans: Sequence[Scan], order: I64Array) -> None:
+    """Every point lies on its ray, but for what the azimuth leaves open, and so on a surface."""
+    sight = sent.seen
+    there = sight.counts[order] > 0
+    xyz_m = np.concatenate([scan.xyz for scan in scans]).reshape(*there.shape, 3)
+    assert np.array_equal(np.isfinite(xyz_m).all(axis=3), there)
+    body_m = xyz_m[there].astype(np.float64) @ EYE.pose[:3, :3].T + EYE.pose[:3, 3]
+    distance_m: F64Array = np.linalg.norm(body_m - EYE.pose[:3, 3], axis=1)
+    aside_m = ASIDE_PER_M * distance_m + FLOAT32_M
+    away_m: F64Array = np.linalg.norm(body_m - sight.xyz_m[order][there], axis=1)
+    assert (away_m - aside_m).max() < 0
+    off_m = EYE.scene.distance_to_surfaces(body_m)
+    assert (off_m - aside_m - sight.unit_m / 2).max() < 0
 
 
 def check_dense(sent: Sent, dense: Result, order: I64Array) -> None:

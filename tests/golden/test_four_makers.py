@@ -23,15 +23,15 @@ from mlbatch.types import BoolArray, F64Array, I64Array
 from tests.builders.four_makers import FOLDER, HOUR_NS, PLACES, VELODYNE, arrivals, main, seen
 from tests.builders.run import Cloud, command, load, scan_files
 from tests.builders.scene import hall
-from tests.builders.seen import Seen
+from tests.builders.seen import ASIDE_PER_M, Seen
 from tests.builders.seen_points import Expected, Points, pair_types, repeated
 
 PCAP, RIG = FOLDER / "four_makers.pcap", FOLDER / "rig.yaml"
 SENSORS = [seen()[place.name] for place in PLACES]
 NAMES = [place.name for place in PLACES]
 ROOF = PLACES.index(VELODYNE)
-# Packets count the azimuth in 0.01 degrees: half of that is 8.7e-5 m per metre.
-ASIDE_PER_M = 1e-4
+# Half a step of the azimuth, 0.01 degrees, is 8.7e-5 m per metre: as much only along the normal.
+OFF_PER_M = 1e-4
 FLOAT32_AT_20_M = 1e-5
 
 
@@ -95,11 +95,15 @@ def check_windows(converted: Run) -> None:
         assert np.array_equal(scan["column_stamp_ns"], stamps)
 
 
-def check_points(converted: Run, *, keep_repeated: bool = False) -> None:
-    """All but the places: what each point is, when it was measured, and the order of points."""
+def check_points(converted: Run, *, keep_repeated: bool = False, are_turned: bool = True) -> None:
+    """What each point is, when it was measured, where it lies, and the order of points."""
     expected = Expected(SENSORS, keep_repeated=keep_repeated)
     for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
-        check_cloud(Cloud.of(path), expected.points(*columns_of(window)))
+        cloud, wanted = Cloud.of(path), expected.points(*columns_of(window))
+        check_cloud(cloud, wanted)
+        # On the very ray, but for the azimuth.
+        away_m: F64Array = np.linalg.norm(cloud.xyz - wanted.xyz_m, axis=1)
+        assert (away_m < ASIDE_PER_M * wanted.range_m + FLOAT32_AT_20_M).all() == are_turned
 
 
 def check_cloud(cloud: Cloud, wanted: Points) -> None:
@@ -118,7 +122,7 @@ def check_places(cloud: Cloud) -> None:
     for number, (place, sight) in enumerate(zip(PLACES, SENSORS, strict=True)):
         own = cloud.of_sensor(number)
         xyz_m, range_m = own.xyz.astype(np.float64), own.range_m.astype(np.float64)
-        allowed_m = sight.unit_m / 2 + ASIDE_PER_M * range_m + FLOAT32_AT_20_M
+        allowed_m = sight.unit_m / 2 + OFF_PER_M * range_m + FLOAT32_AT_20_M
         assert (hall().distance_to_surfaces(xyz_m) - allowed_m).max() < 0, place.name
         straight_m: F64Array = np.linalg.norm(xyz_m - place.body_from_sensor[:3, 3], axis=1)
         assert np.abs(straight_m - range_m).max() < 0.06, place.name
@@ -157,7 +161,7 @@ def test_every_point_lies_on_a_surface_of_the_scene(whole: Run) -> None:
 def test_without_the_motion_of_the_rotor_points_are_off(whole: Run, tmp_path: Path) -> None:
     """The firing times move points by more than the check allows; all else stays."""
     moved = run(tmp_path / "out", "20", 1, "--keep-partial", "--decode", "firing_azimuth=off")
-    check_points(moved)
+    check_points(moved, are_turned=False)
     for number in range(1, len(PLACES)):
         one = Cloud.of_all(whole.folder).of_sensor(number)
         other = Cloud.of_all(moved.folder).of_sensor(number)
