@@ -195,7 +195,7 @@ def robosense_sees(
         robosense.firing_times_ns(spec, columns),
         counts,
         level,
-        eye.points(origin, direction, counts * spec.range_unit_m),
+        eye.points(origin, direction, np.asarray(counts * spec.range_unit_m, np.float64)),
         spec.range_unit_m,
         robosense.msop(spec, counts + flag, level),
         int(spec.columns_per_packet),
