@@ -17,11 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.types import I64Array, U8Array
+from mlbatch.units import NS_PER_S
 from tests.builders import hesai, robosense, velodyne
 from tests.builders.captures import udp_frame
 
 US = 1000
 PIECE = 2000  # packets
+DEG_PER_NS = 360e-8  # 600 rpm
 Piece = tuple[I64Array, U8Array]  # arrival in ns, payloads (P, size)
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -48,19 +50,39 @@ def vlp16_dual(seconds: float) -> Iterator[Piece]:
     for first in range(0, int(seconds * 1e6 / packet_us), PIECE):
         shape = (PIECE * per_packet, 16, 2)
         begin_us = first * packet_us
-        now = replace(spec, start_us=1e6 + begin_us, start_azimuth_deg=begin_us * 360e-5 % 360)
+        now = replace(
+            spec, start_us=1e6 + begin_us, start_azimuth_deg=begin_us * US * DEG_PER_NS % 360
+        )
         sent = velodyne.encode(now, *readings(first * per_packet, shape, 10_000))
         yield sent.host_ns, sent.payloads
+
+
+def pandar64_dual(seconds: float) -> Iterator[Piece]:
+    """A HESAI Pandar64 with two returns."""
+    spec = hesai.HesaiSpec("Pandar64", mode=0x39)
+    step_ns = int(spec.row.step_ns * spec.groups)
+    for first in range(0, int(seconds * NS_PER_S / step_ns), PIECE):
+        shape = (PIECE * spec.groups, 64, 2)
+        began_ns = first * step_ns
+        now = replace(
+            spec,
+            start_ns=EPOCH_NS + began_ns,
+            start_deg=began_ns * DEG_PER_NS % 360,
+            sequence=first,
+        )
+        sent = hesai.encode_packets(now, *readings(first * spec.groups, shape, 10_000))
+        payloads = np.frombuffer(b"".join(sent), np.uint8).reshape(len(sent), -1)
+        yield hesai.host_times_ns(now, len(sent)), payloads
 
 
 def ruby_plus(seconds: float) -> Iterator[Piece]:
     """A RoboSense Ruby Plus 128 with one return."""
     spec = robosense.RobosenseSpec("Ruby Plus 128", "strongest", start_ns=EPOCH_NS)
     columns = 3
-    for first in range(0, int(seconds * 1e9 / (columns * 55_560)), PIECE):
+    for first in range(0, int(seconds * NS_PER_S / (columns * 55_560)), PIECE):
         shape = (PIECE * columns, 128, 1)
         began_ns = first * columns * 55_560
-        now = replace(spec, start_ns=EPOCH_NS + began_ns, start_deg=began_ns * 360e-8 % 360)
+        now = replace(spec, start_ns=EPOCH_NS + began_ns, start_deg=began_ns * DEG_PER_NS % 360)
         sent = robosense.msop(now, *readings(first * columns, shape, 8000))
         payloads = np.frombuffer(b"".join(data for _, data in sent), np.uint8)
         yield np.array([at for at, _ in sent]), payloads.reshape(len(sent), -1)
@@ -68,8 +90,10 @@ def ruby_plus(seconds: float) -> Iterator[Piece]:
 
 KINDS: Mapping[str, Callable[[float], Iterator[Piece]]] = {
     "vlp16-dual": vlp16_dual,
+    "pandar64-dual": pandar64_dual,
     "ruby-plus": ruby_plus,
 }
+PORTS = {"ruby-plus": 6699}
 
 
 def write(kind: str, path: Path, seconds: float) -> None:
@@ -78,17 +102,22 @@ def write(kind: str, path: Path, seconds: float) -> None:
         file.write(bytes.fromhex("d4c3b2a1020004000000000000000000ffff000001000000"))
         for host_ns, payloads in KINDS[kind](seconds):
             size = payloads.shape[1]
-            frame = udp_frame(bytes(size), dport=6699 if kind == "ruby-plus" else 2368)[0]
+            frame = udp_frame(bytes(size), dport=PORTS.get(kind, 2368))[0]
             head = np.frombuffer(frame[:-size], np.uint8)
             record = np.zeros(
                 len(payloads),
-                [("time", "<u4", 2), ("length", "<u4", 2), ("head", "u1", len(head))]
-                + [("data", "u1", size)],
+                [
+                    *(("time", "<u4", 2), ("length", "<u4", 2)),
+                    *(("head", "u1", len(head)), ("data", "u1", size)),
+                ],
             )
             record["time"] = np.stack([host_ns // 10**9, host_ns % 10**9 // US], axis=1)
             record["length"] = len(head) + size
             record["head"], record["data"] = head, payloads
             file.write(record.tobytes())
+    if kind == "pandar64-dual":
+        angles = hesai.angles_csv(np.linspace(15, -25, 64).tolist(), [0.0] * 64)
+        path.with_suffix(".csv").write_bytes(angles)
     if kind == "ruby-plus":
         spec = robosense.RobosenseSpec("Ruby Plus 128", "strongest")
         text = robosense.angles_csv(robosense.fan(spec))
