@@ -164,9 +164,12 @@ class Projector:
             np.greater(part.range_m, 0, out=part.keep)
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
-        words = part.label.view(np.uint64)
-        self._label.take(self._row(member, encoder), axis=0, out=words, mode="clip")
-        words += offset_ns.astype(np.uint64)[:, None]
+        words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)[:, None]
+        if len(self._label) == 1:
+            np.add(self._label, offset, out=words)
+        else:
+            self._label.take(self._row(member, encoder), axis=0, out=words, mode="clip")
+            words += offset
         if lidar.returns == 2:
             self._type_returns(part)
         self._keep(member, part)
@@ -228,8 +231,10 @@ class Projector:
         alone = (first == 0) | (second == 0)
         if lidar.sends_twice:
             alone |= first == second
-        types[:, 0::2] = np.where(alone, _ONLY, kind)
-        types[:, 1::2] = np.where(alone, _ONLY, _BOTH - kind)
+        # All bits of 3 to 6 are bits of 7, so that it wins by a plain "or".
+        only = alone.view(np.uint8) * _ONLY
+        np.bitwise_or(kind, only, out=types[:, 0::2])
+        np.bitwise_or(np.subtract(_BOTH, kind, out=kind), only, out=types[:, 1::2])
 
     def _keep(self, member: I64Array, part: Part) -> None:
         """Unmark the points that are not wanted, and count them under their reason."""
