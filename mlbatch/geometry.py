@@ -232,13 +232,19 @@ class Turning:
         np.add(sine, half, out=sine)
 
     def _combine(self, vectors: F32Array, axis: int, out: F32Array) -> None:
-        """cos * V1 + sin * V2 + V3 of one axis: (n, B)."""
+        """cos * V1 + sin * V2 + V3 of one axis: (n, B); vectors that are zero are left out."""
         count = len(out)
+        turning, level = vectors[:2, axis, :count], vectors[2, axis, :count]
+        # All columns are alike, so that the first one tells.
+        if not turning[:, :1].any():
+            out[:] = level
+            return
         scratch = self._scratch[:count]
-        np.multiply(self._cosine[:count], vectors[0, axis, :count], out=out)
-        np.multiply(self._sine[:count], vectors[1, axis, :count], out=scratch)
+        np.multiply(self._cosine[:count], turning[0], out=out)
+        np.multiply(self._sine[:count], turning[1], out=scratch)
         np.add(out, scratch, out=out)
-        np.add(out, vectors[2, axis, :count], out=out)
+        if level[:1].any():
+            np.add(out, level, out=out)
 
 
 def _planes(vectors: F64Array, columns: int, beams: int) -> F32Array:

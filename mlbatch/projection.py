@@ -156,12 +156,8 @@ class Projector:
             reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
             self._projection.points(range_m, part.point[:, slots, :3])
-            if lidar.returns > 1:
-                np.greater(range_m, 0, out=part.keep[:, slots])
-                if self._needs_range:
-                    part.range_m[:, slots] = range_m
-        if lidar.returns == 1:
-            np.greater(part.range_m, 0, out=part.keep)
+            if lidar.returns > 1 and self._needs_range:
+                part.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
         words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)[:, None]
@@ -237,16 +233,16 @@ class Projector:
         np.bitwise_or(np.subtract(_BOTH, kind, out=kind), only, out=types[:, 1::2])
 
     def _keep(self, member: I64Array, part: Part) -> None:
-        """Unmark the points that are not wanted, and count them under their reason."""
+        """Mark the points that are wanted, and count the others under their reason."""
         keep = part.keep
         columns = np.bincount(member, minlength=len(self._sources))
-        left = self._left(member, keep)
-        for counts, number, points in zip(self.counts, columns.tolist(), left, strict=True):
+        found, left = self._mark(member, part)
+        for counts, number, points, wanted in zip(
+            self.counts, columns.tolist(), found, left, strict=True
+        ):
             counts.slots += number * self.slots
             counts.no_return += number * self.slots - points
-        if self._drops_repeated:
-            self._cut_repeated(keep)
-            left = self._drop("repeated", member, keep, left)
+            counts.repeated += points - wanted
         if self._is_limited:
             limits_m = self._limits_m[member]
             keep &= part.range_m >= limits_m[:, :1]
@@ -272,12 +268,27 @@ class Projector:
             setattr(counts, reason, getattr(counts, reason) + had - has)
         return left
 
-    def _cut_repeated(self, keep: BoolArray) -> None:
-        """Leave out returns that an earlier one of the same shot equals."""
-        returns, ranges_m = self._lidar.returns, self._range_m[:, : len(keep)]
-        for which in range(1, returns):
-            for earlier in range(which):
-                keep[:, which::returns] &= ranges_m[which] != ranges_m[earlier]
+    def _mark(self, member: I64Array, part: Part) -> tuple[list[int], list[int]]:
+        """Mark the slots with a return; how many there are, and how many equal no earlier one.
+
+        Both for each sensor. A return that equals an earlier one of the same shot is not marked.
+        """
+        keep, returns = part.keep, self._lidar.returns
+        if returns == 1:
+            np.greater(part.range_m, 0, out=keep)
+            found = self._left(member, keep)
+            return found, found
+        ranges_m = self._range_m[:, : len(keep)]
+        found, left = [0] * len(self._sources), [0] * len(self._sources)
+        for which, range_m in enumerate(ranges_m):
+            own = range_m > 0
+            found = list(map(int.__add__, found, self._left(member, own)))
+            if self._drops_repeated:
+                for earlier in ranges_m[:which]:
+                    own &= range_m != earlier
+            left = list(map(int.__add__, left, self._left(member, own)))
+            keep[:, which::returns] = own
+        return found, left
 
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self._boxes_m:
