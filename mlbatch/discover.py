@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mlbatch import sensors
+from mlbatch._rigged import Wanted, is_model, match_rig
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.lidar import Calibration, ModelFile
-from mlbatch.looking import calibrations_for, look, read_given, with_clouds
-from mlbatch.matching import Matched, Wanted, match, match_rig
+from mlbatch.looking import calibrations_for, fault_of, look, read_given, with_clouds
+from mlbatch.matching import Matched, match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
 from mlbatch.streams import Found, Kind, Router, Sampler
@@ -82,7 +83,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     lidar_kinds = [kind for kind in matched.unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
         reason = _nothing_found(sampler, recordings, lidar_kinds, looked, matched.failures)
-        raise RecordingError(f"{reason}{_hints(recordings, learner.faults)}")
+        faults = [*learner.faults, *filter(None, map(fault_of, files))]
+        raise RecordingError(f"{reason}{_hints(recordings, faults)}")
     notes = [] if rig is not None else _unmatched(sampler, lidar_kinds, looked, matched.failures)
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
@@ -146,7 +148,9 @@ def _find_rigged(
 def _of_model(calibrations: Sequence[Calibration], model: str | None) -> list[Calibration]:
     """The calibrations, where files leave it open as those of the model that the rig names."""
     named = [
-        one.for_model(model) if model is not None and isinstance(one, ModelFile) else None
+        one.for_model(model)
+        if model is not None and one.path is not None and isinstance(one, ModelFile)
+        else None
         for one in calibrations
     ]
     return [own or one for own, one in zip(named, calibrations, strict=True)]
@@ -179,11 +183,9 @@ def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
 
 def _check_model(name: str, wanted: str, got: str, origin: Path) -> None:
     """A model named in the rig must be the one that the calibration or the packets describe."""
-    alike = {model.like for model in sensors.models() if model.name == wanted}
-    # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
-    if got not in alike and not got.replace("-", "").startswith(wanted.replace("-", "")):
+    if not is_model(wanted, got):
         raise RigError(
-            f"{origin}: sensor {name}: wanted a {wanted}, got the metadata of a {got}; "
+            f"{origin}: sensor {name}: wanted the model {wanted}, got metadata of {got}; "
             "correct model or metadata"
         )
 

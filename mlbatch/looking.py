@@ -115,6 +115,15 @@ def calibrations_for(
     return found, looked
 
 
+def fault_of(path: Path) -> str:
+    """What is wrong with a calibration beside the recording that could not be used, or ""."""
+    try:
+        sensors.read_calibration(path)
+    except RigError as err:
+        return str(err)
+    return ""
+
+
 def _folder_of(recording: Path) -> Path:
     """Where calibrations of a recording lie: beside it, or beside the folder of a ROS 2 bag."""
     folder = recording.parent

@@ -1,15 +1,14 @@
-"""Which calibration the packets of a stream were made with: by their bytes, or by the rig.
+"""Which calibration the packets of a stream were made with, by their bytes.
 
 A calibration is of one unit (Ouster metadata, HESAI angles) or shared by all of a model; of those
-every stream is a sensor of its own.
+every stream is a sensor of its own. What a rig says of it besides: `_rigged.py`.
 """
 
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -17,9 +16,8 @@ from mlbatch import sensors
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames import GENERIC, namespace
 from mlbatch.lidar import READABLE, Calibration, Evidence, Lidar
-from mlbatch.rig import StreamSelector
 from mlbatch.streams import Found, Kind, Sampler
-from mlbatch.types import StreamTable, U8Array
+from mlbatch.types import StreamTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +30,7 @@ class Matched:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class Fit:
     """A calibration that fits packets."""
 
     score: int
@@ -51,7 +49,7 @@ def match(
     found: dict[tuple[int, int], Found] = {}
     matched = Matched([], [])
     for kind in sampler.samples:
-        fits, failure = _best_fits(sampler.evidence(kind), every, options)
+        fits, failure = best_fits(sampler.evidence(kind), every, options)
         if failure:
             matched.failures[kind] = failure
         if not fits:
@@ -59,10 +57,9 @@ def match(
         for fit in fits:
             key = fit.number, kind[0] if every[fit.number].is_shared else -1
             sensor = found.setdefault(key, Found("", fit.lidar))
+            sensor.notes += other_size(sampler.table, sensor.lidar, kind)
             if sensor.lidar.packet_size in (kind[1], kind[1] - 1):
                 sensor.kinds.add(kind)
-            else:
-                matched.unknown.append(kind)
     _refuse_shared(sampler.table, found, every)
     matched.sensors.extend(sorted(found.values(), key=lambda one: _order(sampler.table, one)))
     _name_all(sampler.table, matched.sensors)
@@ -83,12 +80,12 @@ def _name_all(table: StreamTable, found: Sequence[Found]) -> None:
             sensor.name = f"{maker}_{sensor.lidar.serial or counts[maker]}"
 
 
-def _best_fits(
+def best_fits(
     evidence: Evidence,
     calibrations: Sequence[Calibration],
     options: Mapping[str, str],
     model: str | None = None,
-) -> tuple[list[_Fit], str]:
+) -> tuple[list[Fit], str]:
     """The sensors that sent a kind; several when the packets of units are mixed in it.
 
     model: that of the rig; it may be another one than the packets name. Second comes why a
@@ -109,9 +106,12 @@ def _best_fits(
         _refuse_ambiguous(evidence, [calibrations[number] for number, _ in first])
         number, part = first[0]
         try:
-            best.append(_Fit(top, number, calibrations[number].lidar(options, part)))
+            best.append(Fit(top, number, calibrations[number].lidar(options, part)))
         except RigError as err:
             failure = str(err)
+            if top == READABLE:
+                what = sensors.describe(evidence.size, evidence.sample) or "others"
+                failure = f"its packets are {what}, not {model}, as which they were read: {err}"
     return best, failure
 
 
@@ -179,108 +179,13 @@ def _ip_number(text: str) -> int:
     return int(ipaddress.ip_address(text)) if text else 0
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """A sensor of the rig: where it sends from, its model if named, its possible calibrations."""
-
-    name: str
-    selector: StreamSelector
-    calibrations: Sequence[Calibration]
-    decode: Mapping[str, str]
-    model: str | None = None
-
-
-def match_rig(sampler: Sampler, wanted: Sequence[Wanted], origin: Path) -> Matched:
-    """Sensors of a rig, in its order; origin: the rig file.
-
-    Raises RigError where a sensor has no calibration.
-    """
-    found = [_find(sampler, one, origin) for one in wanted]
-    taken = {kind for sensor in found for kind in sensor.kinds}
-    return Matched(found, [kind for kind in sampler.samples if kind not in taken])
-
-
-def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found:
-    serial = wanted.selector.serial
-    usable = [one for one in wanted.calibrations if not serial or one.serial in ("", serial)]
-    _refuse_none(wanted, usable, origin)
-    scored: dict[int, tuple[_Fit, set[Kind]]] = {}
-    failures, others = [], set[str]()
-    for kind in sampler.samples:
-        if not wanted.selector.selects(sampler.table.streams[kind[0]]):
-            continue
-        fits, failure = _best_fits(sampler.evidence(kind), usable, wanted.decode, wanted.model)
-        failures += [failure] if failure else []
-        for fit in fits:
-            if serial and fit.lidar.serial != serial:
-                others.add(fit.lidar.serial)
-                continue
-            before, kinds = scored.get(fit.number, (fit, set[Kind]()))
-            scored[fit.number] = max(before, fit, key=_score), kinds | {kind}
-    best = max(scored.values(), key=lambda one: one[0].score, default=None)
-    if best is None:
-        own = any(one.serial == serial for one in usable)
-        if failures and not (serial and own):
-            raise RigError(f"{origin}: sensor {wanted.name}: {failures[0]}")
-        if serial and not own:
-            _refuse_serial(wanted, others - {""}, origin)
-        return Found(wanted.name, _unseen(wanted, usable, origin), wanted.selector)
-    fit, kinds = best
-    found = Found(wanted.name, fit.lidar, wanted.selector, kinds)
-    if fit.score == READABLE:
-        what = sensors.describe(*_first_of(sampler, kinds)) or "another model"
-        found.notes.append(f"read as {fit.lidar.model}, which the rig names; it looks like {what}")
-    return found
-
-
-def _score(fit: _Fit) -> int:
-    return fit.score
-
-
-def _first_of(sampler: Sampler, kinds: set[Kind]) -> tuple[int, U8Array]:
-    evidence = sampler.evidence(min(kinds))
-    return evidence.size, evidence.sample
-
-
-def _refuse_none(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> None:
-    if not usable:
-        serial = wanted.selector.serial
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: no metadata"
-            + (f" with serial number {serial}" if serial else "")
-            + f" among {_paths(wanted.calibrations)}; give it as `metadata:` of the sensor, or "
-            "with --metadata"
-        )
-
-
-def _refuse_serial(wanted: Wanted, others: Collection[str], origin: Path) -> None:
-    """A serial number that neither packets nor files bear; others: those of the packets."""
-    if not others:
-        _refuse_none(wanted, (), origin)
-    raise RigError(
-        f"{origin}: sensor {wanted.name}: wanted packets of serial number "
-        f"{wanted.selector.serial}, got those of {', '.join(sorted(others))}; correct the serial"
-    )
-
-
-def _unseen(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> Lidar:
-    """A sensor that is silent at first needs calibrations that are surely its own."""
-    own = [one for one in usable if one.path is not None]
-    if wanted.model is not None:
-        named = [one for one in usable if one.model == wanted.model]
-        own = [one for one in named if one.path is not None] or named or own
-    if len(own) != 1:
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted a packet of it ({wanted.selector}) in the "
-            f"first 10 seconds, got none to tell which of {_paths(own)} is its metadata; "
-            "correct its stream, or give `metadata:`"
-        )
-    try:
-        return own[0].lidar(wanted.decode, None)
-    except RigError as err:
-        raise RigError(f"{origin}: sensor {wanted.name}: {err}") from err
-
-
-def _paths(calibrations: Sequence[Calibration]) -> str:
-    names = (str(one.path) for one in calibrations if one.path is not None)
-    return ", ".join(names) or "the files given"
+def other_size(table: StreamTable, lidar: Lidar, kind: Kind) -> list[str]:
+    """What is wrong with packets that are the lidar's, but of another size than its first ones."""
+    size = lidar.packet_size
+    if kind[1] in (size, size + 1):
+        return []
+    return [
+        f"{table.streams[kind[0]]}: wanted packets of {size} bytes as at first, got {kind[1]} "
+        "bytes as well, which are rejected as bad_size; split the recording where the settings "
+        "of the lidar change"
+    ]

@@ -120,7 +120,7 @@ class BuiltIn:
         if angles is None:
             got = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
             raise RigError(
-                f"{evidence.stream}: {MAKER} {self.model}: wanted the angles of its channels, got "
+                f"{MAKER} {self.model}: wanted the angles of its channels, got "
                 f"{got} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
                 "or give a csv of `elevation,azimuth` lines with --metadata"
             )

@@ -14,7 +14,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("assembly",),),
     (("feeding",), ("job",)),
     (("inertial",), ("passing",), ("discover",)),
-    (("looking",), ("mounting",), ("matching",)),
+    (("looking",), ("mounting",), ("matching", "_rigged")),
     (("learning",),),
     (
         ("readers",),

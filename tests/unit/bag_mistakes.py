@@ -9,7 +9,26 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "clouds.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
-        " the lidar's driver publishes its packets",
+        " the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
+        "read; the first: wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; "
+        "convert the recording to that encoding)",
+    ),
+    "clouds without times": (
+        "timeless.db3",
+        1,
+        "timeless.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
+        " the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
+        "read; the first: wanted the time of each point in a field t, time, timestamp, "
+        "time_stamp, timestamps, offset_time or ts, got x, y, z; record the raw packets, or "
+        "clouds with times)",
+    ),
+    "one of two lidars": (
+        "drive.mcap --rig one.yaml",
+        1,
+        "one.yaml: sensor left: wanted packets of one lidar, got those of several (OS-0-32-U1, "
+        "OS-1-32-U1) on /left/ouster/lidar_packets, /right/ouster/lidar_packets; name its stream "
+        "(source_ip, port, topic or serial)",
     ),
     "topic of the rig": (
         "drive.mcap --rig topic.yaml",

@@ -269,8 +269,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/two_lidars.pcap --rig fix/astray.yaml",
         1,
         "fix/astray.yaml: sensor rear: wanted a packet of it (source_ip 10.5.5.99) in the first "
-        "10 seconds, got none to tell which of fix/left.json, fix/right.json is its metadata; "
-        "correct its stream, or give `metadata:`",
+        "10 seconds, got none to tell its model; correct its stream, or give `metadata:` or "
+        "`model:`",
     ),
     "rig sensor that is silent": (
         "fix/two_lidars.pcap --rig fix/silent.yaml",

@@ -11,6 +11,7 @@ import pytest
 
 from tests.builders.bags import Body, Recorded, transforms_message
 from tests.builders.ouster import metadata_json
+from tests.builders.points import XYZ, cloud_message
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder, write_rosbag2
 from tests.builders.sessions_of_bags import (
@@ -60,6 +61,8 @@ def _write_sessions(folder: Path) -> None:
     write_rosbag2(folder / "frames.db3", [one[0], frame])
     cloud = Recorded("/points", "sensor_msgs/PointCloud2", one[0].log_ns, bytes(64))
     write_rosbag2(folder / "clouds.db3", [cloud])
+    timeless = replace(cloud, data=cloud_message(XYZ, [(1.0, 2.0, 3.0)]))
+    write_rosbag2(folder / "timeless.db3", [timeless])
 
 
 def _metadata(message: Recorded, serial: int) -> Recorded:
@@ -91,7 +94,9 @@ def _moving(messages: list[Recorded]) -> list[Recorded]:
 def _write_rigs(folder: Path) -> None:
     rigs = {
         "topic": "{name: left, stream: {topic: /left/ouster/lidar}}",
-        "frame": "{name: left, extrinsics: {frame: os_lft}}",
+        "frame": "{name: left, stream: {topic: /left/ouster/lidar_packets}, "
+        "extrinsics: {frame: os_lft}}",
+        "one": "{name: left}",
         "both": "{name: left, stream: {topic: /left/ouster/lidar_packets, port: 7502}}",
         "points": "{name: imu, stream: {topic: /imu/data}}",
     }

@@ -156,7 +156,7 @@ def test_random_bytes_are_nobodys(size: int, seed: int, count: int) -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.binary(min_size=1, max_size=1500), st.integers(1, 3))
 def test_any_bytes_give_a_name_or_none(payload: bytes, count: int) -> None:
-    assert named(rows([payload] * count)) is None
+    assert "\n" not in (named(rows([payload] * count)) or "")
 
 
 @pytest.mark.parametrize("fill", [0, 1, 2, 0x55, 0xEE, 0xFF])
