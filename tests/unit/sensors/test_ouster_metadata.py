@@ -87,7 +87,9 @@ def test_the_beam_origin_by_product_line(product: str, offset_mm: float) -> None
 def test_columns_per_frame_from_the_mode(mode: str) -> None:
     calibration = read(reduced(mode=mode))
     assert calibration.metadata.columns_per_frame == int(mode.split("x")[0])
-    assert len(calibration.lidar({}, None).beams.angle_rad) == int(mode.split("x")[0])
+    angle_rad = calibration.lidar({}, None).beams.angle_rad
+    assert angle_rad is not None
+    assert len(angle_rad) == int(mode.split("x")[0])
 
 
 def test_error_texts_of_old_firmware_count_as_absent() -> None:
@@ -167,6 +169,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
     table = read(metadata_json(spec)).lidar({}, None).beams
     n_m = 5**0.5 / 1000
     assert table.reach_m.tolist() == [pytest.approx(-n_m, abs=1e-15)]
+    assert table.angle_rad is not None
     angle = table.angle_rad[128]
     assert angle == pytest.approx(1.5 * np.pi)
     for column, level, up in (

@@ -94,7 +94,6 @@ class TestEveryRecording:
 
     def test_xyz_as_the_reference_has_it(self, case: Case) -> None:
         _, lidar, _, reference = loaded(case)
-        table = lidar.beams
         frame, which = 0, 0
         range_m = reference["range_mm"][frame, :, :, which].T / 1000
         hit = range_m > 0
@@ -102,11 +101,11 @@ class TestEveryRecording:
         wanted = np.moveaxis(reference["xyz_m"][frame, :, :, which], 1, 0)
         assert hit.any()
         assert np.abs(xyz - wanted)[hit].max() < MAX_XYZ_ERROR_M
-        assert len(table.angle_rad) == range_m.shape[0]
+        assert len(angles_rad(lidar)) == range_m.shape[0]
 
     def test_the_table_equals_the_formula(self, case: Case) -> None:
         _, lidar, _, reference = loaded(case)
-        range_m = np.full((len(lidar.beams.angle_rad), lidar.channels), 17.25)
+        range_m = np.full((len(angles_rad(lidar)), lidar.channels), 17.25)
         wanted = formula_m(reference, range_m)
         assert np.abs(projected(lidar, range_m) - wanted).max() < MAX_TABLE_ERROR_M
 
@@ -146,10 +145,17 @@ def in_mm(pose: F64Array) -> F64Array:
     return scaled
 
 
+def angles_rad(lidar: OusterLidar) -> F64Array:
+    """Angle of every measurement id."""
+    assert lidar.beams.angle_rad is not None
+    return lidar.beams.angle_rad
+
+
 def projected(lidar: OusterLidar, range_m: F64Array) -> F64Array:
     """Ranges (W, H) through the beam table in float64: (W, H, 3)."""
     table = lidar.beams
-    cosine, sine = np.cos(table.angle_rad)[:, None, None], np.sin(table.angle_rad)[:, None, None]
+    angle_rad = angles_rad(lidar)[:, None, None]
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     direction = cosine * table.direction[0] + sine * table.direction[1] + table.direction[2]
     origin = cosine * table.origin[0] + sine * table.origin[1] + table.origin[2]
     xyz: F64Array = (range_m + table.reach_m)[:, :, None] * direction + origin
