@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mlbatch import sensors
 from mlbatch.errors import RigError
-from mlbatch.lidar import READABLE, Calibration
+from mlbatch.lidar import READABLE, Calibration, Lidar
 from mlbatch.matching import Fit, Matched, best_fits, other_size
 from mlbatch.rig import StreamSelector
 from mlbatch.streams import Found, Kind, Sampler
@@ -181,7 +181,7 @@ def _silent(
             if not carried or own[0].path is None:
                 raise RigError(f"{origin}: sensor {wanted.name}: {err}") from err
     is_placed = bool(wanted.selector.source_ip or wanted.selector.topic)
-    if carried and own and (is_placed or (len(own) == 1 and lidar is None)):
+    if carried and own and (is_placed or (len(own) == 1 and not _tells_serial(lidar))):
         raise RigError(
             f"{origin}: sensor {wanted.name}: wanted packets that {_paths(own)} fits, got "
             f"{carried}; correct its stream or metadata"
@@ -195,6 +195,11 @@ def _silent(
             f"seconds, got none to tell {which}; correct its stream, or give {remedy}"
         )
     return Found(wanted.name, lidar, wanted.selector)
+
+
+def _tells_serial(lidar: Lidar | None) -> bool:
+    """Whether the sensor's own packets would have been known among others."""
+    return lidar is not None and lidar.carries_serial
 
 
 def _own(wanted: Wanted, used: Collection[str]) -> list[Calibration]:

@@ -86,6 +86,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         faults = [*learner.faults, *filter(None, map(fault_of, files))]
         raise RecordingError(f"{reason}{_hints(recordings, faults)}")
     notes = [] if rig is not None else _unmatched(sampler, lidar_kinds, looked, matched.failures)
+    notes += _unused(found, wishes.metadata)
     chosen = _choose(found, wishes)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
@@ -237,6 +238,17 @@ def _unmatched(
     return notes
 
 
+def _unused(found: Sequence[Found], given: Sequence[Path]) -> list[Note]:
+    """Files that the user named, and no sensor took."""
+    used = {sensor.lidar.calibration for sensor in found}
+    advice = "it is not used; leave it out, or name its sensor in a rig file (--rig)"
+    return [
+        Note("calibration", "", f"{path}: wanted a sensor that it fits, got none; {advice}")
+        for path in given
+        if str(path) not in used
+    ]
+
+
 def _nothing_found(
     sampler: Sampler,
     recordings: Sequence[Recording],
@@ -341,8 +353,9 @@ def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
 def absent(sensor: Mounted, rig: Path | None) -> RigError:
     """The error about a sensor of the rig that sent nothing."""
     selector = sensor.rig.stream if sensor.rig is not None else None
+    lidar = sensor.found.lidar
+    source = f"from {selector}" if selector else f"of a {lidar.model} ({lidar.calibration})"
     return RigError(
-        f"{rig}: sensor {sensor.name}: wanted its packets, got none from "
-        f"{selector or sensor.found.lidar.calibration}; correct its stream or serial, or set "
-        "`optional: true`"
+        f"{rig}: sensor {sensor.name}: wanted its packets, got none {source}; correct its stream "
+        "or serial, or set `optional: true`"
     )

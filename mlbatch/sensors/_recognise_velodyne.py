@@ -21,7 +21,7 @@ from mlbatch.sensors._recognise_bytes import (
 )
 from mlbatch.types import BoolArray, I64Array, U8Array
 
-BLOCKS, STRIDE = 12, 100
+BLOCKS, STRIDE, BLOCK_LASERS = 12, 100, 32
 PACKET_SIZE, POSITION_SIZE = 1206, 512
 STAMP_AT, MODE_AT = 1200, 1204
 NMEA_AT, NMEA_SIZE, PPS_AT, POSITION_STAMP_AT = 206, 128, 202, 198
@@ -64,7 +64,8 @@ class Identity:
     """What data packets are by their bytes and by their pace.
 
     model: "" where they do not say; banks: blocks that a firing sequence takes; label: the model
-    that a wrong product byte names, or what else is odd about the factory bytes.
+    that a wrong product byte names, or what else is odd about the factory bytes; block_us: time
+    from block to block, None where it was not measured.
     """
 
     model: str
@@ -72,6 +73,7 @@ class Identity:
     banks: int
     label: str = ""
     is_decoded: bool = True
+    block_us: float | None = None
 
     @property
     def returns(self) -> int:
@@ -176,16 +178,19 @@ def _one_bank(packets: U8Array | None) -> Identity | None:
     took_us = block_time_us(number(packets, STAMP_AT, 4), azimuth, HOUR_US)
     told = _PRODUCTS.get(factory >> 8)
     mode = MODES.get(factory & 0xFF, UNSET_MODES[in_pairs(azimuth)])
-    seen = next((n for n in _OLDEST if _takes(_PRODUCTS[n].block_us, took_us)), None)
+    seen = next((n for n in _OLDEST if takes(_PRODUCTS[n].block_us, took_us)), None)
     if factory == 0 and seen is not None:
-        return Identity(_PRODUCTS[seen].name, mode, 1, "its factory bytes are not set")
+        unset = "its factory bytes are not set"
+        return Identity(_PRODUCTS[seen].name, mode, 1, unset, block_us=took_us)
     if told is None or factory & 0xFF not in MODES:
         label = f"factory bytes {factory & 0xFF:02X} {factory >> 8:02X}"
-        return Identity("", mode, 1, label, is_decoded=False)
+        return Identity("", mode, 1, label, is_decoded=False, block_us=took_us)
     if factory >> 8 in _OLDEST and seen is not None and seen != factory >> 8:
-        return Identity(_PRODUCTS[seen].name, mode, 1, f"its product byte says {told.name}")
-    return Identity(told.name, mode, 1, is_decoded=told.is_decoded)
+        belied = f"its product byte says {told.name}"
+        return Identity(_PRODUCTS[seen].name, mode, 1, belied, block_us=took_us)
+    return Identity(told.name, mode, 1, is_decoded=told.is_decoded, block_us=took_us)
 
 
-def _takes(block_us: float, took_us: float | None) -> bool:
+def takes(block_us: float, took_us: float | None) -> bool:
+    """Whether a block took as long as those of a model do, as far as that was measured."""
     return took_us is not None and abs(took_us - block_us) < _TIME_TOLERANCE * block_us

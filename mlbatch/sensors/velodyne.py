@@ -14,7 +14,7 @@ import numpy as np
 from mlbatch.errors import RigError
 from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
 from mlbatch.sensors._options import check_options
-from mlbatch.sensors._recognise_velodyne import Identity, identify, velodyne
+from mlbatch.sensors._recognise_velodyne import BLOCK_LASERS, Identity, identify, takes, velodyne
 from mlbatch.sensors._velodyne_calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors._velodyne_clock import (
     clock_offset_ns,
@@ -35,7 +35,7 @@ from mlbatch.sensors._velodyne_packets import (
     steps,
 )
 from mlbatch.types import U8Array
-from mlbatch.units import RAD_PER_DEG
+from mlbatch.units import NS_PER_US, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]
 
@@ -92,7 +92,7 @@ class VelodyneCalibration:
         # Models that packets do not name (Puck LITE, series of the HDL-64E) are named by the rig.
         first = next((row for row in ALL if row.seen_as == seen.model), None)
         if first is None or first.seen_as != self.row.seen_as:
-            return READABLE
+            return READABLE if _is_paced(self.row, seen) else 0
         if self.file is not None:
             return _FITS_FILE
         return _FITS_BYTES if first is self.row else READABLE
@@ -156,6 +156,12 @@ def _away_deg(row: Model, file: VelodyneFile) -> float:
         return 0.0
     away = np.abs(file.elevation_rad / RAD_PER_DEG - np.array(row.elevation_deg))
     return float(away.mean())
+
+
+def _is_paced(row: Model, seen: Identity) -> bool:
+    """Whether packets come as fast as the model's: a wrong name is possible, a wrong pace not."""
+    block_us = row.sequence_ns * BLOCK_LASERS / row.lasers / NS_PER_US
+    return seen.block_us is None or takes(block_us, seen.block_us)
 
 
 def _file_notes(calibration: VelodyneCalibration) -> list[str]:
