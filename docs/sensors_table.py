@@ -1,0 +1,54 @@
+"""The table of sensors in the README, made from the models: `python docs/sensors_table.py`.
+
+Models that differ in nothing but their name share a row.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from mlbatch.lidar import SensorModel
+from mlbatch.sensors import models
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+BEGIN, END = "<!-- sensors: python docs/sensors_table.py -->", "<!-- end of sensors -->"
+HEAD = ("maker", "models (channels)", "returns", "clock", "calibration", "verified")
+
+
+def table() -> str:
+    """The rows, in the order of `mlbatch sensors`."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for model in models():
+        names.setdefault(_shared(model), []).append(_name(model))
+    rows = [HEAD, ("---",) * len(HEAD)]
+    rows += [(alike[0], ", ".join(found), *alike[1:]) for alike, found in names.items()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def with_table(page: str) -> str:
+    """A page with the table of today between its marks."""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise SystemExit(f"wanted the marks {BEGIN} and {END} in the page, got none; put them back")
+    return f"{before}{BEGIN}\n\n{table()}\n{END}{after}"
+
+
+def _shared(model: SensorModel) -> tuple[str, ...]:
+    returns = ", ".join(map(str, model.returns))
+    return model.maker, returns, model.clock, model.calibration, model.verified
+
+
+def _name(model: SensorModel) -> str:
+    """Most names say how many channels a model has; the others are helped."""
+    channels = str(model.channels)
+    return (
+        model.name if channels in re.findall(r"\d+", model.name) else f"{model.name} ({channels})"
+    )
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else README
+    target.write_text(with_table(target.read_text(encoding="utf-8")), encoding="utf-8")

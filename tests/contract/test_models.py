@@ -1,0 +1,275 @@
+"""Every supported model: what its maker's module offers, an encoder, a case, the laws of `Lidar`.
+
+What is missing for a new one is named here; docs/add-a-sensor.md says where it goes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mlbatch.errors import MlbatchError
+from mlbatch.geometry import read_rotor_words
+from mlbatch.lidar import (
+    FAULTS,
+    READABLE,
+    Beside,
+    Calibration,
+    Evidence,
+    Lidar,
+    ModelFile,
+    SensorModel,
+)
+from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
+from mlbatch.types import I64Array, Pixels, Stream, U8Array
+from mlbatch.units import NS_PER_S
+from tests.builders import hesai_models, livox, ouster, points, robosense_models, velodyne_tables
+from tests.builders.others import rows
+from tests.golden.test_every_model import CASES, ROBOSENSE_NAMES, Sent
+
+WORDS = ("real recording", "two sources", "one source")
+ADVICE = "see docs/add-a-sensor.md"
+SOURCE = "192.168.1.201"
+START_NS = 1_700_000_000_000_000_000
+# Rows of encoders that go by another name than the model, or are a second kind of its packets.
+VARIANTS = {"Pandar64-7": "Pandar64", **ROBOSENSE_NAMES}
+# Sizes of packets that any maker knows, and of some that nobody does.
+SIZES = (*range(0, 64), 80, 512, 554, 568, 812, 820, 861, 1072, 1080, 1095, 1127, 1198, 1200, 1206)
+SIZES += (1210, 1212, 1248, 1262, 1266, 1268, 1270, 1362, 1380, 1392, 3392, 6464, 8448, 12608)
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """A lidar, and packets of it: (P, packet_size), with their arrival."""
+
+    lidar: Lidar
+    packets: U8Array
+    host_ns: I64Array
+
+
+def encoded() -> frozenset[str]:
+    """Models that the encoders know."""
+    tables = (velodyne_tables.MODELS, hesai_models.MODELS, robosense_models.MODELS)
+    return frozenset(VARIANTS.get(name, name) for table in tables for name in table)
+
+
+def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
+    """The lidar that a case of test_every_model.py is of."""
+    sent = make(*words)
+    payloads = sent.seen.payloads
+    packets = rows([payload for _, payload in payloads])
+    host_ns = np.array([at for at, _ in payloads])
+    beside = tuple(
+        Beside(Stream(SOURCE, 7788), len(payload), rows([payload]), np.array([at]))
+        for at, payload in sent.beside
+    )
+    evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, beside)
+    given = parse_calibration(Path(sent.file), sent.content) if sent.file else None
+    known = built_in() if given is None else [given]
+    found = [calibration for one in known if (calibration := _named(one, sent))]
+    score, best = max(((one.fit(evidence), one) for one in found), key=lambda pair: pair[0])
+    assert score > 0 or (score == READABLE and sent.is_named)
+    return Stand(best.lidar({}, evidence), packets, host_ns)
+
+
+def _named(calibration: Calibration, sent: Sent) -> Calibration | None:
+    """A calibration as that of the model a rig names; None if it is another one's."""
+    if not sent.is_named:
+        return calibration
+    if calibration.model == sent.model:
+        return calibration
+    return calibration.for_model(sent.model) if isinstance(calibration, ModelFile) else None
+
+
+def _ouster(model: SensorModel) -> Stand:
+    beams, product = model.channels, model.name.replace("OS", "OS-", 1)
+    spec = ouster.OusterSpec(beams=beams, columns_per_frame=512, product=product)
+    ranges = np.full((512, beams, 1), 4000)
+    packets = rows(ouster.encode_frame(spec, START_NS, 5, ranges)[:8])
+    content = json.dumps(ouster.metadata_json(spec)).encode()
+    given = parse_calibration(Path("unit.json"), content)
+    assert given is not None
+    host_ns = START_NS + np.arange(len(packets)) * 3_000_000
+    evidence = Evidence(Stream(SOURCE, 7502), packets.shape[1], packets, host_ns)
+    return Stand(given.lidar({}, evidence), packets, host_ns)
+
+
+def _livox(kind: int) -> Stand:
+    spec = livox.LivoxSpec(kind=kind)
+    values = 1 + np.arange(8 * spec.points * spec.returns * 4).reshape(-1, spec.returns, 4) % 200
+    sent = livox.point_packets(spec, values[..., :3], values[..., 3])
+    packets = rows([payload for _, payload in sent])
+    host_ns = np.array([at for at, _ in sent])
+    evidence = Evidence(Stream(SOURCE, 56301), packets.shape[1], packets, host_ns)
+    best = max(built_in(), key=lambda one: one.fit(evidence))
+    return Stand(best.lidar({}, evidence), packets, host_ns)
+
+
+@lru_cache(maxsize=1)
+def cases() -> Mapping[str, Callable[[], Stand]]:
+    """What makes a lidar of each model, in each of its modes."""
+    found: dict[str, Callable[[], Stand]] = {}
+    for make, words in CASES:
+        found[" ".join(words)] = partial(_case, make, words)
+    for model in filter(_is_ouster, models()):
+        found[model.name] = partial(_ouster, model)
+    for kind in (livox.CARTESIAN32, livox.CARTESIAN16, livox.SPHERICAL, livox.DUAL):
+        found[f"Livox SDK2 {kind}"] = partial(_livox, kind)
+    return found
+
+
+def _is_ouster(model: SensorModel) -> bool:
+    return model.maker == "Ouster"
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
+def test_a_plugin_offers_all_that_is_asked_of_it(plugin: Plugin) -> None:
+    assert plugin.MAKER
+    assert plugin.MODELS
+    for model in plugin.MODELS:
+        assert model.verified in WORDS, f"{model.name}: wanted one of {WORDS}"
+        assert model.channels > 0
+        assert model.returns
+        assert model.clock
+        assert model.calibration
+    names = {model.name for model in models()}
+    for calibration in plugin.BUILT_IN:
+        assert (calibration.path, calibration.is_shared) == (None, True)
+        assert calibration.model in names
+    assert {model.like for model in plugin.MODELS} <= {"", *names}
+
+
+def test_no_two_models_have_one_name() -> None:
+    names = [model.name for model in models()]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda model: model.name)
+def test_every_model_has_an_encoder_and_a_case(model: SensorModel) -> None:
+    if model.name in (*points_kinds(), "Livox SDK2") or _is_ouster(model):
+        return  # Their encoders have no rows: any number of beams, or none at all.
+    # Models whose packets look like those of another one are encoded as that one.
+    twins = {words[2]: words[0] for _, words in CASES if len(words) > 2}
+    row = twins.get(model.name, model.like or model.name)
+    assert row in encoded(), f"{model.name}: no row in tests/builders; {ADVICE}"
+    named = {VARIANTS.get(words[0], words[0]) for _, words in CASES}
+    missing = f"{model.name}: no case in tests/golden/test_every_model.py; {ADVICE}"
+    assert row in named, missing
+
+
+def points_kinds() -> tuple[str, ...]:
+    """Clouds: their packets are made by the package itself."""
+    return tuple(name.rpartition("/")[2] for name in (points.CLOUD, points.CUSTOM))
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
+@settings(deadline=None, max_examples=60)
+@given(size=st.sampled_from(SIZES), count=st.integers(0, 9), seed=st.integers(0, 2**32))
+def test_random_bytes_are_nobodys(plugin: Plugin, size: int, count: int, seed: int) -> None:
+    sample = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
+    assert plugin.describe(size, sample) is None
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
+@settings(deadline=None, max_examples=60)
+@given(content=st.binary(max_size=400) | st.text(max_size=400).map(str.encode))
+def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) -> None:
+    refusal = "some.file: "
+    try:
+        found = plugin.read_calibration(Path("some.file"), content)
+    except MlbatchError as err:
+        found, refusal = None, str(err)
+    assert found is None
+    assert refusal.startswith("some.file: ")
+
+
+@pytest.mark.parametrize("name", cases())
+def test_a_lidar_keeps_the_laws(name: str) -> None:
+    stand = cases()[name]()
+    lidar, packets = stand.lidar, stand.packets
+    _check_table(lidar)
+    shape = (len(packets), lidar.columns_per_packet)
+    heads = lidar.heads(packets, stand.host_ns)
+    assert heads.stamp_ns.shape == heads.encoder.shape == heads.valid.shape == shape
+    kinds = [field.dtype.name for field in (heads.stamp_ns, heads.encoder, heads.valid)]
+    assert kinds == ["int64", "int64", "bool"]
+    assert np.ptp(heads.stamp_ns) < NS_PER_S
+    faults = lidar.faults(packets)
+    assert (faults.shape, faults.dtype.name) == ((len(packets),), "uint8")
+    assert not faults.any()
+    damaged = lidar.faults(np.random.default_rng(1).integers(0, 256, packets.shape, np.uint8))
+    assert damaged.max() < len(FAULTS)
+    sequence = lidar.sequence(packets)
+    assert len(np.unique(sequence)) == len(packets)
+    if lidar.sequence_modulus:
+        assert sequence.max() < lidar.sequence_modulus
+    assert lidar.owns(packets).all()
+
+
+@pytest.mark.parametrize("name", cases())
+def test_a_packet_says_the_same_in_any_company(name: str) -> None:
+    stand = cases()[name]()
+    lidar, packets, host_ns = stand.lidar, stand.packets, stand.host_ns
+    order = np.random.default_rng(2).permutation(len(packets))
+    whole, shuffled = lidar.heads(packets, host_ns), lidar.heads(packets[order], host_ns[order])
+    for field in ("stamp_ns", "encoder", "valid"):
+        assert np.array_equal(getattr(whole, field)[order], getattr(shuffled, field))
+    records = _records(lidar, packets)
+    mixed = np.random.default_rng(3).permutation(len(records))
+    for which in range(lidar.returns):
+        both, apart = _read(lidar, records, which), _read(lidar, records[mixed], which)
+        assert np.array_equal(both.range_m[mixed], apart.range_m)
+        assert np.array_equal(both.intensity[mixed], apart.intensity)
+        assert np.isfinite(both.range_m).all()
+        assert both.range_m.min() >= 0
+        if lidar.beams.angle_rad is None:
+            tables = read_rotor_words(whole.encoder.reshape(-1))[2]
+            assert not both.range_m[lidar.firing_ns[tables] < 0].any()
+
+
+def _check_table(lidar: Lidar) -> None:
+    """What a lidar says of its columns before any packet."""
+    model = next(m for m in models() if _is_named(lidar, m))
+    assert (lidar.maker, lidar.channels) == (model.maker, model.channels)
+    assert lidar.firing_ns.ndim == 2
+    assert lidar.firing_ns.shape[1] == lidar.channels
+    assert lidar.firing_ns.min() >= -1
+    for table in lidar.firing_ns:
+        assert table[table >= 0].min() == 0
+        assert table.max() < NS_PER_S
+    assert np.array_equal(np.sort(lidar.channel), np.arange(lidar.channels))
+    assert len(lidar.return_types) == lidar.returns
+    assert lidar.typed_by in ("order", "level", "")
+    assert lidar.beams.direction.shape == (3, lidar.channels, 3)
+    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
+    assert begins.min() >= 0
+    assert begins.max() + at.size <= lidar.packet_size
+
+
+def _is_named(lidar: Lidar, model: SensorModel) -> bool:
+    return model.name == lidar.model or model.name == lidar.model.replace("OS-", "OS", 1)
+
+
+def _records(lidar: Lidar, packets: U8Array) -> U8Array:
+    """The bytes of all columns, one by one."""
+    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
+    found = packets[:, begins[:, None] + np.arange(at.size)]
+    return np.ascontiguousarray(found.reshape(-1, at.size))
+
+
+def _read(lidar: Lidar, records: U8Array, which: int) -> Pixels:
+    shape = (len(records), lidar.channels)
+    reflectivity = np.zeros(shape, np.uint16) if lidar.has_reflectivity else None
+    pixels = Pixels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), reflectivity)
+    lidar.read(records, which, pixels)
+    return pixels
