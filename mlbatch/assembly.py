@@ -72,7 +72,7 @@ def run_info(setup: Setup, job: Job, grid: Grid, scale: str) -> RunInfo:
                 sensor.body_from_sensor,
             )
         )
-        ring_base += lidar.channels
+        ring_base += max(lidar.channels, int(lidar.channel.max()) + 1)
     return RunInfo(
         tuple(sensors), setup.frame_id, rate_text(grid.rate), scale, job.slices, job.layout
     )

@@ -115,7 +115,8 @@ class Lidar(Protocol):
     """One physical sensor: how its packets are read, nothing of windows or files.
 
     `records`: where its `columns_per_packet` columns lie. `channels`: beams of a column, in the
-    order of the wire; `channel`: (channels,) the number of each in the output. `firing_ns`:
+    order of the wire; `channel`: (channels,) the number of each in the output, or (T, channels) by
+    the same rows as `firing_ns`:
     (T, channels) when each beam fires after its column's stamp, >= 0; rotor words choose the row,
     all else uses row 0. `sequence_modulus`: the sequence number wraps there (0: packets carry no
     count). `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`:

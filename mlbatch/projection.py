@@ -127,7 +127,8 @@ class Projector:
         self._elements = np.arange(columns * self.slots)
         if self._order is not None and self._tables == 1:
             self._elements = self._ordered(np.zeros(columns, np.int64)).reshape(-1)
-        number = lidar.channel[:, None] * lidar.returns + np.arange(lidar.returns)
+        channel = lidar.channel if lidar.channel.ndim == 1 else np.arange(lidar.channels)
+        number = channel[:, None] * lidar.returns + np.arange(lidar.returns)
         self.number: I64Array = number.reshape(-1)
         limits = [(source.min_range_m, source.max_range_m) for source in sources]
         self._limits_m = np.array(limits, np.float32)
@@ -315,7 +316,9 @@ def _projection(sources: Sequence[Source], columns: int) -> Projection:
 
 def _firing_order(lidar: Lidar) -> I64Array | None:
     """Slots in the order of firing, channel, return: (T, slots); None if it is that of the wire."""
-    beams = [np.lexsort((lidar.channel, firing)) for firing in np.maximum(lidar.firing_ns, 0)]
+    firing_ns = np.maximum(lidar.firing_ns, 0)
+    channels = np.broadcast_to(lidar.channel, firing_ns.shape)
+    beams = [np.lexsort(keys) for keys in zip(channels, firing_ns, strict=True)]
     order = np.stack(beams)[:, :, None] * lidar.returns + np.arange(lidar.returns)
     order = order.reshape(len(beams), -1)
     return None if bool((order == np.arange(order.shape[1])).all()) else order
@@ -328,7 +331,9 @@ def _labels(source: Source, lidar_id: int) -> Labels:
     beam = slot // lidar.returns
     label = np.zeros((len(lidar.firing_ns), source.slots), LABEL)
     label["time_ns"] = np.maximum(lidar.firing_ns, 0)[:, beam]
-    label["ring"] = source.ring_base + lidar.channel[beam]
+    label["ring"] = (
+        source.ring_base + np.broadcast_to(lidar.channel, lidar.firing_ns.shape)[:, beam]
+    )
     label["return_type"] = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
     label["lidar_id"] = lidar_id
     return label

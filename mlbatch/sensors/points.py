@@ -3,7 +3,8 @@
 Source: facts/messages.md, section 8. The packets are those of `mlbatch.clouds`, one column each:
 points that share a stamp. Points have a place already, so that no beam has angles; ranges are the
 distances of the points from the origin of the cloud's frame. A point's channel is its ring where
-many points of a stamp are on rings of their own, else its turn among those that share its stamp.
+many points of a stamp are on rings of their own, and where every point has a time of its own; else
+its turn among those that share its stamp.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from mlbatch.clouds import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, Projection
+from mlbatch.geometry import BeamTable, Projection, rotor_words
 from mlbatch.lidar import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._turning_lidar import TurningLidar
@@ -40,6 +41,8 @@ _FITS = 100
 _BAD_HEADER = FAULTS.index("bad_header")
 # Magic, version, kind and slots: the same in all packets of a topic.
 _SHARED_BYTES = 8
+# As many rings of single points as a rotor word can tell.
+_RINGS = 128
 
 
 def _layout(sample: U8Array) -> Layout | None:
@@ -118,10 +121,14 @@ class PointsLidar(TurningLidar):
         self.records = Records(0, layout.size, layout.size)
         # `read` leaves places for the projection of the same topic.
         self.pixel_layout = ("points", slots, topic)
-        self.channel = np.arange(slots)
-        self.firing_ns = np.zeros((1, slots), np.int64)
+        # Of columns of one point the rotor word tells the ring.
+        rings = _RINGS if slots == 1 else 1
+        self.channel = (
+            np.arange(slots) + np.arange(rings)[:, None] if slots == 1 else np.arange(slots)
+        )
+        self.firing_ns = np.zeros((rings, slots), np.int64)
         nowhere = np.zeros((3, slots, 3))
-        self.beams = BeamTable(nowhere, nowhere[:, :1], np.zeros(1), np.zeros(1))
+        self.beams = BeamTable(nowhere, nowhere[:, :1], np.zeros(1))
         self.calibration = "none"
         self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
         self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
@@ -138,7 +145,14 @@ class PointsLidar(TurningLidar):
         """The stamp that the points of a column share."""
         head = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)
         stamp_ns: I64Array = head["stamp_ns"].astype(np.int64)
-        return Heads(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
+        still = np.zeros(stamp_ns.shape)
+        ring: I64Array | int = 0
+        if self.channels == 1:
+            at = HEAD.itemsize + 4 * REALS
+            ring = (
+                np.ascontiguousarray(packets[:, at : at + 2]).view("<u2").astype(np.int64) % _RINGS
+            )
+        return Heads(stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_))
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Distances and levels of columns (n, records.size); their places wait for `points`."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mlbatch
 from mlbatch import sensors
 from mlbatch._cloud_packets import Layout, Points, layout_of, pack
 from mlbatch.errors import RigError, UsageError
@@ -15,7 +17,8 @@ from mlbatch.ring import RawRing
 from mlbatch.sensors.points import BUILT_IN, MODELS
 from mlbatch.transforms import from_quaternion
 from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array
-from tests.builders.points import STAMP_NS
+from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
+from tests.builders.rosbag2 import write_rosbag2
 
 TOPIC = Stream(topic="/left/points")
 CLOUD, CUSTOM = BUILT_IN
@@ -199,3 +202,23 @@ def test_columns_by_ring_are_named_so() -> None:
     layout = layout_of(points, 0)
     lidar = CLOUD.lidar({}, _evidence(pack(points, layout, 0)))
     assert lidar.mode == "up to 16 points a column by ring"
+
+
+def test_points_with_times_of_their_own_keep_their_rings(tmp_path: Path) -> None:
+    """As of a Velodyne driver: a time and a ring for every point; two topics, rings run on."""
+    points = [(1.0 + i, 2.0, 3.0, 7.0, (5 * i) % 16, -0.1 + 1e-4 * i) for i in range(800)]
+    stamps = [STAMP_NS + k * 80_000_000 for k in range(4)]
+    messages = [
+        message
+        for topic in ("/a/points", "/b/points")
+        for message in write_points(topic, [cloud_message(VELODYNE, points, at) for at in stamps])
+    ]
+    bag = write_rosbag2(tmp_path / "clouds.cdr", messages)
+    scans = list(mlbatch.scans(bag, keep_partial=True, identity_extrinsics=True))
+    xyz, ring, lidar = (
+        np.concatenate([getattr(scan, name) for scan in scans])
+        for name in ("xyz", "ring", "lidar_id")
+    )
+    assert len(xyz) == 2 * 4 * 800
+    number = np.rint(xyz[:, 0] - 1).astype(int)
+    assert np.array_equal(ring, lidar.astype(int) * 128 + (5 * number) % 16)
