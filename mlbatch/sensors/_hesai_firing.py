@@ -1,11 +1,14 @@
 """When the beams of HESAI lidars fire, in ns after the time of their block (facts/hesai.md 5, 12).
 
-That of the JT128: HesaiTechnology/HesaiLidar_SDK_2.0 `correction/firetime_correction`.
+That of the JT128: HesaiTechnology/HesaiLidar_SDK_2.0 `correction/firetime_correction`. Those of the
+Pandar20: HesaiTechnology/HesaiLidar_General_SDK `pandarGeneral_internal.cc`, -3620 - 1304 a
+- 1968 b ns with whole numbers a and b of each channel.
 
 Tables are (channels,) int64 in wire order, as the maker's firing-time files and manuals print them:
-those of Pandar40P and Pandar64 count back from the block's end and are negative (`P40`, `P64`), all
-others are 0 or later. NEVER marks a channel that does not fire in that table. Tables of the
-128-channel families are chosen by operation mode (HIGH, STANDARD, SAVING) and azimuth state.
+those of Pandar20, Pandar40P and Pandar64 count back from the block's end and are negative (`P20A`,
+`P20B`, `P40`, `P64`), all others are 0 or later. NEVER marks a channel that does not fire in that
+table. Tables of the 128-channel families are chosen by operation mode (HIGH, STANDARD, SAVING) and
+azimuth state.
 """
 
 from __future__ import annotations
@@ -19,7 +22,15 @@ from mlbatch.types import I64Array
 NEVER = -1
 HIGH, STANDARD, SAVING = "high", "standard", "saving"
 
-# In the texts below a row holds 16 channels (8 or 10 in the first three), `-` is a silent one.
+# In the texts below a row holds 16 channels (8 or 10 in the first five), `-` is a silent one.
+_P20A = """
+-16044 -3620 -45492 -31740 -47460 -20620 -40916 -20620 -50732 -36980
+-23892 -11468 -48764 -35012 -9500 -29772 -4924 -28468 -16044 -3620
+"""
+_P20B = """
+-45492 -31740 -47460 -20620 -40916 -8196 -20620 -50732 -14740 -45492
+-23892 -11468 -48764 -35012 -21924 -9500 -29772 -4924 -28468 -16044
+"""
 _P40 = """
 -42220 -28470 -16040 -3620 -45490 -31740 -47460 -54670 -20620 -33710
 -40910 -8190 -20620 -27160 -50730 -8190 -14740 -36980 -45490 -52700
@@ -231,6 +242,7 @@ def _even(first_ns: int, step_ns: int, channels: int, together: int = 1) -> I64A
     return table
 
 
+P20A, P20B = _tables(_P20A + _P20B, 20)
 P40 = _tables(_P40, 40)[0]
 P64 = _tables(_P64, 64)[0]
 QT64 = _tables(_QT64, 64)[0]

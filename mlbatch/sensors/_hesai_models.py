@@ -3,7 +3,9 @@
 Source: facts/hesai.md sections 2 (layout), 3 (tails), 5 (times), 6 (optical centres), 8 (JT16) and
 12; the vertical fields of view are those of the data sheets. The Pandar128E3X fires a few of its
 channels at other times at targets nearer than 2.85 m; the times of the far field are used for all
-(up to 55 us apart, `_hesai_firing.E128_NEAR`).
+(up to 55 us apart, `_hesai_firing.E128_NEAR`). Pandar20A and B: HesaiTechnology/
+HesaiLidar_General_SDK. Its versions have the one table of elevations or the other; each is given
+to the model whose beams fire when those of a Pandar40P at these elevations do.
 """
 
 from __future__ import annotations
@@ -161,6 +163,20 @@ PANDAR64 = Model(
     header=8,
     unit=3,
     unit_mm_at=5,
+)
+# No source gives its optical centre.
+PANDAR20A = replace(
+    PANDAR64,
+    name="Pandar20A",
+    channels=20,
+    blocks=(20,),
+    timing=PANDAR40P.timing,
+    firing_ns=firing.P20A[None],
+    centre_mm=(0.0, 0.0, 0.0),
+    elevation_deg=(-25.0, 8.0),
+)
+PANDAR20B = replace(
+    PANDAR20A, name="Pandar20B", firing_ns=firing.P20B[None], elevation_deg=(-18.9, 3.1)
 )
 PANDARQT64 = Model(
     "PandarQT64",

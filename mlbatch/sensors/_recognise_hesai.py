@@ -1,7 +1,8 @@
 """What HESAI packets are, by their content: lengths, header versions, return modes in the tail.
 
 Source: facts/hesai.md sections 1 to 4; facts/messages.md section 2 (correction); HesaiTechnology/
-HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC).
+HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC), HesaiLidar_General_SDK
+(Pandar20: 8 + 20 x 62 + 22 = 1270 bytes, never a sequence number).
 """
 
 from __future__ import annotations
@@ -42,8 +43,12 @@ _FIXED = (0, 1, 2, 3, 6, 7, 9, 11)
 _FIXED_64 = (0, 1, 2, 3, 5)
 _FIXED_JT16 = (0, 1, 2, 3, 5)
 _PANDAR40_BLOCKS, _PANDAR40_STRIDE = 10, 124
-# Payloads without sequence number, and the blocks that they hold.
-_PANDAR64_BLOCKS = {1194: 6, 1388: 7}
+# Models whose header has lasers and blocks: payloads without and with a sequence number.
+_SIZED: tuple[tuple[Model, int, tuple[int, ...]], ...] = (
+    (rows.PANDAR64, 6, (1194, 1198)),
+    (rows.PANDAR64, 7, (1388, 1392)),
+    (rows.PANDAR20A, 20, (1270,)),
+)
 _PANDAR40_SIZE, _PANDAR40_UNDATED_SIZE = 1262, 1256
 _PANDAR20_MAGIC = _SOP + bytes((20, 20))
 _JT16_IMU_SIZE, _JT16_SIZE = 34, 80
@@ -94,6 +99,11 @@ _FAMILIES: Mapping[tuple[int, int], _Family] = {
     (7, 2): _Family("FT120", turns=False),
 }
 _UNDECODED = frozenset({"Pandar128"})
+# Packets that several models send.
+_ALIKE = {
+    rows.PANDAR40P.name: "Pandar40P or Pandar40M",
+    rows.PANDAR20A.name: "Pandar20A or Pandar20B",
+}
 # Protocol 1.4 by the version of the status info: the first one at or below it.
 _STATUS_VERSION = (1, 4)
 _STATUS_VERSIONS = ((137, rows.JT128), (128, rows.OT128), (0, rows.PANDAR128E3X))
@@ -112,7 +122,7 @@ def hesai(size: int, packets: U8Array) -> str | None:
     found = identify(size, packets)
     if found is None:
         return None
-    name = "Pandar40P or Pandar40M" if found.name == rows.PANDAR40P.name else found.name
+    name = _ALIKE.get(found.name, found.name)
     mode = "" if found.mode is None else f", {found.mode.text}"
     return f"HESAI lidar {name}{mode}{'' if found.layout else NO_DECODER}"
 
@@ -144,12 +154,11 @@ def _identify_sized(size: int, packets: U8Array) -> Identity | None:
         if size in (_PANDAR40_SIZE, _PANDAR40_SIZE + _SEQUENCE_SIZE):
             flags = SEQUENCE if size > _PANDAR40_SIZE else 0
             return _identity(rows.PANDAR40P, size, 0, chosen, _PANDAR40_BLOCKS, flags, ())
-    for least, blocks in _PANDAR64_BLOCKS.items():
-        marked = starts(packets, _SOP + bytes((64, blocks)))
-        chosen = mostly(packets, marked)
-        if chosen is not None and size in (least, least + _SEQUENCE_SIZE):
-            flags = SEQUENCE if size > least else 0
-            return _identity(rows.PANDAR64, size, 0, chosen, blocks, flags, _FIXED_64)
+    for model, blocks, sizes in _SIZED:
+        chosen = mostly(packets, starts(packets, _SOP + bytes((model.channels, blocks))))
+        if chosen is not None and size in sizes:
+            flags = SEQUENCE if size > sizes[0] else 0
+            return _identity(model, size, 0, chosen, blocks, flags, _FIXED_64)
     if mostly(packets, starts(packets, _PANDAR20_MAGIC)) is not None:
         return Identity("Pandar20")
     return None

@@ -8,6 +8,7 @@ from 0 in the order of the wire.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ MAKER = "HESAI"
 BUILT_IN: tuple[Calibration, ...] = ()
 _REAL, _TWO, _ONE = "real recording", "two sources", "one source"
 _VERIFIED: Mapping[str, str] = {
+    "Pandar20A": _ONE,
+    "Pandar20B": _ONE,
     "Pandar40P": _REAL,
     "Pandar40M": _TWO,
     "Pandar64": _REAL,
@@ -51,6 +54,7 @@ _LIKE = {"Pandar40M": rows.PANDAR40P.name}
 _ROWS: Mapping[str, Model] = {
     row.name: row
     for row in (
+        *(rows.PANDAR20A, rows.PANDAR20B),
         *(rows.PANDAR40P, rows.PANDAR64, rows.PANDARQT64, rows.QT128, rows.XT16, rows.XT32),
         *(rows.XT32M2X, rows.PANDAR128E3X, rows.OT128, rows.AT128, rows.JT16, rows.JT128),
     )
@@ -110,6 +114,7 @@ class HesaiCalibration:
         layout = _layout(evidence)
         if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
             return 0
+        layout = _told_by_beams(layout, self._angles)
         if layout.model.name == rows.AT128.name:
             return 1
         return _FITS if _note_on_beams(self._angles, layout.model) else _FITS_BEAMS
@@ -117,8 +122,9 @@ class HesaiCalibration:
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
         """The sensor."""
         check_options(options)
-        layout = _seen(self.path, evidence)
-        model, angles = layout.model, self._angles
+        angles = self._angles
+        layout = _told_by_beams(_seen(self.path, evidence), angles)
+        model = layout.model
         if model.name == rows.AT128.name:
             raise RigError(
                 f"{self.path}: HESAI {model.name}: wanted its correction file (.dat), got a csv, "
@@ -188,6 +194,7 @@ class HesaiLidar(TurningLidar):
         self.channels, self.returns = model.channels, layout.mode.returns
         self.packet_size = layout.size
         self.columns_per_packet = layout.columns
+        self.column_period_ns = model.timing.step_ns / model.timing.divisor
         self.records = self._reader.records
         self.pixel_layout = (MAKER, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
         self.return_types = layout.mode.types
@@ -262,6 +269,12 @@ def _seen(path: Path | None, evidence: Evidence | None) -> Layout:
             "tell its model and mode, got none; check its stream in the rig file, or leave it out"
         )
     return layout
+
+
+def _told_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
+    """The layout, of the model whose beams the file has, where packets leave that open."""
+    is_b = layout.model is rows.PANDAR20A and not _note_on_beams(angles, rows.PANDAR20B)
+    return replace(layout, model=rows.PANDAR20B) if is_b else layout
 
 
 def _note_on_beams(angles: HesaiAngles, model: Model) -> str:

@@ -1,7 +1,8 @@
 """Layouts of HESAI packets by model, for the encoder.
 
 Source: facts/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times), laid out here once
-more, apart from the decoder; only the firing tables of section 12 are shared.
+more, apart from the decoder; only the firing tables of section 12 are shared. Pandar20:
+HesaiTechnology/HesaiLidar_General_SDK.
 """
 
 from __future__ import annotations
@@ -88,6 +89,9 @@ _P40 = HesaiModel(
     40, 10, "", _PANDAR, -28580, Fraction(55560), 3, 4, b"\xff\xee", date=SINCE_2000, flags=0
 )
 _P64 = HesaiModel(64, 6, "eeff400600000000", _PANDAR, -42580, Fraction(55560), 3)
+_P20 = HesaiModel(
+    20, 20, "eeff141400000000", _PANDAR, -28580, Fraction(55560), 3, date=SINCE_2000, flags=0
+)
 _QT64 = HesaiModel(
     64, 4, "eeff03010000400400000200", _QT, 25710, Fraction(500000, 3), counts_back=False
 )
@@ -129,6 +133,8 @@ _AT128 = HesaiModel(
     units_per_deg=25600,
 )
 MODELS: Mapping[str, HesaiModel] = {
+    "Pandar20A": _P20,
+    "Pandar20B": _P20,
     "Pandar40P": _P40,
     "Pandar64": _P64,
     "Pandar64-7": replace(_P64, blocks=7, head="eeff400700000000"),
@@ -152,6 +158,8 @@ MODELS: Mapping[str, HesaiModel] = {
 }
 # JT16 has none: all at once.
 TABLES: Mapping[str, I64Array] = {
+    "Pandar20A": firing.P20A,
+    "Pandar20B": firing.P20B,
     "Pandar40P": firing.P40,
     "Pandar64": firing.P64,
     "Pandar64-7": firing.P64,

@@ -85,12 +85,17 @@ def velodyne_sent(model: str, mode: str, name: str = "") -> Sent:
     return Sent(name or model, sight, types, is_named=bool(name))
 
 
+# Models that only their angles tell apart.
+HESAI_BEAMS_DEG = {"Pandar20A": (7.9, -24.9), "Pandar20B": (2.9, -18.9)}
+
+
 def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sent:
     """mode: byte of the return mode; operation: of models with protocol 1.4."""
     # All columns of an AT128 lie within the field of one mirror.
     spec = hesai.HesaiSpec(model, int(mode, 16), start_deg=351.3, operation=operation)
     channels = spec.row.channels
-    elevation = np.round(np.linspace(14.9, -15.1, channels), 3).tolist()
+    highest, lowest = HESAI_BEAMS_DEG.get(model, (14.9, -15.1))
+    elevation = np.round(np.linspace(highest, lowest, channels), 3).tolist()
     azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
     beams: Beams = Angles(elevation, azimuth)
     file, content = "unit.csv", angles_csv(elevation, azimuth)

@@ -11,6 +11,9 @@ from mlbatch.types import I64Array
 
 # Channel (from 1) and its ns, picked by eye in the sheet.
 SPOTS = {
+    # Of a Pandar20 in the source of the SDK: 3.62 + 1.304 a + 1.968 b us before the block's end.
+    "P20A": (20, {1: -16044, 2: -3620, 9: -50732, 17: -4924, 20: -3620}),
+    "P20B": (20, {1: -45492, 6: -8196, 9: -14740, 15: -21924, 20: -16044}),
     "P40": (40, {1: -42220, 8: -54670, 16: -8190, 21: -23890, 28: -6230, 40: -3620}),
     "P64": (64, {1: -23180, 16: -34988, 18: -52700, 35: -42860, 39: -6228, 64: -12748}),
     "QT64": (64, {1: 2310, 16: 33560, 17: 36610, 48: 102150, 56: 119600, 64: 136450}),
@@ -43,6 +46,13 @@ def test_sum_of_the_first_row(name: str) -> None:
 def test_tables_are_on_the_side_of_the_block_time_that_the_sheet_says() -> None:
     assert firing.P40.max() == firing.P64.max() == -3620
     assert min(firing.QT64.min(), firing.XT16.min(), firing.XT32.min()) > 0
+
+
+def test_beams_of_pandar20_fire_as_those_of_pandar40p_that_look_alike() -> None:
+    """Channels of a Pandar40P at elevations of 8, 5, 3, 2, 1.67, 1 deg; and from 3 deg on."""
+    same = [2, 3, 4, 5, 6, 8]
+    assert np.abs(firing.P20A[:6] - firing.P40[same]).max() < 10
+    assert np.abs(firing.P20B[:4] - firing.P40[same[2:]]).max() < 10
 
 
 def test_repeated_groups_of_pandar40p() -> None:

@@ -25,6 +25,7 @@ def hesai(size: int, head: str, mode_at: int = 0, mode: int = 0x37) -> U8Array:
 # (model, size, header, byte of the return mode) by facts/hesai.md sections 1 to 3; the byte is
 # header + blocks x stride + checks + place in the tail, worked by hand.
 DECODED = [
+    ("Pandar20A or Pandar20B", 1270, "eeff14140004", 1262),  # 8 + 20 x 62 + 14
     ("Pandar64", 1194, "eeff40060004", 1186),  # 8 + 6 x 194 + 14
     ("Pandar64", 1198, "eeff40060004", 1186),
     ("Pandar64", 1388, "eeff40070004", 1380),  # 8 + 7 x 194 + 14
@@ -46,7 +47,7 @@ DECODED = [
     ("XT32M2X", 820, "eeff06010000200601050301", 802),  # 12 + 6 x 130 + 10
 ]
 NAMED_ONLY = [
-    ("Pandar20", 1270, "eeff1414", 0),
+    ("Pandar20", 1274, "eeff1414", 0),  # with a sequence number, which no source knows of
     ("Pandar128", 812, "eeff01030000800200040100", 800),  # 12 + 2 x 386 + 16
     ("Pandar128E3X, 64 channels", 477, "eeff01040000400200040107", 433),  # 12 + 388 + 21 + 12
     ("PandarQT32", 560, "eeff03010000200401040201", 548),  # 12 + 4 x 130 + 16
