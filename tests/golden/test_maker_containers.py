@@ -1,0 +1,139 @@
+"""Velodyne and HESAI packets: every container, message, buffer and interleaving, the same scans."""
+
+from __future__ import annotations
+
+import functools
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.discover import Wishes
+from mlbatch.job import Job
+from mlbatch.readers import open_recording
+from mlbatch.types import StreamTable
+from tests.builders import hesai, velodyne
+from tests.builders.hesai_angles import angles_csv
+from tests.builders.run import RECORDINGS, Values, buffers_of, in_memory, prints
+from tests.golden.maker_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
+
+LENGTH_NS = 250 * NS_PER_MS
+
+
+@functools.cache
+def pair() -> tuple[Unit, Unit]:
+    """A PandarXT-16 and a VLP-16 at the same time, both with two returns; readings at random."""
+    rng = np.random.default_rng(11)
+    xt16 = hesai.HesaiSpec("PandarXT-16", hesai.DUAL, start_deg=351.3)
+    # The same second, as so many microseconds past its hour.
+    vlp16 = velodyne.VelodyneSpec("VLP-16", "dual", start_azimuth_deg=93.0, start_us=800_000_417.0)
+    columns = 4 * (LENGTH_NS // 200_000), 12 * (LENGTH_NS // 663_552)
+    readings = []
+    for count in columns:
+        counts = rng.integers(0, 20_000, (count, 16, 2))
+        # Many single returns, sent twice.
+        counts[..., 1] = np.where(rng.random(counts.shape[:2]) < 0.6, *np.moveaxis(counts, 2, 0))
+        readings.append((counts, rng.integers(0, 256, counts.shape)))
+    payloads = hesai.encode_packets(xt16, *readings[0])
+    host_ns = hesai.host_times_ns(xt16, len(payloads)).tolist()
+    sent = velodyne.encode(vlp16, *readings[1])
+    turning = zip(sent.host_ns.tolist(), (row.tobytes() for row in sent.payloads), strict=True)
+    return (
+        unit_of("hesai", tuple(zip(host_ns, payloads, strict=True))),
+        unit_of("velodyne", tuple(turning)),
+    )
+
+
+def angles(folder: Path) -> Path:
+    """The angle file of the XT-16."""
+    path = folder / "unit.csv"
+    path.write_bytes(angles_csv([15.0 - 2 * row for row in range(16)], [0.0] * 16))
+    return path
+
+
+def job(metadata: Path, *recordings: Path) -> Job:
+    """Everything in a session, at 20 Hz."""
+    wishes = Wishes(metadata=(metadata,), identity_extrinsics=True)
+    return Job(recordings, wishes, Fraction(20), keep_partial=True)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> list[Values]:
+    """What the capture gives."""
+    folder = tmp_path_factory.mktemp("plain")
+    result = in_memory(job(angles(folder), CONTAINERS["pcap"](folder, pair())))
+    ledgers = [sensor.ledger.points for sensor in result.report.sensors]
+    assert len(ledgers) == 2
+    assert min(points.written for points in ledgers) > 50_000
+    assert min(points.repeated for points in ledgers) > 20_000
+    return prints(result)
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_scans_do_not_depend_on_the_container(
+    name: str, plain: list[Values], tmp_path: Path
+) -> None:
+    path = CONTAINERS[name](tmp_path, pair())
+    assert prints(in_memory(job(angles(tmp_path), path))) == plain
+
+
+@pytest.mark.parametrize("size", [4_001, 65_537, 1 << 20])
+def test_scans_do_not_depend_on_buffers(size: int, plain: list[Values], tmp_path: Path) -> None:
+    path = CONTAINERS["pcap"](tmp_path, pair())
+    with buffers_of(size):
+        assert prints(in_memory(job(angles(tmp_path), path))) == plain
+
+
+@pytest.mark.parametrize("late_ms", [(0, 180), (430, 0), (0, 900)])
+@pytest.mark.parametrize("name", ["pcap", "db3", "MCAP", "ROS 1"])
+def test_scans_do_not_depend_on_the_interleaving(
+    late_ms: tuple[int, int], name: str, plain: list[Values], tmp_path: Path
+) -> None:
+    """The packets of one unit arrive later than they were sent."""
+    units = tuple(unit.late(by_ms * NS_PER_MS) for unit, by_ms in zip(pair(), late_ms, strict=True))
+    path = CONTAINERS[name](tmp_path, units)
+    assert prints(in_memory(job(angles(tmp_path), path))) == plain
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_scans_do_not_depend_on_the_files_of_a_session(
+    first: int, plain: list[Values], tmp_path: Path
+) -> None:
+    """Two captures, each of one unit, in either order."""
+    hesai_unit, velodyne_unit = pair()
+    paths = [CONTAINERS["pcap"](tmp_path, (hesai_unit,))]
+    paths.append(CONTAINERS["pcapng"](tmp_path, (velodyne_unit,)))
+    found = in_memory(job(angles(tmp_path), paths[first], paths[1 - first]))
+    assert prints(found) == plain
+
+
+REAL = {
+    "velodyne": ("velodyne/vlp16_ros2_dual", "1673400471837873222", "VLP16.yaml"),
+    "hesai": ("hesai/pandarxt16", "1732848127890747768", "PandarXT16.csv"),
+}
+
+
+def packets_of(path: Path) -> tuple[tuple[int, bytes], ...]:
+    """Arrival and payload of all packets of a recording."""
+    found = []
+    for batch in open_recording(path, StreamTable()).packets():
+        places = (batch.host_ns, batch.start, batch.size)
+        for host_ns, start, size in zip(*(values.tolist() for values in places), strict=True):
+            found.append((host_ns, batch.data[start : start + size].tobytes()))
+    return tuple(found)
+
+
+@pytest.mark.parametrize("maker", REAL)
+def test_packets_of_a_real_bag_in_other_containers(maker: str, tmp_path: Path) -> None:
+    folder, bag, file = REAL[maker]
+    if not (RECORDINGS / folder).is_dir():
+        pytest.skip(f"no recording: wanted ../shared/recordings/{folder}")
+    metadata, source = RECORDINGS / folder / file, RECORDINGS / folder / bag
+    whole = prints(in_memory(job(metadata, source)))
+    assert len(whole) > 6
+    unit = unit_of(maker, packets_of(source))
+    for number, write in enumerate(CONTAINERS.values()):
+        (tmp_path / str(number)).mkdir()
+        path = write(tmp_path / str(number), (unit,))
+        assert prints(in_memory(job(metadata, path))) == whole
