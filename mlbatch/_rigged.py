@@ -180,12 +180,8 @@ def _silent(
         except RigError as err:
             if not carried or own[0].path is None:
                 raise RigError(f"{origin}: sensor {wanted.name}: {err}") from err
-    is_placed = bool(wanted.selector.source_ip or wanted.selector.topic)
-    if carried and own and (is_placed or (len(own) == 1 and not _tells_serial(lidar))):
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted packets that {_paths(own)} fits, got "
-            f"{carried}; correct its stream or metadata"
-        )
+    if carried:
+        _refuse_carried(wanted, own, lidar, carried, origin)
     if lidar is None:
         selector = f" ({wanted.selector})" if str(wanted.selector) else ""
         which = f"which of {_paths(own)} is its metadata" if own else "its model"
@@ -195,6 +191,23 @@ def _silent(
             f"seconds, got none to tell {which}; correct its stream, or give {remedy}"
         )
     return Found(wanted.name, lidar, wanted.selector)
+
+
+def _refuse_carried(
+    wanted: Wanted, own: Sequence[Calibration], lidar: Lidar | None, carried: str, origin: Path
+) -> None:
+    """A silent sensor whose place other packets come from, or that they surely stand for."""
+    start = f"{origin}: sensor {wanted.name}: wanted"
+    if not own:
+        raise RigError(
+            f"{start} metadata that fit {carried}, got none; give them as `metadata:` of the "
+            "sensor, or with --metadata"
+        )
+    is_placed = bool(wanted.selector.source_ip or wanted.selector.topic)
+    if is_placed or (len(own) == 1 and not _tells_serial(lidar)):
+        is_built_in = any(one.path is None for one in own)
+        which = f"of the model {wanted.model}" if is_built_in else f"that fit {_paths(own)}"
+        raise RigError(f"{start} packets {which}, got {carried}; correct model, stream or metadata")
 
 
 def _tells_serial(lidar: Lidar | None) -> bool:

@@ -259,7 +259,8 @@ def _nothing_found(
     where = ", ".join(str(recording.path) for recording in recordings)
     table, types = sampler.table, packet_types(recordings)
     for kind, why in failures.items():
-        return RecordingError(f"{where}: {table.streams[kind[0]]}: {why}")
+        unfit = f" (does not fit: {_some(looked)})" if looked else ""
+        return RecordingError(f"{where}: {table.streams[kind[0]]}: {why}{unfit}")
     carried = [(table.streams[kind[0]], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
         if not lacks_decoder(what):
