@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["PointCounts", "report_inputs", "why_nothing"]
 
 _KB_PER_MB = 1024
-_NO_SCANS = ScanStatistics(0, 0, 0, 0, Spread(), Spread())
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
 
 
 def report_inputs(run: Conversion) -> ReportInputs:
@@ -47,7 +47,9 @@ def report_inputs(run: Conversion) -> ReportInputs:
         slices=run.job.slices,
         capture=_capture(run),
         sensors=tuple(_sensor(run, number) for number in range(len(run.feeds))),
-        scans=_NO_SCANS if table is None else table.statistics(run.batcher.empty),
+        scans=_NO_SCANS
+        if table is None
+        else table.statistics(run.batcher.empty, run.dropped_incomplete),
         unassigned=_unassigned(run),
         timing=_timing(run),
         messages=tuple(
@@ -60,6 +62,8 @@ def report_inputs(run: Conversion) -> ReportInputs:
 
 # A note, not a fault: what the times of clouds were taken for.
 CLOUDS = "clouds"
+# Share of a sensor's packets that is worth a warning: a change of mode, a wrong calibration.
+MANY_REJECTED = 0.01
 
 
 def late_notes(run: Conversion) -> list[Note]:
@@ -75,6 +79,13 @@ def late_notes(run: Conversion) -> list[Note]:
         if isinstance(recording, CloudRecording)
         for text in recording.verdicts
     ]
+    for sensor, feed in zip(run.setup.sensors, run.feeds, strict=True):
+        packets = feed.ledger.packets
+        rejected = sum(packets.rejected.values())
+        if rejected > MANY_REJECTED * packets.read:
+            reasons = ", ".join(f"{n} {reason}" for reason, n in packets.rejected.items())
+            text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
+            notes.append(Note("rejected", sensor.name, text))
     table, seen = run.setup.sampler.table, run.setup.sampler.samples
     for kind in sorted(run.feeder.samples):
         what = _what(run, kind)
@@ -192,11 +203,13 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
 
 
 def _what(run: Conversion, kind: Kind) -> str:
-    """What unassigned packets look like."""
+    """What unassigned packets look like: one of them, else those seen at first."""
+    sample = run.feeder.samples.get(kind)
+    if sample is not None and (text := sensors.describe(kind[1], sample)):
+        return text
     if kind in run.setup.sampler.samples:
         return discover.describe(run.setup.sampler, kind) or "unknown"
-    sample = run.feeder.samples.get(kind)
-    return (None if sample is None else sensors.describe(kind[1], sample)) or "unknown"
+    return "unknown"
 
 
 def _timing(run: Conversion) -> Timing:

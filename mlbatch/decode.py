@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mlbatch.geometry import SECTORS, sectors
 from mlbatch.ledger import PointCounts
 from mlbatch.projection import (
     LABEL,
@@ -104,6 +105,9 @@ class Decoder:
         self._extras = extras
         self._slots = max(source.slots for source in sources)
         self._columns = tile_columns(self._slots)
+        # Rotor positions of a turn, None for those that columns tell themselves.
+        angles = [source.lidar.beams.angle_rad for source in sources]
+        self._positions = [None if one is None else len(one) for one in angles]
         groups = _alike(sources)
         first = only or 0
         self._projectors = [
@@ -243,6 +247,7 @@ class Decoder:
     def _scan(self, due: Due, label: Label, points: int) -> Scan:
         rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
         lidar_id = self._lidar_id(due, slice(None))
+        passes = self._passes(due)
         has_column = "column" in self._extras and not self._organized
         return Scan(
             info=self._info,
@@ -268,7 +273,28 @@ class Decoder:
                 np.bincount(lidar_id, minlength=len(self._info.sensors)).tolist()
             ),
             max_gap_ns=self._gaps(due.stamp_ns, lidar_id),
+            coverage=self._shares(passes >= 1),
+            overlap=self._shares(passes >= 2),
         )
+
+    def _passes(self, due: Due) -> I64Array:
+        """How often the rotor of each sensor entered each sector: (sensors, SECTORS)."""
+        passes = np.zeros((len(self._positions), SECTORS), np.int64)
+        for number, positions in enumerate(self._positions):
+            own = due.encoder if len(self._positions) == 1 else due.encoder[due.sensor == number]
+            if not len(own):
+                continue
+            sector = sectors(own, positions)
+            entered = np.flatnonzero(sector[1:] != sector[:-1]) + 1
+            passes[number] = np.bincount(sector[entered], minlength=SECTORS)
+            passes[number, sector[0]] += 1
+        return passes
+
+    def _shares(self, sectors_seen: BoolArray) -> tuple[float, ...]:
+        shares: list[float] = (np.count_nonzero(sectors_seen, axis=1) / SECTORS).tolist()
+        if self._only is None:
+            return tuple(shares)
+        return tuple(shares[0] if n == self._only else 0.0 for n in range(len(self._info.sensors)))
 
     def _gaps(self, stamp_ns: I64Array, lidar_id: U8Array) -> tuple[int, ...]:
         """Widest step between columns of each sensor, ns."""

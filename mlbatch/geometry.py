@@ -110,6 +110,20 @@ def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:
     return angle, speed, words >> (_ANGLE_BITS + _SPEED_BITS)
 
 
+# Of a turn; wide enough that columns of slow lidars leave none out.
+SECTORS = 120
+
+
+def sectors(encoder: I64Array, positions: int | None) -> I64Array:
+    """Sector of a turn, below SECTORS, in which the rotor stands; (n,).
+
+    positions: of a turn, where these are numbered; None for rotor words.
+    """
+    if positions is not None:
+        return encoder * SECTORS // positions
+    return (encoder & ((1 << _ANGLE_BITS) - 1)) * SECTORS >> _ANGLE_BITS
+
+
 class Projection(Protocol):
     """Ranges to points in the body frame, for columns of sensors that are decoded together."""
 

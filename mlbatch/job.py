@@ -19,7 +19,8 @@ DEFAULT_MAX_WAIT_NS = NS_PER_S
 class Job:
     """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
 
-    rate None: that of the rig, else 10 Hz; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
+    rate None: that of the rig, else 10 Hz; drop_incomplete: percent of the columns of every sensor
+    that a window must hold; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
     those of EXTRAS that the output has a place for; passed: patterns of topics to pass through.
     """
 
@@ -31,6 +32,7 @@ class Job:
     split: bool = False
     keep_partial: bool = False
     keep_repeated: bool = False
+    drop_incomplete: float = 0.0
     max_wait_ns: int | None = DEFAULT_MAX_WAIT_NS
     start: Limit | None = None
     end: Limit | None = None

@@ -10,7 +10,10 @@ from mlbatch.types import CaptureCounts
 # `fragment`: a frame that its datagram's last fragment completed; it is in that datagram.
 CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
-COLUMN_REASONS = ("before_start", "late", "tail", "head", "invalid", "outside_time")
+# `incomplete`: of windows left out by --drop-incomplete.
+COLUMN_REASONS = (
+    *("before_start", "late", "tail", "head", "invalid", "outside_time", "incomplete"),
+)
 # `no_place`: the format of the output has none for them.
 IMU_REASONS = ("bad_stamp", "outside_time", "no_place")
 

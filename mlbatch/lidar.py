@@ -123,6 +123,7 @@ class Lidar(Protocol):
     the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
     numbering of facts/outputs.md section 3 per return; `typed_by`: how those of two returns are
     told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at all).
+    `column_period_ns`: from column to column where nothing is left out, 0 unknown.
     `sends_twice`: a single return is sent once for each return of the mode. `extrinsics`: (4, 4)
     body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
     driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "".
@@ -138,6 +139,7 @@ class Lidar(Protocol):
     has_reflectivity: bool
     packet_size: int
     columns_per_packet: int
+    column_period_ns: float
     records: Records
     pixel_layout: tuple[str | int | bool, ...]
     sequence_modulus: int

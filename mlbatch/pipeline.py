@@ -24,7 +24,6 @@ from mlbatch.job import DEFAULT_RATE, Job
 from mlbatch.mounting import Mounted
 from mlbatch.passing import PassQueue
 from mlbatch.readers import merge, open_recording
-from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.scan_table import ScanTable
 from mlbatch.types import (
     IMU,
@@ -34,7 +33,6 @@ from mlbatch.types import (
     RunInfo,
     Scan,
     StreamTable,
-    Summary,
 )
 from mlbatch.units import NS_PER_S
 from mlbatch.writers import ScanWriter
@@ -50,7 +48,6 @@ class Stages:
     write_s: float = 0.0
 
 
-OpenWriter = Callable[[RunInfo], ScanWriter]
 Progress = Callable[[int, int], None]
 
 
@@ -63,6 +60,7 @@ class Conversion:
         self.table: ScanTable | None = None
         self.info: RunInfo | None = None
         self.delivered = 0
+        self.dropped_incomplete = 0
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
@@ -70,6 +68,8 @@ class Conversion:
         opened = [open_recording(path, streams) for path in job.recordings]
         self.setup: Setup = discover(opened, streams, job.wishes)
         self.recordings: Sequence[Recording] = self.setup.recordings
+        sampler = self.setup.sampler
+        self._columns_per_s = [sampler.columns_per_s(one.found) for one in self.setup.sensors]
         self._prepare()
         for note in self.setup.notes:
             self.warn(note)
@@ -152,6 +152,8 @@ class Conversion:
             yield from self._decode(window)
 
     def _decode(self, window: Window) -> Iterator[tuple[Scan, int | None]]:
+        if self._is_too_incomplete(window):
+            return
         label = Label(
             window.index,
             window.slice,
@@ -178,6 +180,22 @@ class Conversion:
             self._account(scan)
             yield scan, only
 
+    def _is_too_incomplete(self, window: Window) -> bool:
+        """Whether --drop-incomplete leaves a window out; its columns are counted."""
+        share = self.job.drop_incomplete / 100
+        if not share:
+            return False
+        counts = np.bincount(window.sensor, minlength=len(self.feeds)).tolist()
+        seconds = (window.end_ns - window.start_ns) / NS_PER_S
+        # Of a sensor that was not seen at first at least one column is expected.
+        wanted = [1 if rate is None else share * rate * seconds for rate in self._columns_per_s]
+        if all(count >= least for count, least in zip(counts, wanted, strict=True)):
+            return False
+        for feed, count in zip(self.feeds, counts, strict=True):
+            feed.ledger.columns.drop("incomplete", count)
+        self.dropped_incomplete += 1
+        return True
+
     def _account(self, scan: Scan) -> None:
         for feed, count in zip(self.feeds, scan.columns_per_sensor, strict=True):
             feed.ledger.columns.written += count
@@ -192,7 +210,7 @@ class Conversion:
             self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
         self._check_dates(shared)
         self.info = run_info(self.setup, self.job, self.grid, shared)
-        self.table = ScanTable(self.info)
+        self.table = ScanTable(self.info, self._columns_per_s)
         boxes_m, extras = boxes_of(self.setup, self.job), self.job.extras
         sources = [
             source_of(sensor, feed, info.ring_base, self.job)
@@ -352,40 +370,3 @@ class Conversion:
         finally:
             spent_s = time.perf_counter() - began_s
             setattr(self.stages, stage, getattr(self.stages, stage) + spent_s)
-
-
-def convert(
-    job: Job,
-    open_writer: OpenWriter | None,
-    progress: Progress | None = None,
-) -> tuple[Conversion, ReportInputs]:
-    """Run a job; open_writer None is a dry run. Gives the run and what its report is made of."""
-    run = Conversion(job)
-    writer: ScanWriter | None = None
-    try:
-        for scan, only in run.scans(progress):
-            began_s = time.perf_counter()
-            if writer is None and open_writer is not None:
-                writer = open_writer(scan.info)
-            run.hand_over(writer, scan.end_ns)
-            if writer is not None:
-                writer.write(scan, only)
-            run.stages.write_s += time.perf_counter() - began_s
-        began_s = time.perf_counter()
-        run.hand_over(writer, None)
-        run.tell_of_passed()
-        inputs = accounts.report_inputs(run)
-        broken = imbalances(inputs)
-        if broken:
-            raise RecordingError(f"the ledger does not balance, please report: {broken[0]}")
-        if writer is not None:
-            table = run.table.text() if run.table is not None else ""
-            report = report_text(inputs, machine=False)
-            writer.finish(Summary(run.batcher.t_init_ns, report, table))
-            writer = None
-            run.stages.write_s += time.perf_counter() - began_s
-            inputs = accounts.report_inputs(run)
-    finally:
-        if writer is not None:
-            writer.abandon()
-    return run, inputs

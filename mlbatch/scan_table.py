@@ -13,7 +13,7 @@ import numpy as np
 
 from mlbatch.errors import ExportError
 from mlbatch.types import F64Array, RunInfo, Scan
-from mlbatch.units import NS_PER_MS
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # scans.csv stays in memory up to this size, then goes to a temporary file.
 _SPOOL_BYTES = 2**20
@@ -35,6 +35,7 @@ class ScanStatistics:
     written: int
     empty: int
     incomplete: int
+    dropped_incomplete: int
     points: int
     span_ms: Spread
     period_ms: Spread
@@ -46,7 +47,8 @@ class ScanTable:
     Scans of one window or slice that are added one after the other (`--split`) share a row.
     """
 
-    def __init__(self, info: RunInfo) -> None:
+    def __init__(self, info: RunInfo, columns_per_s: Sequence[float | None] = ()) -> None:
+        """columns_per_s: what each sensor sends where nothing is lost; None where unknown."""
         # The table itself must not outlive this object: its text leaves by `text`.
         self._file = tempfile.SpooledTemporaryFile(_SPOOL_BYTES)  # noqa: SIM115
         self._slices = info.slices
@@ -58,8 +60,10 @@ class ScanTable:
         names = [sensor.name for sensor in info.sensors]
         start = ["index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns"]
         counts = ["points", "columns", *(f"columns_{name}" for name in names), "complete"]
-        gaps = [*(f"max_gap_ns_{name}" for name in names), "ready_host_ns"]
-        self._append([*start, *counts, *gaps])
+        gaps = (f"max_gap_ns_{name}" for name in names)
+        turns = (f"{word}_{name}" for word in ("coverage", "overlap", "missing") for name in names)
+        self._append([*start, *counts, *gaps, *turns, "ready_host_ns"])
+        self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
     def add(self, scan: Scan) -> None:
         """Add a scan that was written."""
@@ -84,13 +88,18 @@ class ScanTable:
         self._file.seek(0, io.SEEK_END)
         return text
 
-    def statistics(self, empty: int) -> ScanStatistics:
-        """Figures for the report; `empty`: windows without any column, which are not written."""
+    def statistics(self, empty: int, dropped_incomplete: int = 0) -> ScanStatistics:
+        """Figures for the report.
+
+        empty: windows without any column; dropped_incomplete: those left out by
+        `--drop-incomplete`. Neither are written.
+        """
         self._close_row()
         return ScanStatistics(
             self._written,
             empty,
             self._incomplete,
+            dropped_incomplete,
             self._points,
             _spread(np.frombuffer(self._spans_ns, dtype=np.int64) / NS_PER_MS),
             _spread(np.frombuffer(self._periods_ns, dtype=np.float64) / NS_PER_MS),
@@ -100,7 +109,7 @@ class ScanTable:
         row, self._open = self._open, None
         if row is None:
             return
-        self._append(row.cells())
+        self._append([*row.cells(), *self._missing(row), row.ready_host_ns])
         self._written += 1
         self._incomplete += not row.complete
         self._points += row.points
@@ -111,6 +120,14 @@ class ScanTable:
         if self._last is not None and step > self._last[0]:
             self._periods_ns.append((row.start_ns - self._last[1]) / (step - self._last[0]))
         self._last = (step, row.start_ns)
+
+    def _missing(self, row: _Row) -> list[int | str]:
+        """Columns that each sensor should have sent in a window and did not; "" where unknown."""
+        seconds = (row.end_ns - row.start_ns) / NS_PER_S
+        return [
+            "" if rate is None else max(0, round(rate * seconds) - count)
+            for rate, count in zip(self._columns_per_s, row.columns, strict=True)
+        ]
 
     def _append(self, cells: Sequence[int | str]) -> None:
         line = io.StringIO()
@@ -138,11 +155,14 @@ class _Row:
     complete: bool
     max_gap_ns: tuple[int, ...]
     ready_host_ns: int
+    coverage: tuple[float, ...]
+    overlap: tuple[float, ...]
 
     @classmethod
     def of(cls, scan: Scan) -> _Row:
         """The row of one scan."""
         stamps = scan.column_stamp_ns
+        nothing = (0.0,) * len(scan.columns_per_sensor)
         return cls(
             (scan.index, scan.slice),
             scan.start_ns,
@@ -154,6 +174,8 @@ class _Row:
             scan.complete,
             scan.max_gap_ns,
             scan.ready_host_ns,
+            scan.coverage or nothing,
+            scan.overlap or nothing,
         )
 
     def joined(self, other: _Row) -> _Row:
@@ -169,16 +191,19 @@ class _Row:
             self.complete and other.complete,
             tuple(max(pair) for pair in zip(self.max_gap_ns, other.max_gap_ns, strict=True)),
             max(self.ready_host_ns, other.ready_host_ns),
+            tuple(max(pair) for pair in zip(self.coverage, other.coverage, strict=True)),
+            tuple(max(pair) for pair in zip(self.overlap, other.overlap, strict=True)),
         )
 
     def cells(self) -> list[int | str]:
-        """Values in the order of the header."""
+        """Values in the order of the header, but what the table adds."""
         total = sum(self.columns)
         stamps = (self.first_stamp_ns, self.last_stamp_ns) if total else ("", "")
         start = (*self.key, self.start_ns, self.end_ns, *stamps)
         complete = str(self.complete).lower()
         counts = (self.points, total, *self.columns, complete)
-        return [*start, *counts, *self.max_gap_ns, self.ready_host_ns]
+        shares = (f"{share:.3f}" for share in (*self.coverage, *self.overlap))
+        return [*start, *counts, *self.max_gap_ns, *shares]
 
 
 def _spread(values_ms: F64Array) -> Spread:

@@ -22,6 +22,8 @@ from mlbatch.units import NS_PER_S
 Kind = tuple[int, int]  # (number of the stream, payload size)
 SAMPLES_PER_KIND = 16
 SAMPLE_EVERY_NS = NS_PER_S // 4
+# Less of a recording does not tell how much a sensor sends.
+SHORTEST_NS = 2 * NS_PER_S
 # Different first words of a kind that are looked out for; most makers change them in every packet.
 MOST_BEGINNINGS = 8
 _WORD = 4
@@ -120,6 +122,37 @@ class Sampler:
                 host_ns = self.sample_host_ns[kind][row]
                 firsts.append((host_ns, stamp_ns - host_ns))
         return min(firsts)[1] if firsts else None
+
+    def columns_per_s(self, sensor: Found) -> float | None:
+        """Columns that a sensor sends in a second where nothing is lost; None if it is not known.
+
+        What it would send over whole turns, times the share of it that was seen, in percent: rates
+        that were measured must not depend on when packets arrive.
+        """
+        period_ns = sensor.lidar.column_period_ns
+        shares = [self._share(sensor, kind, period_ns) for kind in sensor.kinds if period_ns]
+        share = max((share for share in shares if share is not None), default=0.0)
+        return round(share, 2) * NS_PER_S / period_ns if share else None
+
+    def _share(self, sensor: Found, kind: Kind, period_ns: float) -> float | None:
+        """Valid columns that were sent between two samples, by what a whole turn would hold."""
+        lidar = sensor.lidar
+        packets = as_rows(self.samples[kind], kind[1])[:, : lidar.packet_size]
+        hosts_ns = np.array(self.sample_host_ns[kind], np.int64)
+        good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+        packets, hosts_ns = packets[good], hosts_ns[good]
+        if len(packets) < 2 or hosts_ns[-1] - hosts_ns[0] < SHORTEST_NS:
+            return None
+        heads, number = lidar.heads(packets, hosts_ns), lidar.sequence(packets)
+        first, last = 0, len(packets) - 1
+        sent = self.packets[kind] - 1
+        counted = (number >= 0).nonzero()[0]
+        if lidar.sequence_modulus and len(counted) > 1:
+            first, last = int(counted[0]), int(counted[-1])
+            sent = int(number[last] - number[first]) % lidar.sequence_modulus
+        passed_ns = int(heads.stamp_ns[last].max() - heads.stamp_ns[first].max())
+        valid = float(heads.valid.sum(axis=1).mean())
+        return sent * valid * period_ns / passed_ns if passed_ns > 0 else None
 
     def evidence(self, kind: Kind) -> Evidence:
         """What is known of a kind."""

@@ -242,7 +242,8 @@ class Scan:
     (p,) uint8; column: (p,) uint32, or None when organized; column_stamp_ns: (n,) int64;
     column_lidar_id: (n,) uint8. The arrays of EXTRAS are None where nobody asked for them.
     `ready_host_ns` is the arrival of the packet that closed the window; `max_gap_ns[s]` the widest
-    step between columns of sensor s (0: fewer than two).
+    step between columns of sensor s (0: fewer than two); `coverage[s]`, `overlap[s]`: shares of a
+    turn that its rotor passed at least once, and more than once.
     """
 
     info: RunInfo
@@ -266,6 +267,8 @@ class Scan:
     points: int
     columns_per_sensor: tuple[int, ...]
     max_gap_ns: tuple[int, ...]
+    coverage: tuple[float, ...] = ()
+    overlap: tuple[float, ...] = ()
 
     @property
     def slices(self) -> int:

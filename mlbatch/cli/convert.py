@@ -43,6 +43,12 @@ def convert(
     keep_partial: Annotated[
         bool, typer.Option("--keep-partial", help="Also write the first and last, partial window.")
     ] = False,
+    drop_incomplete: Annotated[
+        float,
+        typer.Option(
+            help="Leave out scans with fewer than P % of any sensor's columns.", metavar="P"
+        ),
+    ] = 0.0,
     max_wait: Annotated[
         str, typer.Option(help="Wait for a silent sensor so long, s of stamps, or inf.")
     ] = "1.0",
@@ -73,7 +79,8 @@ def convert(
         bool, typer.Option("--identity-extrinsics", help="Sensors without extrinsics: at 0, 0, 0.")
     ] = False,
     decode: Annotated[
-        list[str] | None, typer.Option(help="KEY=VALUE for decoders: crc=check; repeatable.")
+        list[str] | None,
+        typer.Option(help="KEY=VALUE for decoders: crc=check, firing_azimuth=off; repeatable."),
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
@@ -137,6 +144,7 @@ def convert(
         split=split,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
+        drop_incomplete=values.percent("--drop-incomplete", drop_incomplete),
         max_wait_ns=values.max_wait_ns(max_wait),
         start=first,
         end=last,

@@ -11,8 +11,9 @@ from pathlib import Path
 import typer
 
 from mlbatch.cli import checks
+from mlbatch.converting import OpenWriter, convert
 from mlbatch.job import Job
-from mlbatch.pipeline import Conversion, OpenWriter, Progress, convert
+from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (

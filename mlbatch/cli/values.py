@@ -12,15 +12,10 @@ from fractions import Fraction
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
 from mlbatch.rate import parse_rate
+from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
 
 MAX_SLICES = 10_000
-DECODE_KEYS = {
-    "firing_azimuth": ("on", "off"),
-    "vertical_offset": ("on", "off"),
-    "optical_centre": ("on", "off"),
-    "crc": ("check",),
-}
 
 
 def rate(text: str) -> Fraction:
@@ -118,15 +113,15 @@ def decode_options(texts: Sequence[str]) -> dict[str, str]:
     options = {}
     for text in texts:
         key, sign, value = text.partition("=")
-        if key not in DECODE_KEYS:
+        if key not in DECODE_OPTIONS:
             raise UsageError(
-                f"--decode: wanted one of {', '.join(DECODE_KEYS)}, got {key!r}; "
+                f"--decode: wanted one of {', '.join(DECODE_OPTIONS)}, got {key!r}; "
                 "write --decode crc=check"
             )
-        if not sign or value not in DECODE_KEYS[key]:
+        if not sign or value not in DECODE_OPTIONS[key]:
             raise UsageError(
-                f"--decode {key}: wanted {' or '.join(DECODE_KEYS[key])}, got {value!r}; "
-                f"write --decode {key}={DECODE_KEYS[key][0]}"
+                f"--decode {key}: wanted {' or '.join(DECODE_OPTIONS[key])}, got {value!r}; "
+                f"write --decode {key}={DECODE_OPTIONS[key][0]}"
             )
         options[key] = value
     return options
@@ -140,3 +135,10 @@ def choice(option: str, text: str, allowed: Sequence[str], later: Sequence[str] 
     raise UsageError(
         f"{option}: wanted {' or '.join(allowed)}, got {text!r}{note}; choose one of them"
     )
+
+
+def percent(option: str, value: float) -> float:
+    """A share in percent."""
+    if not 0 <= value <= 100:
+        raise UsageError(f"{option}: wanted a share from 0 to 100 %, got {value:g}; correct it")
+    return value

@@ -14,7 +14,20 @@ from typing import Protocol, cast
 
 from mlbatch.errors import RigError
 from mlbatch.lidar import Calibration, SensorModel
+from mlbatch.sensors._options import DECODE_OPTIONS
 from mlbatch.types import U8Array
+
+__all__ = [
+    "DECODE_OPTIONS",
+    "MAX_CALIBRATION_BYTES",
+    "Plugin",
+    "built_in",
+    "describe",
+    "models",
+    "parse_calibration",
+    "plugins",
+    "read_calibration",
+]
 
 # No calibration file comes near; what is larger is a recording or something else altogether.
 MAX_CALIBRATION_BYTES = 16_000_000

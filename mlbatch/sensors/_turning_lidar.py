@@ -35,6 +35,7 @@ class TurningLidar:
     carries_serial: bool = False
     has_reflectivity: bool = False
     sequence_modulus: int = 0
+    column_period_ns: float = 0.0
     imu_port: int = 0
     typed_by: str = "level"
     sends_twice: bool = True

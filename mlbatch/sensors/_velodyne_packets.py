@@ -86,6 +86,7 @@ class VelodyneLidar(TurningLidar):
         self.returns = returns
         self.packet_size = PACKET_SIZE
         self.columns_per_packet = self._layout.columns
+        self.column_period_ns = measured.sequence_ns
         self.records = self._layout.records
         self._dark = np.zeros(0, np.int64) if file is None else (~file.enabled).nonzero()[0]
         dark = str(self._dark.tolist())

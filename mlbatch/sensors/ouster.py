@@ -36,6 +36,7 @@ from mlbatch.sensors._ouster_packets import (
 from mlbatch.sensors._ouster_pixels import PixelReader
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
+from mlbatch.units import NS_PER_S
 
 __all__ = [
     "BUILT_IN",
@@ -158,6 +159,7 @@ class OusterLidar:
         self.has_reflectivity = True
         self.packet_size = layout.packet_size
         self.columns_per_packet = layout.columns
+        self.column_period_ns = _column_period_ns(described)
         self.records = Records(layout.record_start, layout.record_size, layout.record_size)
         self.pixel_layout = (MAKER, layout.profile.name, layout.beams, described.strongest_first)
         # Which of two returns is the strongest depends on their order: the decoder sorts them out.
@@ -260,6 +262,14 @@ def _headers(described: Metadata, check_crc: bool) -> Headers:
     if layout.legacy:
         return LegacyHeaders(layout, columns)
     return PacketHeaders(layout, columns, described.header, described.serial, check_crc)
+
+
+def _column_period_ns(described: Metadata) -> float:
+    """By the mode, as 1024x10; 0 where the metadata name none."""
+    turns_per_s = described.lidar_mode.rpartition("x")[2]
+    if not turns_per_s.isdigit() or not int(turns_per_s):
+        return 0.0
+    return NS_PER_S / (described.columns_per_frame * int(turns_per_s))
 
 
 def _packet_ranks(described: Metadata) -> tuple[I64Array, int]:

@@ -113,7 +113,8 @@ class PointsLidar(TurningLidar):
     def __init__(self, layout: Layout, topic: str) -> None:
         slots = layout.slots
         self.model = KINDS[layout.kind]
-        self.maker = MODELS[layout.kind].maker
+        # What a sensor is named after where nothing else tells its place.
+        self.maker = "Cloud"
         self.mode = str(layout)
         self.channels, self.returns, self.return_types = slots, 1, (0,)
         self.packet_size = layout.size

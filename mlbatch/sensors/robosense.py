@@ -219,6 +219,7 @@ class RobosenseLidar(TurningLidar):
         self.returns = shape.returns
         self.packet_size = evidence.size
         self.columns_per_packet = shape.rows * shape.columns
+        self.column_period_ns = float(row.round_ns)
         self.records = shape.records
         self.return_types = (returned.type,) * shape.returns
         self.channel = np.arange(row.channels)

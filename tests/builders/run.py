@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from mlbatch import pipeline
 from mlbatch.cli import main
+from mlbatch.converting import convert
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
-from mlbatch.pipeline import Conversion, convert
+from mlbatch.pipeline import Conversion
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
 from mlbatch.report import ReportInputs

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from mlbatch import ledger
+from mlbatch.converting import convert
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
-from mlbatch.pipeline import convert
 from mlbatch.readers import readers
 from mlbatch.report import build_report
 from mlbatch.rig import read_rig

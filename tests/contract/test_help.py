@@ -31,6 +31,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--max-range": r"\bm\b",
         "--exclude-box": r"x0,y0,z0,x1,y1,z1, m, body frame.*repeatable",
         "--keep-repeated": "second",
+        "--drop-incomplete": "%",
         "--pass": "topic",
         "--metadata": "repeatable",
         "--identity-extrinsics": "without extrinsics",
@@ -47,6 +48,15 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--verbose": "chosen",
     },
     "inspect": {"--metadata": "repeatable", "--json": "JSON", "--write-rig": "convert"},
+    "compare": {
+        "--rig": "YAML",
+        "--rate": "Hz",
+        "--metadata": "repeatable",
+        "--clock": "sensor.*host",
+        "--tolerance": r"\bs\b.*other",
+        "--timeout": r"\bs\b",
+        "--json": "JSON",
+    },
     "sensors": {"--json": "JSON"},
 }
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")

@@ -9,7 +9,8 @@ from tests.contract.tree import PLUGIN_PACKAGES, Module, imports, modules, plugi
 # From left to right: a module imports modules of its own group, and groups of later lines.
 LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("cli", "__main__"),),
-    (("api",),),
+    (("api",), ("compare",)),
+    (("converting",),),
     (("pipeline", "accounts"), ("survey",)),
     (("assembly",),),
     (("feeding",), ("job",)),
@@ -33,6 +34,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("ring",),
         ("ledger",),
         ("scan_table",),
+        ("turns", "tally"),
         ("clock",),
     ),
     (("lidar",), ("transforms",)),

@@ -273,8 +273,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown decoder option": (
         "vlp16/drive.pcap --decode nonsense=1",
         2,
-        "--decode: wanted one of firing_azimuth, vertical_offset, optical_centre, crc, got "
-        "'nonsense'; write --decode crc=check",
+        "--decode: wanted one of crc, firing_azimuth, optical_centre, packet_stamp, "
+        "vertical_offset, got 'nonsense'; write --decode crc=check",
     ),
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",

@@ -208,8 +208,9 @@ def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Pa
     report = _converted(shell, "p40/drive.pcap", tmp_path)
     (sensor,) = report["sensors"]
     assert sensor["packets"]["rejected"] == {"bad_size": MANY}
-    ((name, told),) = _told(report)
-    assert name == "hesai_1"
+    (name, told), (same, counted) = _told(report)
+    assert name == same == "hesai_1"
+    assert counted == f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size)"
     assert told == (
         f"{IP} > port {PORT}: wanted packets of 1262 bytes as at first, got 1266 bytes as well, "
         "which are rejected as bad_size; split the recording where the settings of the lidar change"
@@ -223,6 +224,8 @@ def test_packets_of_another_return_mode_are_rejected(
     report = _converted(shell, f"{session}/drive.pcap", tmp_path)
     assert report["sensors"][0]["packets"]["rejected"] == {"bad_header": MANY}
     assert report["sensors"][0]["packets"]["accepted"] == MANY
+    ((_, told),) = _told(report)
+    assert told.endswith(f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header)")
 
 
 def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> None:

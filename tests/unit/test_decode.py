@@ -280,3 +280,31 @@ def test_a_smaller_scan_after_a_larger_one_holds_nothing_of_it(tmp_path: Path) -
     scan = _scan(decoder, [bench], [(0, 9)])
     assert (scan.points, len(scan.xyz), len(scan.ring)) == (15, 15, 15)
     assert decoder.counts[0].written == 1599 + 15
+
+
+# -- how much of a turn a scan saw ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mids", "coverage", "overlap"),
+    [
+        (range(TURN), 1.0, 0.0),
+        (range(TURN // 2), 0.5, 0.0),
+        # A turn and a quarter: the first quarter was passed twice.
+        ([*range(TURN), *range(TURN // 4)], 1.0, 0.25),
+        ([*range(TURN), *range(TURN), *range(TURN)], 1.0, 1.0),
+        ([5], 1 / 120, 0.0),
+    ],
+)
+def test_how_much_of_a_turn_was_seen(
+    tmp_path: Path, mids: Sequence[int], coverage: float, overlap: float
+) -> None:
+    for name in ("1", "2"):
+        (tmp_path / name).mkdir()
+    one = Bench(tmp_path / "1", FLAT, {"RANGE": _ranges(4000)})
+    two = Bench(tmp_path / "2", FLAT, {"RANGE": _ranges(4000)}, ring_base=16)
+    columns = [(0, mid) for mid in mids]
+    assert _scan(_decoder(one), [one], columns).coverage == pytest.approx((coverage,))
+    scan = _scan(_decoder(one, two), [one, two], [*columns, (1, 7)])
+    assert scan.coverage == pytest.approx((coverage, 1 / 120))
+    assert scan.overlap == pytest.approx((overlap, 0.0))

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import mlbatch
+from mlbatch.converting import convert
 from mlbatch.discover import Wishes
 from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.job import Job
-from mlbatch.pipeline import Conversion, convert
+from mlbatch.pipeline import Conversion
 from mlbatch.report import ReportInputs
 from mlbatch.types import RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory

@@ -114,14 +114,18 @@ def test_table_of_scans_by_hand() -> None:
     rows = list(csv.reader(io.StringIO(table.text())))
     assert ",".join(rows[0]) == (
         "index,slice,start_ns,end_ns,first_stamp_ns,last_stamp_ns,points,columns,"
-        "columns_left,columns_right,complete,max_gap_ns_left,max_gap_ns_right,ready_host_ns"
+        "columns_left,columns_right,complete,max_gap_ns_left,max_gap_ns_right,"
+        "coverage_left,coverage_right,overlap_left,overlap_right,missing_left,missing_right,"
+        "ready_host_ns"
     )
     start, end = START_NS, START_NS + PERIOD_NS
     last = start + 75_000_000  # four columns, 25 ms apart
     times = [start, end, start, last]
-    assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, end + 7]))
+    # Nothing is known of rotors here, nor of what the sensors should have sent.
+    rest = [*["0.000"] * 4, "", ""]
+    assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, *rest, end + 7]))
     times = [start - PERIOD_NS, start, start - PERIOD_NS, start - PERIOD_NS]
-    assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, start + 7]))
+    assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, *rest, start + 7]))
     assert len(rows) == 3
 
 
@@ -135,15 +139,19 @@ def test_the_text_may_be_read_before_the_last_scan() -> None:
 
 def test_sensors_of_one_window_share_a_row() -> None:
     left = replace(dense_scan(points=2, columns=4), columns_per_sensor=(4, 0), max_gap_ns=(8, 0))
+    left = replace(left, coverage=(0.75, 0.0), overlap=(0.25, 0.0))
     later = left.column_stamp_ns + 10_000_000
     right = replace(left, columns_per_sensor=(0, 4), max_gap_ns=(0, 9), column_stamp_ns=later)
-    table = ScanTable(run_info())
+    right = replace(right, coverage=(0.0, 1.0), overlap=(0.0, 0.5))
+    # 70 and 40 columns a second are 7 and 4 in a window of 0.1 s.
+    table = ScanTable(run_info(), (70.0, 40.0))
     table.add(left)
     table.add(replace(right, complete=False))
     _, row = csv.reader(io.StringIO(table.text()))
     last = START_NS + 85_000_000
+    turns = ["0.750", "1.000", "0.250", "0.500", 3, 0]
     assert row[4:] == list(
-        map(str, [START_NS, last, 4, 8, 4, 4, "false", 8, 9, START_NS + PERIOD_NS + 7])
+        map(str, [START_NS, last, 4, 8, 4, 4, "false", 8, 9, *turns, START_NS + PERIOD_NS + 7])
     )
     assert table.statistics(0).written == 1
 
