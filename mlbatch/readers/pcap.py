@@ -123,9 +123,7 @@ class _Walker:
         """Where records begin that follow each other with frames of one length; none to many."""
         step = _RECORD_BYTES + length
         count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
-        lengths = np.ndarray(
-            count, self.layout["captured"], data.data, begin + _LENGTH_AT, (step,)
-        )
+        lengths = np.ndarray(count, self.layout["captured"], data.data, begin + _LENGTH_AT, (step,))
         others = (lengths != length).nonzero()[0]
         run = int(others[0]) if len(others) else count
         return begin + step * np.arange(run)
