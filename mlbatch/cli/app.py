@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 import mlbatch
+from mlbatch.cli.compare import compare
 from mlbatch.cli.convert import convert
 from mlbatch.cli.inspect import inspect
 from mlbatch.cli.sensors import sensors
@@ -41,4 +42,5 @@ def root(
 
 app.command()(convert)
 app.command()(inspect)
+app.command()(compare)
 app.command()(sensors)

@@ -1,0 +1,72 @@
+"""`mlbatch compare`: turns joined to sets against windows, on the same recording."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mlbatch.errors import UsageError
+from mlbatch.units import NS_PER_S
+
+
+def compare(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+    ],
+    rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
+    rate: Annotated[
+        str | None, typer.Option(help="Windows a second, Hz: 10, 29.97. [default: rig's, 10]")
+    ] = None,
+    metadata: Annotated[
+        list[Path] | None,
+        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+    ] = None,
+    clock: Annotated[
+        str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
+    ] = "sensor",
+    tolerance: Annotated[
+        str, typer.Option(help="Nearest turns: they begin within so many s of each other.")
+    ] = "0.05",
+    timeout: Annotated[
+        str, typer.Option(help="Collected turns: a set is closed after so many s.")
+    ] = "0.1",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """Measure joined turns of several lidars against windows: time spans, columns, stale data."""
+    from mlbatch.cli import values
+    from mlbatch.cli.tables import columns
+    from mlbatch.compare import Settings, compare
+    from mlbatch.discover import Wishes
+    from mlbatch.job import Job
+
+    values.choice("--clock", clock, ("sensor", "host"))
+    settings = Settings(
+        _duration_ns("--tolerance", tolerance),
+        _duration_ns("--timeout", timeout),
+    )
+    wishes = Wishes(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
+    job = Job(tuple(recordings), wishes, rate=None if rate is None else values.rate(rate))
+    found = compare(job, settings)
+    for note in found.notes:
+        typer.echo(f"mlbatch: warning: {note.code}: {note.message}", err=True)
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+        return
+    typer.echo(found.title())
+    for line in columns(found.rows()):
+        typer.echo(line)
+
+
+def _duration_ns(option: str, text: str) -> int:
+    """A time in s, above 0."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise UsageError(f"{option}: wanted seconds above 0, got {text!r}; write 0.05")
+    return round(seconds * NS_PER_S)

@@ -1,0 +1,113 @@
+"""Recordings of two lidars whose rotors stand in a known phase: what joining turns makes of them.
+
+    python -m tests.builders.phases FOLDER
+
+writes the recordings of all `CASES`. Stamps matter, pixels do not: there are four beams and no
+echoes. A packet arrives with the stamp of its last column, as if the way took no time.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
+
+NS_PER_S, NS_PER_MS = 10**9, 10**6
+# A whole number of periods of 10 Hz and of 20 Hz; the rotors pass zero some time after it.
+EPOCH_NS = 1_800_000_000 * NS_PER_S
+BEAMS, COLUMNS = 4, 512
+TURN_NS = 100 * NS_PER_MS
+
+
+@dataclass(frozen=True, slots=True)
+class Rotor:
+    """A lidar that first passes zero `zero_ms` after the epoch, and then every `turn_ns`.
+
+    silent_s: from when to when its packets are lost, seconds after the epoch.
+    """
+
+    serial: int
+    zero_ms: int = 20
+    turn_ns: int = TURN_NS
+    silent_s: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def spec(self) -> OusterSpec:
+        """The sensor that the packets and the metadata are of."""
+        return OusterSpec(
+            beams=BEAMS,
+            columns_per_frame=COLUMNS,
+            rate_hz=round(NS_PER_S / self.turn_ns),
+            serial=self.serial,
+            init_id=self.serial,
+            with_crc=False,
+        )
+
+    def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
+        """(arrival, payload) of all packets of the whole turns that end in the time given."""
+        begin_ns = EPOCH_NS + self.zero_ms * NS_PER_MS
+        turns = int((seconds * NS_PER_S - self.zero_ms * NS_PER_MS) // self.turn_ns)
+        column = np.arange(turns * COLUMNS)
+        stamp_ns = begin_ns + column * self.turn_ns // COLUMNS
+        mids, frames = column % COLUMNS, column // COLUMNS
+        payloads = encode_packets(self.spec, stamp_ns, mids, frames, {})
+        size = self.spec.columns_per_packet
+        silent_ns = [EPOCH_NS + round(at * NS_PER_S) for at in self.silent_s]
+        ends_ns = stamp_ns[size - 1 :: size].tolist()
+        for first_ns, last_ns, payload in zip(
+            stamp_ns[::size].tolist(), ends_ns, payloads, strict=True
+        ):
+            if not silent_ns[0] <= first_ns < silent_ns[1]:
+                yield last_ns, payload
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Two rotors, and for how long they are recorded."""
+
+    left: Rotor
+    right: Rotor
+    seconds: float = 10.0
+
+
+LEFT, RIGHT = 1001, 1002
+CASES: dict[str, Case] = {
+    "10 Hz, in phase": Case(Rotor(LEFT), Rotor(RIGHT)),
+    "10 Hz, 37 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 57)),
+    "10 Hz, 63 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 83)),
+    "10 Hz with 20 Hz": Case(Rotor(LEFT), Rotor(RIGHT, turn_ns=TURN_NS // 2)),
+    "10.00 Hz with 9.95 Hz": Case(Rotor(LEFT), Rotor(RIGHT, turn_ns=100_502_513), 60.0),
+    "10 Hz, one silent from 5 s to 8 s": Case(Rotor(LEFT), Rotor(RIGHT, silent_s=(5.0, 8.0))),
+}
+
+
+def write_case(folder: Path, case: Case) -> Path:
+    """A capture of the case in `folder`, metadata beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = []
+    for number, rotor in enumerate((case.left, case.right), 1):
+        (folder / f"{rotor.serial}.json").write_text(
+            json.dumps(metadata_json(rotor.spec)), encoding="utf-8"
+        )
+        records += [
+            (host_ns, udp_frame(payload, f"10.0.0.{number}")[0])
+            for host_ns, payload in rotor.packets(case.seconds)
+        ]
+    return write_pcap(folder / "drive.pcap", sorted(records, key=lambda record: record[0]))
+
+
+def slug(name: str) -> str:
+    """The name of a case as that of a folder."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+if __name__ == "__main__":
+    for title, one in CASES.items():
+        write_case(Path(sys.argv[1]) / slug(title), one)

@@ -1,0 +1,165 @@
+"""Joined turns against windows on recordings whose phases are known; figures worked out by hand.
+
+Turns of `left` begin 20 ms after a line of the grid. A set's span counts from its first column to
+its last one, so it misses the last column's own time: 100 ms / 512.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mlbatch.compare import WINDOWS, Comparison, compare
+from mlbatch.job import Job
+from mlbatch.tally import WayReport
+from tests.builders.phases import CASES, slug, write_case
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "compare.md"
+WAYS = ("newest turns", "nearest turns", "collected turns", WINDOWS)
+IN_PHASE, BY_37, BY_63, DOUBLE, DRIFTING, SILENT = CASES
+# 511 / 512 of 100 ms, rounded down to ns as the encoder does.
+TURN_MS = 99.804687
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Comparison]:
+    folder = tmp_path_factory.mktemp("phases")
+    return {
+        name: compare(Job((write_case(folder / slug(name), case),))) for name, case in CASES.items()
+    }
+
+
+def _way(found: dict[str, Comparison], case: str, way: str) -> WayReport:
+    return next(one for one in found[case].ways if one.way == way)
+
+
+def _spans_ms(report: WayReport) -> tuple[float, float]:
+    low, high = report.span_ms.min, report.span_ms.max
+    assert low is not None
+    assert high is not None
+    return low, high
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_windows_span_one_period_and_use_each_column_once(
+    found: dict[str, Comparison], case: str
+) -> None:
+    ours = _way(found, case, WINDOWS)
+    assert _spans_ms(ours)[1] < 100
+    assert (ours.stale, ours.used_twice, ours.never_used) == (0, 0, 0)
+    # From t_init at 100 ms; the last window holds the last stamp, and is left out.
+    assert ours.sets == CASES[case].seconds * 10 - 2
+
+
+@pytest.mark.parametrize(
+    ("case", "spans_ms"),
+    [
+        # Turns that begin together end together.
+        (IN_PHASE, (0, 0, 0)),
+        # Right's turn that ended by then began 63 ms before left's; the nearest, 37 ms after it.
+        (BY_37, (63, 37, 37)),
+        # Turns are collected from left's first on: right's follows 63 ms later, though one that
+        # began 37 ms before left's would have been nearer.
+        (BY_63, (37, 37, 63)),
+    ],
+)
+def test_phases_add_to_the_span(
+    found: dict[str, Comparison], case: str, spans_ms: tuple[float, ...]
+) -> None:
+    for way, more_ms in zip(WAYS, spans_ms, strict=False):
+        report = _way(found, case, way)
+        assert _spans_ms(report) == pytest.approx((TURN_MS + more_ms,) * 2, abs=1e-9)
+        assert (report.apart_ms.min, report.apart_ms.max) == (more_ms, more_ms)
+        assert (report.without_a_sensor, report.stale, report.used_twice) == (0, 0, 0)
+        # 99 turns: the first has no known begin, the last no end; and some have no partner.
+        assert 96 <= report.sets <= 97
+    for sensor in found[case].sensors:
+        assert (sensor.turns, sensor.turn_ms) == (97, 100.0)
+
+
+def test_half_of_the_faster_turns_is_lost(found: dict[str, Comparison]) -> None:
+    # The right turn of the same end has its last column nearer to it; the one of the same begin
+    # ends before; that which came first began 50 ms before left's turn.
+    spans_ms = (100 - 50 / 512, TURN_MS, 50 + TURN_MS)
+    for way, span_ms in zip(WAYS, spans_ms, strict=False):
+        report = _way(found, DOUBLE, way)
+        assert _spans_ms(report) == pytest.approx((span_ms, span_ms), abs=2e-6)
+        # Two of three columns are right's; half of them are in no set.
+        assert report.never_used / report.columns == pytest.approx(1 / 3, abs=0.01)
+    assert _way(found, DOUBLE, WINDOWS).columns == 98 * 3 * 512
+
+
+def test_drifting_rotors_pass_through_all_phases(found: dict[str, Comparison]) -> None:
+    """In 60 s the rotors of 10.00 and 9.95 Hz drift by three turns."""
+    newest, nearest, collected = (_way(found, DRIFTING, way) for way in WAYS[:3])
+    # Right's newest turn ended up to 100.5 ms ago, and took 100.5 ms.
+    low, high = _spans_ms(newest)
+    assert 100 < low < 102
+    assert 198 < high < 201.01
+    # Begins at most 50 ms apart; where turns stand in opposition some find no partner.
+    low, high = _spans_ms(nearest)
+    assert low < 101
+    assert 148 < high <= 150.51
+    assert 590 <= nearest.sets < 597
+    assert nearest.never_used > 0
+    # Right's turn is awaited for 100 ms; when it comes later still, the set goes without.
+    low, high = _spans_ms(collected)
+    assert low < 101
+    assert 198 < high <= 200.51
+    assert 1 <= collected.without_a_sensor <= 3
+
+
+def test_a_silent_lidar_pollutes_joined_turns(found: dict[str, Comparison]) -> None:
+    newest, nearest, collected, ours = (_way(found, SILENT, way) for way in WAYS)
+    # Right's last whole turn began at 4.82 s; left's turn that ends at 7.92 s still meets it.
+    assert _spans_ms(newest) == pytest.approx((TURN_MS, 3000 + TURN_MS), abs=2e-6)
+    # Those that end from 5.22 s to 7.92 s: more than 200 ms after it.
+    assert newest.stale == 28
+    # Left's turns that begin from 4.92 s to 7.92 s find none.
+    assert nearest.sets == newest.sets - 31
+    assert _spans_ms(nearest) == pytest.approx((TURN_MS, TURN_MS), abs=2e-6)
+    # Right's broken turn from 4.92 s is published at 8 s, and meets left's that ended at 7.92 s.
+    assert _spans_ms(collected) == pytest.approx((TURN_MS, 2900 + TURN_MS), abs=2e-6)
+    assert (collected.without_a_sensor, collected.stale) == (29, 1)
+    # The windows from 5.1 s to 8.0 s.
+    assert ours.without_a_sensor == 29
+
+
+def test_the_tables_of_the_page_come_from_these_runs(found: dict[str, Comparison]) -> None:
+    """README shows the first of them, too."""
+    page = PAGE.read_text(encoding="utf-8")
+    for table in (_spans_table(found), _losses_table(found)):
+        assert table in page, f"put this into {PAGE.name}:\n{table}"
+
+
+def _spans_table(found: dict[str, Comparison]) -> str:
+    return _table("time span of a set, ms", found, _span)
+
+
+def _losses_table(found: dict[str, Comparison]) -> str:
+    return _table("what else", found, _losses)
+
+
+def _table(title: str, found: dict[str, Comparison], tell: Callable[[WayReport], str]) -> str:
+    rows = [[title, *WAYS], ["---"] * (1 + len(WAYS))]
+    rows += [[case, *map(tell, one.ways)] for case, one in found.items()]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _span(report: WayReport) -> str:
+    low, high = (f"{value:.0f}" for value in _spans_ms(report))
+    return low if low == high else f"{low} to {high}"
+
+
+def _losses(report: WayReport) -> str:
+    share = 100 * report.never_used / report.columns
+    said = [
+        f"{report.without_a_sensor} sets of one lidar" if report.without_a_sensor else "",
+        f"{report.stale} stale" if report.stale else "",
+        # Less than a turn or two: the ends of the recording.
+        f"{share:.0f} % of the columns unused" if share > 1 else "",
+    ]
+    return ", ".join(filter(None, said)) or "-"
