@@ -26,7 +26,11 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("report",),
         ("streams",),
     ),
-    (("knowledge",), ("clouds", "_cloud_messages", "_cloud_packets", "_cloud_times")),
+    (
+        ("knowledge",),
+        ("clouds", "_cloud_messages", "_cloud_packets", "_cloud_times"),
+        ("faults", "_fault_chance", "_fault_specs", "_fault_traffic"),
+    ),
     (
         ("rig", "_rig_values", "_yaml", "_yaml_tree"),
         ("frames",),
