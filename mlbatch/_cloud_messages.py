@@ -153,13 +153,15 @@ def read_cloud(message: Message) -> Cloud:
 
 
 def _reals(rows: Rows) -> F32Array:
-    """x, y, z and intensity, (4, n); intensity 0 where there is none."""
+    """x, y, z and intensity, (4, n); intensity 0 where there is none that is finite."""
     reals = np.zeros((4, len(rows)), np.float32)
     # A place beyond all float32 is infinite, and is left out as such.
     with np.errstate(over="ignore", invalid="ignore"):
         for plane, name in zip(reals, (*_AXES, "intensity"), strict=True):
             if name in (rows.dtype.names or ()):
                 plane[:] = rows[name]
+    level = reals[3]
+    level[~np.isfinite(level)] = 0
     return reals
 
 

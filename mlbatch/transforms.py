@@ -19,6 +19,7 @@ from mlbatch.units import RAD_PER_DEG
 TOLERANCE = 1e-3
 # Far above the rounding of a matrix that was computed, far below what a person types.
 _ROUNDING = 1e-12
+_MOST = 1e100
 
 
 def from_rpy_deg(translation_m: Sequence[float], rpy_deg: Sequence[float]) -> F64Array:
@@ -66,7 +67,8 @@ def rigid(matrix: F64Array) -> F64Array:
             f"wanted 0, 0, 0, 1 as last row, got {shown}; "
             "give the translation as last column, metres"
         )
-    rotation = np.array(matrix[:3, :3], dtype=np.float64)
+    # Products of numbers much larger than those of a rotation would overflow.
+    rotation = np.clip(matrix[:3, :3], -_MOST, _MOST).astype(np.float64)
     skew = np.abs(_gram(rotation) - np.eye(3)).max()
     if not skew <= TOLERANCE:
         raise RigError(

@@ -8,7 +8,6 @@ document types (and thus no entities), no more than 16 MB, and no tree of elemen
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -20,6 +19,8 @@ from mlbatch.units import RAD_PER_DEG
 MAX_BYTES = 16 * 1024 * 1024
 _REMEDY = "give the extrinsics in a rig file (--rig)"
 _SHOWN_CHARS = 60
+# No robot is larger (m), no angle needs more turns (rad); NaN is not less.
+_MOST = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +127,8 @@ def _three(text: str | None, key: str, where: str) -> list[float]:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise _error("3 finite numbers", text, f"{where}, origin {key}")
+    if len(numbers) != 3 or not all(abs(number) <= _MOST for number in numbers):
+        raise _error(f"3 numbers of at most {_MOST:g}", text, f"{where}, origin {key}")
     return numbers
 
 

@@ -16,6 +16,8 @@ from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
 
 MAX_SLICES = 10_000
+# Nothing lasts longer, and ns of it still fit into int64.
+_MOST_S = 2**33
 
 
 def rate(text: str) -> Fraction:
@@ -59,8 +61,10 @@ def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
         return None, False
     relative = text.startswith("+")
     try:
-        return Limit(int(Decimal(text) * NS_PER_S), from_t_init=relative), False
-    except (InvalidOperation, ValueError, OverflowError):
+        seconds = Decimal(text)
+        if seconds.is_finite() and abs(seconds) <= _MOST_S:
+            return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
+    except InvalidOperation:
         pass
     try:
         return Limit(_iso_ns(text)), True
@@ -90,7 +94,7 @@ def max_wait_ns(text: str) -> int | None:
         seconds = math.nan
     if math.isnan(seconds) or seconds <= 0:
         raise UsageError(f"--max-wait: wanted seconds above 0, or inf, got {text!r}; write 1.0")
-    return None if math.isinf(seconds) else round(seconds * NS_PER_S)
+    return None if seconds > _MOST_S else round(seconds * NS_PER_S)
 
 
 def box_m(text: str) -> tuple[float, ...]:

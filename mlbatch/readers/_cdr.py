@@ -21,6 +21,8 @@ _OTHER_KINDS = tuple(bytes([0, kind]) for kind in (0, 2, 3, *range(6, 12)))
 _ENCAPSULATION_BYTES = 4
 _U32 = struct.Struct("<I")
 _BYTES = ("uint8", "int8", "byte", "char")
+# Definitions come with the recording: they may hold themselves, or count what takes no bytes.
+_MOST_STEPS, _MOST_LEVELS = 1_000_000, 32
 
 
 class MessageError(RecordingError):
@@ -44,6 +46,7 @@ class Cursor:
         self.types, self.aligned = types, encoding == "cdr"
         self.data, self.at, self.origin, self.end = data, begin, begin, end
         self.words: list[int] = []
+        self._steps = self._levels = 0
         if self.aligned:
             self.words.append(self.place(_ENCAPSULATION_BYTES, 1))
             self.origin = self.at
@@ -91,6 +94,15 @@ class Cursor:
         """Number of elements of an array."""
         return self.length() if field.count == SEQUENCE else field.count or 0
 
+    def step(self) -> None:
+        """Count a part of the message; there are never as many as a definition may claim."""
+        self._steps += 1
+        if self._steps > _MOST_STEPS:
+            raise MessageError(
+                f"wanted at most {_MOST_STEPS} parts in a message, got more by its definition; "
+                "the definition is damaged"
+            )
+
     def skip(self, field: Field) -> None:
         """Pass over a field."""
         if field.count is None:
@@ -105,6 +117,7 @@ class Cursor:
             self.place(primitive[0] * count, primitive[1])
 
     def _skip_one(self, kind: str) -> None:
+        self.step()
         if kind in PRIMITIVES:
             self.place(*PRIMITIVES[kind][:2])
         elif kind == "string":
@@ -113,11 +126,23 @@ class Cursor:
             self.enter(kind)
             for field in self.fields(kind):
                 self.skip(field)
+            self.leave()
 
     def enter(self, kind: str) -> None:
         """Begin a nested message; CDR gives one without fields a byte of its own."""
+        self.step()
+        self._levels += 1
+        if self._levels > _MOST_LEVELS:
+            raise MessageError(
+                f"wanted at most {_MOST_LEVELS} messages within each other, got {kind} in more by "
+                "its definition; the definition is damaged"
+            )
         if self.aligned and not self.fields(kind):
             self.place(1, 1)
+
+    def leave(self) -> None:
+        """End a nested message."""
+        self._levels -= 1
 
     def leaves(self, kind: str, prefix: str = "") -> dict[str, Leaf]:
         """All values of a message by their dotted names; arrays: `name.0`, and `name` for bytes."""
@@ -134,9 +159,11 @@ class Cursor:
             else:
                 for number in range(self.count(field)):
                     self._leaf(field.type, f"{name}.{number}", found)
+        self.leave()
         return found
 
     def _leaf(self, kind: str, name: str, found: dict[str, Leaf]) -> None:
+        self.step()
         if kind in PRIMITIVES:
             size, align, code = PRIMITIVES[kind]
             values = struct.unpack_from("<" + code, self.data, self.place(size, align))

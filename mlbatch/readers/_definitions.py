@@ -39,8 +39,10 @@ _ALIASES = {
     "Header": "std_msgs/Header",
 }
 _RULE = re.compile(r"^=+[ \t]*\r?$", re.MULTILINE)
-_FIELD = re.compile(r"^([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=?)")
+_FIELD = re.compile(r"^([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=?)", re.ASCII)
 _BREAK = "=" * 80
+# Definitions come with the recording. The longest of ROS have some 10 kB; no array is as long.
+_MOST_CHARACTERS, _MOST_DIGITS = 400_000, 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,8 @@ def type_key(name: str) -> str:
 @lru_cache(maxsize=64)
 def definitions_of(topic: Topic) -> Definitions:
     """All types that a topic's messages are made of; those of the recording win over ours."""
+    if len(topic.definition) > _MOST_CHARACTERS:
+        return ours(topic.encoding)
     if topic.format == "ros2idl":
         from mlbatch.readers._idl import parse_idl
 
@@ -143,7 +147,8 @@ def _fields(text: str, package: str) -> Iterator[Field]:
             continue
         array = match[2]
         digits = "" if array is None else array.strip("[]")
-        count = None if array is None else int(digits) if digits.isdigit() else SEQUENCE
+        many = int(digits[:_MOST_DIGITS]) if digits.isdigit() else SEQUENCE
+        count = None if array is None else many
         yield Field(match[3], resolve(match[1], package), count)
 
 

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.errors import RecordingError
+from mlbatch.errors import RecordingError, RigError
 
 _BAG_FILE = re.compile(r"\.(db3|mcap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
 _METADATA = "metadata.yaml"
-_MAX_METADATA_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +78,12 @@ def _packed(name: str, names: set[str]) -> bool:
 
 def _listed(metadata: Path) -> list[str] | None:
     """Names of files in metadata.yaml, None where it is no such file."""
-    import yaml
+    from mlbatch._yaml_tree import read_yaml
 
+    # Only names are compared: no file outside the folder is ever opened.
     try:
-        if metadata.stat().st_size > _MAX_METADATA_BYTES:
-            return None
-        document = yaml.safe_load(metadata.read_bytes())
-        paths = document["rosbag2_bagfile_information"]["relative_file_paths"]
-        return [Path(str(path)).name for path in paths]
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        bag = read_yaml(metadata).entries["rosbag2_bagfile_information"]
+        paths = bag.entries["relative_file_paths"].elements("files")
+    except (KeyError, RigError):
         return None
+    return [Path(path.text).name for path in paths]

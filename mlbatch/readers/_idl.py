@@ -9,11 +9,14 @@ import re
 
 from mlbatch.readers._definitions import PRIMITIVES, SEQUENCE, Field, resolve
 
+# What is never closed goes on to the end: to try anew at every place would take hours.
 _NOISE = re.compile(
-    r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^=+\s*$|^IDL:[^\n]*|@\w+\s*(\((\"(\\.|[^\"\\])*\"|[^()\"])*\))?",
+    r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t]*#[^\n]*|^=+\s*$|^IDL:[^\n]*"
+    r"|@\w+\s*(\((\"(\\.|[^\"\\])*(?:\"|\\?\Z)|[^()\"])*\)?)?",
     re.MULTILINE | re.DOTALL,
 )
-_TOKEN = re.compile(r"\"(?:\\.|[^\"\\])*\"|[\w:.+-]+|[{}<>\[\];,=()]")
+_TOKEN = re.compile(r"\"(?:\\.|[^\"\\])*(?:\"|\\?\Z)|[\w:.+-]+|[{}<>\[\];,=()]")
+_MOST_DIGITS = 12
 _WORDS = {
     "boolean": "bool",
     "octet": "uint8",
@@ -47,7 +50,7 @@ def parse_idl(text: str) -> dict[str, tuple[Field, ...]]:
         elif token != ";":
             statement.append(token)
             continue
-        elif statement[:1] == ["typedef"]:
+        elif statement[:1] == ["typedef"] and len(statement) > 2:
             alias = _member(statement[1:], scope, aliases)
             aliases[alias.name] = alias
         elif fields is not None and statement:
@@ -59,8 +62,8 @@ def parse_idl(text: str) -> dict[str, tuple[Field, ...]]:
 def _member(words: list[str], scope: list[str], aliases: dict[str, Field]) -> Field:
     """A field (or typedef) from its words: type, name and perhaps [count]."""
     count: int | None = None
-    if words[-1] == "]" and len(words) > 4 and words[-2].isdigit():
-        words, count = words[:-3], int(words[-2])
+    if words[-1] == "]" and len(words) > 4 and words[-2].isdecimal():
+        words, count = words[:-3], int(words[-2][:_MOST_DIGITS])
     name, kind = words[-1], words[:-1]
     if kind[:2] == ["sequence", "<"]:
         kind, count = kind[2:-1], SEQUENCE

@@ -5,6 +5,7 @@ Types: facts/messages.md, sections 2 and 6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeAlias
 
 from mlbatch.errors import RecordingError
@@ -35,11 +36,16 @@ def decode_transforms(topic: Topic, data: bytes) -> list[Transform]:
     found: list[Transform] = []
     while f"transforms.{len(found)}.child_frame_id" in leaves:
         prefix = f"transforms.{len(found)}"
-        place = f"{prefix}.transform"
-        x, y, z = (float(leaves[f"{place}.translation.{axis}"]) for axis in "xyz")
-        qx, qy, qz, qw = (float(leaves[f"{place}.rotation.{axis}"]) for axis in "xyzw")
-        parent, child = (str(leaves[f"{prefix}.{name}"]) for name in _FRAMES)
-        found.append((parent.lstrip("/"), child.lstrip("/"), (x, y, z), (qx, qy, qz, qw)))
+        try:
+            x, y, z = (_value(leaves, f"{prefix}.transform.translation.{a}") for a in "xyz")
+            qx, qy, qz, qw = (_value(leaves, f"{prefix}.transform.rotation.{a}") for a in "xyzw")
+            parent, child = (_text(leaves, f"{prefix}.{name}") for name in _FRAMES)
+        except KeyError as err:
+            raise RecordingError(
+                f"{topic.name}: wanted transforms of frames, got a definition without {err}; "
+                "this variant of the message is not known"
+            ) from err
+        found.append((parent, child, (x, y, z), (qx, qy, qz, qw)))
     return found
 
 
@@ -49,3 +55,18 @@ def _leaves(topic: Topic, data: bytes) -> dict[str, Leaf]:
         return cursor.leaves(type_key(topic.type))
     except (MessageError, KeyError) as err:
         raise RecordingError(f"{topic.name}: {err}") from err
+
+
+def _value(leaves: Mapping[str, Leaf], name: str) -> float:
+    """A number of a message whose definition may lack it."""
+    value = leaves.get(name)
+    if not isinstance(value, int | float):
+        raise KeyError(name)
+    return float(value)
+
+
+def _text(leaves: Mapping[str, Leaf], name: str) -> str:
+    value = leaves.get(name)
+    if not isinstance(value, str):
+        raise KeyError(name)
+    return value.lstrip("/")

@@ -20,6 +20,8 @@ _U32 = np.dtype([("value", "<u4")])
 _NONE = np.zeros(0, np.int64)
 # Bytes of a packet's size and of its stamp, and their alignment.
 _SIZE, _STAMP = (4, 4), (8, 4)
+# Far more than any packet is made of; a chain of so many nested ones is no packet.
+_MOST_TYPES = 100
 
 
 def u32(data: U8Array, at: I64Array) -> I64Array:
@@ -110,7 +112,7 @@ class Tracer:
             self._packet(cursor, one.type, places)
             if done == 1 and self._alignment:
                 stride = int(places.start[1][0] - places.start[0][0])
-                if stride % self._alignment == 0:
+                if stride % self._alignment == 0 and stride > 0:
                     # The last packet has no padding behind it.
                     cursor.place((count - 2) * stride, 1)
                     places.repeat(count, stride)
@@ -130,6 +132,7 @@ class Tracer:
                 places.stamp_at.append(_one(cursor.place(*_STAMP)))
             else:
                 cursor.skip(one)
+        cursor.leave()
 
 
 def _one(value: int) -> I64Array:
@@ -158,10 +161,19 @@ def _holder(types: Definitions, root: str, envelope: Envelope) -> Field | None:
     return holder
 
 
-def _fixed_alignment(types: Definitions, kind: str) -> int:
-    """The largest alignment within a type of fixed length; 0 where the length varies."""
+def _fixed_alignment(types: Definitions, kind: str, known: dict[str, int] | None = None) -> int:
+    """The largest alignment within a type of fixed length; 0 where the length varies.
+
+    known: of types that were looked at; one that is met within itself has no length.
+    """
     if kind in PRIMITIVES:
         return PRIMITIVES[kind][1]
-    inner = types.get(kind, ())
-    parts = [0 if f.count == SEQUENCE else _fixed_alignment(types, f.type) for f in inner]
-    return max(parts) if parts and all(parts) else 0
+    known = {} if known is None else known
+    if kind not in known and len(known) < _MOST_TYPES:
+        known[kind] = 0
+        inner = types.get(kind, ())
+        parts = [
+            0 if f.count == SEQUENCE else _fixed_alignment(types, f.type, known) for f in inner
+        ]
+        known[kind] = max(parts) if parts and all(parts) else 0
+    return known.get(kind, 0)
