@@ -18,12 +18,14 @@ PLACES = 2
 class Traffic:
     """Packets of a batch, (n,) each.
 
-    sensor: its number, -1 none; number: of the packet among its sensor's; key_ns, place: packets
-    leave in the order of both; key_ns is the largest arrival up to the packet (and its delay).
+    sensor: its number, -1 none; lane: what its packets of one size share, -1 none; number: of the
+    packet in its lane; key_ns, place: packets leave in the order of both; key_ns is the largest
+    arrival up to the packet (and its delay).
     """
 
     batch: PacketBatch
     sensor: I64Array
+    lane: I64Array
     number: I64Array
     key_ns: I64Array
     place: I64Array
@@ -36,6 +38,7 @@ class Traffic:
         return Traffic(
             self.batch.take(index),
             self.sensor[index],
+            self.lane[index],
             self.number[index],
             self.key_ns[index],
             self.place[index],
@@ -63,7 +66,7 @@ def nothing() -> Traffic:
     """Traffic without a packet."""
     none = np.zeros(0, np.int64)
     batch = PacketBatch(np.zeros(0, np.uint8), none, none, none, none)
-    return Traffic(batch, none, none, none, none)
+    return Traffic(batch, none, none, none, none, none)
 
 
 def joined(batches: Sequence[PacketBatch], out: U8Array) -> PacketBatch:
@@ -99,9 +102,9 @@ def _copy(batch: PacketBatch, out: U8Array, at: I64Array) -> None:
 
 @dataclass(slots=True)
 class Overtaking:
-    """Puts packets behind the next one of their sensor, to arrive together with it.
+    """Puts packets behind the next one of their lane, to arrive together with it.
 
-    Of each sensor at most one packet waits for its next one; with it, the fault that chose it.
+    Of each lane at most one packet waits for its next one; with it, the fault that chose it.
     """
 
     _waiting: dict[int, tuple[int, Traffic]] = field(default_factory=dict)
@@ -119,21 +122,21 @@ class Overtaking:
             key_ns=traffic.key_ns.copy(),
             place=traffic.place.copy(),
         )
-        senders = {*self._waiting, *np.unique(traffic.sensor[chosen >= 0]).tolist()}
-        for sensor in sorted(senders):
-            rows = (traffic.sensor == sensor).nonzero()[0]
+        lanes = {*self._waiting, *np.unique(traffic.lane[chosen >= 0]).tolist()}
+        for lane in sorted(lanes):
+            rows = (traffic.lane == lane).nonzero()[0]
             if not len(rows):
                 continue
             fault = chosen[rows]
-            if sensor in self._waiting:
-                number, before = self._waiting.pop(sensor)
+            if lane in self._waiting:
+                number, before = self._waiting.pop(lane)
                 lots.append(_behind(before, traffic, rows[:1]))
                 faults.append(np.array([number]))
                 fault[0] = -1
             front = _every_second(fault >= 0).nonzero()[0]
             if len(front) and front[-1] == len(rows) - 1:
                 last, front = rows[-1:], front[:-1]
-                self._waiting[sensor] = int(fault[-1]), traffic.take(last).compact()
+                self._waiting[lane] = int(fault[-1]), traffic.take(last).compact()
                 stays[last] = False
             faults.append(fault[front])
             _move(traffic, rows[front], traffic, rows[front + 1])
@@ -209,6 +212,7 @@ class Queue:
         return Traffic(
             batch,
             np.concatenate([traffic.sensor for traffic in ready]),
+            np.concatenate([traffic.lane for traffic in ready]),
             np.concatenate([traffic.number for traffic in ready]),
             np.concatenate([traffic.key_ns for traffic in ready]),
             np.concatenate([traffic.place for traffic in ready]),

@@ -1,7 +1,8 @@
 """Fault replay: what a session would have been with packets lost, late, damaged or misdated.
 
 What befalls a packet depends on the seed, the fault, its sensor's name and its number among that
-sensor's packets, or on its arrival; so that it is the same for every container and buffer size.
+sensor's packets of its size (so that it does not matter how IMU packets lie among the others), or
+on its arrival: it is the same for every container and buffer size.
 Faults act in one order, whatever the order they are given in: packets are removed, damaged,
 overtaken, repeated, delayed (docs/faults.md).
 """
@@ -26,6 +27,8 @@ __all__ = ["KINDS", "Fault", "FaultCount", "FaultLedger", "FaultReplay", "parse_
 _REMOVING = ("drop", "stall", "late", "early")
 _OF_CLOCKS = ("jump", "drift")
 _PER_MILLION = 1e-6
+# More than the length of any payload needs.
+_SIZE_BITS = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,8 @@ class FaultReplay:
             np.zeros(self._sensors, np.int64) for _ in range(4)
         )
         self._packets = 0
+        self._lanes: dict[int, int] = {}
+        self._in_lane: list[int] = []
         self._newest_ns = FIRST_NS
         self._overtaking = Overtaking()
         self._queue = Queue()
@@ -148,17 +153,29 @@ class FaultReplay:
         owned = (sensor >= 0).nonzero()[0]
         if self.begin_ns is None and len(owned):
             self.begin_ns = int(batch.host_ns[owned[0]])
-        number = np.zeros(len(batch), np.int64)
-        for one in np.unique(sensor[owned]).tolist():
-            rows = (sensor == one).nonzero()[0]
-            number[rows] = self._read[one] + np.arange(len(rows))
         self._read += self._per_sensor(sensor)
         # Where the recorder's clock steps back, packets still arrive in their order.
         key_ns = np.maximum(np.maximum.accumulate(batch.host_ns), self._newest_ns)
         self._newest_ns = int(key_ns[-1])
         place = PLACES * (self._packets + np.arange(len(batch)))
         self._packets += len(batch)
-        return Traffic(replace(batch, messages=()), sensor, number, key_ns, place)
+        lane, number = self._numbered(sensor, batch.size)
+        return Traffic(replace(batch, messages=()), sensor, lane, number, key_ns, place)
+
+    def _numbered(self, sensor: I64Array, size: I64Array) -> tuple[I64Array, I64Array]:
+        """The lane of each packet (sensor and size), and its number there."""
+        both = np.where(sensor >= 0, sensor << _SIZE_BITS | size, -1)
+        lane, number = np.full(len(both), -1, np.int64), np.zeros(len(both), np.int64)
+        for one in np.unique(both[sensor >= 0]).tolist():
+            if one not in self._lanes:
+                self._lanes[one] = len(self._in_lane)
+                self._in_lane.append(0)
+            mine = self._lanes[one]
+            rows = (both == one).nonzero()[0]
+            lane[rows] = mine
+            number[rows] = self._in_lane[mine] + np.arange(len(rows))
+            self._in_lane[mine] += len(rows)
+        return lane, number
 
     def _remaining(self, traffic: Traffic) -> Traffic:
         stays = np.ones(len(traffic), bool)

@@ -95,9 +95,10 @@ def of(session: Sequence[One], sensor: int) -> list[One]:
 
 @dataclass
 class Moving:
-    """A packet of the reference; key: what it is sorted by."""
+    """A packet of the reference; lane: sensor and size; key: what it is sorted by."""
 
     one: One
+    lane: tuple[int, int]
     number: int
     key: list[int]
 
@@ -133,12 +134,13 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
             and drawn(seed, number, packet) / 2**64 < fault.share
         ]
 
-    numbers: Counter[int] = Counter()
+    numbers: Counter[tuple[int, int]] = Counter()
     left, newest = [], 0
     for place, one in enumerate(session):
         newest = max(newest, one.host_ns)
-        packet = Moving(one, numbers[one.sensor], [newest, place])
-        numbers[one.sensor] += 1
+        lane = one.sensor, len(one.payload)
+        packet = Moving(one, lane, numbers[lane], [newest, place])
+        numbers[lane] += 1
         if any(hits(kind, packet) for kind in ("drop", "stall", "late", "early")):
             continue
         for fault in hits("truncate", packet):
@@ -155,8 +157,8 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
                 payload[bit // 8] ^= 1 << bit % 8
                 packet.one = replace(packet.one, payload=bytes(payload))
         left.append(packet)
-    for sensor in range(len(NAMES)):
-        own = [packet for packet in left if packet.one.sensor == sensor]
+    for lane in {packet.lane for packet in left}:
+        own = [packet for packet in left if packet.lane == lane]
         moved = [bool(hits("reorder", packet)) for packet in own]
         at = 0
         while at < len(own):
@@ -309,6 +311,18 @@ def test_a_sensor_has_its_faults_whoever_else_there_is() -> None:
     second = [replace(one, sensor=1) for one in session]
     beside = replayed(FaultReplay(faults, 0, ["top", "left"]), second, [300])
     assert [one.payload for one in alone] == [one.payload for one in beside]
+
+
+def test_other_packets_of_a_sensor_do_not_matter() -> None:
+    """Some containers hold the packets of its IMU too, or hold them elsewhere in the order."""
+    session = steady(300)
+    others = [replace(one, payload=one.payload + b"IMU") for one in session[::7]]
+    mixed_in = sorted([*session, *others], key=lambda one: (one.host_ns, -len(one.payload)))
+    faults = [parse_fault(f"{kind}:left:20%") for kind in SHARED]
+    alone = replayed(FaultReplay(faults, 0, NAMES), session, [300])
+    for order in (mixed_in, [*session, *others]):
+        beside = replayed(FaultReplay(faults, 0, NAMES), order, [len(order)])
+        assert Counter(alone) <= Counter(beside)
 
 
 def test_a_delay_holds_no_more_than_its_worth() -> None:
