@@ -26,6 +26,10 @@ class RecordingError(MlbatchError):
     """A recording that cannot be read, or in which nothing usable was found."""
 
 
+class NoScanError(RecordingError):
+    """A recording of which no scan came out, with the reason."""
+
+
 class ClockError(RecordingError):
     """Sensor clocks that cannot be compared, or that were reset within the recording."""
 

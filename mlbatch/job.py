@@ -7,6 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 
 from mlbatch.batching.windows import Limit
+from mlbatch.clipping import Part
 from mlbatch.discover import Wishes
 from mlbatch.types import EXTRAS
 from mlbatch.units import NS_PER_S
@@ -41,5 +42,6 @@ class Job:
     max_range_m: float = float("inf")
     boxes_m: tuple[tuple[float, ...], ...] = ()
     strict: bool = False
+    part: Part = field(default_factory=Part)
     passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS

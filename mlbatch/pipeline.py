@@ -13,11 +13,13 @@ from mlbatch import accounts
 from mlbatch.assembly import boxes_of, feed_of, intake_of, run_info, source_of
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
+from mlbatch.batching.jumps import JumpGuard
 from mlbatch.batching.windows import Policy, Window
+from mlbatch.clipping import ClippedRecording, Part
 from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Due, Label
 from mlbatch.discover import Note, Setup, absent, discover, untimed
-from mlbatch.errors import PacketError, RecordingError, UsageError
+from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
@@ -66,6 +68,8 @@ class Conversion:
         self._notes: list[Note] = []
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
+        if job.part != Part():
+            opened = [ClippedRecording(recording, job.part) for recording in opened]
         self.setup: Setup = discover(opened, streams, job.wishes)
         self.recordings: Sequence[Recording] = self.setup.recordings
         sampler = self.setup.sampler
@@ -84,8 +88,10 @@ class Conversion:
             for sensor in self.setup.sensors
         ]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
-        self.batcher = Batcher(self.grid, intakes, policy)
         host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
+        # By the recorder's clock no sensor's clock can jump.
+        guards = [] if any(host_clocks) else [JumpGuard(s.name) for s in self.setup.sensors]
+        self.batcher = Batcher(self.grid, intakes, policy, guards)
         self._refuse_untimed()
         self.feeder = Feeder(self.setup, self.feeds, host_clocks)
         self._decoders: list[Decoder] = []
@@ -310,7 +316,7 @@ class Conversion:
             # A date can lie so far from an uptime clock that no window was ever reached.
             self._check_dates(common_timescale(names))
         if self.table is None or not self.table.rows:
-            raise RecordingError(accounts.why_nothing(self))
+            raise NoScanError(accounts.why_nothing(self))
 
     def _points(self, number: int) -> accounts.PointCounts:
         if not self._decoders:

@@ -15,6 +15,7 @@ import numpy as np
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, Arrival, Delivery, Intake
+from mlbatch.batching.jumps import JumpGuard
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.types import BoolArray, Columns, I64Array
 from mlbatch.units import NS_PER_MS
@@ -53,12 +54,20 @@ class _Progress:
 class Batcher:
     """Takes packets in arrival order, gives windows; one named object owns all state."""
 
-    def __init__(self, grid: Grid, intakes: Sequence[Intake], policy: Policy) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        intakes: Sequence[Intake],
+        policy: Policy,
+        guards: Sequence[JumpGuard] = (),
+    ) -> None:
+        """guards: one for each sensor whose clock must not jump; all or none."""
         self._grid = grid
         self._policy = policy
         self._schedule = Schedule(grid, policy)
         self._tracks = [_Track(intake) for intake in intakes]
         self._watermark = NEVER
+        self._guards = tuple(guards)
 
     # -- what came in -------------------------------------------------------------------------
 
@@ -71,6 +80,9 @@ class Batcher:
             None if arrival is None else track.intake.accept(arrival)
             for track, arrival in zip(self._tracks, arrivals, strict=True)
         ]
+        for guard, delivery in zip(self._guards, accepted, strict=False):
+            if delivery is not None:
+                guard.check(delivery)
         events = [
             np.empty(0, np.int64) if delivery is None else delivery.packets.position
             for delivery in accepted

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.batching.loss import Loss
-from mlbatch.errors import ClockError
+from mlbatch.errors import ClockJump
 from mlbatch.types import BoolArray, Heads, I64Array
 from mlbatch.units import NS_PER_S
 
@@ -105,8 +105,9 @@ class Intake:
         if self._held is not None or self._steps(low, high).any():
             arrival = self._judge(arrival)
             low, high = extremes(arrival.heads)
+        else:
+            self._newest = max(self._newest, int(high.max(initial=NEVER)))
         self.loss.add(arrival.key)
-        self._newest = max(self._newest, int(high.max(initial=NEVER)))
         if self._host_clock and len(high):
             stamp, known = arrival.heads.stamp_ns, high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
@@ -165,7 +166,9 @@ class Intake:
                     near = first - STEP_NS <= lowest and highest <= first + STEP_NS
                     if steps and near:
                         if first < newest:
-                            raise self._reset(newest, first)
+                            if not self._host_clock:
+                                raise self._reset(newest, first, int(rows.host_ns[held]))
+                            newest = NEVER  # Stamps only tell ages within a packet.
                         accepted.append(held)
                         # It is let in together with the packet that confirms it.
                         position[held] = position[row]
@@ -179,6 +182,7 @@ class Intake:
                     continue
                 newest = max(newest, highest)
             accepted.append(row)
+        self._newest = newest
         self._held = None if held is None else _copied(rows, held)
         rows.position = position
         return rows.take(np.array(accepted, np.int64))
@@ -188,11 +192,12 @@ class Intake:
         heads = rows.heads
         return int(heads.stamp_ns[row][heads.valid[row]][0])
 
-    def _reset(self, newest: int, back: int) -> ClockError:
-        return ClockError(
+    def _reset(self, newest: int, back: int, host_ns: int) -> ClockJump:
+        return ClockJump(
             f"sensor {self.name}: clock reset within the recording: stamps went back from "
             f"{newest / NS_PER_S:.6f} s to {back / NS_PER_S:.6f} s; wanted one running clock; "
-            "cut the recording there, or use --clock host"
+            "use --on-jump split, or --clock host",
+            host_ns,
         )
 
     @property

@@ -12,8 +12,9 @@ judged in its own order:
   is rejected, Q accepted. All of Q lies within 1 s of the held one's first valid stamp: confirmed;
   forward it is a gap, both are accepted in order; backward it is a reset, a `ClockError`. Else the
   held one is rejected and Q is held. End of input rejects what is held.
-- With the host clock the same is judged on the sensor's stamps; then the stamps of an accepted
-  packet become its host time minus their age against its largest valid stamp.
+- With the host clock the same is judged on the sensor's stamps, but that a reset is accepted; then
+  the stamps of an accepted packet become its host time minus their age against its largest valid
+  stamp.
 """
 
 from __future__ import annotations
@@ -96,7 +97,9 @@ class Intake:
             self._reject("bad_stamp")
             self.held = packet
             return []
-        if first < newest:
+        if first < newest and self.host_clock:
+            self.newest = None
+        elif first < newest:
             raise ClockError(
                 f"sensor {self.sensor}: wanted a clock that runs on, got a reset from "
                 f"{newest} ns back to {first} ns; cut the recording there or use --clock host"

@@ -60,6 +60,10 @@ def convert(
     clock: Annotated[
         str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
     ] = "sensor",
+    on_jump: Annotated[
+        str,
+        typer.Option(help="Where a clock jumps: error, or split into outputs named .segN."),
+    ] = "error",
     min_range: Annotated[float, typer.Option(help="Drop nearer points, m.")] = 0.0,
     max_range: Annotated[
         float, typer.Option(help="Drop farther points, m.", show_default="none")
@@ -118,6 +122,7 @@ def convert(
     values.choice("--layout", layout, ("dense", "organized"))
     values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
     values.choice("--clock", clock, ("sensor", "host"))
+    values.choice("--on-jump", on_jump, ("error", "split"))
     if jobs != 1:
         raise UsageError(f"--jobs: wanted 1, got {jobs}; more than one is not in this version")
     if output is None and not dry_run:
@@ -163,6 +168,7 @@ def convert(
             point_layout=point_layout,
             dry_run=dry_run,
             report=report,
+            splits_jumps=on_jump == "split",
             overwrite=overwrite,
             quiet=quiet,
             verbose=verbose,

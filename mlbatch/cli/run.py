@@ -11,7 +11,9 @@ from pathlib import Path
 import typer
 
 from mlbatch.cli import checks
+from mlbatch.clipping import Part
 from mlbatch.converting import OpenWriter, convert
+from mlbatch.errors import ClockJump, NoScanError
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import report_text, summary_lines
@@ -37,13 +39,58 @@ class Wanted:
     point_layout: str
     dry_run: bool
     report: Path | None
+    splits_jumps: bool
     overwrite: bool
     quiet: bool
     verbose: bool
 
 
 def run(job: Job, wanted: Wanted) -> None:
-    """Convert, write the report, print the summary."""
+    """Convert, write the report, print the summary; with `--on-jump split` part by part."""
+    if not wanted.splits_jumps:
+        _convert(job, wanted)
+        return
+    number, part, scans = 1, Part(), 0
+    while True:
+        # Without a jump there is one part, which needs no number.
+        alone = part == Part()
+        try:
+            _convert(replace(job, part=part), wanted if alone else _numbered(wanted, number))
+            scans += 1
+        except ClockJump as jump:
+            if jump.host_ns <= (part.begin_ns or 0):
+                raise
+            typer.echo(f"mlbatch: part {number} ends where {jump}", err=True)
+            part = Part(part.begin_ns, jump.host_ns)
+            continue
+        except NoScanError as err:
+            if alone:
+                raise
+            typer.echo(f"mlbatch: warning: part {number}: {err}", err=True)
+        if part.end_ns is None:
+            break
+        number, part = number + 1, Part(part.end_ns)
+    if not scans:
+        raise NoScanError(f"none of {number} parts between clock jumps holds a whole window")
+
+
+def _numbered(wanted: Wanted, number: int) -> Wanted:
+    """The same with names of a part: scans.seg2.mcap, scans.seg2."""
+    return replace(
+        wanted,
+        output=_of_part(wanted.output, number, ".mcap", ".bag"),
+        report=_of_part(wanted.report, number, ".json"),
+    )
+
+
+def _of_part(path: Path | None, number: int, *suffixes: str) -> Path | None:
+    if path is None:
+        return None
+    suffix = path.suffix if path.suffix.lower() in suffixes else ""
+    return path.with_name(f"{path.name.removesuffix(suffix)}.seg{number}{suffix}")
+
+
+def _convert(job: Job, wanted: Wanted) -> None:
     opener, report_path = None, wanted.report
     options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
     # A dry run without an output decodes what a .mcap of this point layout would hold.

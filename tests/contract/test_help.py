@@ -27,6 +27,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--start": r"epoch s.*ISO.*\+S",
         "--end": "--start",
         "--clock": "sensor.*host",
+        "--on-jump": "error.*split",
         "--min-range": r"\bm\b",
         "--max-range": r"\bm\b",
         "--exclude-box": r"x0,y0,z0,x1,y1,z1, m, body frame.*repeatable",

@@ -15,7 +15,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("assembly",),),
     (("feeding",), ("job",)),
     (("inertial",), ("passing",), ("discover",)),
-    (("looking",), ("mounting",), ("matching", "_rigged")),
+    (("looking",), ("mounting",), ("clipping",), ("matching", "_rigged")),
     (("learning",),),
     (
         ("readers",),

@@ -167,7 +167,7 @@ def test_a_reset_clock_is_an_error_that_names_both_times() -> None:
         intake.accept(_alone(100_000, 100_010, 3, 13))
     assert str(err.value) == (
         "sensor left: clock reset within the recording: stamps went back from 100.010000 s to "
-        "0.003000 s; wanted one running clock; cut the recording there, or use --clock host"
+        "0.003000 s; wanted one running clock; use --on-jump split, or --clock host"
     )
 
 

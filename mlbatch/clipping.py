@@ -1,0 +1,94 @@
+"""A part of a session by arrival: what `--on-jump split` converts on its own."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.types import BoolArray, CaptureCounts, Message, PacketBatch, Recording, Topic
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Arrivals in [begin_ns, end_ns); None: no limit."""
+
+    begin_ns: int | None = None
+    end_ns: int | None = None
+
+
+@dataclass(slots=True)
+class ClippedRecording:
+    """The packets and messages of a recording that arrived within a part; `Recording`.
+
+    What lies outside is left out of the counts, too: it belongs to another part. Messages from
+    before the part are kept as long as sensors are looked for, since metadata stand at the start.
+    """
+
+    inner: Recording
+    part: Part
+    topics: tuple[Topic, ...] = ()
+    keep: frozenset[str] = frozenset()
+    notes: list[str] = field(default_factory=list)
+    path: Path = Path()
+    container: str = ""
+    counts: CaptureCounts = field(default_factory=CaptureCounts)
+    size_bytes: int = 0
+    position_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        self.path, self.container = self.inner.path, self.inner.container
+        self.size_bytes = self.inner.size_bytes
+        self._follow(0)
+
+    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+        """Yield the packets of the part, in file order; may be called again (counts restart).
+
+        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
+        """
+        self.inner.keep = self.keep
+        batches = self.inner.packets()
+        outside, first_ns = 0, None
+        try:
+            for batch in batches:
+                inside = self._inside(batch)
+                outside += len(batch) - int(np.count_nonzero(inside))
+                self._follow(outside)
+                clipped = batch if inside.all() else batch.take(np.flatnonzero(inside))
+                clipped = replace(clipped, messages=self._messages(batch))
+                if len(clipped) or clipped.messages:
+                    yield clipped
+                if len(clipped):
+                    first_ns = int(clipped.host_ns[0]) if first_ns is None else first_ns
+                    if until_ns is not None and int(clipped.host_ns[-1]) - first_ns > until_ns:
+                        return
+        finally:
+            if isinstance(batches, Generator):
+                batches.close()
+            self._follow(outside)
+
+    def _inside(self, batch: PacketBatch) -> BoolArray:
+        low, high = self.part.begin_ns, self.part.end_ns
+        inside = np.ones(len(batch), np.bool_)
+        if low is not None:
+            inside &= batch.host_ns >= low
+        if high is not None:
+            inside &= batch.host_ns < high
+        return inside
+
+    def _messages(self, batch: PacketBatch) -> tuple[Message, ...]:
+        high = self.part.end_ns
+        return tuple(m for m in batch.messages if high is None or m.host_ns < high)
+
+    def _follow(self, outside: int) -> None:
+        """Take over what the inner recording says of itself, but for what lies outside."""
+        inner = self.inner
+        self.topics, self.notes = inner.topics, inner.notes
+        self.position_bytes = inner.position_bytes
+        self.counts = replace(
+            inner.counts,
+            frames=inner.counts.frames - outside,
+            datagrams=inner.counts.datagrams - outside,
+        )

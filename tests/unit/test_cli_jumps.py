@@ -1,0 +1,149 @@
+"""Clocks that jump within a recording: named with their times, or cut into outputs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit.sessions import (
+    EPOCH_NS,
+    NS_PER_MS,
+    NS_PER_S,
+    Shell,
+    Unit,
+    twin,
+    write_session,
+)
+
+TURN_NS = 100 * NS_PER_MS
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    """The command line, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return Shell(monkeypatch, capsys)
+
+
+def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
+    """The same lidar, whose clock steps after every piece while the recorder's runs on."""
+    pieces, begin_ns, ahead_ns = [], unit.begin_ns, unit.host_ns
+    for number, step_ns in enumerate((0, *steps_ns)):
+        begin_ns, ahead_ns = begin_ns + step_ns, ahead_ns - step_ns
+        pieces.append(
+            replace(
+                unit,
+                begin_ns=begin_ns,
+                host_ns=ahead_ns,
+                turns=turns,
+                first_frame=5 + number * turns,
+            )
+        )
+        begin_ns += turns * TURN_NS
+    return pieces
+
+
+FORWARD, BACK = 37 * NS_PER_S, -20 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "words"),
+    [
+        (
+            FORWARD,
+            "clock jump within the recording: stamps went forward from 1800000000.619805 s to "
+            "1800000037.623125 s while only 0.003125 s passed at the recorder; wanted one running "
+            "clock; use --on-jump split, or --clock host",
+        ),
+        (
+            BACK,
+            "clock reset within the recording: stamps went back from 1800000000.619805 s to "
+            "1799999980.620000 s; wanted one running clock; use --on-jump split, or --clock host",
+        ),
+    ],
+)
+def test_a_jump_is_an_error_that_names_its_times(
+    shell: Shell, tmp_path: Path, step_ns: int, words: str
+) -> None:
+    write_session(tmp_path, *_pieces(Unit(), step_ns))
+    outcome = shell("convert drive.pcap -o out.mcap")
+    assert outcome.code == 1
+    assert outcome.err == f"mlbatch: error: sensor ouster_111: {words}\n"
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
+    """Five seconds of silence, at the sensor and at the recorder."""
+    first = Unit(turns=6)
+    later = replace(first, begin_ns=first.begin_ns + 5 * NS_PER_S, first_frame=55)
+    write_session(tmp_path, first, later)
+    outcome = shell("convert drive.pcap -o out --on-jump split")
+    assert outcome.code == 0, outcome.err
+    assert (tmp_path / "out" / "report.json").is_file()
+
+
+@pytest.mark.parametrize("steps_ns", [(FORWARD,), (BACK,), (FORWARD, BACK, FORWARD)])
+def test_every_stretch_becomes_an_output(
+    shell: Shell, tmp_path: Path, steps_ns: tuple[int, ...]
+) -> None:
+    pieces = _pieces(Unit(), *steps_ns)
+    write_session(tmp_path, *pieces)
+    outcome = shell("convert drive.pcap -o out --on-jump split --keep-partial")
+    assert outcome.code == 0, outcome.err
+    names = sorted(path.name for path in tmp_path.glob("out*"))
+    assert names == [f"out.seg{number + 1}" for number in range(len(pieces))]
+    read = 0
+    for piece, name in zip(pieces, names, strict=True):
+        report = json.loads((tmp_path / name / "report.json").read_text())
+        (sensor,) = report["sensors"]
+        read += sensor["packets"]["read"]
+        assert sensor["packets"]["accepted"] == 6 * 32
+        assert sensor["columns"]["dropped"] == {}
+        assert report["capture"]["datagrams"] == 6 * 32
+        # Eq. (1): the first point of the grid after the first stamp.
+        assert report["grid"]["t_init_ns"] == -(-piece.begin_ns // TURN_NS) * TURN_NS
+        stamps = [
+            np.load(path)["column_stamp_ns"] for path in sorted((tmp_path / name).glob("*.npz"))
+        ]
+        assert sum(map(len, stamps)) == 6 * 512
+    assert read == len(pieces) * 6 * 32
+
+
+def test_the_other_sensors_are_cut_at_the_same_time(shell: Shell, tmp_path: Path) -> None:
+    one = Unit(turns=12)
+    other = twin(Unit(), 222)
+    write_session(tmp_path, one, *_pieces(other, 700 * NS_PER_MS + 3 * NS_PER_S, -3_700_000_000))
+    # Beyond 1 s the second stretch of the other is not comparable with the first sensor.
+    outcome = shell("convert drive.pcap -o out.mcap --on-jump split --identity-extrinsics")
+    assert outcome.code == 1
+    assert "clocks of the sensors cannot be compared" in outcome.err
+    assert (tmp_path / "out.seg1.mcap").is_file()
+
+
+def test_arrival_times_know_no_jumps(shell: Shell, tmp_path: Path) -> None:
+    for step_ns in (FORWARD, BACK):
+        write_session(tmp_path, *_pieces(Unit(), step_ns))
+        outcome = shell("convert drive.pcap -o out --clock host --overwrite --keep-partial")
+        assert outcome.code == 0, outcome.err
+        report = json.loads((tmp_path / "out" / "report.json").read_text())
+        assert report["sensors"][0]["packets"]["accepted"] == 2 * 6 * 32
+        assert report["sensors"][0]["columns"]["dropped"] == {}
+
+
+def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path) -> None:
+    """PTP is found: from 50 s after power-on to today."""
+    start = replace(Unit(), begin_ns=50 * NS_PER_S, host_ns=EPOCH_NS)
+    write_session(tmp_path, *_pieces(start, EPOCH_NS))
+    outcome = shell("convert drive.pcap -o out --on-jump split")
+    assert outcome.code == 0, outcome.err
+    reports = [
+        json.loads(path.read_text()) for path in sorted(tmp_path.glob("out.seg*/report.json"))
+    ]
+    assert [one["timescale"] for one in reports] == ["uptime", "utc"]
+    assert [one["scans"]["empty"] for one in reports] == [0, 0]
