@@ -131,9 +131,11 @@ class PacketReader:
         azimuth, good = self._azimuths(packets)
         speed, row_ns = self._steps(azimuth, good)
         round_ns = np.arange(shape.columns) * model.round_ns + min(model.firing_ns[0])
-        after_ns = (row_ns[:, :, None] + round_ns).reshape(len(packets), -1)
+        # No packet at all is a batch of damaged ones.
+        flat = len(packets), row_ns.shape[1] * shape.columns
+        after_ns = (row_ns[:, :, None] + round_ns).reshape(flat)
         turned = azimuth[:, :, None] + speed[:, None, None] * (round_ns / NS_PER_S)
-        turns = self._sense / _CDEG_PER_TURN * turned.reshape(len(packets), -1)
+        turns = self._sense / _CDEG_PER_TURN * turned.reshape(flat)
         turns_per_s = (self._sense / _CDEG_PER_TURN * self._moving) * speed
         words = rotor_words(turns, np.broadcast_to(turns_per_s[:, None], turns.shape))
         valid = np.repeat(good, shape.columns, axis=1)
