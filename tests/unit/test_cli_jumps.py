@@ -58,7 +58,7 @@ FORWARD, BACK = 37 * NS_PER_S, -20 * NS_PER_S
         (
             FORWARD,
             "clock jump within the recording: stamps went forward from 1800000000.619805 s to "
-            "1800000037.623125 s while only 0.003125 s passed at the recorder; wanted one running "
+            "1800000037.622930 s while only 0.003125 s passed at the recorder; wanted one running "
             "clock; use --on-jump split, or --clock host",
         ),
         (
