@@ -7,6 +7,7 @@ that bags on read-only media and bags of other users can be read.
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -28,12 +29,18 @@ from mlbatch.types import I64Array, Topic, U8Array
 
 MAGIC = b"SQLite format 3\0"
 BUFFER_BYTES = WINDOW_BYTES
-_MAX_MESSAGE_BYTES = 512 << 20
+_MAX_MESSAGE_BYTES = 1 << 28
+# Where the file's header tells its version, pages and their size (SQLite file format, 1.3).
+_HEAD_BYTES, _PAGE_SIZE_AT, _CHANGES_AT, _PAGES_AT, _VALID_FOR_AT = 100, 16, 24, 28, 92
+_COMPUTED = re.compile(r"\b(virtual|as)\b")
+_ASKED_TABLES = ("messages", "topics", "message_definitions", "sqlite_master")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _BEFORE_ALL = (-(1 << 63), -(1 << 63))
 _COUNT = "SELECT count(*) FROM messages WHERE timestamp > ? AND timestamp < ?"
 _COLUMNS = ["id", "topic_id", "timestamp", "data"]
 _RESERVED_AT = 20
+# No more is written where the header of a compressed database does not tell how large it is.
+_MOST_BYTES = 1 << 40
 _BY_TIME = (
     "SELECT id, topic_id, timestamp, data FROM messages WHERE timestamp >= ?1 AND "
     "(timestamp > ?1 OR id > ?2) AND topic_id IN ({}) ORDER BY timestamp, id"
@@ -77,7 +84,7 @@ class Database:
                 self.topics = _topics(connection)
                 self._indexed = _has_time_index(connection)
                 self.first_ns = self._first_ns(connection)
-        except sqlite3.Error as err:
+        except (sqlite3.Error, KeyError, TypeError, ValueError) as err:
             raise RecordingError(
                 f"{path}: wanted a ROS 2 bag (tables topics and messages), got a database that "
                 f"cannot be read ({err}); record or copy it again, or try `sqlite3 .recover`"
@@ -92,10 +99,14 @@ class Database:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
             target = folder / "bag.db3"
             piece = memoryview(bytearray(BUFFER_BYTES))
+            count = source.fill(piece)
+            left = _said_bytes(bytes(piece[: min(count, _HEAD_BYTES)]), self.path)
             try:
                 with target.open("wb") as out:
-                    while count := source.fill(piece):
-                        out.write(piece[:count])
+                    # What a database holds beyond its pages is no part of it, and may be endless.
+                    while count and left:
+                        left -= out.write(piece[: min(count, left)])
+                        count = source.fill(piece)
             except OSError as err:
                 raise RecordingError(
                     f"{self.path}: wanted room to decompress it to {folder.parent}, "
@@ -156,11 +167,13 @@ class Database:
         if self._logged or [row[1] for row in columns] != _COLUMNS or columns[0][5] != 1:
             raise HandOver
         (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
-        (root,) = connection.execute(
+        place = connection.execute(
             "SELECT rootpage FROM sqlite_master WHERE type = 'table' AND name = 'messages'"
         ).fetchone()
+        if place is None or not isinstance(place[0], int):
+            raise HandOver
         reserved = file.read(_RESERVED_AT + 1)[_RESERVED_AT]
-        return Table(file, page_bytes, page_bytes - reserved, root)
+        return Table(file, page_bytes, page_bytes - reserved, place[0])
 
 
 @dataclass(slots=True)
@@ -273,6 +286,9 @@ class _Reading:
         import zstandard
 
         try:
+            # The size that the data claim is what would be allocated.
+            if zstandard.frame_content_size(data) > _MAX_MESSAGE_BYTES:
+                return b""
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE_BYTES)
         except zstandard.ZstdError:
             return b""
@@ -284,10 +300,41 @@ def _any_zstd(buffer: U8Array, rows: Rows) -> bool:
     return bool((u32(buffer, start) == int.from_bytes(_ZSTD, "little")).any())
 
 
+def _said_bytes(head: bytes, path: Path) -> int:
+    """Size of a database by its header."""
+    if not head.startswith(MAGIC) or len(head) < _HEAD_BYTES:
+        raise RecordingError(
+            f"{path}: wanted a compressed SQLite database, got one that begins with "
+            f"{head[:8].hex(' ')}; record or copy it again"
+        )
+    page_bytes, changes, pages, valid_for = (
+        int.from_bytes(head[at : at + size], "big")
+        for at, size in ((_PAGE_SIZE_AT, 2), (_CHANGES_AT, 4), (_PAGES_AT, 4), (_VALID_FOR_AT, 4))
+    )
+    # Old versions of SQLite leave the number of pages as it was.
+    is_told = pages > 0 and changes == valid_for
+    return pages * (1 << 16 if page_bytes == 1 else page_bytes) if is_told else _MOST_BYTES
+
+
+def _tables(connection: sqlite3.Connection) -> set[str]:
+    """Names of the tables; ValueError where one that is asked is computed (a view, columns).
+
+    What is computed comes from the file, and may never end.
+    """
+    found = set()
+    for row in connection.execute("SELECT name, type, sql FROM sqlite_master"):
+        name, kind, text = (str(cell).lower() for cell in row)
+        found |= {name} if kind == "table" else set()
+        computed = kind != "table" or _COMPUTED.search(text) is not None
+        if name in _ASKED_TABLES and computed:
+            raise ValueError(f"{kind} {name} is computed")
+    return found
+
+
 def _topics(connection: sqlite3.Connection) -> dict[int, Topic]:
     """Topics by number; definitions are there from schema 4 on."""
     connection.row_factory = sqlite3.Row
-    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    tables = _tables(connection)
     definitions: dict[str, tuple[str, str]] = {}
     if "message_definitions" in tables:
         for row in connection.execute("SELECT * FROM message_definitions"):

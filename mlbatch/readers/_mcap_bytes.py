@@ -17,7 +17,7 @@ from mlbatch.types import U8Array
 
 BUFFER_BYTES = 4 << 20
 # No recorder makes larger chunks or messages: rosbag2 has 0.75 to 4 MB, others less than 100 MB.
-MAX_RECORD_BYTES = 512 << 20
+MAX_RECORD_BYTES = 1 << 28
 _PIECE_BYTES = 1 << 18
 
 

@@ -37,7 +37,7 @@ CONTAINER = "ROS 1 bag"
 _NAME = b"#ROSBAG V"
 _MAGIC = b"#ROSBAG V2.0\n"
 # The recorder begins a new chunk every 0.75 MB, unless it is told otherwise.
-_MAX_CHUNK_BYTES = 1 << 30
+_MAX_CHUNK_BYTES = 1 << 28
 _MAX_INDEX_BYTES = 16 << 20
 _WORD_BYTES = 4
 _PLAIN = "none"
