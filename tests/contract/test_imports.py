@@ -40,10 +40,14 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("scan_table",),
         ("turns", "tally"),
         ("clock",),
+        (
+            *("doctor", "_doctor_bins", "_doctor_envelope", "_doctor_names", "_doctor_steps"),
+            *("clock_compare", "clock_fit"),
+        ),
     ),
-    (("lidar",), ("transforms",)),
+    (("lidar",), ("transforms",), ("verify",)),
     (("geometry",),),
-    (("types",),),
+    (("types",), ("leap_seconds",)),
     (("rate",), ("units",)),
     (("errors",),),
     # The root: its version. What else it offers, it loads when asked.

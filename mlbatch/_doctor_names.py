@@ -1,0 +1,114 @@
+"""Names for what clocks count and for the differences between them.
+
+facts/ouster.md section 7, facts/velodyne.md section 7, facts/hesai.md section 4: the mode a sensor
+was set to does not prove what its clock does; the values do.
+"""
+
+from __future__ import annotations
+
+from mlbatch.leap_seconds import GPS_EPOCH_S, TAI_GPS_S, gps_utc_s, tai_utc_s
+from mlbatch.units import NS_PER_MS, NS_PER_S
+
+UTC, TAI, GPS = "utc", "tai", "gps"
+TOP_OF_HOUR, UPTIME, WRONG_YEAR, UNKNOWN = "top_of_hour", "uptime", "wrong_year", "unknown"
+# Kinds of jumps that the sensor's clock has no part in; what stepped between two packets.
+HOST, DELAY, SENSOR = "host", "delay", "sensor"
+# Domains whose clocks follow the world's time.
+EPOCHS = (UTC, TAI, GPS)
+IN_WORDS = {
+    UTC: "UTC",
+    TAI: "TAI",
+    GPS: "GPS time",
+    TOP_OF_HOUR: "past an hour, not synchronised",
+    UPTIME: "since power-on",
+    WRONG_YEAR: "a wrong date",
+    UNKNOWN: "unknown",
+}
+HOUR_NS = 3600 * NS_PER_S
+DAY_NS = 24 * HOUR_NS
+# Stamps below (2001) are no time of today.
+EPOCH_NS = 10**9 * NS_PER_S
+# No sensor runs for three years on end; 1973 to 2001 is a calendar that was never set.
+LONGEST_UPTIME_NS = 10**8 * NS_PER_S
+# How far the recorder's clock may be off for a domain to be told.
+NEAR_NS = 2 * NS_PER_S
+_HALF_A_YEAR_NS = 182 * DAY_NS
+# Sensors send within seconds of power-on, their clocks begin there.
+_STARTED_NS = 600 * NS_PER_S
+_LARGEST_ZONE_H = 14
+# Counters that wrap: of 32 bits in us and ns, and past the hour.
+_WRAPS_NS = (2**32 * 1000, 2**32, HOUR_NS, DAY_NS)
+_WRAP_ERROR_NS = 20 * NS_PER_MS
+
+
+def shifts_ns(utc_ns: int) -> tuple[tuple[str, int], ...]:
+    """How far clocks of each epoch domain are ahead of UTC; GPS also as counted from 1980."""
+    tai_s, gps_s = tai_utc_s(utc_ns), gps_utc_s(utc_ns)
+    shifts = ((UTC, 0), (TAI, tai_s), (GPS, gps_s), (GPS, gps_s - GPS_EPOCH_S))
+    return tuple((name, seconds * NS_PER_S) for name, seconds in shifts)
+
+
+def domain_of(stamp_ns: int, offset_ns: int, period_ns: int) -> str:
+    """What a stamp counts that is `offset_ns` ahead of the recorder's clock (UTC).
+
+    period_ns: what the sensor leaves out and the recorder's clock gave (the hour), 0: nothing.
+    """
+    if period_ns:
+        return UTC if abs(offset_ns) < NEAR_NS else TOP_OF_HOUR
+    host_ns = stamp_ns - offset_ns
+    if host_ns >= EPOCH_NS:
+        for name, shift_ns in shifts_ns(host_ns):
+            if abs(offset_ns - shift_ns) < NEAR_NS:
+                return name
+    if stamp_ns < LONGEST_UPTIME_NS:
+        return UPTIME
+    if stamp_ns < EPOCH_NS or (host_ns >= EPOCH_NS and abs(offset_ns) >= _HALF_A_YEAR_NS):
+        return WRONG_YEAR
+    return UNKNOWN
+
+
+def whole_ns(difference_ns: int, utc_ns: int, error_ns: int) -> tuple[int, str] | None:
+    """The known difference that is met within `error_ns`, and its name; None if there is none."""
+    if abs(difference_ns) <= error_ns:
+        return None
+    sign = 1 if difference_ns > 0 else -1
+    tai_s, gps_s = tai_utc_s(utc_ns), gps_utc_s(utc_ns)
+    known = (
+        (tai_s, f"{tai_s} s: TAI - UTC"),
+        (gps_s, f"{gps_s} s: GPS - UTC"),
+        (TAI_GPS_S, f"{TAI_GPS_S} s: TAI - GPS"),
+        (GPS_EPOCH_S, "from 1970 to 1980: GPS time without its epoch"),
+        (GPS_EPOCH_S - gps_s, "UTC against GPS time from 1980"),
+    )
+    for seconds, name in known:
+        if abs(abs(difference_ns) - seconds * NS_PER_S) <= error_ns:
+            return sign * seconds * NS_PER_S, name
+    for unit_ns, most, unit in (
+        (DAY_NS, None, "day(s)"),
+        (HOUR_NS, _LARGEST_ZONE_H, "hour(s): a time zone, or the wrong hour"),
+        (NS_PER_S, None, "second(s)"),
+    ):
+        count = round(abs(difference_ns) / unit_ns)
+        if count and (most is None or count <= most):
+            whole = sign * count * unit_ns
+            if abs(difference_ns - whole) <= error_ns:
+                return whole, f"{count} whole {unit}"
+    return None
+
+
+def kind_of_jump(before_ns: int, after_ns: int, size_ns: int, period_ns: int) -> str:
+    """`forward`, `backward`, `restart` or `wrap`: what a sensor's clock did between two stamps."""
+    # An hour that was found anew may also go up; counters only fall back.
+    wraps_ns = {period_ns} if size_ns > 0 else {period_ns, *_WRAPS_NS}
+    if any(abs(abs(size_ns) - wrap_ns) < _WRAP_ERROR_NS for wrap_ns in wraps_ns - {0}):
+        return "wrap"
+    if after_ns < before_ns and after_ns < _STARTED_NS:
+        return "restart"
+    return "forward" if size_ns > 0 else "backward"
+
+
+def in_seconds(value_ns: int) -> str:
+    """A difference for people: ms below a second, else s."""
+    if abs(value_ns) < NS_PER_S:
+        return f"{value_ns / NS_PER_MS:+.3f} ms"
+    return f"{value_ns / NS_PER_S:+.6f} s"
