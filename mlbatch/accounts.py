@@ -14,6 +14,7 @@ from mlbatch.passing import PASS_REASONS
 from mlbatch.rate import rate_text
 from mlbatch.report import (
     ClockReport,
+    FaultReport,
     InputReport,
     Passed,
     ReportInputs,
@@ -56,6 +57,7 @@ def report_inputs(run: Conversion) -> ReportInputs:
             Passed(topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS))
             for topic, counts in sorted(run.passed.counts.items())
         ),
+        faults=tuple(FaultReport(one.fault, one.packets) for one in run.replay.counts),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
@@ -81,9 +83,11 @@ def late_notes(run: Conversion) -> list[Note]:
     ]
     for sensor, feed in zip(run.setup.sensors, run.feeds, strict=True):
         packets = feed.ledger.packets
-        rejected = sum(packets.rejected.values())
+        # What was captured twice is no loss.
+        reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
+        rejected = sum(reasons_of.values())
         if rejected > MANY_REJECTED * packets.read:
-            reasons = ", ".join(f"{n} {reason}" for reason, n in packets.rejected.items())
+            reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
             text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
             notes.append(Note("rejected", sensor.name, text))
     table, seen = run.setup.sampler.table, run.setup.sampler.samples

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +12,14 @@ from mlbatch.discover import Setup
 from mlbatch.ledger import SensorLedger
 from mlbatch.lidar import FAULTS, Lidar
 from mlbatch.ring import RawRing
+from mlbatch.sensors import content_keys
 from mlbatch.streams import Kind, Role, split_by_kind
 from mlbatch.types import BoolArray, I64Array, ImuSamples, PacketBatch, U8Array
+
+# Copies are looked for among so many IMU packets.
+RECENT_IMU = 64
+# Sensor, arrivals (P,) in ns: what is added to the stamps of these packets, (P,) ns.
+ClockShift = Callable[[int, I64Array], I64Array]
 
 
 @dataclass(slots=True)
@@ -39,12 +45,21 @@ class Feeder:
     What belongs to none is counted in `unassigned`; `samples` has one of each kind, (1, size).
     """
 
-    def __init__(self, setup: Setup, feeds: Sequence[Feed], host_clocks: Sequence[bool]) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        feeds: Sequence[Feed],
+        host_clocks: Sequence[bool],
+        shift_ns: ClockShift | None = None,
+    ) -> None:
+        """shift_ns: what is added to the stamps of packets, by sensor and their arrival."""
         self.unassigned: dict[Kind, int] = {}
         self.samples: dict[Kind, U8Array] = {}
         self._router = setup.router
         self._feeds = list(feeds)
         self._host_clocks = list(host_clocks)
+        self._shift_ns = shift_ns
+        self._recent: list[I64Array] = [np.empty(0, np.int64) for _ in self._feeds]
 
     def feed(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Fed:
         """Route a batch, copy lidar packets to their rings and read their heads."""
@@ -77,6 +92,21 @@ class Feeder:
             self._unassign(kind, batch, index[~owned[index]])
         return fed
 
+    def owners(self, batch: PacketBatch) -> I64Array:
+        """Number of the sensor that each packet is of, its IMU included; -1 of none."""
+        owner = np.full(len(batch), -1, np.int64)
+        for kind, index in split_by_kind(batch):
+            begin = int(batch.start[index[0]])
+            route = self._router.route(kind, batch.data[begin : begin + kind[1]])
+            if len(route.sensors) == 1:
+                owner[index] = route.sensors[0]
+                continue
+            for number in route.sensors:
+                lidar, left = self._feeds[number].lidar, index[owner[index] < 0]
+                packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
+                owner[left[lidar.owns(packets)]] = number
+        return owner
+
     def _unassign(self, kind: Kind, batch: PacketBatch, index: I64Array) -> None:
         if not len(index):
             return
@@ -106,24 +136,45 @@ class Feeder:
         good = mine & (faults == 0)
         if not good.all():
             packets, place, index = packets[good], place[good], index[good]
+        host_ns = batch.host_ns[index]
+        heads = lidar.heads(packets, host_ns)
+        if self._shift_ns is not None:
+            heads.stamp_ns = heads.stamp_ns + self._shift_ns(number, host_ns)[:, None]
         return Arrival(
             position=index,
-            host_ns=batch.host_ns[index],
+            host_ns=host_ns,
             key=lidar.sequence(packets),
-            heads=lidar.heads(packets, batch.host_ns[index]),
+            heads=heads,
             place=place,
         )
+
+    def _fresh(self, number: int, key: I64Array) -> BoolArray:
+        """Which IMU packets (n,) of a sensor are no copies of recent ones, by their content."""
+        keys = np.concatenate([self._recent[number], key])
+        _, first = np.unique(keys, return_index=True)
+        fresh = np.zeros(len(keys), np.bool_)
+        fresh[first] = True
+        self._recent[number] = keys[-RECENT_IMU:]
+        return fresh[len(keys) - len(key) :]
 
     def _imu(self, batch: PacketBatch, index: I64Array, number: int) -> list[ImuSamples]:
         feed = self._feeds[number]
         feed.ledger.imu_packets += len(index)
         payloads = batch.data[batch.start[index, None] + np.arange(int(batch.size[index[0]]))]
-        if not self._host_clocks[number]:
+        fresh = self._fresh(number, content_keys(payloads))
+        if not fresh.all():
+            again = len(feed.lidar.imu(payloads[~fresh], number).stamp_ns)
+            feed.ledger.imu_samples.decoded += again
+            feed.ledger.imu_samples.drop("duplicate", again)
+            payloads, index = payloads[fresh], index[fresh]
+        if not self._host_clocks[number] and self._shift_ns is None:
             return [feed.lidar.imu(payloads, number)]
         samples = []
         for host_ns, payload in zip(batch.host_ns[index].tolist(), payloads, strict=True):
             sample = feed.lidar.imu(payload[None], number)
-            if len(sample.stamp_ns):
+            if not self._host_clocks[number] and self._shift_ns is not None:
+                sample.stamp_ns = sample.stamp_ns + self._shift_ns(number, np.array([host_ns]))
+            elif len(sample.stamp_ns):
                 # Ages first: damaged stamps may be too large to be added to an arrival.
                 sample.stamp_ns = sample.stamp_ns - sample.stamp_ns[-1:] + host_ns
             samples.append(sample)

@@ -9,6 +9,7 @@ from pathlib import Path
 from mlbatch.batching.windows import Limit
 from mlbatch.clipping import Part
 from mlbatch.discover import Wishes
+from mlbatch.faults import Fault
 from mlbatch.types import EXTRAS
 from mlbatch.units import NS_PER_S
 
@@ -21,8 +22,9 @@ class Job:
     """What to make of which recordings; times in ns, ranges and boxes in m, body frame.
 
     rate None: that of the rig, else 10 Hz; drop_incomplete: percent of the columns of every sensor
-    that a window must hold; max_wait_ns None: for ever; boxes_m: (k, 6); extras:
-    those of EXTRAS that the output has a place for; passed: patterns of topics to pass through.
+    that a window must hold; max_wait_ns None: for ever; boxes_m: (k, 6); extras: those of EXTRAS
+    that the output has a place for; fault_begin_ns: arrival from which times of faults count, None:
+    the first packet; part: of the session, by arrival; passed: patterns of topics to pass through.
     """
 
     recordings: tuple[Path, ...]
@@ -42,6 +44,9 @@ class Job:
     max_range_m: float = float("inf")
     boxes_m: tuple[tuple[float, ...], ...] = ()
     strict: bool = False
+    faults: tuple[Fault, ...] = ()
+    fault_seed: int = 0
+    fault_begin_ns: int | None = None
     part: Part = field(default_factory=Part)
     passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS

@@ -15,7 +15,7 @@ COLUMN_REASONS = (
     *("before_start", "late", "tail", "head", "invalid", "outside_time", "incomplete"),
 )
 # `no_place`: the format of the output has none for them.
-IMU_REASONS = ("bad_stamp", "outside_time", "no_place")
+IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
 
 
 @dataclass(slots=True)

@@ -20,6 +20,7 @@ from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Due, Label
 from mlbatch.discover import Note, Setup, absent, discover, untimed
 from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
+from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
@@ -93,7 +94,12 @@ class Conversion:
         guards = [] if any(host_clocks) else [JumpGuard(s.name) for s in self.setup.sensors]
         self.batcher = Batcher(self.grid, intakes, policy, guards)
         self._refuse_untimed()
-        self.feeder = Feeder(self.setup, self.feeds, host_clocks)
+        self.replay = FaultReplay(
+            job.faults, job.fault_seed, [sensor.name for sensor in self.setup.sensors]
+        )
+        self.replay.begin_ns = job.fault_begin_ns
+        shift = self.replay.shift_ns if job.faults else None
+        self.feeder = Feeder(self.setup, self.feeds, host_clocks, shift)
         self._decoders: list[Decoder] = []
         self._imu = ImuQueue(
             [feed.ledger.imu_samples for feed in self.feeds],
@@ -117,6 +123,8 @@ class Conversion:
         size = sum(recording.size_bytes for recording in self.recordings)
         self.passed.keep(self.recordings)
         batches = merge(self.recordings)
+        if self.job.faults:
+            batches = self.replay.batches(batches, self.feeder.owners)
         while (batch := self._read(batches)) is not None:
             yield from self._windows(self._push(batch))
             if progress is not None:
@@ -354,6 +362,13 @@ class Conversion:
     def notes(self) -> Sequence[Note]:
         """Warnings so far."""
         return self._notes
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Arrival of the first packet of any sensor, as far as they were seen at first."""
+        spans = self.setup.sampler.span_ns
+        kinds = [kind for sensor in self.setup.sensors for kind in sensor.found.kinds]
+        return min((spans[kind][0] for kind in kinds if kind in spans), default=None)
 
     @property
     def elapsed_s(self) -> tuple[float, float]:

@@ -106,6 +106,14 @@ class Passed:
 
 
 @dataclass(frozen=True, slots=True)
+class FaultReport:
+    """A fault that was replayed, and how many packets it touched."""
+
+    fault: str
+    packets: int
+
+
+@dataclass(frozen=True, slots=True)
 class Warned:
     """A warning; `sensor` is empty where it concerns the run."""
 
@@ -130,6 +138,7 @@ class ReportInputs:
     timing: Timing | None = None
     warnings: tuple[Warned, ...] = ()
     messages: tuple[Passed, ...] = ()
+    faults: tuple[FaultReport, ...] = ()
 
 
 def build_report(run: ReportInputs) -> Section:
@@ -154,6 +163,7 @@ def build_report(run: ReportInputs) -> Section:
         "unassigned": [asdict(item) for item in run.unassigned],
         "sensors": [_sensor(sensor) for sensor in run.sensors],
         "messages": [asdict(item) for item in run.messages],
+        **({"faults": [asdict(item) for item in run.faults]} if run.faults else {}),
         "scans": asdict(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
         "warnings": [asdict(item) for item in run.warnings],

@@ -96,6 +96,11 @@ def convert(
         list[str] | None,
         typer.Option("--pass", help="Copy this topic (or pattern) of a bag; repeatable."),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Replay a fault, as drop:left:5% or stall:left:5s-8s; repeatable."),
+    ] = None,
+    fault_seed: Annotated[int, typer.Option(help="Which packets random faults befall.")] = 0,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Do all but write; print the report.")
     ] = False,
@@ -158,6 +163,8 @@ def convert(
         max_range_m=max_range,
         boxes_m=tuple(values.box_m(text) for text in exclude_box or ()),
         strict=strict,
+        faults=values.faults(fault or ()),
+        fault_seed=values.seed(fault_seed),
         passed=tuple(pass_ or ()),
     )
     run(

@@ -50,6 +50,9 @@ def run(job: Job, wanted: Wanted) -> None:
     if not wanted.splits_jumps:
         _convert(job, wanted)
         return
+    if job.faults:
+        # Times of faults count from the start of the session, in all parts of it.
+        job = replace(job, fault_begin_ns=Conversion(job).begin_ns)
     number, part, scans = 1, Part(), 0
     while True:
         # Without a jump there is one part, which needs no number.

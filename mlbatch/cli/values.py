@@ -11,6 +11,7 @@ from fractions import Fraction
 
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
+from mlbatch.faults import Fault, parse_fault
 from mlbatch.rate import parse_rate
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
@@ -146,3 +147,15 @@ def percent(option: str, value: float) -> float:
     if not 0 <= value <= 100:
         raise UsageError(f"{option}: wanted a share from 0 to 100 %, got {value:g}; correct it")
     return value
+
+
+def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
+    """`--fault KIND:SENSOR:VALUE`, repeatable."""
+    return tuple(parse_fault(text) for text in texts)
+
+
+def seed(number: int) -> int:
+    """`--fault-seed`, a whole number from 0."""
+    if number < 0:
+        raise UsageError(f"--fault-seed: wanted a whole number from 0, got {number}; correct it")
+    return number

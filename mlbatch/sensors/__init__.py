@@ -15,6 +15,7 @@ from typing import Protocol, cast
 from mlbatch.errors import RigError
 from mlbatch.lidar import Calibration, SensorModel
 from mlbatch.sensors._options import DECODE_OPTIONS
+from mlbatch.sensors._turning_lidar import content_keys
 from mlbatch.types import U8Array
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "MAX_CALIBRATION_BYTES",
     "Plugin",
     "built_in",
+    "content_keys",
     "describe",
     "models",
     "parse_calibration",

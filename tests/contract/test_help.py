@@ -39,6 +39,8 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--decode": "KEY=VALUE.*repeatable",
         "--only": "repeatable",
         "--ignore": "repeatable",
+        "--fault": "repeatable",
+        "--fault-seed": "random",
         "--dry-run": "report",
         "--report": "JSON",
         "--jobs": "this version",
@@ -59,6 +61,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--json": "JSON",
     },
     "sensors": {"--json": "JSON"},
+    "verify": {"--report": "JSON.*beside", "--json": "JSON"},
 }
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
