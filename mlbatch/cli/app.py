@@ -11,6 +11,7 @@ from mlbatch.cli.compare import compare
 from mlbatch.cli.convert import convert
 from mlbatch.cli.inspect import inspect
 from mlbatch.cli.sensors import sensors
+from mlbatch.cli.verify import verify
 
 app = typer.Typer(
     name="mlbatch",
@@ -44,3 +45,4 @@ app.command()(convert)
 app.command()(inspect)
 app.command()(compare)
 app.command()(sensors)
+app.command()(verify)

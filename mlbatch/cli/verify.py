@@ -1,0 +1,96 @@
+"""`mlbatch verify`: a proof of an output from the output alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mlbatch.verify import Verdict
+
+# Violations that are shown to people; the rest is counted. JSON has more of them.
+SHOWN = 20
+
+
+def verify(
+    output: Annotated[
+        Path, typer.Argument(help="Output of convert: folder of npz or PLY, .mcap, .bag, rosbag2.")
+    ],
+    report: Annotated[
+        Path | None, typer.Option(help="Report of the run (JSON). [default: in or beside OUTPUT]")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """Prove grid, order, times, counts and ledgers of an output, from nothing but the output."""
+    from mlbatch.verify import VerifyError
+    from mlbatch.verify import verify as prove
+
+    verdict = prove(output, report)
+    if as_json:
+        typer.echo(json.dumps(_values(verdict), indent=1))
+    else:
+        for line in _lines(verdict):
+            typer.echo(line)
+    if not verdict.ok:
+        broken = sum(check.violations > 0 for check in verdict.checks)
+        raise VerifyError(
+            f"{output}: wanted none, got {verdict.count} violation(s) of {broken} check(s); "
+            "see above, and convert again"
+        )
+
+
+def _values(verdict: Verdict) -> dict[str, object]:
+    return {
+        "schema": "mlbatch.verdict/1",
+        "output": verdict.path,
+        "format": verdict.format,
+        "ok": verdict.ok,
+        "scans": verdict.scans,
+        "points": verdict.points,
+        "columns": verdict.columns,
+        "checks": [
+            {
+                "name": check.name,
+                "outcome": check.outcome,
+                "judged": check.judged,
+                "violations": check.violations,
+                "limit": check.limit,
+            }
+            for check in verdict.checks
+        ],
+        "violations": [
+            {"check": one.check, "where": one.where, "wanted": one.wanted, "got": one.got}
+            for one in verdict.violations
+        ],
+    }
+
+
+def _lines(verdict: Verdict) -> list[str]:
+    from mlbatch.cli.tables import columns
+
+    size = f"{verdict.scans} scans, {verdict.points} points"
+    if verdict.columns is not None:
+        size += f", {verdict.columns} columns"
+    rows = [
+        (
+            check.name,
+            str(check.judged or ""),
+            _outcome(check.violations, check.outcome),
+            check.limit,
+        )
+        for check in verdict.checks
+    ]
+    lines = [f"{verdict.path}: {verdict.format}, {size}"]
+    lines += columns([("check", "judged", "outcome", "what stays open"), *rows])
+    shown = verdict.violations[:SHOWN]
+    lines += map(str, shown)
+    if verdict.count > len(shown):
+        lines.append(f"and {verdict.count - len(shown)} more")
+    return lines
+
+
+def _outcome(violations: int, outcome: str) -> str:
+    return f"{violations} violated" if violations else outcome
