@@ -7,6 +7,7 @@ their packets prove to be its own.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -26,6 +27,8 @@ SAMPLE_EVERY_NS = NS_PER_S // 4
 SHORTEST_NS = 2 * NS_PER_S
 # Different first words of a kind that are looked out for; most makers change them in every packet.
 MOST_BEGINNINGS = 8
+# No lidar sends so many kinds; a camera does, and a recorder that copies files.
+MOST_BESIDE = 64
 _WORD = 4
 
 
@@ -68,10 +71,14 @@ class Sampler:
     packets: dict[Kind, int] = field(default_factory=dict)
     span_ns: dict[Kind, tuple[int, int]] = field(default_factory=dict)
     beginnings: dict[Kind, set[int]] = field(default_factory=dict)
+    _neighbours: dict[str, list[Kind]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
         """Look at a batch."""
         for kind, index in split_by_kind(batch):
+            if kind not in self.samples:
+                source = self.table.streams[kind[0]].source_ip
+                self._neighbours.setdefault(source, []).append(kind)
             kept = self.samples.setdefault(kind, [])
             hosts_ns = self.sample_host_ns.setdefault(kind, [])
             for at in self._telling(kind, index, batch):
@@ -157,10 +164,14 @@ class Sampler:
     def evidence(self, kind: Kind) -> Evidence:
         """What is known of a kind."""
         stream = self.table.streams[kind[0]]
+        near = (
+            other
+            for other in self._neighbours[stream.source_ip]
+            if other != kind and is_beside(self.table.streams[other[0]], stream)
+        )
         beside = tuple(
             Beside(self.table.streams[other[0]], other[1], *self._sample(other))
-            for other in self.samples
-            if other != kind and is_beside(self.table.streams[other[0]], stream)
+            for other in itertools.islice(near, MOST_BESIDE)
         )
         return Evidence(stream, kind[1], *self._sample(kind), beside)
 

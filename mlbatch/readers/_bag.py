@@ -34,6 +34,9 @@ from mlbatch.types import (
     U8Array,
 )
 
+# A file of nothing but damage would fill memory and screen with what is wrong with it.
+MOST_NOTES = 100
+
 
 @dataclass(frozen=True, slots=True)
 class Portion:
@@ -72,9 +75,12 @@ class BagRecording:
     notes: list[str] = field(default_factory=list)
     position_bytes: int = 0
     keep: frozenset[str] = frozenset()
+    _numbers: dict[Topic, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.notes = list(self.standing)
+        for number, topic in enumerate(self.topics):
+            self._numbers.setdefault(topic, number)
 
     def wants(self, topic: Topic) -> bool:
         """Whether the messages of a topic are asked for: they hold packets, or shall be kept."""
@@ -82,13 +88,15 @@ class BagRecording:
 
     def number(self, topic: Topic) -> int:
         """Number of a topic, also of one that is met only while reading."""
-        if topic not in self.topics:
+        number = self._numbers.setdefault(topic, len(self.topics))
+        if number == len(self.topics):
             self.topics = (*self.topics, topic)
-        return self.topics.index(topic)
+        return number
 
     def lose(self, note: str, count: int = 1) -> None:
         """Note what cannot be read, and count `count` messages of it as truncated."""
-        self.notes.append(note)
+        if len(self.notes) < MOST_NOTES:
+            self.notes.append(note)
         self.counts.frames += count
         self.counts.skip("truncated", count)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Set
 from dataclasses import dataclass, field
 
+from mlbatch.readers._bag import MOST_NOTES
 from mlbatch.readers._mcap_bytes import (
     BUFFER_BYTES,
     MAX_RECORD_BYTES,
@@ -186,7 +187,8 @@ class Walk:
         )
 
     def _note(self, place: int, text: str) -> None:
-        self.notes.append(f"byte {place}: {text}")
+        if len(self.notes) < MOST_NOTES:
+            self.notes.append(f"byte {place}: {text}")
 
 
 def _fault_in_chunk(stretch: Stretch, bound: int) -> str:

@@ -7,6 +7,7 @@ is one, tells the topics at once and which chunks need not be looked into.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
@@ -34,6 +35,8 @@ CONTAINER = "MCAP"
 # How far to look for topics in a file that has no summary; recorders tell them at the front.
 _LOOK_BYTES = 64 << 20
 _PEEK_BYTES = 1 << 16
+# A summary of more records is not kept in memory; the file is read without it.
+_MOST_RECORDS = 500_000
 
 
 def recognises(head: bytes) -> bool:
@@ -91,8 +94,12 @@ def _summary(source: SkippingSource) -> _Summary:
     if not start or not 0 < place - start <= MAX_RECORD_BYTES:
         return found
     # A channel is known by its schema, which may stand behind it here.
-    records = sorted(records_of(source.look_at(start, place - start)), key=lambda record: record[0])
-    for opcode, body in records:
+    told = (Op.SCHEMA, Op.CHANNEL, Op.CHUNK_INDEX)
+    every = records_of(source.look_at(start, place - start))
+    records = list(itertools.islice((one for one in every if one[0] in told), _MOST_RECORDS))
+    if len(records) == _MOST_RECORDS:
+        return found
+    for opcode, body in sorted(records, key=lambda record: record[0]):
         if opcode in (Op.SCHEMA, Op.CHANNEL):
             found.channels.add(opcode, body)
         elif opcode == Op.CHUNK_INDEX and (chunk := chunk_of_index(body)) is not None:
