@@ -115,7 +115,7 @@ def layout_of(points: Points, kind: int) -> Layout:
         rings = int(points.ring.max()) + 1
         slots = next(slots for slots in _RING_SLOTS if slots >= rings)
         column = _column(_same_ring(points.ring[order], is_first), is_first)
-        if slots * (int(column[-1]) + 1) <= _MOST_PER_POINT * len(points):
+        if slots * (int(column.max()) + 1) <= _MOST_PER_POINT * len(points):
             return Layout(kind, slots, by_ring=True)
     starts = is_first.nonzero()[0]
     if len(starts) == 1:
@@ -140,7 +140,8 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
         rank = _rank(is_first)
         slot = rank % layout.slots
         column = _column(rank // layout.slots, is_first)
-    columns, size = int(column[-1]) + 1, layout.size
+    # The last ring of the last time may have fewer points than others.
+    columns, size = int(column.max()) + 1, layout.size
     if columns * size > _MOST_GROWTH * message_bytes + _FREE_BYTES:
         raise CloudError(
             f"wanted points that share times as in the first cloud (up to {layout.slots} one), got "

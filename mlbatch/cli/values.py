@@ -63,7 +63,8 @@ def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
     relative = text.startswith("+")
     try:
         seconds = Decimal(text)
-        if seconds.is_finite() and abs(seconds) <= _MOST_S:
+        # Compared, not computed: even the absolute value of 1e999999999 overflows.
+        if seconds.is_finite() and -_MOST_S <= seconds <= _MOST_S:
             return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
     except InvalidOperation:
         pass

@@ -65,6 +65,12 @@ def test_points_lie_at_their_ring_where_columns_are_full_enough() -> None:
     assert second == (10, [*range(13, 25), 0, 0, 0, 0])
 
 
+def test_the_last_ring_of_a_cloud_may_have_fewer_points_than_others() -> None:
+    points = _points([0] * 4, rings=[1, 0, 0, 0])
+    columns = _columns(pack(points, Layout(0, 2, by_ring=True), 0))
+    assert columns == [(0, [2, 1]), (0, [3, 0]), (0, [4, 0])]
+
+
 def test_a_second_point_on_a_ring_starts_a_column_of_its_own() -> None:
     points = _points([0, 0, 0, 5], rings=[1, 0, 1, 3])
     packets = pack(points, Layout(0, 16, by_ring=True), 0)
