@@ -53,8 +53,8 @@ class Twins:
     """Finds columns that are there twice: of one sensor, one stamp and equal points.
 
     Some sensors give several columns one stamp (each return a column of its own, or points of a
-    cloud without times), and these may well be equal. `usual`: how many each sensor gives to most
-    of its stamps; as many may be equal.
+    cloud without times), and these may well be equal. `usual`: how many each sensor gives to a
+    quarter of its stamps; as many may be equal.
     """
 
     judge: Judge
@@ -93,8 +93,8 @@ class Twins:
     def _note_usual(self, stamps: I64Array, owner: U8Array) -> None:
         for sensor in np.unique(owner).tolist():
             _, counts = np.unique(stamps[owner == sensor], return_counts=True)
-            most = int(np.sort(counts)[(len(counts) - 1) // 2])
-            self.usual[sensor] = min(most, self.usual.get(sensor, most))
+            often = int(np.sort(counts)[len(counts) * 3 // 4])
+            self.usual[sensor] = min(often, self.usual.get(sensor, often))
 
 
 def _content(scan: HeldScan, column: int) -> bytes:

@@ -7,11 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from mlbatch.types import F64Array
 from mlbatch.verify.agreement import check_report
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.column_checks import Twins, check_columns
-from mlbatch.verify.geometry_checks import check_geometry
+from mlbatch.verify.geometry_checks import Geometry
 from mlbatch.verify.papers import Papers
 from mlbatch.verify.placing import Placing
 from mlbatch.verify.point_checks import (
@@ -46,11 +45,9 @@ class Examination:
                 table = papers.table = None
         self.tally = Tally(judge, self._sensors, table)
         self._twins = Twins(judge)
-        self._poses: F64Array | None = None
-        if papers.report is not None:
-            self._poses = poses_of(papers.report)
-        if self._poses is not None and len(self._poses) != self._sensors:
-            self._poses = None
+        poses = None if papers.report is None else poses_of(papers.report)
+        fits = poses is not None and len(poses) == self._sensors
+        self._geometry = Geometry(judge, poses if fits else None)
 
     def scan(self, scan: HeldScan) -> None:
         """Hold one scan against the rules."""
@@ -71,7 +68,7 @@ class Examination:
             scan.lidar_id = scan.column_lidar_id = scan.column_stamp_ns = scan.column = None
             points = replace(points, lidar_id=None)
         else:
-            check_geometry(judge, scan, points, self._poses)
+            self._geometry.check(scan, points)
             self._twins.check(scan)
         check_times(judge, scan, points, end_ns - scan.start_ns)
         self.tally.add(scan, points, place)

@@ -25,7 +25,7 @@ from mlbatch.verify.rosbag1 import BagFile
 from mlbatch.verify.rosbag2 import METADATA, bag_file, check_metadata
 from mlbatch.verify.verdict import DamageError, Judge, Verdict, VerifyError
 
-_RANGES = "ranges to 0.5 m: beams do not leave from the origin of their sensor"
+_RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report beside it; give it with --report"
 _FOREIGN = "wanted an output of mlbatch (a folder of npz or PLY files, an MCAP file, a bag)"
 
