@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,6 +20,8 @@ BUFFER_BYTES = 4 << 20
 # No recorder makes larger chunks or messages: rosbag2 has 0.75 to 4 MB, others less than 100 MB.
 MAX_RECORD_BYTES = 1 << 28
 _PIECE_BYTES = 1 << 18
+# Most chunks are smaller, and are had at once.
+_FIRST_BYTES = 16 << 20
 
 
 class SkippingSource(Source):
@@ -97,6 +100,31 @@ class Window:
         return count > 0
 
 
+def in_pieces(
+    unpack: Callable[[bytes | memoryview, int], bytes], stored: memoryview, size: int
+) -> U8Array:
+    """Up to `size` bytes that a decompressor makes of `stored`; none where they are corrupt.
+
+    unpack: as `BZ2Decompressor.decompress`, which keeps the input that it did not come to. Piece by
+    piece, since large results are held twice while they grow.
+    """
+    try:
+        first = unpack(stored, min(size, _FIRST_BYTES))
+        if len(first) < _FIRST_BYTES or size == len(first):
+            return np.frombuffer(first, np.uint8)
+        data = np.zeros(size, np.uint8)
+        done, piece = 0, first
+        while piece:
+            data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
+            done += len(piece)
+            piece = unpack(b"", min(size - done, _PIECE_BYTES)) if done < size else b""
+    except EOFError:
+        return data[:done]
+    except (RuntimeError, ValueError, OSError):
+        return np.zeros(0, np.uint8)
+    return data[:done]
+
+
 class Unzipper:
     """Decompresses chunks into one reused buffer."""
 
@@ -112,11 +140,7 @@ class Unzipper:
     def _unlz4(self, stored: memoryview, size: int) -> U8Array:
         # The package tells no types, so that a plain import would not pass the type checker.
         frame = importlib.import_module("lz4.frame")
-        try:
-            data: bytes = frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
-        except (RuntimeError, ValueError):
-            return self._data[:0]
-        return np.frombuffer(data, np.uint8)
+        return in_pieces(frame.LZ4FrameDecompressor().decompress, stored, size)
 
     def _unzstd(self, stored: memoryview, size: int) -> U8Array:
         import zstandard

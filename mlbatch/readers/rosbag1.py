@@ -15,7 +15,7 @@ import numpy as np
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import BagRecording, Portion
-from mlbatch.readers._mcap_bytes import SkippingSource, Unzipper, Window
+from mlbatch.readers._mcap_bytes import SkippingSource, Unzipper, Window, in_pieces
 from mlbatch.readers._rosbag1_records import (
     MAX_HEAD_BYTES,
     HeadError,
@@ -284,7 +284,4 @@ def _unpacked(compression: str, stored: memoryview, size: int) -> U8Array:
         return Unzipper().unpack(compression, stored, size)
     if compression != "bz2":
         return np.zeros(0, np.uint8)
-    try:
-        return np.frombuffer(bz2.BZ2Decompressor().decompress(stored, size), np.uint8)
-    except (OSError, EOFError, ValueError):
-        return np.zeros(0, np.uint8)
+    return in_pieces(bz2.BZ2Decompressor().decompress, stored, size)
