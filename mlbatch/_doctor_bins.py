@@ -1,9 +1,9 @@
 """Packets of a clock that runs on without a break, as at most 4096 bins of equal packet counts.
 
-A bin keeps four things of its packets: the one whose stamp is farthest ahead of its arrival (it
-was the fastest on its way, so it lies on the envelope), the first one, and the two packets before
-which stamp minus arrival rose and fell most. When all bins are full, pairs of them merge. So the
-bins depend on the sequence of packets alone, not on the pieces they came in.
+A bin keeps of its packets: the one whose stamp is farthest ahead of its arrival (it was the fastest
+on its way, so it lies on the envelope), the first one, those before which stamp minus arrival rose
+and fell most, and the one before which stamps rose least. When all bins are full, pairs of them
+merge. So the bins depend on the sequence of packets alone, not on the pieces they came in.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from mlbatch.types import I64Array
 
 MOST_BINS = 4096
 # Columns of a bin: stamp and arrival of its top and of its first packet; stamp and arrival of the
-# packets before and after the largest rise, and the largest fall, of stamp minus arrival.
-TOP, FIRST, RISE, FALL = slice(0, 2), slice(2, 4), slice(4, 8), slice(8, 12)
-_WIDTH = 12
+# packets before and after the largest rise, and the largest fall, of stamp minus arrival, and the
+# smallest step of stamps (bursts cause falls, so they may hide a clock that was set back).
+TOP, FIRST, RISE, FALL, BACK = slice(2), slice(2, 4), slice(4, 8), slice(8, 12), slice(12, 16)
+_WIDTH = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What is known of a stretch of packets: rows (bins, 12), in order of arrival.
+    """What is known of a stretch of packets: rows (bins, 16), in order of arrival.
 
     per_bin: packets of a bin, the last one may hold fewer; last: (stamp, arrival) of the last
     packet.
@@ -70,7 +71,7 @@ class Bins:
             self._rows = _merged(self._rows, np.arange(0, len(self._rows), 2))
         number = (self.packets + np.arange(count)) // self._per_bin
         starts = np.flatnonzero(np.diff(number, prepend=-1))
-        rows = _merged(np.hstack([here, here, before, here, before, here]), starts)
+        rows = _merged(np.hstack([here, here, *(before, here) * 3]), starts)
         if self.packets % self._per_bin:
             # The last bin was not full.
             both = np.concatenate([self._rows[-1:], rows[:1]])
@@ -93,12 +94,14 @@ def _merged(rows: I64Array, starts: I64Array) -> I64Array:
         return rows
     rise = _step(rows[:, RISE])
     fall = _step(rows[:, FALL])
+    back = rows[:, BACK.start + 2] - rows[:, BACK.start]
     return np.hstack(
         [
             rows[_largest(rows[:, 0] - rows[:, 1], starts), TOP],
             rows[starts, FIRST],
             rows[_largest(rise, starts), RISE],
             rows[_largest(-fall, starts), FALL],
+            rows[_largest(-back, starts), BACK],
         ]
     )
 

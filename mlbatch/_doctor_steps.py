@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch._doctor_bins import FALL, RISE, Track
+from mlbatch._doctor_bins import BACK, FALL, RISE, Track
 from mlbatch._doctor_envelope import MOST_GROUPS, Line, Part, envelope, groups
 from mlbatch._doctor_names import HOST, SENSOR
 from mlbatch.types import F64Array, I64Array
@@ -85,30 +85,35 @@ def _split(track: Track) -> list[Part]:
     whole = Part(track, 0, len(track.rows), track.first, track.last)
     host_ns, offset_ns, row = whole.points()
     tops = groups(host_ns, offset_ns, whole, MOST_GROUPS)
-    level = _level(host_ns[tops], offset_ns[tops])
+    rate = _usual_rate(host_ns[tops], offset_ns[tops])
+    level = _level(host_ns[tops], offset_ns[tops] - offset_ns[0], host_ns[0], rate)
     if len(level) < 2 * _LEAST_RISE:
         return [whole]
     usual_ns = float(np.median(np.abs(np.diff(level))))
     size = _gaps(level)
+    tops_of_rows = track.rows[:, 0] - track.rows[:, 1] - offset_ns[0]
+    levels = _level(track.rows[:, 1], tops_of_rows, host_ns[0], rate)
     parts: list[Part] = []
     begin, first = 0, whole.first
     for at in np.flatnonzero(np.abs(size) > max(SMALLEST_NS, _SCALES * usual_ns)).tolist():
-        near = row[tops[max(at - 2, 0)]], row[tops[min(at + 1, len(tops) - 1)]] + 1
-        cut = _cut(track, slice(*near), int(offset_ns[tops[at - 1]]), float(size[at]))
+        near = slice(row[tops[max(at - 2, 0)]], row[tops[min(at + 1, len(tops) - 1)]] + 1)
+        cut = _cut(track, near, levels, float(level[at - 1]), float(size[at]))
         if cut is not None and cut.end > begin and cut.start < len(track.rows):
             parts.append(Part(track, begin, cut.end, first, cut.before))
             begin, first = cut.start, cut.after
     return [*parts, Part(track, begin, len(track.rows), first, whole.last)]
 
 
-def _level(host_ns: I64Array, offset_ns: I64Array) -> F64Array:
-    """Offsets without their usual rate from each point to the next."""
-    x = (host_ns - host_ns[0]).astype(np.float64)
-    y = (offset_ns - offset_ns[0]).astype(np.float64)
-    run = np.diff(x)
-    rates = np.diff(y)[run > 0] / run[run > 0]
-    usual = float(np.median(rates)) if len(rates) else 0.0
-    level: F64Array = y - usual * x
+def _usual_rate(host_ns: I64Array, offset_ns: I64Array) -> float:
+    """The usual rate from each point to the next; steps do not count."""
+    run = np.diff(host_ns)
+    rates = np.diff(offset_ns)[run > 0] / run[run > 0]
+    return float(np.median(rates)) if len(rates) else 0.0
+
+
+def _level(host_ns: I64Array, offset_ns: I64Array, begin_ns: int, rate: float) -> F64Array:
+    """Offsets (small numbers) without what a steady rate since `begin_ns` explains."""
+    level: F64Array = offset_ns - rate * (host_ns - begin_ns)
     return level
 
 
@@ -141,38 +146,41 @@ class _Cut:
     after: tuple[int, int]
 
 
-def _cut(track: Track, near: slice, old_ns: int, size: float) -> _Cut | None:
-    """Where a step lies in the rows `near`; old_ns: level before it; None if it is no step."""
-    rows = track.rows[near]
-    over = np.flatnonzero(rows[:, 0] - rows[:, 1] > old_ns + size / 2)
+def _cut(track: Track, near: slice, level: F64Array, old: float, size: float) -> _Cut | None:
+    """Where a step lies in the rows `near`; level: of all rows; old: before it; None: no step."""
+    over = np.flatnonzero(level[near] > old + size / 2)
     if not len(over):
         return None
     # Delays only lower points: the first row up there holds a rise, and the last one is at or
     # right before a fall.
     at = near.start + int(over[0] if size > 0 else over[-1])
     begin = at if size > 0 else at + 1
-    sides = (track.rows[max(begin - _ROWS, 0) : begin], track.rows[begin : begin + _ROWS])
+    sides = (level[max(begin - _ROWS, 0) : begin], level[begin : begin + _ROWS])
     if not all(len(side) for side in sides):
         return None
-    low, high = (float((side[:, 0] - side[:, 1]).max() - old_ns) / size for side in sides)
+    low, high = (float(side.max() - old) / size for side in sides)
     if low > _SHARE or high < 1 - _SHARE:
         return None
-    candidates = [at] if size > 0 else [at, at + 1]
-    pairs = track.rows[candidates, RISE if size > 0 else FALL]
+    pairs = track.rows[[at], RISE] if size > 0 else _falls(track.rows[at : at + 2])
     heights = (pairs[:, 2] - pairs[:, 0]) - (pairs[:, 3] - pairs[:, 1])
     best = int(np.argmin(np.abs(heights - size)))
     before, after = pairs[best, :2].tolist(), pairs[best, 2:].tolist()
-    end = candidates[best]
+    # Of a fall, the first half of the pairs is of the last row before it, or in that row.
+    end = at if size > 0 or best < len(pairs) // 2 else at + 1
     # A row of one packet lies on one side; one of many may hold packets of both.
     return _Cut(end, end + (track.per_bin > 1), tuple(before), tuple(after))
+
+
+def _falls(rows: I64Array) -> I64Array:
+    """Pairs of packets around falls, of one row after the other."""
+    return np.stack([rows[:, FALL], rows[:, BACK]], axis=1).reshape(-1, 4)
 
 
 def _step(one: Part, line: Line, two: Part, next_line: Line) -> Step:
     """The step between two parts."""
     before, after = one.last, two.first
-    at = np.array([after[1]], np.int64)
-    size_ns = int(next_line.at(at)[0]) - int(line.at(at)[0])
     stamps_ns, hosts_ns = after[0] - before[0], after[1] - before[1]
+    size_ns = _size(line, next_line, after[1], after[1])
     period_ns = one.span_ns // max(one.packets - 1, 1)
     if min(stamps_ns, hosts_ns) > _PAUSE_NS + _PAUSE_PERIODS * period_ns:
         return Step(before, after, size_ns, "")
@@ -181,4 +189,14 @@ def _step(one: Part, line: Line, two: Part, next_line: Line) -> Step:
         by_sensor = abs(stamps_ns - period_ns - size_ns) < abs(stamps_ns - period_ns)
     else:
         by_sensor = abs(stamps_ns - period_ns) >= abs(hosts_ns - period_ns)
+    if not by_sensor:
+        # The time over which the recorder's clock stepped never was: nothing drifted in it.
+        size_ns = _size(line, next_line, before[1], after[1])
     return Step(before, after, size_ns, SENSOR if by_sensor else HOST)
+
+
+def _size(line: Line, next_line: Line, before_ns: int, after_ns: int) -> int:
+    """How far an envelope lies above another, each at its own time of arrival, ns."""
+    low = line.at(np.array([before_ns], np.int64))
+    high = next_line.at(np.array([after_ns], np.int64))
+    return int(high[0]) - int(low[0])

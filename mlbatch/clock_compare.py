@@ -108,8 +108,8 @@ class Comparison:
         return tuple(pair for pair in self.pairs if _least(pair) > limit_ns)
 
     def in_words(self) -> list[str]:
-        """Lines for people: the verdict, each sensor, each pair, each step of the recorder."""
-        lines = [f"clocks: {self.verdict}{self._bound()}"]
+        """Lines for people: the verdict (of two or more sensors), each sensor, each pair."""
+        lines = [f"clocks: {self.verdict}{self._bound()}"] if self.pairs else []
         lines += [f"{name}: {finding.in_words()}" for name, finding in self.findings]
         lines += [pair.in_words() for pair in self.pairs]
         return lines
@@ -234,7 +234,8 @@ def _pair(one: Named, two: Named, bound_ns: int) -> Pair:
     if broken:
         return replace(pair, why=", ".join(broken))
     if uncertainty_ns > bound_ns:
-        return replace(pair, why="too few packets, or too irregular, to tell")
+        sure = "apart, and " if _least(pair) > bound_ns else ""
+        return replace(pair, why=f"{sure}too few packets, or too irregular, to tell exactly")
     apart_ppm = _apart_ppm(finding, other)
     if pair.bound_ns <= bound_ns and not apart_ppm:
         return replace(pair, verdict=SYNCHRONISED, why=_within(pair.bound_ns))

@@ -8,13 +8,13 @@ as it was at the start. Steps of the sensor's clock are taken out of its stamps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mlbatch._doctor_names import DELAY, HOST
 from mlbatch.clock_compare import with_host_steps
-from mlbatch.doctor import ClockFinding, ClockWatch, Stretch, steady, stretch_of
+from mlbatch.doctor import LIMIT_NS, ClockFinding, ClockWatch, Stretch, steady, stretch_of
 from mlbatch.errors import ClockError
 from mlbatch.types import F64Array, I64Array
 from mlbatch.units import NS_PER_MS
@@ -22,20 +22,21 @@ from mlbatch.units import NS_PER_MS
 TO_HOST, TO_FIRST = "host", "first"
 # Whatever steps on the recorder's side: the stamps went on.
 _TAKEN_OUT = (HOST, DELAY)
-_LEAST = -(2**62)
+_FAR = 2**62
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
     """A stretch of a map: offsets to add at stamps (k,), ns; beyond them the rate goes on.
 
-    least_ns: no aligned stamp is smaller, so that none lies before the stretch before it.
+    least_ns, most_ns: no aligned stamp lies outside, so that stretches keep their order.
     """
 
     stamp_ns: I64Array
     offset_ns: I64Array
     rate: float
     least_ns: int
+    most_ns: int
 
     def apply(self, stamp_ns: I64Array) -> I64Array:
         """Aligned stamps: exact, since only differences, never epochs, become floats."""
@@ -45,7 +46,7 @@ class _Piece:
         rates = np.append(self._rates(), self.rate)[inner]
         rates = np.where(at < 0, self.rate, rates)
         added_ns = self.offset_ns[inner] + np.rint(since * rates).astype(np.int64)
-        aligned: I64Array = np.maximum(stamp_ns + added_ns, self.least_ns)
+        aligned: I64Array = np.clip(stamp_ns + added_ns, self.least_ns, self.most_ns)
         return aligned
 
     def _rates(self) -> F64Array:
@@ -70,11 +71,16 @@ class ClockMap:
     _pieces: tuple[_Piece, ...]
 
     def apply(self, stamp_ns: I64Array, host_ns: I64Array | None = None) -> I64Array:
-        """Aligned stamps, int64 ns, of any shape.
+        """Aligned stamps, int64 ns, of any shape; what is no time at all stays as it is.
 
         host_ns: arrivals, of a shape that fits; they tell stamps apart that a clock gave twice
         because it was set back.
         """
+        sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS)
+        if not sane.all():
+            # Damaged stamps could come round to good ones by overflow.
+            good_ns = np.where(sane, stamp_ns, 0)
+            return np.where(sane, self.apply(good_ns, host_ns), stamp_ns)
         if len(self._pieces) == 1:
             return self._pieces[0].apply(stamp_ns)
         which = stretch_of(self.stretches, stamp_ns, host_ns)
@@ -133,16 +139,19 @@ def _target(finding: ClockFinding | None) -> tuple[Stretch, ...]:
 def _itself(finding: ClockFinding) -> ClockMap:
     """The map of the target: nothing changes."""
     nothing = np.zeros(1, np.int64)
-    return ClockMap(TO_FIRST, 0, 0, 0, finding.stretches[:1], (_Piece(nothing, nothing, 0.0, 0),))
+    return ClockMap(
+        TO_FIRST, 0, 0, 0, finding.stretches[:1], (_Piece(nothing, nothing, 0.0, -_FAR, _FAR),)
+    )
 
 
 def _map(finding: ClockFinding, to: str, target: Sequence[Stretch]) -> ClockMap:
     pieces: list[_Piece] = []
-    least_ns = _LEAST
-    for one, named in zip(steady(finding, _TAKEN_OUT), finding.stretches, strict=True):
+    least_ns = -_FAR
+    for one in steady(finding, _TAKEN_OUT):
         piece = _piece(one, target, least_ns)
-        pieces.append(piece)
-        least_ns = int(piece.apply(np.array([named.last_stamp_ns], np.int64))[0])
+        least_ns = int(piece.apply(np.array([one.last_stamp_ns], np.int64))[0])
+        pieces.append(replace(piece, most_ns=least_ns))
+    pieces[-1] = replace(pieces[-1], most_ns=_FAR)
     residual_ns = np.concatenate([one.line.residual_ns for one in finding.stretches])
     return ClockMap(
         to,
@@ -165,11 +174,11 @@ def _piece(one: Stretch, target: Sequence[Stretch], least_ns: int) -> _Piece:
         rate = target[-1].line.rate
     ours_ns = one.line.at(at_ns)
     stamp_ns = at_ns + ours_ns
-    newest = np.maximum.accumulate(np.append(_LEAST, stamp_ns))[:-1]
+    newest = np.maximum.accumulate(np.append(-_FAR, stamp_ns))[:-1]
     kept = stamp_ns > newest
     offset_ns = (_offsets(target, at_ns) - ours_ns)[kept]
     rate = (rate - one.line.rate) / (1 + one.line.rate)
-    return _Piece(stamp_ns[kept], offset_ns, rate, least_ns)
+    return _Piece(stamp_ns[kept], offset_ns, rate, least_ns, _FAR)
 
 
 def _offsets(target: Sequence[Stretch], at_ns: I64Array) -> I64Array:

@@ -31,6 +31,18 @@ from mlbatch._doctor_steps import Course, Step, course_of
 from mlbatch.types import I64Array
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
+__all__ = [
+    "LIMIT_NS",
+    "ClockFinding",
+    "ClockWatch",
+    "Jump",
+    "Stretch",
+    "in_seconds",
+    "steady",
+    "stretch_of",
+    "whole_ns",
+]
+
 # A step between packets that is looked at at once; the same as batching/intake.py.
 HARD_NS = NS_PER_S
 LIMIT_NS = 2**31 * NS_PER_S
@@ -155,7 +167,7 @@ class ClockWatch:
         self._unsteady = False
 
     def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
-        """Add packets (P,), in order of arrival: stamps, and arrivals at the recorder."""
+        """Add packets (P,) in order of arrival: newest stamp of each, and its arrival."""
         sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS) & (host_ns >= 0) & (host_ns < LIMIT_NS)
         if not sane.all():
             self.damaged += int(np.count_nonzero(~sane))

@@ -22,13 +22,15 @@ GPS_1980_NS = (18 - 315_964_800) * NS_PER_S
 class Clock:
     """A clock: true time (UTC) + offset + drift since the begin + steps (after s, by ns).
 
-    quantum_ns: its stamps are multiples of that; wrap_ns: it counts on from 0 there, 0: never;
-    past_hour: its stamps leave out the hour, which the decoder takes from the first arrival.
+    wander: (ppm, period s) of a drift that comes and goes, with the temperature; quantum_ns: its
+    stamps are multiples of that; wrap_ns: it counts on from 0 there, 0: never; past_hour: its
+    stamps leave out the hour, which the decoder takes from the first arrival.
     """
 
     offset_ns: int = 0
     drift_ppm: float = 0.0
     steps: tuple[tuple[float, int], ...] = ()
+    wander: tuple[float, float] = (0.0, 1.0)
     quantum_ns: int = 1
     wrap_ns: int = 0
     past_hour: bool = False
@@ -36,7 +38,12 @@ class Clock:
     def error_ns(self, true_ns: I64Array) -> I64Array:
         """What it shows more than the true time."""
         since_ns = true_ns - BEGIN_NS
-        error: I64Array = np.rint(since_ns * (self.drift_ppm * 1e-6)).astype(np.int64)
+        drifted_ns = since_ns * (self.drift_ppm * 1e-6)
+        ppm, period_s = self.wander
+        if ppm:
+            turn_ns = period_s * NS_PER_S / (2 * np.pi)
+            drifted_ns += ppm * 1e-6 * turn_ns * (1 - np.cos(since_ns / turn_ns))
+        error: I64Array = np.rint(drifted_ns).astype(np.int64)
         error += self.offset_ns
         for after_s, by_ns in self.steps:
             error += np.where(since_ns >= after_s * NS_PER_S, by_ns, 0)
@@ -73,14 +80,18 @@ class Heard:
     host_ns: I64Array
 
 
+TRUE = Clock()
+USUAL = Way()
+
+
 def hear(
     rng: np.random.Generator,
     clock: Clock,
     *,
     seconds: float,
     rate_hz: float,
-    way: Way = Way(),
-    host: Clock = Clock(),
+    way: Way = USUAL,
+    host: Clock = TRUE,
     begin_s: float = 0.0,
     silent: tuple[tuple[float, float], ...] = (),
 ) -> Heard:

@@ -6,7 +6,7 @@ and what the recorder's clock does are drawn with a fixed seed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -106,9 +106,7 @@ def _jumps(rng: np.random.Generator, clock: Clock, domain: str, seconds: float) 
     after_s = float(rng.uniform(0.25, 0.45) * seconds)
     sizes_ns = [5 * NS_PER_MS, -5 * NS_PER_MS, 37 * NS_PER_S, -37 * NS_PER_S, 123_456_789]
     by_ns = int(rng.choice(sizes_ns))
-    return Clock(
-        clock.offset_ns, clock.drift_ppm, ((after_s, by_ns),), clock.quantum_ns, 0, clock.past_hour
-    )
+    return replace(clock, steps=((after_s, by_ns),))
 
 
 def _simulate(seed: int) -> Simulated:
