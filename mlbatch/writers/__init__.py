@@ -13,10 +13,12 @@ from mlbatch.writers._atomic import (
     SCANS_CSV,
     check_free_space,
     discard,
+    discard_old,
+    partial_path,
     side_path,
     write_text,
 )
-from mlbatch.writers._options import ScanWriter, WriterModule, WriterOptions
+from mlbatch.writers._options import Safe, ScanWriter, WriterModule, WriterOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,14 +27,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ReportPaths",
+    "Safe",
     "ScanWriter",
     "WriterOptions",
     "check_free_space",
     "check_target",
     "choose_format",
+    "discard",
+    "discard_old",
     "extras",
     "formats",
     "open_writer",
+    "partial_path",
     "plugin",
     "report_paths",
     "write_text",

@@ -1,8 +1,9 @@
 """Outputs that appear whole or not at all (CONTRACT.md, section 2).
 
 An output grows under `<OUTPUT>.partial` and is renamed at the end. A killed run leaves its
-`.partial` behind; the next run to the same output replaces it. Renames guard against killed
-processes; nothing is forced to the disk, so a power cut right after a run is not covered.
+`.partial` behind; the next run to the same output continues it (`--resume`) or replaces it. Renames
+guard against killed processes; nothing is forced to the disk, so a power cut right after a run is
+not covered.
 """
 
 from __future__ import annotations
@@ -59,8 +60,11 @@ class Output:
     def publish(self) -> None:
         """Give the finished output its final name; only now an older one is replaced."""
         with export_errors(self.target):
+            old = old_path(self.target)
             if not os.path.lexists(self.target):
                 self.partial.rename(self.target)
+                # Of a run that was killed between two renames.
+                _remove(old)
                 return
             _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
             if self.target.is_dir():
@@ -70,7 +74,7 @@ class Output:
 
     def _replace_folder(self) -> None:
         """Swap folders: a folder cannot be renamed onto one that is not empty."""
-        old = self.target.with_name(f"{self.target.name}.old{PARTIAL_SUFFIX}")
+        old = old_path(self.target)
         _remove(old)
         self.target.rename(old)
         try:
@@ -81,8 +85,8 @@ class Output:
         shutil.rmtree(old)
 
 
-def prepare(target: Path, overwrite: bool, folder: bool) -> Output:
-    """Check that `target` can be written, drop a stale `.partial`, make the new one if a folder."""
+def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
+    """Check that `target` can be written, and make a new `.partial` unless one is to be kept."""
     if target.name in ("", ".", ".."):
         raise ExportError(f"{target}: wanted the name of a new output, got a folder; add a name")
     if not target.parent.is_dir():
@@ -92,7 +96,9 @@ def prepare(target: Path, overwrite: bool, folder: bool) -> Output:
         )
     if os.path.lexists(target):
         _check_replaceable(target, overwrite, folder)
-    partial = target.with_name(target.name + PARTIAL_SUFFIX)
+    partial = partial_path(target)
+    if keep:
+        return Output(target, partial, overwrite)
     with export_errors(partial):
         _remove(partial)
         if folder:
@@ -104,9 +110,25 @@ def prepare(target: Path, overwrite: bool, folder: bool) -> Output:
 
 def discard(target: Path) -> None:
     """Remove the `.partial` of an output that will not be."""
-    partial = target.with_name(target.name + PARTIAL_SUFFIX)
+    partial = partial_path(target)
     with export_errors(partial):
         _remove(partial)
+
+
+def partial_path(target: Path) -> Path:
+    """Where an output grows."""
+    return target.with_name(target.name + PARTIAL_SUFFIX)
+
+
+def old_path(target: Path) -> Path:
+    """Where a folder stands while another takes its name."""
+    return target.with_name(f"{target.name}.old{PARTIAL_SUFFIX}")
+
+
+def discard_old(target: Path) -> None:
+    """Remove a replaced folder that a killed run left beside its finished output."""
+    with export_errors(target):
+        _remove(old_path(target))
 
 
 def side_path(target: Path, name: str) -> Path:
@@ -127,7 +149,7 @@ def check_free_space(target: Path, wanted_bytes: int) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a small file under its final name at once, replacing an older one."""
-    partial = path.with_name(path.name + PARTIAL_SUFFIX)
+    partial = partial_path(path)
     with export_errors(path):
         partial.write_text(text, encoding="utf-8", newline="\n")
         os.replace(partial, path)

@@ -6,6 +6,7 @@ facts/outputs.md section 4, CONTRACT.md section 3. A `Sink` is the container the
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -14,7 +15,7 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
-from mlbatch.writers._options import WriterOptions
+from mlbatch.writers._options import Safe, WriterOptions
 from mlbatch.writers._ros_messages import (
     CloudMessage,
     NewWire,
@@ -29,7 +30,14 @@ _TF_STATIC = "/tf_static"
 
 
 class Sink(Protocol):
-    """A file of messages under construction."""
+    """A file of messages under construction, in chunks; `chunks`: how many are complete."""
+
+    @property
+    def chunks(self) -> int: ...
+
+    def flush(self) -> int:
+        """Hand complete chunks to the system; gives the bytes up to their end."""
+        ...
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
@@ -50,7 +58,8 @@ class Sink(Protocol):
         ...
 
 
-NewSink: TypeAlias = Callable[[Path], Sink]
+# Path, and the bytes to keep of an existing file, None: begin a new one.
+NewSink: TypeAlias = Callable[[Path, int | None], Sink]
 
 
 def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
@@ -81,6 +90,9 @@ class BagWriter:
         self._cloud = CloudMessage(layout_of(options), info.frame_id, wire)
         self._waiting: list[ImuSamples | Message] = []
         self._begun = False
+        # The chunk that each scan lies in whose chunk is not complete, and how many lie before.
+        self._open_scans: deque[int] = deque()
+        self._safe_scans = 0
         self._topics: dict[int | None, str] = {None: "/points"}
         if options.split:
             self._topics |= {i: f"/{info.sensors[i].name}/points" for i in range(len(info.sensors))}
@@ -88,7 +100,7 @@ class BagWriter:
         self._own = frozenset({_TF_STATIC, *self._topics.values(), *imu})
         self._output = output
         with export_errors(output.partial):
-            self._sink = sink(output.partial)
+            self._sink = sink(output.partial, options.kept_bytes)
 
     def write(self, scan: Scan, sensor: int | None = None) -> None:
         """Write one scan as a PointCloud2, after what waited for it."""
@@ -96,8 +108,24 @@ class BagWriter:
         with export_errors(self._output.partial):
             self._begin(scan.start_ns)
             message = self._cloud.assemble(points_of(scan), scan.start_ns, dense)
-            topic = self._topics[sensor]
-            self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+            self._send_scan(scan, sensor, message)
+
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+        """Send what is as long as the scan: it lies in what is kept of the file."""
+        dense = scan.info.layout != "organized"
+        with export_errors(self._output.partial):
+            self._begin(scan.start_ns)
+            shape = (scan.points,) if dense else scan.time_ns.T.shape
+            self._send_scan(scan, sensor, self._cloud.blank(shape, scan.start_ns))
+
+    def safe(self) -> Safe:
+        """The scans in complete chunks."""
+        with export_errors(self._output.partial):
+            kept_bytes = self._sink.flush()
+        while self._open_scans and self._open_scans[0] < self._sink.chunks:
+            self._open_scans.popleft()
+            self._safe_scans += 1
+        return Safe(self._safe_scans, kept_bytes)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples at their own stamps."""
@@ -113,7 +141,7 @@ class BagWriter:
             )
         self._write_or_wait(message)
 
-    def finish(self, summary: Summary) -> None:
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Add what tells of the run, close the file and give it its final name."""
         output = self._output
         with export_errors(output.partial):
@@ -121,14 +149,20 @@ class BagWriter:
             self._sink.finish(summary, self._grid(summary))
         if output.partial.is_dir():
             write_text(output.partial / SCANS_CSV, summary.scans_csv)
-        is_file = output.partial.is_file()
-        output.publish()
-        if is_file:
+        else:
             write_text(side_path(output.target, SCANS_CSV), summary.scans_csv)
+        if last is not None:
+            last(output.partial)
+        output.publish()
 
     def abandon(self) -> None:
         """Close the file; it has no index and stays under `.partial`."""
         self._sink.abandon()
+
+    def _send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
+        self._open_scans.append(self._sink.chunks)
+        topic = self._topics[sensor]
+        self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
 
     def _write_or_wait(self, item: ImuSamples | Message) -> None:
         with export_errors(self._output.partial):

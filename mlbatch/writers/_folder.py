@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
-from mlbatch.errors import UsageError
+from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
-from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, WriterOptions
+from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
 
 Save: TypeAlias = Callable[[BinaryIO, Scan], None]
 
@@ -31,19 +31,35 @@ class FolderWriter:
                 f"--point-layout: wanted {DEFAULT_POINT_LAYOUT} for {suffix} files, got "
                 f"{options.point_layout}; presets shape PointCloud2, write a .mcap output for them"
             )
-        self._output = prepare(target, options.overwrite, folder=True)
+        keep = options.kept_bytes is not None
+        self._output = prepare(target, options.overwrite, folder=True, keep=keep)
         self._suffix = suffix
         self._save = save
+        self._written = 0
         self._folders: dict[int | None, Path] = {None: self._output.partial}
         if options.split:
             self._folders |= self._sensor_folders(info)
 
     def write(self, scan: Scan, sensor: int | None = None) -> None:
         """Write one scan into a file of its own."""
-        name = scan_name(scan.index, scan.slice, scan.slices) + self._suffix
-        path = self._folders[sensor] / name
+        path = self._path(scan, sensor)
         with export_errors(path), path.open("wb") as file:
             self._save(file, scan)
+        self._written += 1
+
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+        """Leave a scan's file as it is."""
+        path = self._path(scan, sensor)
+        if not path.is_file():
+            raise ExportError(
+                f"{path}: wanted a scan of the interrupted run to go on after it, got none; leave "
+                "out --resume to begin anew"
+            )
+        self._written += 1
+
+    def safe(self) -> Safe:
+        """All: files are closed one by one."""
+        return Safe(self._written)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Files of scans have no place for IMU samples."""
@@ -51,21 +67,27 @@ class FolderWriter:
     def write_message(self, message: Message) -> None:
         """Files of scans have no place for messages."""
 
-    def finish(self, summary: Summary) -> None:
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Add scans.csv and give the folder its final name."""
         path = self._output.partial / SCANS_CSV
         with export_errors(path):
             path.write_text(summary.scans_csv, encoding="utf-8", newline="\n")
+        if last is not None:
+            last(self._output.partial)
         self._output.publish()
 
     def abandon(self) -> None:
         """Nothing is open between scans; the folder stays under `.partial`."""
+
+    def _path(self, scan: Scan, sensor: int | None) -> Path:
+        name = scan_name(scan.index, scan.slice, scan.slices) + self._suffix
+        return self._folders[sensor] / name
 
     def _sensor_folders(self, info: RunInfo) -> dict[int | None, Path]:
         folders: dict[int | None, Path] = {}
         for number, sensor in enumerate(info.sensors):
             folder = self._output.partial / sensor.name
             with export_errors(folder):
-                folder.mkdir()
+                folder.mkdir(exist_ok=True)
             folders[number] = folder
         return folders

@@ -101,6 +101,16 @@ class Container:
         return [(c, names[c.schema_id], self._sent.get(c.id, 0)) for c in channels]
 
     @property
+    def chunks(self) -> int:
+        """Chunks that are complete."""
+        return len(self._chunks)
+
+    @property
+    def position_bytes(self) -> int:
+        """Bytes of the file so far."""
+        return self._at
+
+    @property
     def span_ns(self) -> tuple[int, int]:
         """First and last log time of the file, once it is finished."""
         return self._span_ns

@@ -7,15 +7,26 @@ from pathlib import Path
 
 from mlbatch.types import Message, Summary
 from mlbatch.writers._atomic import SCANS_CSV
+from mlbatch.writers._kept import open_output
 from mlbatch.writers._mcap_file import Container
 
 
 class McapSink:
     """Messages, metadata records `mlbatch.grid` and `mlbatch.report`, attachment scans.csv."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("wb")
+    def __init__(self, path: Path, kept_bytes: int | None) -> None:
+        self._file = open_output(path, kept_bytes)
         self.container = Container(self._file)
+
+    @property
+    def chunks(self) -> int:
+        """Chunks that are complete."""
+        return self.container.chunks
+
+    def flush(self) -> int:
+        """Hand complete chunks to the system; gives the bytes up to their end."""
+        self._file.flush()
+        return self.container.position_bytes
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False

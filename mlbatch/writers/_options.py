@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
@@ -18,12 +19,22 @@ class WriterOptions:
     """Options of an output.
 
     point_layout: preset of a PointCloud2; overwrite: replace an existing output at the end;
-    split: one output stream per sensor instead of merged scans.
+    split: one output stream per sensor instead of merged scans; kept_bytes: what stays of the file
+    in an existing `.partial` that is continued (its scans, where they are files), None: start anew.
     """
 
     point_layout: str = DEFAULT_POINT_LAYOUT
     overwrite: bool = False
     split: bool = False
+    kept_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Safe:
+    """What a killed process would leave: the first `scans`, in the first `kept_bytes` of a file."""
+
+    scans: int
+    kept_bytes: int = 0
 
 
 class ScanWriter(Protocol):
@@ -36,6 +47,14 @@ class ScanWriter(Protocol):
         """
         ...
 
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+        """Go past a scan that the continued `.partial` holds; its point arrays mean nothing."""
+        ...
+
+    def safe(self) -> Safe:
+        """Hand what was written to the system, and say what of it needs no second writing."""
+        ...
+
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples; formats without a place for them ignore the call."""
         ...
@@ -44,8 +63,11 @@ class ScanWriter(Protocol):
         """Write a message of the recording as it is; formats without a place ignore the call."""
         ...
 
-    def finish(self, summary: Summary) -> None:
-        """Complete the output and move it to its final name."""
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
+        """Complete the output and move it to its final name.
+
+        last: called with the path of the complete output, just before that.
+        """
         ...
 
     def abandon(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -33,14 +34,23 @@ class CloudMessage:
         head = self._head(points.time_ns.shape, stamp_ns)
         start, size = len(head), points.time_ns.size * self._layout.step
         total = start + size + 1
-        if len(self._buffer) < total:
-            # Zeros: bytes between fields are never written.
-            self._buffer = np.zeros(total * 5 // 4, dtype=np.uint8)
+        self._fit(total)
         self._buffer[:start] = np.frombuffer(head, dtype=np.uint8)
         records = self._buffer[start : start + size].view(self._dtype)
         self._layout.pack(points, records.reshape(points.time_ns.shape))
         self._buffer[start + size] = dense
         return self._buffer[:total].data
+
+    def blank(self, shape: tuple[int, ...], stamp_ns: int) -> memoryview:
+        """A message as long as that of a cloud of this shape; it is valid until the next call."""
+        total = len(self._head(shape, stamp_ns)) + math.prod(shape) * self._layout.step + 1
+        self._fit(total)
+        return self._buffer[:total].data
+
+    def _fit(self, total: int) -> None:
+        if len(self._buffer) < total:
+            # Zeros: bytes between fields are never written.
+            self._buffer = np.zeros(total * 5 // 4, dtype=np.uint8)
 
     def _head(self, shape: tuple[int, ...], stamp_ns: int) -> bytearray:
         """All that precedes the points; `shape`: (width,) or (height, width)."""

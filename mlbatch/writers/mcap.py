@@ -25,12 +25,12 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
     layout_of(options)
-    output = prepare(target, options.overwrite, folder=False)
+    output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Cdr, _sink)
 
 
-def _sink(path: Path) -> Sink:
+def _sink(path: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
     from mlbatch.writers._mcap_sink import McapSink
 
-    return McapSink(path)
+    return McapSink(path, kept_bytes)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary, Topic
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers._kept import open_output
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Ros1
 
@@ -35,20 +36,21 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
     layout_of(options)
-    output = prepare(target, options.overwrite, folder=False)
+    output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Ros1, _sink)
 
 
-def _sink(path: Path) -> Sink:
-    # It creates the file itself, and only where none is.
-    path.unlink()
-    return _Rosbag1Sink(path)
+def _sink(path: Path, kept_bytes: int | None) -> Sink:
+    if kept_bytes is None:
+        # It creates the file itself, and only where none is.
+        path.unlink()
+    return _Rosbag1Sink(path, kept_bytes)
 
 
 class _Rosbag1Sink:
     """Connections and messages of one bag."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kept_bytes: int | None) -> None:
         from rosbags.rosbag1 import Writer
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -56,7 +58,21 @@ class _Rosbag1Sink:
         self._types.register(get_types_from_msg(_TF_TEXT, _TF))
         self._connections: dict[str | Topic, Connection] = {}
         self._bag = Writer(path)
-        self._bag.open()
+        if kept_bytes is None:
+            self._bag.open()
+        else:
+            self._reopen(path, kept_bytes)
+
+    @property
+    def chunks(self) -> int:
+        """Chunks that are complete; the library's last one is open."""
+        return len(self._bag.chunks) - 1
+
+    def flush(self) -> int:
+        """Hand complete chunks to the system; gives the bytes up to their end."""
+        file = self._file
+        file.flush()
+        return file.tell()
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
@@ -89,6 +105,23 @@ class _Rosbag1Sink:
         with contextlib.suppress(OSError):
             if self._bag.bio is not None:
                 self._bag.bio.close()
+
+    @property
+    def _file(self) -> BinaryIO:
+        if self._bag.bio is None:
+            raise ExportError(f"{self._bag.path}: wanted an open bag, got a closed one; report it")
+        return self._bag.bio
+
+    def _reopen(self, path: Path, kept_bytes: int) -> None:
+        """Continue a bag: the library only begins new ones, so it begins one beside it."""
+        beside = path.with_name(f"{path.name}.new")
+        beside.unlink(missing_ok=True)
+        self._bag.path = beside
+        self._bag.open()
+        self._file.close()
+        self._bag.path, self._bag.bio = path, open_output(path, kept_bytes)
+        self._bag.bio.write(beside.read_bytes())
+        beside.unlink()
 
     def _adopt(self, topic: Topic) -> Connection:
         """A connection that says of a topic what its recording said."""

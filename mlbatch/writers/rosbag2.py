@@ -35,15 +35,15 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
     layout_of(options)
-    output = prepare(target, options.overwrite, folder=True)
+    output = prepare(target, options.overwrite, folder=True, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Cdr, partial(_sink, f"{target.name}_0.mcap"))
 
 
-def _sink(name: str, folder: Path) -> Sink:
+def _sink(name: str, folder: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
     from mlbatch.writers._mcap_sink import McapSink
 
-    return _BagSink(folder, name, McapSink(folder / name))
+    return _BagSink(folder, name, McapSink(folder / name, kept_bytes))
 
 
 class _BagSink:
@@ -53,6 +53,15 @@ class _BagSink:
         self._folder = folder
         self._name = name
         self._file = file
+
+    @property
+    def chunks(self) -> int:
+        """Chunks that are complete."""
+        return self._file.chunks
+
+    def flush(self) -> int:
+        """Hand complete chunks to the system; gives the bytes up to their end."""
+        return self._file.flush()
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False

@@ -1,0 +1,50 @@
+"""A file that is continued: what it already holds is written a second time, and goes nowhere.
+
+A writer that is given the same scans and messages again makes the same file again, byte for byte
+and index for index. So a resumed run repeats the whole writing, with scans of the right size and
+no points, while the bytes that are safe on the disk stay as they are.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from mlbatch.errors import ExportError
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+
+def open_output(path: Path, kept_bytes: int | None) -> BinaryIO:
+    """A new file, or what an existing one holds up to `kept_bytes`, to be written again."""
+    return path.open("wb") if kept_bytes is None else KeptFile(path, kept_bytes)
+
+
+class KeptFile(io.BufferedWriter):
+    """Skips the first `kept_bytes` that are written; `tell` counts them nevertheless."""
+
+    def __init__(self, path: Path, kept_bytes: int) -> None:
+        super().__init__(io.FileIO(path, "r+b"))
+        self._path = path
+        self._left = kept_bytes
+        self.truncate(kept_bytes)
+        super().seek(kept_bytes)
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Write what goes beyond the kept bytes; these must end where a piece of data ends."""
+        if not self._left:
+            return super().write(data)
+        size = memoryview(data).nbytes
+        if size > self._left:
+            raise ExportError(
+                f"{self._path}: wanted the scans of the interrupted run to go on after them, got "
+                "others; leave out --resume to begin anew"
+            )
+        self._left -= size
+        return size
+
+    def tell(self) -> int:
+        """Where the next byte would lie in an uninterrupted writing."""
+        return super().tell() - self._left
