@@ -7,7 +7,8 @@ leave the tile lays their columns between those of other kinds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -28,6 +29,8 @@ from mlbatch.types import EXTRAS, BoolArray, F64Array, I64Array, RunInfo, Scan, 
 __all__ = ["Decoder", "Due", "Label", "Source"]
 
 _NAN = np.float32("nan")
+# What became of the slots of every sensor of a run, in the order of `ledger.POINT_FATES`.
+Fates: TypeAlias = Sequence[Sequence[int]]
 
 
 @dataclass(slots=True)
@@ -137,11 +140,14 @@ class Decoder:
         """The ledger of pixels of each sensor."""
         return [self._projectors[which].counts[member] for which, member in self._seat]
 
-    def scan(self, due: Due, label: Label) -> Scan:
-        """Decode the columns of one window; the arrays are valid until the next call."""
-        rows = len(due) if self._organized else len(due) * self._slots
-        if rows > self._buffer.rows:
-            self._buffer = self._new_buffer(rows)
+    def scan(self, due: Due, label: Label, fates: Fates | None = None) -> Scan:
+        """Decode the columns of one window; the arrays are valid until the next call.
+
+        fates: given where an output already holds the points; their arrays then mean nothing.
+        """
+        if fates is not None:
+            return self._outline(due, label, fates)
+        self._fit(len(due))
         points = 0
         for begin in range(0, len(due), self._columns):
             tile = slice(begin, min(begin + self._columns, len(due)))
@@ -151,6 +157,23 @@ class Decoder:
             else:
                 points += self._compress(laid, tile, points)
         return self._scan(due, label, points)
+
+    def _outline(self, due: Due, label: Label, fates: Fates) -> Scan:
+        """All of a scan but its points; organized, its arrays have their shapes."""
+        if self._organized:
+            self._fit(len(due))
+        counts = self.counts
+        before = sum(one.written for one in counts)
+        own = fates if self._only is None else fates[self._only : self._only + 1]
+        for one, numbers in zip(counts, own, strict=True):
+            one.add(numbers)
+        points = sum(one.written for one in counts) - before
+        return replace(self._scan(due, label, 0), points=points)
+
+    def _fit(self, columns: int) -> None:
+        rows = columns if self._organized else columns * self._slots
+        if rows > self._buffer.rows:
+            self._buffer = self._new_buffer(rows)
 
     def _new_buffer(self, rows: int) -> _Buffer:
         return _Buffer(rows, self._slots if self._organized else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mlbatch.types import CaptureCounts
@@ -16,6 +17,8 @@ COLUMN_REASONS = (
 )
 # `no_place`: the format of the output has none for them.
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
+# What becomes of a slot of a written column.
+POINT_FATES = ("no_return", "range", "box", "repeated", "written")
 
 
 @dataclass(slots=True)
@@ -60,6 +63,17 @@ class PointCounts:
     repeated: int = 0
     written: int = 0
 
+    @property
+    def fates(self) -> list[int]:
+        """What became of the slots, in the order of POINT_FATES."""
+        return [self.no_return, self.range, self.box, self.repeated, self.written]
+
+    def add(self, fates: Sequence[int]) -> None:
+        """Count slots by their fates, in the order of POINT_FATES."""
+        self.slots += sum(fates)
+        for fate, count in zip(POINT_FATES, fates, strict=True):
+            setattr(self, fate, getattr(self, fate) + count)
+
 
 @dataclass(slots=True)
 class SensorLedger:
@@ -75,11 +89,10 @@ class SensorLedger:
         """What does not balance, a line each; empty when all is accounted for."""
         packets, columns, points = self.packets, self.columns, self.points
         samples = self.imu_samples
-        fates = (points.no_return, points.range, points.box, points.repeated, points.written)
         return [
             *_balance("packets", packets.read, (packets.accepted, *packets.rejected.values())),
             *_balance("columns", columns.decoded, (columns.written, *columns.dropped.values())),
-            *_balance("points", points.slots, fates),
+            *_balance("points", points.slots, tuple(points.fates)),
             *_balance("IMU samples", samples.decoded, (samples.written, *samples.dropped.values())),
             *_unknown("packets", packets.rejected, PACKET_REASONS),
             *_unknown("columns", columns.dropped, COLUMN_REASONS),

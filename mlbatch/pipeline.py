@@ -64,6 +64,8 @@ class Conversion:
         self.info: RunInfo | None = None
         self.delivered = 0
         self.dropped_incomplete = 0
+        # Of scans that a continued output holds: the fates of the slots of all sensors.
+        self.finished: Iterator[Sequence[Sequence[int]]] = iter(())
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
@@ -190,7 +192,7 @@ class Conversion:
                     window.encoder[own],
                 )
             with self._timed("decode_s"):
-                scan = decoder.scan(due, label)
+                scan = decoder.scan(due, label, next(self.finished, None))
             self._account(scan)
             yield scan, only
 
@@ -310,7 +312,7 @@ class Conversion:
             ledger.columns.decoded = self.batcher.decoded[number]
             for reason, count in self.batcher.dropped[number].items():
                 ledger.columns.drop(reason, count)
-            ledger.points = self._points(number)
+            ledger.points = self.points(number)
         if self.job.strict:
             self._refuse_rejected()
         for note in accounts.late_notes(self):
@@ -326,7 +328,8 @@ class Conversion:
         if self.table is None or not self.table.rows:
             raise NoScanError(accounts.why_nothing(self))
 
-    def _points(self, number: int) -> accounts.PointCounts:
+    def points(self, number: int) -> accounts.PointCounts:
+        """What became of the pixels of a sensor so far."""
         if not self._decoders:
             return accounts.PointCounts()
         if self.job.split:
