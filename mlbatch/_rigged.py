@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mlbatch import sensors
 from mlbatch.errors import RigError
-from mlbatch.lidar import READABLE, Calibration, Lidar
+from mlbatch.lidar import READABLE, Calibration, Lidar, ModelFile
 from mlbatch.matching import Fit, Matched, best_fits, other_size
 from mlbatch.rig import StreamSelector
 from mlbatch.streams import Found, Kind, Sampler
@@ -84,7 +84,15 @@ def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found | None:
 
 def _usable(wanted: Wanted) -> list[Calibration]:
     serial = wanted.selector.serial
-    return [one for one in wanted.calibrations if not serial or one.serial in ("", serial)]
+    usable = [one for one in wanted.calibrations if not serial or one.serial in ("", serial)]
+    return [_named(one, wanted.model) for one in usable]
+
+
+def _named(calibration: Calibration, model: str | None) -> Calibration:
+    """What is built in for the model that the rig names knows so: packets may leave it open."""
+    if model != calibration.model or not isinstance(calibration, ModelFile):
+        return calibration
+    return calibration.for_model(model) or calibration
 
 
 def _chosen(

@@ -72,7 +72,7 @@ _RUBIES = {
     48: (rows.RUBY_48, rows.RUBY_PLUS_48),
 }
 _RUBY_PLUS_TYPE = 5
-_MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
+MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
 
 
 def robosense(size: int, packets: U8Array) -> str | None:
@@ -81,7 +81,7 @@ def robosense(size: int, packets: U8Array) -> str | None:
     points = point_packets(packets)
     found = identify(points)
     if found is not None and found.model is not None:
-        return _lidar(found.name, _MODE_WORDS[returns_of(points, found.model)])
+        return _lidar(found.name, MODE_WORDS[returns_of(points, found.model)])
     if found is not None:
         return _lidar(found.name) + NO_DECODER
     if 2 * len(points) < len(packets):

@@ -74,11 +74,11 @@ def is_counted(points: U8Array, row: Model) -> bool:
     return len(steps) > 0 and float(np.median(steps)) == 1.0
 
 
-def doubts(points: U8Array, row: Model, difop: Difop | None) -> tuple[str, ...]:
-    """What the packets leave open and the user may know."""
+def doubts(points: U8Array, row: Model, difop: Difop | None, *, is_named: bool) -> tuple[str, ...]:
+    """What the packets leave open and the user may know, or has said: is_named."""
     texts = []
     found = identify(points)
-    if found is not None and found.other is not None:
+    if found is not None and found.other is not None and not is_named:
         texts.append(
             f"packets do not surely tell {found.name} apart: decoded as {row.name}; name the "
             "sensor's model in the rig if it is the other (times differ by up to 34 us)"

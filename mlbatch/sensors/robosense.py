@@ -18,6 +18,7 @@ from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_bytes import mostly, number
 from mlbatch.sensors._recognise_robosense import (
+    MODE_WORDS,
     fits,
     identify,
     is_difop,
@@ -33,11 +34,7 @@ from mlbatch.sensors._robosense_evidence import (
     mode,
     units_per_m,
 )
-from mlbatch.sensors._robosense_models import (
-    MAKER,
-    ROWS,
-    Model,
-)
+from mlbatch.sensors._robosense_models import MAKER, ROWS, Model
 from mlbatch.sensors._robosense_packets import PacketReader, shape_of, times_ns
 from mlbatch.sensors._turning_lidar import TurningLidar
 from mlbatch.types import BoolArray, Heads, I64Array, Pixels, U8Array
@@ -48,7 +45,6 @@ __all__ = ["BUILT_IN", "MAKER", "MODELS", "RobosenseLidar", "describe", "read_ca
 # The bytes name the model; a file that was given is wanted before what is built in.
 _FITS_MODEL, _FITS_FILE = 100, 200
 _DIFOP_PORT = 7788
-_MODE_WORDS = {1: "single return", 2: "dual return"}
 
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
@@ -81,20 +77,28 @@ def read_calibration(path: Path, content: bytes) -> AnglesFile | None:
 class BuiltIn:
     """A model whose units tell their angles themselves; `Calibration` of lidar.py."""
 
-    __slots__ = ("_row", "is_shared", "model", "path", "serial")
+    __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
 
-    def __init__(self, row: Model) -> None:
+    def __init__(self, row: Model, *, is_named: bool = False) -> None:
+        """is_named: the rig says that it is this model."""
         self._row = row
+        self._is_named = is_named
         self.path: Path | None = None
         self.model = row.name
         self.serial = ""
         self.is_shared = True
+
+    def for_model(self, name: str) -> BuiltIn | None:
+        """The same where the rig names this model: packets may leave open which of two it is."""
+        return BuiltIn(self._row, is_named=True) if name == self.model else None
 
     def fit(self, evidence: Evidence) -> int:
         """Whether the point packets name this model, or at least could be read as its."""
         points = point_packets(evidence.sample)
         found = identify(points)
         if found is not None and found.model is self._row:
+            return _FITS_MODEL
+        if found is not None and found.other is self._row and self._is_named:
             return _FITS_MODEL
         chosen = mostly(points, fits(points, self._row.layout))
         if chosen is None:
@@ -124,7 +128,7 @@ class BuiltIn:
                 f"{got} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
                 "or give a csv of `elevation,azimuth` lines with --metadata"
             )
-        lidar = RobosenseLidar(self._row, angles, options, evidence, difop)
+        lidar = RobosenseLidar(self._row, angles, options, evidence, difop, is_named=self._is_named)
         lidar.calibration = origin
         lidar.notes += notes
         return lidar
@@ -155,8 +159,9 @@ class AnglesFile:
 
     def fit(self, evidence: Evidence) -> int:
         """Whether the point packets name a model of as many channels, or can be read as it."""
-        if self._named is not None and BuiltIn(self._named).fit(evidence) == READABLE:
-            return READABLE
+        if self._named is not None:
+            score = BuiltIn(self._named, is_named=True).fit(evidence)
+            return _FITS_FILE if score == _FITS_MODEL else score
         return _FITS_FILE if self._row(evidence) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
@@ -170,7 +175,8 @@ class AnglesFile:
                 f"{self.path}: wanted packets of a {self.model} lidar from {evidence.stream}, got "
                 f"{describe(evidence.size, evidence.sample) or 'others'}; give the csv of its unit"
             )
-        lidar = RobosenseLidar(row, self._angles, options, evidence, find_difop(evidence))
+        difop, is_named = find_difop(evidence), self._named is not None
+        lidar = RobosenseLidar(row, self._angles, options, evidence, difop, is_named=is_named)
         lidar.calibration = str(self.path)
         return lidar
 
@@ -200,7 +206,10 @@ class RobosenseLidar(TurningLidar):
         options: Mapping[str, str],
         evidence: Evidence,
         difop: Difop | None,
+        *,
+        is_named: bool = False,
     ) -> None:
+        """is_named: the rig says which model it is."""
         points = point_packets(evidence.sample)
         points = points[fits(points, row.layout)]
         returned, mode_notes = mode(points, row, difop)
@@ -211,7 +220,7 @@ class RobosenseLidar(TurningLidar):
         self.model = row.name
         self.serial = "" if difop is None else difop.serial
         self.mode = ", ".join(
-            word for word in (_MODE_WORDS[returned.returns], returned.name) if word
+            word for word in (MODE_WORDS[returned.returns], returned.name) if word
         )
         if shape.is_split:
             self.mode += ", a column each"
@@ -232,7 +241,8 @@ class RobosenseLidar(TurningLidar):
             *(steps_per_m, row.range_mask, shape.returns),
         )
         self.calibration = ""
-        self.notes = (*mode_notes, *unit_notes, *doubts(points, row, difop))
+        doubtful = doubts(points, row, difop, is_named=is_named)
+        self.notes = (*mode_notes, *unit_notes, *doubtful)
         self._row = row
         moving = options.get("firing_azimuth") != "off"
         self._packets = PacketReader(row, shape, steps_per_m, mirrored=mirrored, moving=moving)

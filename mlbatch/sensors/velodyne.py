@@ -62,17 +62,24 @@ MODELS: tuple[SensorModel, ...] = tuple(
 class VelodyneCalibration:
     """A model's table, or a file in its place; `Calibration` of lidar.py.
 
-    is_guessed: packets and file leave open which of several models it is.
+    is_guessed: packets and file leave open which of several models it is; is_named: the rig says
+    that it is this one.
     """
 
-    __slots__ = ("file", "is_guessed", "is_shared", "model", "path", "row", "serial")
+    __slots__ = ("file", "is_guessed", "is_named", "is_shared", "model", "path", "row", "serial")
 
     def __init__(
-        self, row: Model, file: VelodyneFile | None = None, *, is_guessed: bool = False
+        self,
+        row: Model,
+        file: VelodyneFile | None = None,
+        *,
+        is_guessed: bool = False,
+        is_named: bool = False,
     ) -> None:
         self.row = row
         self.file = file
         self.is_guessed = is_guessed
+        self.is_named = is_named
         self.path: Path | None = None if file is None else file.path
         self.model = row.name
         # Neither packets nor files name a unit.
@@ -80,9 +87,9 @@ class VelodyneCalibration:
         self.is_shared = True
 
     def for_model(self, name: str) -> VelodyneCalibration | None:
-        """The same file for another model with as many beams; None if it cannot be that one's."""
+        """The same for a model with as many beams that the rig names; None if it cannot be one."""
         rows = [row for row in ALL if row.name == name and row.lasers == self.row.lasers]
-        return VelodyneCalibration(rows[0], self.file) if rows else None
+        return VelodyneCalibration(rows[0], self.file, is_named=True) if rows else None
 
     def fit(self, evidence: Evidence) -> int:
         """How well packets fit: by what they name, or only by how they are laid out."""
@@ -95,7 +102,7 @@ class VelodyneCalibration:
             return READABLE if _is_paced(self.row, seen) else 0
         if self.file is not None:
             return _FITS_FILE
-        return _FITS_BYTES if first is self.row else READABLE
+        return _FITS_BYTES if first is self.row or self.is_named else READABLE
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> VelodyneLidar:
         """The sensor."""

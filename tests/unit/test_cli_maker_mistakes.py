@@ -193,8 +193,16 @@ def test_device_packets_on_the_topic_of_the_points_give_angles(
 def test_a_rig_may_name_a_model_that_packets_do_not(shell: Shell, tmp_path: Path) -> None:
     report = _converted(shell, "vlp16/drive.pcap --rig lite.yaml", tmp_path)
     assert report["sensors"][0]["model"] == "Puck LITE"
-    told = "read as Puck LITE, which the rig names; it looks like Velodyne lidar VLP-16, strongest"
-    assert _told(report) == [("top", f"{told} return")]
+    assert _told(report) == []
+
+
+def test_a_rig_that_names_another_model_than_packets_is_told(shell: Shell, tmp_path: Path) -> None:
+    rig = tmp_path / "hires.yaml"
+    rig.write_text("sensors: [{name: top, model: Puck Hi-Res}]\n", encoding="utf-8")
+    report = _converted(shell, f"vlp16/drive.pcap --rig {rig}", tmp_path)
+    assert report["sensors"][0]["model"] == "Puck Hi-Res"
+    told = "read as Puck Hi-Res, which the rig names; it looks like Velodyne lidar VLP-16,"
+    assert _told(report) == [("top", f"{told} strongest return")]
 
 
 def test_a_rig_chooses_the_lidar_of_its_model(shell: Shell, tmp_path: Path) -> None:

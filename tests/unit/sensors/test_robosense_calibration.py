@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError, UsageError
-from mlbatch.lidar import READABLE, Beside, Evidence
+from mlbatch.lidar import READABLE, Beside, Evidence, ModelFile
 from mlbatch.sensors import models, robosense
 from mlbatch.sensors._robosense_difop import Angles, find_difop
 from mlbatch.sensors._robosense_models import AIRY_96, BPEARL_V4, RS16, RS32, Model
@@ -194,6 +194,21 @@ def test_ruby_and_ruby_plus_are_not_told_apart_silently() -> None:
     (plus,) = [one for one in robosense.BUILT_IN if one.model == "Ruby Plus 80"]
     for lidar in (built_in(evidence).lidar({}, evidence), plus.lidar({}, evidence)):
         assert any("Ruby 80 or Ruby Plus 80" in note for note in lidar.notes)
+
+
+@pytest.mark.parametrize("model", ["Ruby 80", "Ruby Plus 80"])
+def test_a_rig_tells_ruby_and_ruby_plus_apart(model: str) -> None:
+    evidence = _evidence("Ruby 80")
+    (known,) = [one for one in robosense.BUILT_IN if one.model == model]
+    file = robosense.read_calibration(Path("a.csv"), _csv("Ruby 80"))
+    for one, score in ((known, 100), (file, 200)):
+        assert isinstance(one, ModelFile)
+        named = one.for_model(model)
+        assert named is not None
+        assert named.fit(evidence) == score
+        lidar = named.lidar({}, evidence)
+        assert (lidar.model, lidar.notes) == (model, ())
+        assert one.for_model("Ruby 128") is None
 
 
 def test_the_first_firmware_is_not_decoded_silently() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from mlbatch.errors import UsageError
 from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import FAULTS, READABLE, Evidence
+from mlbatch.lidar import FAULTS, READABLE, Evidence, ModelFile
 from mlbatch.sensors import velodyne
 from tests.builders.velodyne import (
     VelodyneSpec,
@@ -191,6 +191,11 @@ def test_a_rig_may_name_what_packets_do_not() -> None:
     assert fits == {"VLP-16": 100, **others, **readable}
     lite = next(one for one in velodyne.BUILT_IN if one.model == "Puck LITE")
     assert lite.lidar({}, evidence(sent)).model == "Puck LITE"
+    files = [one for one in velodyne.BUILT_IN if isinstance(one, ModelFile)]
+    named = [one.for_model(one.model) for one in files]
+    fits = {one.model: one.fit(evidence(sent)) for one in named if one is not None}
+    # VLP-16 and Puck LITE send the same; the packets say that they are of no Puck Hi-Res.
+    assert fits == {"VLP-16": 100, **others, "Puck LITE": 100, "Puck Hi-Res": READABLE}
 
 
 @pytest.mark.parametrize("product", [0x23, 0x31, 0x99])
