@@ -80,6 +80,10 @@ def chunk_head(data: memoryview, at: int, length: int) -> ChunkHead | None:
     return None if stored > length - start else ChunkHead(name, start, stored, size)
 
 
+# Beyond, a file does not repeat its schemas, but goes on with new ones.
+_MOST_SEEN_BYTES = 64 << 20
+
+
 @dataclass(slots=True)
 class Channels:
     """Schemas and channels met so far; topics: by the channel's number."""
@@ -87,6 +91,9 @@ class Channels:
     schemas: dict[int, Schema] = field(default_factory=dict)
     topics: dict[int, Topic] = field(default_factory=dict)
     _seen: set[tuple[int, bytes]] = field(default_factory=set)
+    _seen_bytes: int = 0
+    # Texts of schemas: channels share them, since many may name one long schema.
+    _texts: dict[int, str] = field(default_factory=dict)
 
     def knows(self, opcode: int, body: bytes) -> bool:
         """Whether this very schema or channel was there before."""
@@ -103,17 +110,24 @@ class Channels:
             if opcode == Op.SCHEMA:
                 schema = Schema.read(stream)
                 self.schemas[schema.id] = schema
+                # Definitions that are no text come back byte for byte.
+                self._texts[schema.id] = schema.data.decode("utf-8", "surrogateescape")
             else:
                 channel = Channel.read(stream)
-                self.topics[channel.id] = _topic(channel, self.schemas.get(channel.schema_id))
+                schema_id = channel.schema_id
+                text = self._texts.get(schema_id, "")
+                self.topics[channel.id] = _topic(channel, self.schemas.get(schema_id), text)
         except (EndOfFile, struct.error, UnicodeDecodeError):
             return False
+        if self._seen_bytes > _MOST_SEEN_BYTES:
+            self._seen, self._seen_bytes = set(), 0
         self._seen.add((opcode, body))
+        self._seen_bytes += len(body)
         return True
 
 
-def _topic(channel: Channel, schema: Schema | None) -> Topic:
-    """A channel in the words of bags; definitions that are no text come back byte for byte."""
+def _topic(channel: Channel, schema: Schema | None, definition: str) -> Topic:
+    """A channel in the words of bags."""
     metadata = channel.metadata
     qos = metadata.get("offered_qos_profiles", "")
     latched = metadata.get("latching", "") in _LATCHED_ROS1 or is_latched(qos)
@@ -121,7 +135,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
         name=channel.topic,
         type="" if schema is None else type_key(schema.name),
         encoding=channel.message_encoding,
-        definition="" if schema is None else schema.data.decode("utf-8", "surrogateescape"),
+        definition=definition,
         format="" if schema is None else schema.encoding,
         qos=qos,
         latched=latched,

@@ -28,6 +28,8 @@ _MESSAGE = np.dtype(
     ]
 )
 _MAX_DEFINITION_BYTES = 1 << 24
+# Messages may be as short as their heads: so many places are kept at a time.
+_MOST_STARTS = 1 << 18
 # Records that stand outside chunks; the others may stand anywhere.
 _OF_THE_FILE = (Op.CHUNK, Op.DATA_END, Op.FOOTER)
 _SKIPPED = range(Op.CHUNK + 1, Op.DATA_END)
@@ -52,7 +54,8 @@ class Stretch:
     """How far records could be walked: to byte `next`, which may lie behind the stretch.
 
     need: bytes that the record there takes, 0 if nothing is known to be missing; opcode: of a
-    record there that only stands outside chunks, or 0; fault: why there is no going on.
+    record there that only stands outside chunks, or 0; fault: why there is no going on; full: the
+    messages found so far have to be gathered first.
     """
 
     next: int
@@ -60,6 +63,7 @@ class Stretch:
     opcode: int = 0
     length: int = 0
     fault: str = ""
+    full: bool = False
 
 
 @dataclass(slots=True)
@@ -71,13 +75,16 @@ class Scanner:
     _wanted: BoolArray = field(default_factory=lambda: np.zeros(1 << 16, bool))
 
     def __post_init__(self) -> None:
-        self._judge()
+        for number, topic in self.channels.topics.items():
+            self._wanted[number] = self.wants(topic)
 
     def scan(self, data: U8Array, at: int, end: int, starts: list[int]) -> Stretch:
         """Walk over `data[at:end]`; places of whole messages are added to `starts`."""
         view = data.data
         while True:
             at = _messages(view, at, end, starts)
+            if len(starts) >= _MOST_STARTS:
+                return Stretch(at, full=True)
             if at + HEAD.size > end:
                 return Stretch(at, HEAD.size if at < end else 0)
             opcode, length = HEAD.unpack_from(view, at)
@@ -124,19 +131,18 @@ class Scanner:
             return True
         if not self.channels.add(opcode, body):
             return False
-        self._judge()
+        if opcode == Op.CHANNEL:
+            [number] = _CHANNEL.unpack_from(body)
+            self._wanted[number] = self.wants(self.channels.topics[number])
         return True
-
-    def _judge(self) -> None:
-        """Note which channels are wanted."""
-        for number, topic in self.channels.topics.items():
-            self._wanted[number] = self.wants(topic)
 
 
 def _messages(view: memoryview, at: int, end: int, starts: list[int]) -> int:
     """Step over whole messages from `at` on; the place of the first record that is none."""
     head_at, last = HEAD.unpack_from, end - HEAD.size - MESSAGE_HEAD_BYTES
-    while at <= last:
+    for _ in range(_MOST_STARTS - len(starts)):
+        if at > last:
+            break
         opcode, length = head_at(view, at)
         after = at + 9 + length
         if opcode != 5 or after > end or length < MESSAGE_HEAD_BYTES:

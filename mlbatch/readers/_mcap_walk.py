@@ -85,6 +85,9 @@ class Walk:
                 bound = self._chunk_end - window.place_of(0)
             stretch = self._scanner.scan(window.data, window.begin, min(window.end, bound), starts)
             window.begin = stretch.next
+            if stretch.full:
+                yield from self._scanner.gather(window.data, starts)
+                continue
             fault = stretch.fault
             if self._chunk_end is not None:
                 if stretch.next == bound:
@@ -149,8 +152,10 @@ class Walk:
         stored = window.data.data[begin : min(begin + head.length, window.end)]
         data = self._unzipper.unpack(head.compression, stored, head.size)
         starts: list[int] = []
-        stretch = self._scanner.scan(data, 0, len(data), starts)
-        yield from self._scanner.gather(data, starts)
+        stretch = Stretch(0, full=True)
+        while stretch.full:
+            stretch = self._scanner.scan(data, stretch.next, len(data), starts)
+            yield from self._scanner.gather(data, starts)
         if len(data) < head.size:
             return (
                 f"wanted {head.size} bytes of {head.compression} data, got {len(data)} before "

@@ -24,6 +24,12 @@ _WORD_BYTES = 4
 _OP = b"\x04\0\0\0op="
 # A header holds the name of a topic at most.
 MAX_HEAD_BYTES = 1 << 20
+# The field that tells what a record is.
+LEAST_HEAD_BYTES = len(_OP) + 1
+
+
+# Records may be as short as their lengths: so many are kept at a time.
+MOST_RECORDS = 1 << 18
 
 
 class Op(IntEnum):
@@ -127,12 +133,16 @@ def joined(parts: Sequence[Walked]) -> Walked:
 
 
 def walk(data: U8Array, begin: int, end: int) -> Walked:
-    """The whole records of `data[begin:end]`."""
+    """The whole records of `data[begin:end]`, at most MOST_RECORDS of them."""
     heads, bodies = [], []
     view, length_at, at = data.data, _U32.unpack_from, begin
-    while at + _WORD_BYTES <= end:
-        body = at + _WORD_BYTES + length_at(view, at)[0]
-        if body + _WORD_BYTES > end:
+    for _ in range(MOST_RECORDS):
+        if at + _WORD_BYTES > end:
+            break
+        head_size = length_at(view, at)[0]
+        body = at + _WORD_BYTES + head_size
+        # Zeros would be records without a header, very many of them.
+        if body + _WORD_BYTES > end or head_size < LEAST_HEAD_BYTES:
             break
         after = body + _WORD_BYTES + length_at(view, body)[0]
         if after > end:

@@ -17,7 +17,9 @@ from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import BagRecording, Portion
 from mlbatch.readers._mcap_bytes import SkippingSource, Unzipper, Window, in_pieces
 from mlbatch.readers._rosbag1_records import (
+    LEAST_HEAD_BYTES,
     MAX_HEAD_BYTES,
+    MOST_RECORDS,
     HeadError,
     HeadReader,
     Op,
@@ -123,8 +125,8 @@ def _claims_too_much(window: Window) -> str:
     if at + _WORD_BYTES > end:
         return ""
     head = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little")
-    if head > MAX_HEAD_BYTES:
-        return f"wanted a header of at most {MAX_HEAD_BYTES} bytes, got {head}"
+    if not LEAST_HEAD_BYTES <= head <= MAX_HEAD_BYTES:
+        return f"wanted a header of {LEAST_HEAD_BYTES} to {MAX_HEAD_BYTES} bytes, got {head}"
     at += _WORD_BYTES + head
     size = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little") if at + 4 <= end else 0
     if size > _MAX_CHUNK_BYTES:
@@ -166,7 +168,7 @@ class _Pass:
             if fault:
                 self._recording.lose(f"{_at(window)}: {fault}; the rest of the bag was not read")
                 return
-            if not window.refill():
+            if len(walked.head) < MOST_RECORDS and not window.refill():
                 yield from self._end(window)
                 return
 
@@ -183,24 +185,29 @@ class _Pass:
                 fields = head_fields(raw)
                 if _compression(fields) == _PLAIN:
                     # Messages of chunks that lie in one buffer are dealt with together.
-                    plain.append(self._inside(data, body, body + size))
+                    for part in self._inside(data, body, body + size):
+                        plain.append(part)
+                        if len(part.head) == MOST_RECORDS:
+                            yield from self._messages(data, plain)
+                            plain = []
                     continue
                 yield from self._messages(data, plain)
                 plain = []
                 unpacked = self._unpack(fields, data.data[body : body + size])
-                yield from self._messages(unpacked, [self._inside(unpacked, 0, len(unpacked))])
+                for part in self._inside(unpacked, 0, len(unpacked)):
+                    yield from self._messages(unpacked, [part])
         plain.append(walked.take(np.array(bare, np.int64)))
         yield from self._messages(data, plain)
 
-    def _inside(self, data: U8Array, begin: int, end: int) -> Walked:
-        """The records of a chunk."""
-        walked = walk(data, begin, end)
+    def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[Walked]:
+        """The records of a chunk, in parts."""
+        for walked in _parts(data, begin, end):
+            yield walked
         if walked.next < end and not self._cut:
             self._recording.lose(
                 f"a chunk: wanted whole records, got {end - walked.next} bytes that are none; "
                 "the rest of the chunk was not read"
             )
-        return walked
 
     def _unpack(self, fields: dict[str, bytes], stored: memoryview) -> U8Array:
         """The bytes of a compressed chunk, as far as they can be had."""
@@ -211,7 +218,9 @@ class _Pass:
                 f"a chunk ({compression}): wanted {whole} bytes, got {len(found)}; "
                 "the rest of the chunk was not read"
             )
-            return found[: walk(found, 0, len(found)).next]
+            # Of a part of a record nothing is told again.
+            *_, last = _parts(found, 0, len(found))
+            return found[: last.next]
         return found
 
     def _messages(self, data: U8Array, parts: list[Walked]) -> Generator[Portion, None, None]:
@@ -262,6 +271,13 @@ class _Pass:
         with contextlib.suppress(HeadError):
             if window.end > data:
                 yield from self._records(window.data, record)
+
+
+def _parts(data: U8Array, begin: int, end: int) -> Iterator[Walked]:
+    """The records of `data[begin:end]`, as many at a time as are kept; at least one part."""
+    yield (walked := walk(data, begin, end))
+    while len(walked.head) == MOST_RECORDS:
+        yield (walked := walk(data, walked.next, end))
 
 
 def _one(value: int) -> I64Array:
