@@ -107,9 +107,18 @@ def existing_file(node: Node) -> Path:
     return path
 
 
+# Epochs that a rig may name; leap_seconds.py has how far they are ahead of UTC.
+EPOCHS = ("utc", "tai", "gps")
+
+
 def clock_source(node: Node) -> str:
     """Which clock stamps the columns."""
     return node.choice(("sensor", "host"))
+
+
+def clock_epoch(node: Node) -> str:
+    """What a sensor's clock counts."""
+    return node.choice(EPOCHS)
 
 
 def offset_ns(node: Node) -> int:

@@ -175,14 +175,21 @@ def _clock(run: Conversion, number: int) -> ClockReport:
     sensor, first = run.setup.sensors[number], run.batcher.firsts[number]
     source = "host" if run.uses_host_clock(sensor) else "sensor"
     mode = sensor.found.lidar.timestamp_mode
-    notes = (f"timestamp mode {mode}",) if mode else ()
+    notes: tuple[str, ...] = (f"timestamp mode {mode}",) if mode else ()
     if first is None:
         return ClockReport(source, "unknown", notes=notes)
+    epoch, offset_ns = run.timescale_of(sensor, *first), first[0] - first[1]
+    finding = dict(run.clocks.findings()).get(sensor.name)
+    if finding is None:
+        return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
+    if run.clocks.maps and (found := run.clocks.maps[number]) is not None:
+        notes += (found.in_words(),)
     return ClockReport(
         source,
-        run.timescale_of(sensor, *first),
-        offset_to_host_ms=(first[0] - first[1]) / NS_PER_MS,
-        notes=notes,
+        epoch,
+        offset_to_host_ms=finding.offset_ns / NS_PER_MS,
+        drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
+        notes=(*notes, finding.in_words()),
     )
 
 

@@ -24,12 +24,11 @@ def feed_of(sensor: Mounted) -> Feed:
 
 def intake_of(sensor: Mounted, *, host_clock: bool) -> Intake:
     """The door of a sensor, with what the rig says of its clock."""
-    rig, lidar = sensor.rig, sensor.found.lidar
     return Intake(
         sensor.name,
         host_clock=host_clock,
-        offset_ns=0 if rig is None else rig.offset_ns,
-        modulus=lidar.sequence_modulus,
+        offset_ns=sensor.offset_ns,
+        modulus=sensor.found.lidar.sequence_modulus,
     )
 
 

@@ -11,6 +11,7 @@ from mlbatch import sensors
 from mlbatch._rigged import Wanted, is_model, match_rig
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.leap_seconds import gps_utc_s, tai_utc_s
 from mlbatch.lidar import Calibration, ModelFile
 from mlbatch.looking import calibrations_for, fault_of, look, read_given, with_clouds
 from mlbatch.matching import Matched, match
@@ -18,6 +19,7 @@ from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
 from mlbatch.streams import Found, Kind, Router, Sampler
 from mlbatch.types import Recording, StreamTable
+from mlbatch.units import NS_PER_S
 
 _NO_SUPPORTED = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
 
@@ -32,6 +34,7 @@ class Wishes:
     ignore: tuple[str, ...] = ()
     identity_extrinsics: bool = False
     host_clock: bool = False
+    aligned: bool = False
     decode: dict[str, str] = field(default_factory=dict)
 
 
@@ -101,6 +104,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         metadata_topics=learner.metadata_topics,
         identity_extrinsics=wishes.identity_extrinsics,
     )
+    for sensor in mounted:
+        sensor.offset_ns = rig_offset_ns(sampler, sensor.found, sensor.rig)
     setup = Setup(mounted, mounting.body_frame, router, sampler, notes, recordings, ignored=ignored)
     notes += [Note("message", "", fault) for fault in learner.faults]
     notes += [Note(one.code, one.sensor, in_words(one)) for one in mounting.findings]
@@ -306,14 +311,26 @@ def _compare_clocks(
     sampler: Sampler, chosen: Sequence[Found], rigged: Sequence[RigSensor | None], wishes: Wishes
 ) -> None:
     """Refuse clocks that cannot be merged before anything else is asked for."""
+    if wishes.aligned:
+        return
     offsets_ns: list[tuple[str, int | None]] = []
     for sensor, entry in zip(chosen, rigged, strict=True):
         by_host = wishes.host_clock or (entry is not None and entry.clock == "host")
         offset_ns = None if by_host else sampler.clock_offset_ns(sensor)
-        if offset_ns is not None and entry is not None:
-            offset_ns += entry.offset_ns
+        if offset_ns is not None:
+            offset_ns += rig_offset_ns(sampler, sensor, entry)
         offsets_ns.append((sensor.name, offset_ns))
         refuse_incomparable(offsets_ns, len(offsets_ns) - 1)
+
+
+def rig_offset_ns(sampler: Sampler, sensor: Found, entry: RigSensor | None) -> int:
+    """What the rig adds to a sensor's stamps: its offset, and what turns its epoch into UTC."""
+    if entry is None:
+        return 0
+    hosts_ns = [sampler.span_ns[kind][0] for kind in sensor.kinds if kind in sampler.span_ns]
+    utc_ns = min(hosts_ns, default=0)
+    ahead_s = {"tai": tai_utc_s(utc_ns), "gps": gps_utc_s(utc_ns)}.get(entry.epoch or "", 0)
+    return entry.offset_ns - ahead_s * NS_PER_S
 
 
 def untimed(table: StreamTable, sensor: Found) -> UsageError | None:

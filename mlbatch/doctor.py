@@ -43,6 +43,16 @@ __all__ = [
     "whole_ns",
 ]
 
+__all__ = [
+    "ClockFinding",
+    "ClockWatch",
+    "Jump",
+    "Stretch",
+    "steady",
+    "stretch_of",
+    "whole_ns",
+]
+
 # A step between packets that is looked at at once; the same as batching/intake.py.
 HARD_NS = NS_PER_S
 LIMIT_NS = 2**31 * NS_PER_S

@@ -18,8 +18,8 @@ from mlbatch.types import BoolArray, I64Array, ImuSamples, PacketBatch, U8Array
 
 # Copies are looked for among so many IMU packets.
 RECENT_IMU = 64
-# Sensor, arrivals (P,) in ns: what is added to the stamps of these packets, (P,) ns.
-ClockShift = Callable[[int, I64Array], I64Array]
+# Sensor, stamps (P, C) and arrivals (P,) of its packets: stamps as they are to be batched.
+Retime = Callable[[int, I64Array, I64Array], I64Array]
 
 
 @dataclass(slots=True)
@@ -50,15 +50,15 @@ class Feeder:
         setup: Setup,
         feeds: Sequence[Feed],
         host_clocks: Sequence[bool],
-        shift_ns: ClockShift | None = None,
+        retime: Retime | None = None,
     ) -> None:
-        """shift_ns: what is added to the stamps of packets, by sensor and their arrival."""
+        """retime: what becomes of stamps before they are batched; None: nothing."""
         self.unassigned: dict[Kind, int] = {}
         self.samples: dict[Kind, U8Array] = {}
         self._router = setup.router
         self._feeds = list(feeds)
         self._host_clocks = list(host_clocks)
-        self._shift_ns = shift_ns
+        self._retime = retime
         self._recent: list[I64Array] = [np.empty(0, np.int64) for _ in self._feeds]
 
     def feed(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Fed:
@@ -138,8 +138,8 @@ class Feeder:
             packets, place, index = packets[good], place[good], index[good]
         host_ns = batch.host_ns[index]
         heads = lidar.heads(packets, host_ns)
-        if self._shift_ns is not None:
-            heads.stamp_ns = heads.stamp_ns + self._shift_ns(number, host_ns)[:, None]
+        if self._retime is not None:
+            heads.stamp_ns = self._retime(number, heads.stamp_ns, host_ns)
         return Arrival(
             position=index,
             host_ns=host_ns,
@@ -167,13 +167,14 @@ class Feeder:
             feed.ledger.imu_samples.decoded += again
             feed.ledger.imu_samples.drop("duplicate", again)
             payloads, index = payloads[fresh], index[fresh]
-        if not self._host_clocks[number] and self._shift_ns is None:
+        if not self._host_clocks[number] and self._retime is None:
             return [feed.lidar.imu(payloads, number)]
         samples = []
         for host_ns, payload in zip(batch.host_ns[index].tolist(), payloads, strict=True):
             sample = feed.lidar.imu(payload[None], number)
-            if not self._host_clocks[number] and self._shift_ns is not None:
-                sample.stamp_ns = sample.stamp_ns + self._shift_ns(number, np.array([host_ns]))
+            if not self._host_clocks[number] and self._retime is not None:
+                stamps_ns = sample.stamp_ns[None]
+                sample.stamp_ns = self._retime(number, stamps_ns, np.array([host_ns]))[0]
             elif len(sample.stamp_ns):
                 # Ages first: damaged stamps may be too large to be added to an arrival.
                 sample.stamp_ns = sample.stamp_ns - sample.stamp_ns[-1:] + host_ns

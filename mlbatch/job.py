@@ -24,7 +24,8 @@ class Job:
     rate None: that of the rig, else 10 Hz; drop_incomplete: percent of the columns of every sensor
     that a window must hold; max_wait_ns None: for ever; boxes_m: (k, 6); extras: those of EXTRAS
     that the output has a place for; fault_begin_ns: arrival from which times of faults count, None:
-    the first packet; part: of the session, by arrival; passed: patterns of topics to pass through.
+    the first packet; part: of the session, by arrival; passed: patterns of topics to pass through;
+    align_clocks_to: host or first, "" where clocks are taken as they are.
     """
 
     recordings: tuple[Path, ...]
@@ -47,6 +48,7 @@ class Job:
     faults: tuple[Fault, ...] = ()
     fault_seed: int = 0
     fault_begin_ns: int | None = None
+    align_clocks_to: str = ""
     part: Part = field(default_factory=Part)
     passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS

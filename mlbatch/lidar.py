@@ -126,7 +126,8 @@ class Lidar(Protocol):
     `column_period_ns`: from column to column where nothing is left out, 0 unknown.
     `sends_twice`: a single return is sent once for each return of the mode. `extrinsics`: (4, 4)
     body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
-    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "".
+    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "";
+    `clock_period_ns`: what its stamps leave out and the recorder's clock gave (an hour), or 0.
     """
 
     maker: str
@@ -153,6 +154,7 @@ class Lidar(Protocol):
     extrinsics: F64Array | None
     sensor_from_lidar: F64Array | None
     timestamp_mode: str
+    clock_period_ns: int
     calibration: str
     notes: tuple[str, ...]
 

@@ -18,7 +18,7 @@ class Mounted:
     """A sensor with its place on the body and its wishes from the rig (or their defaults).
 
     extrinsics_source: whose word it is; chain: frames walked from body to sensor, "" where none
-    was.
+    was; offset_ns: added to its stamps.
     """
 
     found: Found
@@ -26,6 +26,7 @@ class Mounted:
     extrinsics_source: str
     rig: RigSensor | None = None
     chain: str = ""
+    offset_ns: int = 0
 
     @property
     def name(self) -> str:

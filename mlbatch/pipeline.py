@@ -13,7 +13,6 @@ from mlbatch import accounts
 from mlbatch.assembly import boxes_of, feed_of, intake_of, run_info, source_of
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.jumps import JumpGuard
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clipping import ClippedRecording, Part
 from mlbatch.clock import common_timescale, timescale
@@ -28,6 +27,7 @@ from mlbatch.mounting import Mounted
 from mlbatch.passing import PassQueue
 from mlbatch.readers import merge, open_recording
 from mlbatch.scan_table import ScanTable
+from mlbatch.timekeeping import Timekeeper
 from mlbatch.types import (
     IMU,
     MESSAGE_ENCODINGS,
@@ -92,16 +92,19 @@ class Conversion:
         ]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
         host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
-        # By the recorder's clock no sensor's clock can jump.
-        guards = [] if any(host_clocks) else [JumpGuard(s.name) for s in self.setup.sensors]
-        self.batcher = Batcher(self.grid, intakes, policy, guards)
         self._refuse_untimed()
         self.replay = FaultReplay(
             job.faults, job.fault_seed, [sensor.name for sensor in self.setup.sensors]
         )
         self.replay.begin_ns = job.fault_begin_ns
-        shift = self.replay.shift_ns if job.faults else None
-        self.feeder = Feeder(self.setup, self.feeds, host_clocks, shift)
+        self.clocks = Timekeeper(self.setup.sensors, host_clocks, self.replay)
+        if job.align_clocks_to:
+            self.clocks.align(merge(self.recordings), self.setup, job.align_clocks_to)
+        self.batcher = Batcher(self.grid, intakes, policy, self.clocks.guards)
+        retimes = bool(job.faults or job.align_clocks_to)
+        self.feeder = Feeder(
+            self.setup, self.feeds, host_clocks, self.clocks.retime if retimes else None
+        )
         self._decoders: list[Decoder] = []
         self._imu = ImuQueue(
             [feed.ledger.imu_samples for feed in self.feeds],
@@ -270,9 +273,7 @@ class Conversion:
 
     def _offset_ns(self, sensor: Mounted) -> int:
         """What is added to the stamps of a sensor; arrival times need no correction."""
-        if sensor.rig is None or self.uses_host_clock(sensor):
-            return 0
-        return sensor.rig.offset_ns
+        return 0 if self.uses_host_clock(sensor) else sensor.offset_ns
 
     def timescale_of(self, sensor: Mounted, stamp_ns: int, host_ns: int) -> str:
         """Timescale of a sensor's stamps as they are batched."""
@@ -315,7 +316,7 @@ class Conversion:
             ledger.points = self.points(number)
         if self.job.strict:
             self._refuse_rejected()
-        for note in accounts.late_notes(self):
+        for note in (*accounts.late_notes(self), *self.clocks.notes()):
             self.warn(note)
         # A later message may be the first without stamps.
         self._refuse_untimed()

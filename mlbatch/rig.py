@@ -33,7 +33,7 @@ SENSOR_KEYS = (
     *("min_range_m", "max_range_m", "optional", "decode"),
 )
 STREAM_KEYS = ("source_ip", "port", "topic", "serial")
-CLOCK_KEYS = ("source", "offset_s")
+CLOCK_KEYS = ("source", "epoch", "offset_s")
 
 # Text that needs no quotes, neither here nor for other readers of YAML.
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./-]*", re.ASCII)
@@ -78,7 +78,8 @@ class RigSensor:
     """One sensor of the rig; None where the file leaves it to the recording.
 
     extrinsics: (4, 4) float64 body_from_sensor in metres, or the name of a frame of the recording;
-    clock: sensor or host; offset_ns is added to the stamps; decode: options as for `--decode`.
+    clock: sensor or host; epoch: what the sensor's clock counts (utc, tai or gps); offset_ns is
+    added to the stamps; decode: options as for `--decode`.
     """
 
     name: str
@@ -87,6 +88,7 @@ class RigSensor:
     metadata: Path | None = None
     extrinsics: F64Array | str | None = None
     clock: str | None = None
+    epoch: str | None = None
     offset_ns: int = 0
     min_range_m: float | None = None
     max_range_m: float | None = None
@@ -147,6 +149,7 @@ def _sensor(node: Node) -> RigSensor:
         metadata=values.take(fields, "metadata", values.existing_file, None),
         extrinsics=values.take(fields, "extrinsics", values.extrinsics, None),
         clock=values.take(clock, "source", values.clock_source, None),
+        epoch=values.take(clock, "epoch", values.clock_epoch, None),
         offset_ns=values.take(clock, "offset_s", values.offset_ns, 0),
         min_range_m=values.take(fields, "min_range_m", values.range_m, None),
         max_range_m=values.take(fields, "max_range_m", values.range_m, None),
@@ -222,7 +225,11 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
     if sensor.metadata is not None:
         yield f"metadata: {_text(_path_from(folder, sensor.metadata))}"
     yield from _extrinsics_lines(sensor.extrinsics)
-    clock = {"source": sensor.clock or "", "offset_s": _seconds(sensor.offset_ns)}
+    clock = {
+        "source": sensor.clock or "",
+        "epoch": sensor.epoch or "",
+        "offset_s": _seconds(sensor.offset_ns),
+    }
     if any(clock.values()):
         yield "clock: " + _braces(clock)
     for key in ("min_range_m", "max_range_m"):

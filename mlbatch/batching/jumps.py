@@ -7,6 +7,8 @@ GPS that locked, or by a restart. Backward steps are told by `intake.py`.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from mlbatch.batching.intake import NEVER, STEP_NS, Delivery
@@ -15,16 +17,31 @@ from mlbatch.types import I64Array
 from mlbatch.units import NS_PER_S
 
 
-class JumpGuard:
-    """Watches the accepted packets of one sensor; `check` raises ClockJump."""
+class Watch(Protocol):
+    """What wants to know the stamps and arrivals of all accepted packets."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
+        """Take in packets (P,), in order of delivery."""
+        ...
+
+
+class JumpGuard:
+    """Looks at the accepted packets of one sensor; `check` raises ClockJump.
+
+    is_watched: False where stamps are arrivals, which tell nothing of a clock.
+    """
+
+    def __init__(self, name: str, watch: Watch | None = None, *, is_watched: bool = True) -> None:
+        self.name = name
+        self._watch = watch
+        self._is_watched = is_watched
         self._newest_ns = NEVER
         self._host_ns = 0
 
     def check(self, delivery: Delivery) -> None:
         """Look at the next packets, in order of delivery."""
+        if not self._is_watched:
+            return
         measured = delivery.newest_ns > NEVER
         stamp_ns, host_ns = delivery.newest_ns[measured], delivery.packets.host_ns[measured]
         if not len(stamp_ns):
@@ -39,12 +56,14 @@ class JumpGuard:
         if jumps.any():
             raise self._jump(newest, hosts, int(np.argmax(jumps)))
         self._newest_ns, self._host_ns = int(newest[-1]), int(host_ns[-1])
+        if self._watch is not None:
+            self._watch.add(stamp_ns, host_ns)
 
     def _jump(self, newest: I64Array, hosts: I64Array, at: int) -> ClockJump:
         before, after = int(newest[at]), int(newest[at + 1])
         passed = int(hosts[at + 1] - hosts[at])
         return ClockJump(
-            f"sensor {self._name}: clock jump within the recording: stamps went forward from "
+            f"sensor {self.name}: clock jump within the recording: stamps went forward from "
             f"{before / NS_PER_S:.6f} s to {after / NS_PER_S:.6f} s while only "
             f"{passed / NS_PER_S:.6f} s passed at the recorder; wanted one running clock; use "
             "--on-jump split, or --clock host",

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from mlbatch.errors import UsageError
-
 
 def convert(
     recordings: Annotated[
@@ -60,6 +58,13 @@ def convert(
     clock: Annotated[
         str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
     ] = "sensor",
+    align_clocks: Annotated[
+        bool,
+        typer.Option("--align-clocks", help="Map the sensors' clocks; reads the recording twice."),
+    ] = False,
+    align_to: Annotated[
+        str, typer.Option(help="host: the recorder's clock; first: that of the first sensor.")
+    ] = "host",
     on_jump: Annotated[
         str,
         typer.Option(help="Where a clock jumps: error, or split into outputs named .segN."),
@@ -127,11 +132,10 @@ def convert(
     values.choice("--layout", layout, ("dense", "organized"))
     values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
     values.choice("--clock", clock, ("sensor", "host"))
+    values.choice("--align-to", align_to, ("host", "first"))
     values.choice("--on-jump", on_jump, ("error", "split"))
-    if jobs != 1:
-        raise UsageError(f"--jobs: wanted 1, got {jobs}; more than one is not in this version")
-    if output is None and not dry_run:
-        raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
+    values.jobs(jobs)
+    values.output(output, dry_run=dry_run)
     values.slices(slices)
     values.ranges_m(min_range, max_range)
     first, first_is_date = values.time_limit("--start", start)
@@ -146,6 +150,7 @@ def convert(
             ignore=tuple(ignore or ()),
             identity_extrinsics=identity_extrinsics,
             host_clock=clock == "host",
+            aligned=align_clocks,
             decode=values.decode_options(decode or ()),
         ),
         rate=None if rate is None else values.rate(rate),
@@ -165,6 +170,7 @@ def convert(
         strict=strict,
         faults=values.faults(fault or ()),
         fault_seed=values.seed(fault_seed),
+        align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
     )
     run(

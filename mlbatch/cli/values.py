@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
+from pathlib import Path
 
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
@@ -160,3 +161,15 @@ def seed(number: int) -> int:
     if number < 0:
         raise UsageError(f"--fault-seed: wanted a whole number from 0, got {number}; correct it")
     return number
+
+
+def jobs(number: int) -> None:
+    """`--jobs`, as far as this version goes."""
+    if number != 1:
+        raise UsageError(f"--jobs: wanted 1, got {number}; more than one is not in this version")
+
+
+def output(path: Path | None, *, dry_run: bool) -> None:
+    """`-o`, which only a dry run goes without."""
+    if path is None and not dry_run:
+        raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")

@@ -42,6 +42,7 @@ class TurningLidar:
     extrinsics: F64Array | None = None
     sensor_from_lidar: F64Array | None = None
     timestamp_mode: str = ""
+    clock_period_ns: int = 0
     notes: tuple[str, ...] = ()
 
     def owns(self, packets: U8Array) -> BoolArray:

@@ -100,6 +100,7 @@ class VelodyneLidar(TurningLidar):
         self.channel = ranks(elevation)
         self.calibration = "built in" if file is None else str(file.path)
         self.timestamp_mode = measured.timestamp_mode
+        self.clock_period_ns = HOUR_NS
         self.notes = notes
         self._start_ns, self._ahead_ns = self._timetable()
 

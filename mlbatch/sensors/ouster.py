@@ -173,6 +173,7 @@ class OusterLidar:
         self.extrinsics = described.extrinsics
         self.sensor_from_lidar: F64Array | None = described.lidar_to_sensor
         self.timestamp_mode = described.timestamp_mode
+        self.clock_period_ns = 0
         self.calibration = str(described.path)
         self.notes = described.notes
         self.lidar_port = described.lidar_port

@@ -27,6 +27,8 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--start": r"epoch s.*ISO.*\+S",
         "--end": "--start",
         "--clock": "sensor.*host",
+        "--align-clocks": "twice",
+        "--align-to": "host.*first",
         "--on-jump": "error.*split",
         "--min-range": r"\bm\b",
         "--max-range": r"\bm\b",

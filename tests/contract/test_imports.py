@@ -12,6 +12,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("api",), ("compare",)),
     (("converting",),),
     (("pipeline", "accounts"), ("survey",)),
+    (("timekeeping",),),
     (("assembly",),),
     (("feeding",), ("job",)),
     (("inertial",), ("passing",), ("discover",)),

@@ -287,14 +287,14 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "clocks of the sensors cannot be compared: stamp minus arrival is -0.001 s for "
         "velodyne_1 and +1199.999 s for velodyne_2, 1200.000 s apart; wanted at most 1 s; use "
-        "--clock host, or give clock.offset_s in the rig",
+        "--align-clocks or --clock host, or give clock.offset_s or clock.epoch in the rig",
     ),
     "counter since power-on beside a clock": (
         "livox/drive.pcap --identity-extrinsics",
         1,
         "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
         "ouster_111 and -1699999000.001 s for livox_1, 1699998999.996 s apart; wanted at most 1 "
-        "s; use --clock host, or give clock.offset_s in the rig",
+        "s; use --align-clocks or --clock host, or give clock.offset_s or clock.epoch in the rig",
     ),
     "two Velodynes without extrinsics": (
         "twins/drive.pcap",

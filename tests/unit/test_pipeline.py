@@ -86,7 +86,10 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     two = replace(twin(one, 222), host_ns=2_300 * NS_PER_MS)
     run, report = convert(_job(write_session(tmp_path, one, two), identity=True), None)
     assert report.timescale == "unknown"
-    assert [note.message for note in run.notes] == ["sensors differ in timescale: utc, unknown"]
+    assert [(note.code, note.message) for note in run.notes[:1]] == [
+        ("timescale", "sensors differ in timescale: utc, unknown")
+    ]
+    assert [note.code for note in run.notes[1:]] == ["clocks"]
 
 
 # -- what a run tells while and after it runs -----------------------------------------------------

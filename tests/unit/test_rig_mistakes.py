@@ -136,7 +136,7 @@ MISTAKES: list[tuple[str, str]] = [
     (one("decode: [crc]"), f"3: {S}.decode: wanted a mapping of options, got a list of 1; "
                            "write {option: value}"),
     (one("decode: {crc: [a]}"), f"3: {S}.decode.crc: wanted one word, got a list of 1; {FIX}"),
-    (one("clock: host"), f"3: {S}.clock: wanted a mapping with keys of source, offset_s, "
+    (one("clock: host"), f"3: {S}.clock: wanted a mapping with keys of source, epoch, offset_s, "
                          "got 'host'; write `key: value`"),
     (one("clock: {source: gps}"), f"3: {S}.clock.source: wanted sensor or host, got 'gps'; "
                                   "use one of these words"),

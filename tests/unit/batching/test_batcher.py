@@ -256,8 +256,8 @@ def test_clocks_must_be_comparable(apart_ms: float, comparable: bool) -> None:
         list(batcher.push(arrivals, host_ns))
     assert str(err.value) == (
         "clocks of the sensors cannot be compared: stamp minus arrival is -3.000 s for right and "
-        "-4.000 s for left, 1.000 s apart; wanted at most 1 s; use --clock host, or give "
-        "clock.offset_s in the rig"
+        "-4.000 s for left, 1.000 s apart; wanted at most 1 s; use --align-clocks or --clock host, "
+        "or give clock.offset_s or clock.epoch in the rig"
     )
 
 
