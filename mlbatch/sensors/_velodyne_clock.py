@@ -36,6 +36,8 @@ _NEAR_NS, _FAR_NS = 15 * NS_PER_MS, 600 * NS_PER_MS
 # VLS-128: no firmware known leaves this range; a lost packet doubles the step.
 _SEQUENCE_NS = (50_000, 62_000)
 _ENOUGH_STEPS = 4
+# Evidence begins with so many; what follows them is chosen by arrival.
+_IN_A_ROW = 16
 
 
 def top_of_hour_ns(packets: U8Array, at: int = STAMP_AT) -> I64Array:
@@ -120,11 +122,18 @@ def rotor_speed(stamp_ns: I64Array, azimuth: I64Array, rough: float | None) -> f
 
 
 def measured_sequence_ns(stamp_ns: I64Array, sequences: int) -> float | None:
-    """Length of a firing sequence of a VLS-128 by the steps between its packets; None: too few."""
-    step_ns = np.diff(stamp_ns) % HOUR_NS
+    """Length of a firing sequence of a VLS-128 by the steps between its packets; None: too few.
+
+    The first packets suffice: they follow each other, so that the rounding of their stamps to us
+    cancels, and which ones they are does not depend on when they arrive.
+    """
     low, high = (limit * sequences for limit in _SEQUENCE_NS)
-    good = step_ns[(step_ns > low) & (step_ns < high)]
-    return float(good.mean()) / sequences if len(good) >= _ENOUGH_STEPS else None
+    for count in (_IN_A_ROW, len(stamp_ns)):
+        step_ns = np.diff(stamp_ns[:count]) % HOUR_NS
+        good = step_ns[(step_ns > low) & (step_ns < high)]
+        if len(good) >= _ENOUGH_STEPS:
+            return float(good.mean()) / sequences
+    return None
 
 
 def _positions(one: Beside) -> tuple[U8Array, I64Array]:

@@ -146,6 +146,11 @@ class TestSpeeds:
         stamp_ns = np.rint(np.arange(16) * 165.832).astype(np.int64) * 1000
         assert measured_sequence_ns(stamp_ns, 3) == pytest.approx(55_277, abs=25)
         assert measured_sequence_ns(np.delete(stamp_ns, 5), 3) == pytest.approx(55_277, abs=40)
+        # What comes later is chosen by arrival, and must not count where enough is known.
+        more_ns = np.append(stamp_ns, stamp_ns[-1] + np.arange(1, 9) * 166_000)
+        assert measured_sequence_ns(more_ns, 3) == measured_sequence_ns(stamp_ns, 3)
+        # They are the last resort.
+        assert measured_sequence_ns(np.append(np.zeros(16, np.int64), stamp_ns), 3) is not None
         assert measured_sequence_ns(stamp_ns[:4], 3) is None
         assert measured_sequence_ns(stamp_ns * 2, 3) is None
 
