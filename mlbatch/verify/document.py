@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeAlias, cast
 
 from mlbatch.verify.verdict import Judge, VerifyError
@@ -22,13 +23,13 @@ class Document:
     _blamed: set[str] = field(default_factory=set)
 
     @classmethod
-    def parsed(cls, judge: Judge, where: str, text: str) -> Document:
-        """A document from its text."""
+    def parsed(cls, judge: Judge, path: Path, text: str, where: str = "") -> Document:
+        """A document from its text; where: in the file at `path`, if that holds more."""
         try:
-            return cls(judge, where, cast(Json, json.loads(text)))
+            return cls(judge, where or path.name, cast(Json, json.loads(text)))
         except (ValueError, RecursionError) as err:
             raise VerifyError(
-                f"{where}: wanted a report in JSON, got {err}; restore it, or convert again"
+                f"{path}: wanted a report in JSON, got {err}; restore it, or convert again"
             ) from err
 
     def at(self, *path: str | int) -> Json:

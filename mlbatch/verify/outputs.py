@@ -156,7 +156,7 @@ def _of_mcap(
         )
     judge.equal("metadata", f"{where} profile", "ros2", file.profile)
     attachment = file.attachments.get(TABLE)
-    papers = inner_papers(judge, where, file.metadata.get("mlbatch.report"), attachment)
+    papers = inner_papers(judge, path, file.metadata.get("mlbatch.report"), attachment)
     check_copies(judge, papers, attachment, proof.beside, asked=proof.asked)
     claims = papers.claims(judge, claims_of_grid(judge, where, grid))
     examination = Examination(judge, str(path), claims, papers)

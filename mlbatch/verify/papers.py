@@ -66,22 +66,22 @@ def read_papers(judge: Judge, beside: Beside, *, asked: bool) -> Papers:
     text = text_of(beside.report)
     if text is None and asked:
         raise VerifyError(f"{beside.report}: wanted a report, got no such file; leave out --report")
-    report = None if text is None else Document.parsed(judge, beside.report.name, text)
+    report = None if text is None else Document.parsed(judge, beside.report, text)
     table = text_of(beside.table)
     found = None if table is None else read_table(judge, beside.table.name, table)
     return Papers(report, found)
 
 
 def inner_papers(
-    judge: Judge, where: str, metadata: dict[str, str] | None, attachment: bytes | None
+    judge: Judge, path: Path, metadata: dict[str, str] | None, attachment: bytes | None
 ) -> Papers:
     """Report and table that lie inside a file."""
-    report = None
+    report, where = None, path.name
     if metadata is None:
         judge.blame("metadata", where, "a metadata record mlbatch.report", "none")
     else:
         name = f"{where} mlbatch.report"
-        report = Document.parsed(judge, name, metadata.get("json", ""))
+        report = Document.parsed(judge, path, metadata.get("json", ""), name)
     if attachment is None:
         judge.blame("table", where, f"an attachment {TABLE}", "none")
         return Papers(report, None)
@@ -97,7 +97,7 @@ def check_copies(
     if text is None and asked:
         raise VerifyError(f"{beside.report}: wanted a report, got no such file; leave out --report")
     if text is not None and inner.report is not None:
-        other = Document.parsed(judge, beside.report.name, text)
+        other = Document.parsed(judge, beside.report, text)
         check_same(judge, inner.report, other)
     table = text_of(beside.table)
     if table is not None and attachment is not None:

@@ -53,9 +53,10 @@ class Placing:
         """Number of the slice that a scan begins in; its neighbour's line may be meant."""
         q = lines.number(scan.start_ns)
         if scan.index is not None and self.first is not None and scan.slice is not None:
-            # Of two lines that the start lies between, the one that the index names.
+            # Of two lines that the start lies between, the nearer one, if the index names it.
             said = (self.first + scan.index) * lines.slices + scan.slice
-            return said if said == q + 1 else q
+            begin, end = lines.bound(q), lines.bound(q + 1)
+            return said if said == q + 1 and 2 * scan.start_ns > begin + end else q
         return q
 
     def _after(self, scan: HeldScan, q: int) -> None:

@@ -23,17 +23,30 @@ class Rings:
     low_at: dict[int, str] = field(default_factory=dict)
     high_at: dict[int, str] = field(default_factory=dict)
 
-    def add(self, sensor: int, ring: I64Array, where: str) -> None:
-        """Rings of points of one sensor."""
-        if not len(ring):
+    def add(self, sensor: int, scan: HeldScan, points: Points) -> None:
+        """Rings of a scan's points of one sensor."""
+        ring, owner = points.ring, points.lidar_id
+        if ring is None:
             return
-        low, high = int(ring.min()), int(ring.max())
+        own = ring if owner is None else ring[owner == sensor]
+        if not len(own):
+            return
+        low, high = int(own.min()), int(own.max())
         if low < self.low[sensor]:
-            self.low[sensor] = low
-            self.low_at[sensor] = f"{where} {int(ring.argmin())} of sensor {sensor}"
+            self.low[sensor], self.low_at[sensor] = low, _place(scan, points, sensor, low)
         if high > self.high[sensor]:
-            self.high[sensor] = high
-            self.high_at[sensor] = f"{where} {int(ring.argmax())} of sensor {sensor}"
+            self.high[sensor], self.high_at[sensor] = high, _place(scan, points, sensor, high)
+
+
+def _place(scan: HeldScan, points: Points, sensor: int, ring: int) -> str:
+    """The first point of a sensor on a ring."""
+    found = points.ring == ring
+    if points.lidar_id is not None:
+        found &= points.lidar_id == sensor
+    at = int(np.argmax(found))
+    if points.valid is not None:
+        at = int(np.flatnonzero(points.valid)[at])
+    return f"{scan.point} {at} of sensor {sensor}"
 
 
 @dataclass(slots=True)
@@ -112,17 +125,14 @@ class Tally:
         alone = scan.sensor if self._sensors > 1 else 0
         if alone is not None:
             self.points_of[alone] += points.count
-            if points.ring is not None:
-                self.rings.add(alone, points.ring.astype(np.int64), scan.point)
+            self.rings.add(alone, scan, points)
             return True
         if owner is None:
             return False
         counts = np.bincount(owner, minlength=self._sensors)[: self._sensors]
         self.points_of += counts
-        if points.ring is not None:
-            for sensor in np.flatnonzero(counts).tolist():
-                own = points.ring[owner == sensor].astype(np.int64)
-                self.rings.add(sensor, own, scan.point)
+        for sensor in np.flatnonzero(counts).tolist():
+            self.rings.add(sensor, scan, points)
         return True
 
     def _columns_of(self, scan: HeldScan) -> I64Array | None:

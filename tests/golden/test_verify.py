@@ -1,0 +1,131 @@
+"""Whatever the tool writes is proven clean, and what a format shows is judged.
+
+Both fixtures in every format, layout and preset; lidars that look odd to a proof: ranges of an
+HDL-64E begin elsewhere, a Ruby gives each return a column of its own, a PandarQT64 fires longest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mlbatch.verify import CHECKS, Verdict, verify
+from mlbatch.verify.scan import COLUMN_NS
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.run import ROOT, command
+from tests.golden.test_every_model import (
+    HOST,
+    RIG,
+    RIG_METADATA,
+    SOURCE,
+    Sent,
+    hesai_sent,
+    robosense_sent,
+    velodyne_sent,
+)
+
+FIXTURES = ("two_lidars", "four_makers")
+ROUNDS: tuple[tuple[str, ...], ...] = (
+    (),
+    ("--slices", "3"),
+    ("--split",),
+    ("--keep-partial", "--rate", "20"),
+    ("--split", "--slices", "2", "--keep-partial", "--rate", "30/7"),
+)
+FORMS: dict[str, tuple[str, ...]] = {
+    "npz": (),
+    "npz organized": ("--layout", "organized"),
+    "ply": ("--format", "ply"),
+    "mcap": ("--format", "mcap"),
+    "mcap organized": ("--format", "mcap", "--layout", "organized"),
+    "rosbag2": ("--format", "rosbag2"),
+    "rosbag1": ("--format", "rosbag1"),
+}
+PRESETS = ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal")
+SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
+# What is judged in each format, of merged scans at the standard layout; the rest stays open.
+MESSAGES = set(CHECKS) - {"names", "geometry", "duplicates", "messages"}
+JUDGED = {
+    "npz": set(CHECKS) - {"stamps", "tf_static", "imu", "messages"},
+    "ply": set(CHECKS) - {"stamps", "tf_static", "imu", "messages", "geometry", "duplicates"},
+    "mcap": MESSAGES,
+    "rosbag2": MESSAGES | {"names"},
+    "rosbag1": MESSAGES,
+}
+
+
+def converted(folder: Path, fixture: str, name: str, *words: str) -> Verdict:
+    """What is said of a conversion of a fixture."""
+    source = ROOT / "fixtures" / fixture
+    target = folder / f"out{SUFFIX.get(name, '')}"
+    rig = ("--rig", source / "rig.yaml", "--quiet", "--overwrite")
+    told = command("convert", source / f"{fixture}.pcap", "-o", target, *rig, *words)
+    assert (told.code, told.err) == (0, "")
+    return verify(target)
+
+
+@pytest.mark.parametrize("fixture", FIXTURES)
+@pytest.mark.parametrize("form", FORMS)
+def test_fixtures_are_clean(form: str, fixture: str, tmp_path: Path) -> None:
+    name = form.split()[0]
+    for words in ROUNDS:
+        verdict = converted(tmp_path, fixture, name, *FORMS[form], *words)
+        assert verdict.ok, (words, verdict.violations)
+        # The Velodyne, the HESAI and the ROBOSENSE of the other fixture have no IMU packets.
+        if not words and fixture == "two_lidars":
+            judged = {check.name for check in verdict.checks if check.judged}
+            assert judged == JUDGED[name]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_clean(preset: str, tmp_path: Path) -> None:
+    for words in ((), ("--layout", "organized"), ("--split",)):
+        layout = ("--point-layout", preset, *words)
+        verdict = converted(tmp_path, "two_lidars", "mcap", *layout)
+        assert verdict.ok, (words, verdict.violations)
+        assert verdict.format == f"mcap, {preset}"
+
+
+ODD: dict[str, Callable[[], Sent]] = {
+    "HDL-64E": lambda: velodyne_sent("HDL-64E S3", "dual"),
+    "Ruby": lambda: robosense_sent("Ruby 128", "dual"),
+    "QT64": lambda: hesai_sent("PandarQT64", "39"),
+    "JT128": lambda: hesai_sent("JT128", "37"),
+    "Airy": lambda: robosense_sent("Airy 96", "strongest"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
+    sent = ODD[name]()
+    longest_ns = int((sent.seen.firing_ns - sent.seen.stamp_ns[:, None]).max())
+    assert 5 * longest_ns < COLUMN_NS
+    path = recorded(sent, tmp_path)
+    words: tuple[str | Path, ...] = ("--metadata", tmp_path / sent.file) if sent.file else ()
+    if sent.is_named:
+        words = ("--rig", tmp_path / "rig.yaml")
+    for layout in ("dense", "organized"):
+        target = tmp_path / layout
+        more = ("--rate", "20", "--keep-partial", "--layout", layout)
+        told = command("convert", path, "-o", target, *words, *more)
+        assert told.code == 0, told.err
+        verdict = verify(target)
+        assert verdict.ok, verdict.violations
+        assert verdict.points > 0
+
+
+def recorded(sent: Sent, folder: Path) -> Path:
+    """A capture of what a lidar sent, and what is needed to read it."""
+    if sent.file:
+        (folder / sent.file).write_bytes(sent.content)
+    more = RIG_METADATA.format(metadata=sent.file) if sent.file else ""
+    rig = RIG.format(model=sent.model, ip=SOURCE) + more
+    (folder / "rig.yaml").write_text(rig, encoding="utf-8")
+    records = [
+        (host_ns, udp_frame(payload, SOURCE, HOST, port, port)[0])
+        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.beside))
+        for host_ns, payload in payloads
+    ]
+    return write_pcap(folder / "lidar.pcap", sorted(records))

@@ -1,0 +1,228 @@
+"""Every edit of a file of messages that breaks a rule is found, and named with its place.
+
+Files are written again by the reference library of MCAP and by rosbags, so that all indexes and
+checksums are right, and only what was changed is wrong.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit.verify.made import (
+    Edit,
+    flipped,
+    forget,
+    found,
+    raw,
+    report,
+    row,
+    spoiled_places,
+    text,
+    with_cell,
+    with_value,
+)
+from tests.unit.verify.remade import (
+    Change,
+    Notes,
+    Sent,
+    gone,
+    later,
+    mcap,
+    on,
+    only,
+    patched,
+    put,
+    twice,
+)
+
+PERIOD_NS = 100_000_000
+# Of a PointCloud2 on `base_link`: seconds and nanoseconds; height and width.
+STAMP, HEIGHT, WIDTH = 4, 28, 32
+Expected = tuple[Edit, str, str]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _clean() -> Iterator[None]:
+    yield
+    forget()
+
+
+def scan(number: int, change: Change) -> Edit:
+    """Change one scan of an MCAP file."""
+    return mcap(only("/points", number, change))
+
+
+def table(line: int, column: str, value: object) -> Notes:
+    """Change the attached table."""
+
+    def change(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
+        old = files["scans.csv"].decode()
+        files["scans.csv"] = with_cell(old, line, column, value).encode()
+
+    return change
+
+
+def inner(*path: str | int, to: object) -> Notes:
+    """Change the report inside."""
+
+    def change(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
+        notes = metadata["mlbatch.report"]
+        notes["json"] = with_value(notes["json"], path, to)
+
+    return change
+
+
+def grid(key: str, value: str) -> Notes:
+    """Change what the file says of its grid."""
+
+    def change(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
+        metadata["mlbatch.grid"][key] = value
+
+    return change
+
+
+def without(name: str) -> Notes:
+    """Leave out a metadata record or an attachment."""
+
+    def change(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
+        metadata.pop(name, None)
+        files.pop(name, None)
+
+    return change
+
+
+def moved(by_ns: int) -> Change:
+    """Another time, the same in the log and in the header."""
+
+    def change(sent: Sent) -> list[Sent]:
+        data, log_ns = bytearray(sent.data), sent.log_ns + by_ns
+        struct.pack_into("<iI", data, STAMP, *divmod(log_ns, 10**9))
+        return [replace(sent, data=bytes(data), log_ns=log_ns, publish_ns=log_ns)]
+
+    return change
+
+
+def words(old: bytes, new: bytes) -> Change:
+    """Other words of the same length."""
+    return lambda sent: [replace(sent, data=sent.data.replace(old, new, 1))]
+
+
+def cut(count: int) -> Change:
+    return lambda sent: [replace(sent, data=sent.data[:-count])]
+
+
+def as_imu(sent: Sent) -> list[Sent]:
+    return [replace(sent, kind="sensor_msgs/msg/Imu")]
+
+
+MCAP: dict[str, Expected] = {
+    "log time": (scan(1, later(1)), "stamps", "/points message 1 log time"),
+    "publish time": (
+        scan(1, lambda s: [replace(s, publish_ns=1)]),
+        "stamps",
+        "/points message 1 publish time",
+    ),
+    "off the grid": (scan(1, moved(-1000)), "grid", "/points message 1 start_ns"),
+    "of another window": (scan(1, moved(PERIOD_NS)), "index", "/points message 2 start_ns"),
+    "scan twice": (scan(2, twice), "index", "/points message 3 start_ns"),
+    "scan left out": (scan(2, gone), "table", "line 4 scan"),
+    "frame": (scan(0, words(b"base", b"cars")), "metadata", "message 0 frame_id"),
+    "width": (scan(0, patched(WIDTH, "<I", 7)), "layout", "/points message 0"),
+    "height": (scan(0, patched(HEIGHT, "<I", 2)), "layout", "/points message 0"),
+    "cut off": (scan(0, cut(3)), "layout", "/points message 0"),
+    "not CDR": (scan(0, patched(1, "<B", 0)), "layout", "/points message 0"),
+    "not dense": (scan(1, lambda s: [replace(s, data=s.data[:-1] + b"\0")]), "layout", "is_dense"),
+    "name of a field": (
+        scan(0, words(b"intensity", b"intensitz")),
+        "layout",
+        "/points message 0",
+    ),
+    "of another type": (scan(1, as_imu), "layout", "/points message 0 type"),
+    "on another topic": (mcap(only("/points", 1, on("/left/points"))), "layout", "/left/points"),
+    "no number": (scan(1, put("standard", "y", 5, np.nan)), "finite", "message 1 point 5"),
+    "time before the scan": (scan(1, put("standard", "time", 5, -0.1)), "times", "point 5"),
+    "time past the scan": (scan(1, put("standard", "time", 6, 0.2)), "times", "point 6"),
+    "time that is none": (scan(1, put("standard", "time", 6, np.nan)), "layout", "message 1"),
+    "time that steps back": (scan(1, put("standard", "time", 900, 0)), "order", "point 900"),
+    "time before all columns": (
+        scan(0, put("standard", "time", 0, 0)),
+        "table",
+        "first_stamp_ns",
+    ),
+    "sensor": (scan(1, put("standard", "lidar_id", 3, 2)), "sensors", "message 1 point 3"),
+    "ring": (scan(1, put("standard", "ring", 3, 900)), "rings", "message 1 point 3"),
+    "return type": (scan(1, put("standard", "return_type", 3, 9)), "returns", "point 3"),
+    "no transforms": (mcap(only("/tf_static", 0, gone)), "tf_static", "messages"),
+    "transforms twice": (mcap(only("/tf_static", 0, twice)), "tf_static", "messages"),
+    "frame of transforms": (
+        mcap(only("/tf_static", 0, words(b"base", b"cars"))),
+        "tf_static",
+        "message 0 frames",
+    ),
+    "name of a sensor": (
+        mcap(only("/tf_static", 0, words(b"right", b"wrong"))),
+        "tf_static",
+        "child frames",
+    ),
+    "pose of a sensor": (
+        mcap(only("/tf_static", 0, patched(44, "<d", 9.0))),
+        "tf_static",
+        "message 0 left",
+    ),
+    "IMU left out": (mcap(only("/left/imu", 4, gone)), "imu", "sensors.0.imu_samples.written"),
+    "IMU log time": (mcap(only("/left/imu", 4, later(5))), "imu", "/left/imu message 4 log time"),
+    "IMU that steps back": (
+        mcap(only("/left/imu", 4, moved(-PERIOD_NS))),
+        "imu",
+        "/left/imu message 4",
+    ),
+    "IMU frame": (
+        mcap(only("/left/imu", 4, words(b"_imu", b"_umi"))),
+        "imu",
+        "message 4 frame_id",
+    ),
+    "IMU value": (
+        mcap(only("/left/imu", 4, lambda s: [replace(s, data=s.data[:-8] + b"\xff" * 8)])),
+        "imu",
+        "/left/imu message 4",
+    ),
+    "message of nobody": (mcap(only("/left/imu", 4, on("/odd"))), "messages", "/odd"),
+    "rate of the grid": (mcap(notes=grid("rate_hz", "20")), "metadata", "rate"),
+    "t_init of the grid": (mcap(notes=grid("t_init_ns", "5")), "metadata", "t_init_ns"),
+    "t_init that is none": (mcap(notes=grid("t_init_ns", "")), "metadata", "t_init_ns"),
+    "slices of the grid": (mcap(notes=grid("slices", "2")), "metadata", "slices"),
+    "sensors of the grid": (mcap(notes=grid("sensors", '["a"]')), "metadata", "sensors"),
+    "frame of the grid": (mcap(notes=grid("frame_id", "map")), "metadata", "frame_id"),
+    "no report inside": (mcap(notes=without("mlbatch.report")), "metadata", "scans.mcap"),
+    "no table inside": (mcap(notes=without("scans.csv")), "table", "scans.mcap"),
+    "report inside": (
+        mcap(notes=inner("scans", "points", to=1)),
+        "report",
+        "mlbatch.report scans.points",
+    ),
+    "ledger inside": (
+        mcap(notes=inner("capture", "frames", to=1)),
+        "ledger",
+        "mlbatch.report capture.frames",
+    ),
+    "report beside": (report("capture", "frames", to=1), "report", "report.json capture.frames"),
+    "table inside": (mcap(notes=table(1, "points", 1)), "table", "scans.csv line 3 points"),
+    "table beside": (row(1, "points", 1), "table", "scans.mcap.scans.csv"),
+    "profile": (mcap(profile="ros1"), "metadata", "profile"),
+    "a byte of a chunk": (raw("", flipped(300_000)), "container", "chunk at byte"),
+    "a byte of the summary": (raw("", flipped(-200)), "container", "CRC of the summary"),
+    "last bytes": (raw("", flipped(-1)), "container", "last bytes"),
+    "a byte of the table": (text("", "index,slice", "Index,slice"), "container", "scans.csv CRC"),
+}
+
+
+@pytest.mark.parametrize("name", MCAP)
+def test_mcap(name: str, tmp_path: Path) -> None:
+    edit, check, where = MCAP[name]
+    found(spoiled_places("scans.mcap", tmp_path, edit), check, where)
