@@ -16,8 +16,8 @@ from pathlib import Path
 
 from mlbatch.errors import RigError
 
-# Takes two seconds to parse, and holds a hundred times as many sensors as any vehicle.
-MAX_BYTES = 300_000
+# Of both, the 256 sensors that a rig may have need less; a parser takes its time for each value.
+MAX_BYTES, MAX_VALUES = 300_000, 20_000
 MAX_DEPTH = 16
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _MAX_DIGITS = 100

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from mlbatch._yaml import KEY, MAX_BYTES, MAX_DEPTH, Node, fault, short
+from mlbatch._yaml import KEY, MAX_BYTES, MAX_DEPTH, MAX_VALUES, Node, fault, short
 from mlbatch.errors import RigError
 
 
@@ -61,6 +61,7 @@ class _Composer:
     def __init__(self, file: Path, events: Iterator[yaml.Event]) -> None:
         self.file = file
         self.events = events
+        self.values = 0
 
     def document(self) -> Node:
         """The only document of the stream; an empty file is a scalar without text."""
@@ -79,6 +80,7 @@ class _Composer:
     def node(self, event: yaml.Event, path: str, depth: int) -> Node:
         """The value that begins with `event`."""
         line = _line(event)
+        self.values += 1
         self._check(event, path, line, depth)
         if isinstance(event, yaml.ScalarEvent):
             plain = event.style is None
@@ -95,6 +97,8 @@ class _Composer:
             message = f"wanted plain values, got the tag {short(tag)}; remove it"
         elif depth > MAX_DEPTH:
             message = f"wanted at most {MAX_DEPTH} levels, got more; remove brackets"
+        elif self.values > MAX_VALUES:
+            message = f"wanted at most {MAX_VALUES} values, got more; check that this is a rig file"
         if message:
             raise fault(self.file, line, path, message)
 

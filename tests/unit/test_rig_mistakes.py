@@ -241,7 +241,7 @@ def test_files_that_are_no_text_are_told(tmp_path: Path) -> None:
     with pytest.raises(RigError) as caught:
         read_rig(file)
     assert str(caught.value) == (
-        f"{file}: wanted at most 1000000 bytes, got more; "
+        f"{file}: wanted at most 300000 bytes, got more; "
         "check that this is a rig file and not a recording"
     )
 

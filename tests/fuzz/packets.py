@@ -1,0 +1,206 @@
+"""Targets: the packets of every model and mode, and the calibration files of every maker."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import zlib
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch import sensors
+from mlbatch.errors import MlbatchError
+from mlbatch.lidar import Calibration, Evidence, ModelFile
+from mlbatch.sensors._ouster_profiles import PROFILES
+from tests.builders import ouster, robosense, velodyne
+from tests.builders.livox import (
+    CARTESIAN16,
+    CARTESIAN32,
+    DUAL,
+    SPHERICAL,
+    LivoxSpec,
+    imu_packet,
+    point_packets,
+)
+from tests.builders.others import livox1_packets
+from tests.builders.velodyne_tables import calibration_yaml
+from tests.contract.tree import ROOT
+from tests.fuzz.decoding import check_lidar, decode_samples, sampled, try_all
+from tests.fuzz.framing import Part, joined, mutated_parts, parts_of
+from tests.fuzz.harness import Target
+from tests.fuzz.mutation import Seeds, mutated, mutated_text
+from tests.golden.test_every_model import CASES
+from tests.unit.sensors.test_velodyne_calibration_xml import points, xml_of
+
+# Parts of an input that are no datagrams: a calibration, its name.
+CALIBRATION, _LIDAR_PORT, _DEVICE_PORT = 0, 2368, 7788
+_PACKETS = 8
+_OUSTER_PACKETS = 3
+START_NS = 1_700_000_000_000_000_000
+NAMES = (".json", ".yaml", ".xml", ".csv", ".dat")
+
+
+@lru_cache(maxsize=1)
+def _streams() -> dict[str, Seeds]:
+    """Inputs of every maker: a few packets of each model and mode, and what comes beside them."""
+    found: dict[str, list[bytes]] = {"ouster": [], "livox": _livox()}
+    for make, words in CASES:
+        sent = make(*words)
+        parts = []
+        if sent.file:
+            kind = NAMES.index(Path(sent.file).suffix)
+            parts.append(Part(CALIBRATION, kind, sent.content))
+        parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.seen.payloads[:_PACKETS]]
+        parts += [Part(_DEVICE_PORT, at, data) for at, data in sent.beside]
+        found.setdefault(make.__name__.removesuffix("_sent"), []).append(joined(parts))
+    spec = velodyne.VelodyneSpec("VLP-16")
+    position = velodyne.position_packets(spec, np.arange(4, dtype=np.float64) * 5e5)
+    found["velodyne"] += [
+        joined(
+            [*parts_of(found["velodyne"][0])]
+            + [
+                Part(8308, int(at), row.tobytes())
+                for at, row in zip(position.host_ns, position.payloads, strict=True)
+            ]
+        )
+    ]
+    found["ouster"] += [
+        _ouster(profile) for profile in PROFILES if "RANGE" in PROFILES[profile].fields
+    ]
+    return {maker: tuple(seeds) for maker, seeds in found.items()}
+
+
+def _livox() -> list[bytes]:
+    seeds = []
+    for kind in (CARTESIAN32, CARTESIAN16, SPHERICAL, DUAL):
+        spec = LivoxSpec(kind, points=12, frame_packets=4)
+        shape = (12 * _PACKETS, spec.returns)
+        coordinates = np.full((*shape, 3), 1500, np.int64)
+        sent = point_packets(spec, coordinates, np.full(shape, 7, np.int64))
+        beside = imu_packet(spec, spec.start_ns, np.zeros(3), np.ones(3))
+        seeds.append(
+            joined([*(Part(56301, at, data) for at, data in sent), Part(56401, sent[0][0], beside)])
+        )
+    old = livox1_packets(2, 1362)
+    seeds.append(joined(Part(56001, 10**18 + at, row.tobytes()) for at, row in enumerate(old)))
+    return seeds
+
+
+def _ouster(profile: str) -> bytes:
+    spec = ouster.OusterSpec(profile, beams=32, columns_per_frame=512)
+    content = json.dumps(ouster.metadata_json(spec)).encode()
+    mids = np.arange(spec.columns_per_packet * _OUSTER_PACKETS)
+    ranges = np.resize([0, 904, 12_000, 250_000], (len(mids), spec.beams))
+    payloads = ouster.encode_packets(
+        spec, START_NS + mids * 195_312, mids, np.full(len(mids), 7), {"RANGE": ranges}
+    )
+    beside = ouster.imu_packet(spec, np.array([START_NS]), np.ones((1, 3)), np.zeros((1, 3)))
+    return joined(
+        [
+            Part(CALIBRATION, NAMES.index(".json"), content),
+            *(Part(7502, START_NS + number, row) for number, row in enumerate(payloads)),
+            Part(7503, START_NS, beside),
+        ]
+    )
+
+
+def _decode(data: bytes, folder: Path) -> None:
+    """Find and decode the sensors of an input, with the calibration that is in it."""
+    parts = parts_of(data)
+    calibrations: list[Calibration] = []
+    for part in parts:
+        if part.kind == CALIBRATION:
+            path = Path(f"unit{NAMES[part.host_ns % len(NAMES)]}")
+            found = sensors.parse_calibration(path, part.data)
+            calibrations += [] if found is None else [found]
+    sampler = sampled(part for part in parts if part.kind != CALIBRATION)
+    decode_samples(sampler, calibrations, random.Random(zlib.crc32(data)))
+
+
+# -- calibration files ----------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _files() -> dict[str, Seeds]:
+    """Calibration files by their suffix."""
+    found: dict[str, list[bytes]] = {name: [] for name in NAMES}
+    for seeds in _streams().values():
+        for seed in seeds:
+            for part in parts_of(seed):
+                if part.kind == CALIBRATION:
+                    found[NAMES[part.host_ns]].append(part.data)
+    for path in sorted((ROOT / "fixtures").glob("*/*.json")):
+        found[".json"].append(path.read_bytes())
+    flat = ouster.OusterSpec("LEGACY", beams=16)
+    found[".json"].append(json.dumps(ouster.flat_json(flat)).encode())
+    found[".yaml"] += [calibration_yaml(model).encode() for model in ("VLP-16", "HDL-64E S2")]
+    found[".xml"] += [xml_of(points(64), [1] * 64).encode(), xml_of(points(16)).encode()]
+    fan = robosense.fan(robosense.RobosenseSpec("Helios 32-31"))
+    found[".csv"].append(robosense.angles_csv(fan).encode())
+    return {name: tuple(dict.fromkeys(seeds)) for name, seeds in found.items()}
+
+
+@lru_cache(maxsize=1)
+def _seen() -> Sequence[Part]:
+    """Sound packets of several makers, to be decoded with files that are not."""
+    streams = _streams()
+    sounds = [parts_of(seeds[0]) for seeds in streams.values()] + [
+        parts_of(seed) for seed in streams["hesai"][::9]
+    ]
+    return [part for parts in sounds for part in parts if part.kind != CALIBRATION]
+
+
+@lru_cache(maxsize=1)
+def _evidence() -> Sequence[Evidence]:
+    sampler = sampled(_seen())
+    return [sampler.evidence(kind) for kind in sampler.samples]
+
+
+def _calibrate(suffix: str, data: bytes, folder: Path) -> None:
+    """Read a file; where it is one, decode sound packets with it."""
+    calibration = sensors.parse_calibration(Path(f"unit{suffix}"), data)
+    if calibration is None:
+        return
+    rng = random.Random(zlib.crc32(data))
+    every = [calibration]
+    if isinstance(calibration, ModelFile):
+        own = [calibration.for_model(model.name) for model in sensors.models()]
+        every += [one for one in own if one is not None][:3]
+    for one in every:
+        try_all(one, rng)
+        for evidence in _evidence():
+            if one.fit(evidence):
+                with contextlib.suppress(MlbatchError):
+                    check_lidar(one.lidar({}, evidence), evidence.sample, evidence.host_ns)
+
+
+def seeds_of(maker: str) -> Seeds:
+    """Inputs of a maker's lidars."""
+    return _streams()[maker]
+
+
+def _files_of(suffix: str) -> Seeds:
+    return _files()[suffix]
+
+
+_SHARES = {"velodyne": 12, "hesai": 16, "robosense": 16, "livox": 8, "ouster": 10}
+TARGETS: Sequence[Target] = (
+    *(
+        Target(f"packets {maker}", partial(seeds_of, maker), _decode, mutated_parts, share)
+        for maker, share in _SHARES.items()
+    ),
+    *(
+        Target(
+            f"calibration {suffix}",
+            partial(_files_of, suffix),
+            partial(_calibrate, suffix),
+            mutated if suffix == ".dat" else mutated_text,
+            6 if suffix == ".yaml" else 20,
+        )
+        for suffix in NAMES
+    ),
+)

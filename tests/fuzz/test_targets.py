@@ -1,0 +1,67 @@
+"""A short campaign on every target; `make fuzz` runs a long one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz import harness
+from tests.fuzz.harness import (
+    LONGEST_S,
+    MOST_BYTES,
+    BrokenLaw,
+    Failure,
+    Tally,
+    Target,
+    campaign,
+    make_input,
+)
+from tests.fuzz.targets import TARGETS
+
+# Inputs of a target by its share; the seeds themselves come first.
+_PER_SHARE = 14
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name.replace(" ", "-"))
+def test_no_input_breaks_it(target: Target) -> None:
+    tally = campaign(target, range(target.share * _PER_SHARE))
+    assert tally.inputs == target.share * _PER_SHARE
+    assert not tally.failures, "\n\n".join(map(str, tally.failures))
+    assert tally.slowest_s < LONGEST_S
+    assert tally.peak_bytes < MOST_BYTES
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name.replace(" ", "-"))
+def test_an_input_follows_from_its_number(target: Target) -> None:
+    first = [make_input(target, 7, number) for number in range(12)]
+    assert first == [make_input(target, 7, number) for number in range(12)]
+    assert len(set(first)) > 6
+
+
+def test_a_campaign_tells_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A campaign that finds nothing would look the same as one that does not look."""
+
+    def crash(data: bytes, folder: Path) -> None:
+        raise BrokenLaw("of thermodynamics")
+
+    def swell(data: bytes, folder: Path) -> None:
+        bytearray(2 * MOST_BYTES)
+
+    def sleep(data: bytes, folder: Path) -> None:
+        while True:
+            pass
+
+    monkeypatch.setattr(harness, "LONGEST_S", 0.2)
+    wanted = ((crash, "BrokenLaw: of thermodynamics"), (swell, "MemoryError"), (sleep, "TooLate"))
+    for run, said in wanted:
+        tally = campaign(Target(run.__name__, lambda: (b"x",), run), range(1))
+        assert said in tally.failures[0].what
+        assert "(1 bytes)" in str(tally.failures[0])
+
+
+def test_tallies_of_parts_are_one() -> None:
+    failure = Failure("a", 0, 1, "what", "place", b"")
+    whole = Tally(2, 1, 1.0, 0.5, 1, 100, [failure])
+    whole.add(Tally(3, 2, 2.0, 0.75, 2, 50, [failure]))
+    assert whole == Tally(5, 3, 3.0, 0.75, 2, 100, [failure])
