@@ -9,19 +9,23 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import Loss
 from mlbatch.clock import timescale
+from mlbatch.clock_compare import Comparison, compare
 from mlbatch.clouds import CloudRecording
 from mlbatch.discover import describe, lacks_decoder, named, packet_types
+from mlbatch.doctor import ClockWatch
 from mlbatch.errors import RigError
 from mlbatch.lidar import Lidar
 from mlbatch.looking import calibrations_for, first_seconds, look, with_clouds
 from mlbatch.matching import match
 from mlbatch.mounting import Mounted, in_words, mount
-from mlbatch.readers import open_recording
+from mlbatch.readers import merge, open_recording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
 from mlbatch.streams import Found, Kind, Role, Router, Sampler, split_by_kind
+from mlbatch.timekeeping import watch_of
 from mlbatch.transforms import from_rpy_deg
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -80,6 +84,7 @@ class _Count:
 
     ring: RawRing
     loss: Loss
+    watch: ClockWatch
     first: tuple[int, int] | None = None
 
 
@@ -95,18 +100,24 @@ class Survey:
     body_frame: str = DEFAULT_BODY_FRAME
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    clocks: Comparison | None = None
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
         return [list(HEAD), *(stream.row() for stream in self.streams)]
 
-    def as_json(self) -> dict[str, str | list[dict[str, Value]] | list[str]]:
+    def as_json(self) -> dict[str, object]:
         """For programs."""
         return {
             "schema": "mlbatch.inspect/1",
             "streams": [asdict(stream) for stream in self.streams],
             "notes": list(self.notes),
+            "clocks": {} if self.clocks is None else _as_json(self.clocks),
         }
+
+    def clock_lines(self) -> list[str]:
+        """What the clock doctor says, for people."""
+        return [] if self.clocks is None else self.clocks.in_words()
 
     def rig_text(self, folder: Path) -> str:
         """A rig file for these sensors; identity extrinsics are marked as to be measured."""
@@ -151,8 +162,11 @@ def _is_placed(sensor: Mounted) -> bool:
     return sensor.extrinsics_source != "identity"
 
 
-def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
-    """Look at the first 10 s of recordings, with the metadata given or found beside them."""
+def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool = False) -> Survey:
+    """Look at the first 10 s of recordings, with the metadata given or found beside them.
+
+    whole: loss and clocks are those of the whole recordings.
+    """
     table = StreamTable()
     opened = with_clouds([open_recording(path, table) for path in recordings], table, ())
     sampler, learner = look(opened, table)
@@ -173,7 +187,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
     for sensor in found:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]
         sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
-    counts = _count(opened, found)
+    counts = _count(opened, found, whole=whole)
     router = Router(table, found, sampler.samples)
     types = packet_types(opened)
     reports = tuple(
@@ -198,12 +212,17 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path]) -> Survey:
         for sensor in found
         if sensor.lidar.calibration in files
     }
-    return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes))
+    named = [(one.name, count.watch.finding()) for one, count in zip(found, counts, strict=True)]
+    findings = [(name, finding) for name, finding in named if finding is not None]
+    clocks = compare(findings) if findings else None
+    return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes), clocks)
 
 
-def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Count]:
-    counts = [_Count(_ring(s.lidar), Loss(s.lidar.sequence_modulus)) for s in found]
-    for batch in first_seconds(recordings):
+def _count(recordings: Sequence[Recording], found: Sequence[Found], *, whole: bool) -> list[_Count]:
+    counts = [
+        _Count(_ring(s.lidar), Loss(s.lidar.sequence_modulus), watch_of(s.lidar)) for s in found
+    ]
+    for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
             for sensor, count in zip(found, counts, strict=True):
                 if kind not in sensor.kinds:
@@ -211,12 +230,38 @@ def _count(recordings: Sequence[Recording], found: Sequence[Found]) -> list[_Cou
                 packets, _ = count.ring.store(batch.data, batch.start[index], None)
                 good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
                 count.loss.add(sensor.lidar.sequence(packets[good]))
-                heads = sensor.lidar.heads(packets[good], batch.host_ns[index[good]])
+                hosts_ns = batch.host_ns[index[good]]
+                heads = sensor.lidar.heads(packets[good], hosts_ns)
+                _, newest_ns = extremes(heads)
+                count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
                 if count.first is None and heads.valid.any():
                     row, column = np.argwhere(heads.valid)[0]
                     host_ns = int(batch.host_ns[index[good]][row])
                     count.first = int(heads.stamp_ns[row, column]), host_ns
     return counts
+
+
+def _as_json(clocks: Comparison) -> dict[str, object]:
+    """The clock doctor's findings for programs; times in ms, arrivals in ns."""
+    return {
+        "verdict": clocks.verdict,
+        "bound_ms": None if clocks.bound_ns is None else clocks.bound_ns / NS_PER_MS,
+        "lines": clocks.in_words(),
+        "sensors": [
+            {
+                "name": name,
+                "domain": finding.domain,
+                "offset_ms": finding.offset_ns / NS_PER_MS,
+                "uncertainty_ms": finding.uncertainty_ns / NS_PER_MS,
+                "drift_ppm": finding.drift_ppm,
+                "jumps": [
+                    {"host_ns": one.host_ns, "size_ms": one.size_ns / NS_PER_MS, "kind": one.kind}
+                    for one in finding.jumps
+                ],
+            }
+            for name, finding in clocks.findings
+        ],
+    }
 
 
 def _ring(lidar: Lidar) -> RawRing:

@@ -18,6 +18,7 @@ from mlbatch.discover import Note, Setup
 from mlbatch.doctor import ClockFinding, ClockWatch
 from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
+from mlbatch.lidar import Lidar
 from mlbatch.mounting import Mounted
 from mlbatch.types import I64Array, PacketBatch
 
@@ -43,7 +44,7 @@ class Timekeeper:
 
     def __post_init__(self) -> None:
         for sensor, by_host in zip(self.sensors, self.host_clocks, strict=True):
-            watch = watch_of(sensor)
+            watch = watch_of(sensor.found.lidar)
             self._watches.append(watch)
             self.guards.append(JumpGuard(sensor.name, watch, is_watched=not by_host))
 
@@ -56,7 +57,7 @@ class Timekeeper:
 
     def align(self, batches: Iterator[PacketBatch], setup: Setup, to: str) -> None:
         """Measure how the clocks run over a whole session, and map them from now on."""
-        watches = [watch_of(sensor) for sensor in self.sensors]
+        watches = [watch_of(sensor.found.lidar) for sensor in self.sensors]
         feeds = [feed_of(sensor) for sensor in self.sensors]
         # Arrivals of sensors on the recorder's clock are needed as their own stamps, too.
         feeder = Feeder(setup, feeds, self.host_clocks, self.retime)
@@ -100,7 +101,6 @@ class Timekeeper:
         return notes
 
 
-def watch_of(sensor: Mounted) -> ClockWatch:
+def watch_of(lidar: Lidar) -> ClockWatch:
     """A watch for the clock of a sensor."""
-    lidar = sensor.found.lidar
     return ClockWatch(period_ns=lidar.clock_period_ns, mode=lidar.timestamp_mode)

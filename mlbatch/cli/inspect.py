@@ -17,6 +17,9 @@ def inspect(
         list[Path] | None,
         typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
     ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Loss and clocks of the whole recording, not of 10 s.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     write_rig: Annotated[
         Path | None, typer.Option(help="Write a rig file that `convert` accepts.")
@@ -26,7 +29,7 @@ def inspect(
     from mlbatch.cli.tables import columns
     from mlbatch.survey import survey
 
-    found = survey(tuple(recordings), tuple(metadata or ()))
+    found = survey(tuple(recordings), tuple(metadata or ()), whole=whole)
     if write_rig is not None:
         from mlbatch.errors import ExportError
         from mlbatch.writers import write_text
@@ -41,6 +44,8 @@ def inspect(
         return
     for line in columns(found.rows()):
         typer.echo(line)
+    if found.clocks is not None:
+        typer.echo("\n" + "\n".join(found.clock_lines()))
     for note in found.notes:
         typer.echo(f"note: {note}")
     if write_rig is not None:

@@ -49,10 +49,16 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--engine": "auto or numpy",
         "--strict": "error",
         "--overwrite": "existing",
+        "--resume": "interrupted.*OUTPUT",
         "--quiet": "progress",
         "--verbose": "chosen",
     },
-    "inspect": {"--metadata": "repeatable", "--json": "JSON", "--write-rig": "convert"},
+    "inspect": {
+        "--whole": "whole",
+        "--metadata": "repeatable",
+        "--json": "JSON",
+        "--write-rig": "convert",
+    },
     "compare": {
         "--rig": "YAML",
         "--rate": "Hz",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
 def test_the_table_of_the_fixture(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE}")
     assert (outcome.code, outcome.err) == (0, "")
-    head, *rows = outcome.out.splitlines()
+    table_text, clocks = outcome.out.split("\n\n")
+    head, *rows = table_text.splitlines()
     starts = [head.index(word) for word in head.split()]
     ends = [*starts[1:], None]
     cells = [[row[a:b].strip() for a, b in zip(starts, ends, strict=True)] for row in [head, *rows]]
@@ -71,6 +73,8 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     assert table["10.5.5.88 > port 7503"][1] == RIGHT
     assert table["10.5.5.20 > port 5353"][:3] == ["unknown", "", "2"]
     assert len(table) == 5
+    assert re.match(r"clocks: synchronised within \d\.\d+ ms\n", clocks)
+    assert clocks.count("clock: UTC, -") == 2
 
 
 def test_json_tells_the_same_with_all_digits(shell: Shell) -> None:
