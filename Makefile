@@ -4,6 +4,7 @@
 #   make test    formatting, lint, types, all tests, branch coverage
 #   make lint    the first three of them
 #   make bench   speed, memory and writers (needs the shared recordings and 10 GB in build/bench)
+#   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make clean   remove what the others made
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ RIG := fixtures/two_lidars
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test lint bench fuzz clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -39,6 +40,13 @@ bench: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.bench.run speed --folder build/bench
 	$(BIN)/python -m tests.bench.run memory --folder build/bench
 	$(BIN)/python -m tests.bench.run writers --folder build/bench
+
+INPUTS ?= 1000000
+SEED ?= 1
+MINUTES ?= 0
+
+fuzz: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.fuzz.run --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
 	rm -rf $(VENV) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
