@@ -118,6 +118,9 @@ def convert(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing output.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted run to the same OUTPUT.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary, no progress.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also say what was found and chosen.")
@@ -183,6 +186,7 @@ def convert(
             report=report,
             splits_jumps=on_jump == "split",
             overwrite=overwrite,
+            resume=values.resume(resume, dry_run=dry_run),
             quiet=quiet,
             verbose=verbose,
         ),

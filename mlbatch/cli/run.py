@@ -10,13 +10,14 @@ from pathlib import Path
 
 import typer
 
-from mlbatch.cli import checks
+from mlbatch.cli import checks, interrupted
 from mlbatch.clipping import Part
-from mlbatch.converting import OpenWriter, convert
-from mlbatch.errors import ClockJump, NoScanError
+from mlbatch.converting import Last, OpenWriter, convert
+from mlbatch.errors import ClockJump, MlbatchError, NoScanError
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
-from mlbatch.report import report_text, summary_lines
+from mlbatch.report import ReportInputs, report_text, summary_lines
+from mlbatch.resume import Course
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -41,15 +42,22 @@ class Wanted:
     report: Path | None
     splits_jumps: bool
     overwrite: bool
+    resume: bool
     quiet: bool
     verbose: bool
 
 
 def run(job: Job, wanted: Wanted) -> None:
     """Convert, write the report, print the summary; with `--on-jump split` part by part."""
-    if not wanted.splits_jumps:
-        _convert(job, wanted)
-        return
+    with interrupted.by_termination():
+        if wanted.splits_jumps:
+            _run_parts(job, wanted)
+        else:
+            _convert(job, wanted)
+
+
+def _run_parts(job: Job, wanted: Wanted) -> None:
+    """Convert each stretch between clock jumps; a jump is found where a part runs into it."""
     if job.faults:
         # Times of faults count from the start of the session, in all parts of it.
         job = replace(job, fault_begin_ns=Conversion(job).begin_ns)
@@ -57,14 +65,18 @@ def run(job: Job, wanted: Wanted) -> None:
     while True:
         # Without a jump there is one part, which needs no number.
         alone = part == Part()
+        now, named = replace(job, part=part), wanted if alone else _numbered(wanted, number)
         try:
-            _convert(replace(job, part=part), wanted if alone else _numbered(wanted, number))
+            interrupted.refuse_jump(now, resume=wanted.resume)
+            _convert(now, named)
             scans += 1
         except ClockJump as jump:
             if jump.host_ns <= (part.begin_ns or 0):
                 raise
             typer.echo(f"mlbatch: part {number} ends where {jump}", err=True)
             part = Part(part.begin_ns, jump.host_ns)
+            if alone and not wanted.dry_run:
+                interrupted.discard(wanted.output)
             continue
         except NoScanError as err:
             if alone:
@@ -94,27 +106,31 @@ def _of_part(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 
 def _convert(job: Job, wanted: Wanted) -> None:
-    opener, report_path = None, wanted.report
+    opener, report_path, course = None, wanted.report, None
     options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
     # A dry run without an output decodes what a .mcap of this point layout would hold.
     name = choose_format(wanted.output or Path("scans.mcap"), wanted.format)
     job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
         checks.place(job, wanted.output)
-        check_target(name, wanted.output, options, job.layout)
+        if wanted.resume and interrupted.is_complete(wanted.output, overwrite=wanted.overwrite):
+            return
+        course = interrupted.course(job, wanted.output, name, options, resume=wanted.resume)
+        options = replace(options, kept_bytes=course.kept_bytes)
+        if options.kept_bytes is None:
+            check_target(name, wanted.output, options, job.layout)
+            checks.disk(job, wanted.output)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
-        checks.disk(job, wanted.output)
     checks.report(job, report_path, wanted.output)
     with _progress(wanted.quiet) as progress:
-        conversion, inputs = convert(job, opener, progress)
+        conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
     for note in conversion.notes:
         typer.echo(f"mlbatch: warning: {note.code}: {note.message}", err=True)
-    text = report_text(inputs)
-    if report_path is not None:
-        write_text(report_path, text)
-    elif wanted.dry_run:
-        typer.echo(text, nl=False)
+    if opener is None and report_path is not None:
+        write_text(report_path, report_text(inputs))
+    elif wanted.dry_run and report_path is None:
+        typer.echo(report_text(inputs), nl=False)
         return
     if not wanted.quiet:
         if wanted.verbose:
@@ -124,6 +140,34 @@ def _convert(job: Job, wanted: Wanted) -> None:
                 typer.echo(line)
         if wanted.output is not None and not wanted.dry_run:
             typer.echo(f"wrote {wanted.output}, report {report_path}")
+
+
+def _converted(
+    job: Job,
+    opener: OpenWriter | None,
+    progress: Progress | None,
+    course: Course | None,
+    last: Last,
+) -> tuple[Conversion, ReportInputs]:
+    try:
+        return convert(job, opener, progress, course, last)
+    except MlbatchError as err:
+        told = interrupted.with_advice(err, course)
+        if told is err:
+            raise
+        raise told from err
+
+
+def _last(wanted: Wanted, report_path: Path | None) -> Last:
+    """The report comes before the output has its name, so that no output is without."""
+
+    def write(inputs: ReportInputs, partial: Path) -> None:
+        if report_path is None or wanted.output is None:
+            return
+        inside = report_path.parent.absolute() == wanted.output.absolute()
+        write_text(partial / report_path.name if inside else report_path, report_text(inputs))
+
+    return write
 
 
 def _opener(name: str, target: Path, options: WriterOptions) -> OpenWriter:

@@ -173,3 +173,12 @@ def output(path: Path | None, *, dry_run: bool) -> None:
     """`-o`, which only a dry run goes without."""
     if path is None and not dry_run:
         raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
+
+
+def resume(wanted: bool, *, dry_run: bool) -> bool:
+    """Whether to go on; a dry run leaves nothing to go on with."""
+    if wanted and dry_run:
+        raise UsageError(
+            "--resume: wanted an output to go on with, got --dry-run; give one of both"
+        )
+    return wanted

@@ -30,10 +30,12 @@ _TF_STATIC = "/tf_static"
 
 
 class Sink(Protocol):
-    """A file of messages under construction, in chunks; `chunks`: how many are complete."""
+    """A file of messages under construction, in chunks."""
 
     @property
-    def chunks(self) -> int: ...
+    def chunks(self) -> int:
+        """Chunks that are complete."""
+        ...
 
     def flush(self) -> int:
         """Hand complete chunks to the system; gives the bytes up to their end."""

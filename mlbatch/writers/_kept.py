@@ -29,6 +29,12 @@ class KeptFile(io.BufferedWriter):
         super().__init__(io.FileIO(path, "r+b"))
         self._path = path
         self._left = kept_bytes
+        size = super().seek(0, io.SEEK_END)
+        if size < kept_bytes:
+            raise ExportError(
+                f"{path}: wanted {kept_bytes} bytes of the interrupted run to go on after them, "
+                f"got {size}; leave out --resume to begin anew"
+            )
         self.truncate(kept_bytes)
         super().seek(kept_bytes)
 

@@ -6,6 +6,7 @@ Types come with their MD5 and full definition, as `rosbag play` wants them; /tf_
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -113,15 +114,14 @@ class _Rosbag1Sink:
         return self._bag.bio
 
     def _reopen(self, path: Path, kept_bytes: int) -> None:
-        """Continue a bag: the library only begins new ones, so it begins one beside it."""
-        beside = path.with_name(f"{path.name}.new")
-        beside.unlink(missing_ok=True)
-        self._bag.path = beside
-        self._bag.open()
-        self._file.close()
+        """Continue a bag: the library only begins new ones, so it begins one elsewhere."""
+        with tempfile.TemporaryDirectory() as folder:
+            self._bag.path = Path(folder) / path.name
+            self._bag.open()
+            self._file.close()
+            head = self._bag.path.read_bytes()
         self._bag.path, self._bag.bio = path, open_output(path, kept_bytes)
-        self._bag.bio.write(beside.read_bytes())
-        beside.unlink()
+        self._bag.bio.write(head)
 
     def _adopt(self, topic: Topic) -> Connection:
         """A connection that says of a topic what its recording said."""

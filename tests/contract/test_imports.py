@@ -11,6 +11,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("cli", "__main__"),),
     (("api",), ("compare",)),
     (("converting",),),
+    (("resume", "_resume_identity", "_resume_state"),),
     (("pipeline", "accounts"), ("survey",)),
     (("timekeeping",),),
     (("assembly",),),
