@@ -187,7 +187,7 @@ def _files_of(suffix: str) -> Seeds:
     return _files()[suffix]
 
 
-_SHARES = {"velodyne": 12, "hesai": 16, "robosense": 16, "livox": 8, "ouster": 10}
+_SHARES = {"velodyne": 6, "hesai": 8, "robosense": 8, "livox": 6, "ouster": 6}
 TARGETS: Sequence[Target] = (
     *(
         Target(f"packets {maker}", partial(seeds_of, maker), _decode, mutated_parts, share)
@@ -199,7 +199,7 @@ TARGETS: Sequence[Target] = (
             partial(_files_of, suffix),
             partial(_calibrate, suffix),
             mutated if suffix == ".dat" else mutated_text,
-            6 if suffix == ".yaml" else 20,
+            4 if suffix == ".yaml" else 20,
         )
         for suffix in NAMES
     ),

@@ -295,6 +295,6 @@ TARGETS: Sequence[Target] = (
     _file_target("mcap", _mcaps, _mutated_mcap, share=14),
     _file_target("bag", _bags, share=12),
     _file_target("db3", _databases, share=12),
-    Target("read folder", _metadata, _read_folder, mutated_text, 4),
+    Target("read folder", _metadata, _read_folder, mutated_text, 3),
 )
 __all__ = ["TARGETS", "check_batch", "read_all"]

@@ -19,6 +19,7 @@ from tests.fuzz.targets import TARGETS
 
 FOLDER = Path("build") / "fuzz"
 _PART = 2000
+_TOLD = 50_000
 # What Python cannot interrupt (a search in C) ends the process with the place where it hung.
 _HANG_S = 60
 
@@ -42,10 +43,13 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         tasks = list(_tasks(chosen, options.seed, options.inputs))
     began_s = time.monotonic()
-    tallies = {at: Tally() for at in chosen}
+    tallies, done = {at: Tally() for at in chosen}, 0
     with multiprocessing.get_context("spawn").Pool(options.processes, maxtasksperchild=40) as pool:
         for at, tally in pool.imap_unordered(_run, tasks):
             tallies[at].add(tally)
+            done += tally.inputs
+            if done // _TOLD > (done - tally.inputs) // _TOLD:
+                print(f"{done:,} inputs, {time.monotonic() - began_s:.0f} s", flush=True)
             for failure in tally.failures:
                 _save(failure)
                 print(failure, flush=True)

@@ -159,7 +159,7 @@ def _typed(data: bytes, folder: Path) -> None:
 
 
 TARGETS: Sequence[Target] = (
-    Target("rig", _rigs, _rig, mutated_text, 24),
+    Target("rig", _rigs, _rig, mutated_text, 10),
     Target("robot description", _urdfs, _urdf, mutated_text, 30),
     Target("typed values", _typed_seeds, _typed, _typed_mutated, 30),
 )
