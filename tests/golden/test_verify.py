@@ -14,7 +14,10 @@ import pytest
 from mlbatch.verify import CHECKS, Verdict, verify
 from mlbatch.verify.scan import COLUMN_NS
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
+from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.run import ROOT, command
+from tests.golden.test_bag_sessions import SESSIONS
 from tests.golden.test_every_model import (
     HOST,
     RIG,
@@ -114,6 +117,40 @@ def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
         verdict = verify(target)
         assert verdict.ok, verdict.violations
         assert verdict.points > 0
+
+
+def test_recorded_messages_are_counted(tmp_path: Path) -> None:
+    session = SESSIONS["MCAP"](tmp_path)
+    for name in ("scans.mcap", "scans.bag"):
+        words = ("--pass", "*metadata", "--quiet")
+        told = command("convert", session, "-o", tmp_path / name, *words)
+        assert told.code == 0, told.err
+        verdict = verify(tmp_path / name)
+        assert verdict.ok, verdict.violations
+        judged = {check.name: check.judged for check in verdict.checks}
+        assert judged["messages"] > 0
+        assert judged["imu"] > 0
+
+
+def test_clouds_are_clean(tmp_path: Path) -> None:
+    """Points of a driver come twice where a shot had one echo; both returns have one stamp."""
+    firings = [
+        (1 + column / 50, ring, 1, 9, ring, column * 5e-4)
+        for column in range(180)
+        for ring in range(16)
+        for _ in range(2)
+    ]
+    messages = [
+        cloud_message(VELODYNE, firings, STAMP_NS + number * 100_000_000) for number in range(4)
+    ]
+    bag = write_rosbag2(tmp_path / "clouds.db3", write_points("/points_raw", messages))
+    for layout in ("dense", "organized"):
+        target = tmp_path / layout
+        told = command("convert", bag, "-o", target, "--keep-partial", "--layout", layout)
+        assert told.code == 0, told.err
+        verdict = verify(target)
+        assert verdict.ok, verdict.violations
+        assert verdict.points == 4 * len(firings)
 
 
 def recorded(sent: Sent, folder: Path) -> Path:
