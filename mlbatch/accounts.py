@@ -187,7 +187,7 @@ def _clock(run: Conversion, number: int) -> ClockReport:
     return ClockReport(
         source,
         epoch,
-        offset_to_host_ms=finding.offset_ns / NS_PER_MS,
+        offset_to_host_ms=offset_ns / NS_PER_MS,
         drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
         notes=(*notes, finding.in_words()),
     )

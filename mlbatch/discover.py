@@ -333,13 +333,13 @@ def rig_offset_ns(sampler: Sampler, sensor: Found, entry: RigSensor | None) -> i
     return entry.offset_ns - ahead_s * NS_PER_S
 
 
-def untimed(table: StreamTable, sensor: Found) -> UsageError | None:
+def untimed(table: StreamTable, sensor: Found, option: str) -> UsageError | None:
     """The error about arrival times wanted of a sensor whose packets have none, or None."""
     for number in sorted({stream for stream, _ in sensor.kinds} & table.untimed):
         return UsageError(
-            f"--clock host: sensor {sensor.name}: wanted the arrival time of each packet, got only "
+            f"{option}: sensor {sensor.name}: wanted the arrival time of each packet, got only "
             f"that of whole messages on {table.streams[number]}; use --clock sensor (in the rig: "
-            "clock.source), or record the packets with tcpdump"
+            "clock.source) without --align-clocks, or record the packets with tcpdump"
         )
     return None
 

@@ -86,18 +86,18 @@ class Conversion:
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
         self.feeds = [feed_of(sensor) for sensor in self.setup.sensors]
-        intakes = [
-            intake_of(sensor, host_clock=self.uses_host_clock(sensor))
-            for sensor in self.setup.sensors
-        ]
+        sensors = self.setup.sensors
+        host_clocks = [self.uses_host_clock(sensor) for sensor in sensors]
+        pairs = zip(sensors, host_clocks, strict=True)
+        intakes = [intake_of(sensor, host_clock=by_host) for sensor, by_host in pairs]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
-        host_clocks = [self.uses_host_clock(sensor) for sensor in self.setup.sensors]
         self._refuse_untimed()
-        self.replay = FaultReplay(
-            job.faults, job.fault_seed, [sensor.name for sensor in self.setup.sensors]
-        )
-        self.replay.begin_ns = job.fault_begin_ns
-        self.clocks = Timekeeper(self.setup.sensors, host_clocks, self.replay)
+        self.replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in sensors])
+        # Not the first packet that is read: bags hold many in a message, of each sensor in turn.
+        begin_ns = self.begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
+        self.replay.begin_ns = begin_ns
+        streams = self.setup.sampler.table
+        self.clocks = Timekeeper(sensors, host_clocks, self.replay, streams.untimed)
         if job.align_clocks_to:
             self.clocks.align(merge(self.recordings), self.setup, job.align_clocks_to)
         self.batcher = Batcher(self.grid, intakes, policy, self.clocks.guards)
@@ -265,10 +265,12 @@ class Conversion:
         return self.job.wishes.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
 
     def _refuse_untimed(self) -> None:
-        """Refuse arrival times as stamps where packets have none of their own."""
+        """Refuse arrival times as stamps, or to map clocks by, where packets have none."""
+        aligned = bool(self.job.align_clocks_to)
+        option = "--align-clocks" if aligned else "--clock host"
         for sensor in self.setup.sensors:
-            error = untimed(self.setup.sampler.table, sensor.found)
-            if error is not None and self.uses_host_clock(sensor):
+            error = untimed(self.setup.sampler.table, sensor.found, option)
+            if error is not None and (aligned or self.uses_host_clock(sensor)):
                 raise error
 
     def _offset_ns(self, sensor: Mounted) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeAlias
@@ -25,7 +25,7 @@ from mlbatch.readers import merge, open_recording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
 from mlbatch.streams import Found, Kind, Role, Router, Sampler, split_by_kind
-from mlbatch.timekeeping import watch_of
+from mlbatch.timekeeping import is_untimed, watch_of
 from mlbatch.transforms import from_rpy_deg
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -187,7 +187,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool 
     for sensor in found:
         streams = [table.streams[stream] for stream, _ in sensor.kinds]
         sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
-    counts = _count(opened, found, whole=whole)
+    counts = _count(opened, found, table.untimed, whole=whole)
     router = Router(table, found, sampler.samples)
     types = packet_types(opened)
     reports = tuple(
@@ -218,7 +218,13 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool 
     return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes), clocks)
 
 
-def _count(recordings: Sequence[Recording], found: Sequence[Found], *, whole: bool) -> list[_Count]:
+def _count(
+    recordings: Sequence[Recording],
+    found: Sequence[Found],
+    untimed: Collection[int],
+    *,
+    whole: bool,
+) -> list[_Count]:
     counts = [
         _Count(_ring(s.lidar), Loss(s.lidar.sequence_modulus), watch_of(s.lidar)) for s in found
     ]
@@ -233,7 +239,8 @@ def _count(recordings: Sequence[Recording], found: Sequence[Found], *, whole: bo
                 hosts_ns = batch.host_ns[index[good]]
                 heads = sensor.lidar.heads(packets[good], hosts_ns)
                 _, newest_ns = extremes(heads)
-                count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
+                if not is_untimed(untimed, sensor):
+                    count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
                 if count.first is None and heads.valid.any():
                     row, column = np.argwhere(heads.valid)[0]
                     host_ns = int(batch.host_ns[index[good]][row])

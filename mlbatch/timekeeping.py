@@ -6,7 +6,7 @@ the maps of `--align-clocks`. What is batched is watched, so that the report can
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from mlbatch.assembly import feed_of
@@ -20,6 +20,7 @@ from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
 from mlbatch.lidar import Lidar
 from mlbatch.mounting import Mounted
+from mlbatch.streams import Found
 from mlbatch.types import I64Array, PacketBatch
 
 SYNCHRONISED = "synchronised"
@@ -31,13 +32,14 @@ _WARNINGS = {"host": "host_step"}
 class Timekeeper:
     """What is known and done of the clocks of a session's sensors, by their numbers.
 
-    host_clocks: sensors whose stamps are arrivals, which nothing here changes; maps: of
-    `--align-clocks`, once they are measured.
+    host_clocks: sensors whose stamps are arrivals, which nothing here changes; untimed: numbers of
+    streams as in StreamTable; maps: of `--align-clocks`, once they are measured.
     """
 
     sensors: Sequence[Mounted]
     host_clocks: Sequence[bool]
     replay: FaultReplay
+    untimed: Collection[int]
     maps: tuple[ClockMap | None, ...] = ()
     guards: list[JumpGuard] = field(default_factory=list)
     _watches: list[ClockWatch] = field(default_factory=list)
@@ -46,7 +48,9 @@ class Timekeeper:
         for sensor, by_host in zip(self.sensors, self.host_clocks, strict=True):
             watch = watch_of(sensor.found.lidar)
             self._watches.append(watch)
-            self.guards.append(JumpGuard(sensor.name, watch, is_watched=not by_host))
+            # Where packets share the log time of a message, their way cannot be told.
+            watched = None if is_untimed(self.untimed, sensor.found) else watch
+            self.guards.append(JumpGuard(sensor.name, watched, has_clock=not by_host))
 
     def retime(self, number: int, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
         """Stamps (P, C) of packets of a sensor as they are to be batched; host_ns: (P,)."""
@@ -99,6 +103,11 @@ class Timekeeper:
             if pair.verdict != SYNCHRONISED
         ]
         return notes
+
+
+def is_untimed(untimed: Collection[int], sensor: Found) -> bool:
+    """Whether a sensor's packets have no arrival times of their own."""
+    return any(stream in untimed for stream, _ in sensor.kinds)
 
 
 def watch_of(lidar: Lidar) -> ClockWatch:

@@ -28,19 +28,20 @@ class Watch(Protocol):
 class JumpGuard:
     """Looks at the accepted packets of one sensor; `check` raises ClockJump.
 
-    is_watched: False where stamps are arrivals, which tell nothing of a clock.
+    watch: told of all packets; None where arrivals are not known well enough. has_clock: False
+    where stamps are arrivals, which tell nothing of a clock.
     """
 
-    def __init__(self, name: str, watch: Watch | None = None, *, is_watched: bool = True) -> None:
+    def __init__(self, name: str, watch: Watch | None = None, *, has_clock: bool = True) -> None:
         self.name = name
         self._watch = watch
-        self._is_watched = is_watched
+        self._has_clock = has_clock
         self._newest_ns = NEVER
         self._host_ns = 0
 
     def check(self, delivery: Delivery) -> None:
         """Look at the next packets, in order of delivery."""
-        if not self._is_watched:
+        if not self._has_clock:
             return
         measured = delivery.newest_ns > NEVER
         stamp_ns, host_ns = delivery.newest_ns[measured], delivery.packets.host_ns[measured]

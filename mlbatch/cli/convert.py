@@ -132,18 +132,18 @@ def convert(
     from mlbatch.discover import Wishes
     from mlbatch.job import Job
 
-    values.choice("--layout", layout, ("dense", "organized"))
+    values.choices(
+        layout=(layout, ("dense", "organized")),
+        clock=(clock, ("sensor", "host")),
+        align_to=(align_to, ("host", "first")),
+        on_jump=(on_jump, ("error", "split")),
+    )
     values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
-    values.choice("--clock", clock, ("sensor", "host"))
-    values.choice("--align-to", align_to, ("host", "first"))
-    values.choice("--on-jump", on_jump, ("error", "split"))
     values.jobs(jobs)
     values.output(output, dry_run=dry_run)
     values.slices(slices)
     values.ranges_m(min_range, max_range)
-    first, first_is_date = values.time_limit("--start", start)
-    last, last_is_date = values.time_limit("--end", end)
-    values.in_order(first, last)
+    first, last, are_dates = values.time_limits(start, end)
     job = Job(
         recordings=tuple(recordings),
         wishes=Wishes(
@@ -166,7 +166,7 @@ def convert(
         max_wait_ns=values.max_wait_ns(max_wait),
         start=first,
         end=last,
-        limits_are_dates=first_is_date or last_is_date,
+        limits_are_dates=are_dates,
         min_range_m=min_range,
         max_range_m=max_range,
         boxes_m=tuple(values.box_m(text) for text in exclude_box or ()),
@@ -176,18 +176,11 @@ def convert(
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
     )
+    splits = on_jump == "split"
     run(
         job,
         Wanted(
-            output=output,
-            format=format_,
-            point_layout=point_layout,
-            dry_run=dry_run,
-            report=report,
-            splits_jumps=on_jump == "split",
-            overwrite=overwrite,
-            resume=values.resume(resume, dry_run=dry_run),
-            quiet=quiet,
-            verbose=verbose,
+            *(output, format_, point_layout, dry_run, report, splits),
+            *(overwrite, values.resume(resume, dry_run=dry_run), quiet, verbose),
         ),
     )

@@ -175,6 +175,20 @@ def output(path: Path | None, *, dry_run: bool) -> None:
         raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
 
 
+def choices(**options: tuple[str, Sequence[str]]) -> None:
+    """Options that are one of a few words: what was given, and the words."""
+    for name, (text, allowed) in options.items():
+        choice(f"--{name.replace('_', '-')}", text, allowed)
+
+
+def time_limits(start: str | None, end: str | None) -> tuple[Limit | None, Limit | None, bool]:
+    """`--start` and `--end` in this order, and whether one of them is a date."""
+    first, first_is_date = time_limit("--start", start)
+    last, last_is_date = time_limit("--end", end)
+    in_order(first, last)
+    return first, last, first_is_date or last_is_date
+
+
 def resume(wanted: bool, *, dry_run: bool) -> bool:
     """Whether to go on; a dry run leaves nothing to go on with."""
     if wanted and dry_run:

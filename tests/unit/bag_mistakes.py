@@ -208,7 +208,7 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         2,
         "--clock host: sensor roof: wanted the arrival time of each packet, got only that of "
         "whole messages on /roof/ouster/frames; use --clock sensor (in the rig: "
-        "clock.source), or record the packets with tcpdump",
+        "clock.source) without --align-clocks, or record the packets with tcpdump",
     ),
     "strict contradiction": (
         "contrary.mcap --strict",
