@@ -70,7 +70,8 @@ def refuse_jump(job: Job, *, resume: bool) -> None:
 
     A resumed run must know where its part ends, since parts that are complete are not made again.
     """
-    if resume and job.part.end_ns is None and (jump := resuming.jump_in(job)) is not None:
+    jump = resuming.jump_in(job) if resume else None
+    if jump is not None:
         raise jump
 
 

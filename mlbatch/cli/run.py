@@ -75,8 +75,8 @@ def _run_parts(job: Job, wanted: Wanted) -> None:
                 raise
             typer.echo(f"mlbatch: part {number} ends where {jump}", err=True)
             part = Part(part.begin_ns, jump.host_ns)
-            if alone and not wanted.dry_run:
-                interrupted.discard(wanted.output)
+            if alone or not wanted.resume:
+                interrupted.discard(None if wanted.dry_run else named.output)
             continue
         except NoScanError as err:
             if alone:

@@ -58,11 +58,18 @@ class _Rosbag1Sink:
         self._types = get_typestore(Stores.ROS1_NOETIC)
         self._types.register(get_types_from_msg(_TF_TEXT, _TF))
         self._connections: dict[str | Topic, Connection] = {}
-        self._bag = Writer(path)
         if kept_bytes is None:
+            self._bag = Writer(path)
             self._bag.open()
-        else:
-            self._reopen(path, kept_bytes)
+            return
+        # The library only begins new bags: the head of one, made elsewhere, is written again.
+        with tempfile.TemporaryDirectory() as folder:
+            self._bag = Writer(Path(folder) / path.name)
+            self._bag.open()
+            self._file.close()
+            head = self._bag.path.read_bytes()
+        self._bag.path, self._bag.bio = path, open_output(path, kept_bytes)
+        self._bag.bio.write(head)
 
     @property
     def chunks(self) -> int:
@@ -112,16 +119,6 @@ class _Rosbag1Sink:
         if self._bag.bio is None:
             raise ExportError(f"{self._bag.path}: wanted an open bag, got a closed one; report it")
         return self._bag.bio
-
-    def _reopen(self, path: Path, kept_bytes: int) -> None:
-        """Continue a bag: the library only begins new ones, so it begins one elsewhere."""
-        with tempfile.TemporaryDirectory() as folder:
-            self._bag.path = Path(folder) / path.name
-            self._bag.open()
-            self._file.close()
-            head = self._bag.path.read_bytes()
-        self._bag.path, self._bag.bio = path, open_output(path, kept_bytes)
-        self._bag.bio.write(head)
 
     def _adopt(self, topic: Topic) -> Connection:
         """A connection that says of a topic what its recording said."""

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import io
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -41,7 +41,7 @@ from mlbatch.types import (
     U16Array,
     U32Array,
 )
-from mlbatch.writers import ScanWriter, WriterOptions, extras, open_writer
+from mlbatch.writers import Safe, ScanWriter, WriterOptions, extras, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT / ".." / "shared" / "recordings"
@@ -97,6 +97,13 @@ class Memory:
         """Keep a scan."""
         self.scans.append((deepcopy(scan), sensor))
 
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+        """Nothing: what is in memory is never continued."""
+
+    def safe(self) -> Safe:
+        """Nothing: see above."""
+        return Safe(0)
+
     def write_imu(self, samples: ImuSamples) -> None:
         """Keep IMU samples."""
         self.imu.append(samples)
@@ -105,9 +112,11 @@ class Memory:
         """Keep recorded messages."""
         self.messages.append(message)
 
-    def finish(self, summary: Summary) -> None:
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Keep the end."""
         self.summary = summary
+        if last is not None:
+            last(Path())
 
     def abandon(self) -> None:
         """Remember that the run failed."""

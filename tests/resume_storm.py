@@ -1,0 +1,307 @@
+"""Conversions that are killed at random and resumed: is the output that of a run in one piece?
+
+    python -m tests.resume_storm --count 200 --seed 1
+
+Every conversion is a forked process that is killed by SIGKILL, after a random time or at a random
+call that touches a file (write, flush, rename ...). It is resumed and killed again, up to three
+times, then left to end. All files must be those of an uninterrupted run, but the report's timings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from mlbatch import resume
+from mlbatch.cli import main as mlbatch
+from tests.builders.bags import Body, Recorded, imu_message, packet_message
+from tests.builders.captures import write_pcap
+from tests.builders.ouster import OusterSpec
+from tests.builders.sessions_of_bags import write_mcap
+from tests.unit.sessions import NS_PER_MS, NS_PER_S, Unit, twin, write_metadata
+
+TURN_NS = 100 * NS_PER_MS
+SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)
+TWO = ("--identity-extrinsics", "--keep-partial")
+TOUCHES = frozenset({"write", "flush", "truncate", "rename", "replace", "unlink", "mkdir", "rmdir"})
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A conversion; output: its name; recording: a file of `write_recordings`."""
+
+    recording: str
+    output: str
+    options: tuple[str, ...] = ()
+
+
+CASES = {
+    "mcap": Case("session/drive.pcap", "out.mcap", TWO),
+    "mcap slices": Case("session/drive.pcap", "out.mcap", (*TWO, "--slices", "4")),
+    "mcap split": Case("session/drive.pcap", "out.mcap", (*TWO, "--split")),
+    "mcap organized": Case("session/drive.pcap", "out.mcap", (*TWO, "--layout", "organized")),
+    "mcap passed": Case("bag/drive.mcap", "out.mcap", (*TWO, "--pass", "/chatter")),
+    "rosbag1": Case("session/drive.pcap", "out.bag", (*TWO, "--slices", "3")),
+    "rosbag2": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", "--pass", "/chatter")),
+    "npz": Case("session/drive.pcap", "out", TWO),
+    "npz split": Case("session/drive.pcap", "out", (*TWO, "--split", "--slices", "2")),
+    "ply": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--min-range", "4.1")),
+    "jumps": Case("jumps/drive.pcap", "out.mcap", ("--on-jump", "split", "--keep-partial")),
+}
+
+
+def write_recordings(folder: Path, turns: int) -> None:
+    """What is converted: two lidars as a capture and as a bag, and one whose clock jumps."""
+    left = Unit(SPEC)
+    right = twin(replace(left, begin_ns=left.begin_ns + 37 * NS_PER_MS), 222)
+    for name in ("session", "bag", "jumps"):
+        (folder / name).mkdir(parents=True)
+        for serial in (111, 222)[: 1 if name == "jumps" else 2]:
+            write_metadata(folder / name / f"{serial}.json", replace(SPEC, serial=serial))
+    records = [
+        one for unit in (left, right) for turn in _turns(unit, turns) for one in turn.records
+    ]
+    records += left.imu_records(turns * 10)
+    write_pcap(folder / "session" / "drive.pcap", sorted(records))
+    write_mcap(folder / "bag" / "drive.mcap", _messages(left, right, turns))
+    pieces, begin_ns = [], left.begin_ns
+    for number, step_ns in enumerate((0, 37 * NS_PER_S, -20 * NS_PER_S)):
+        begin_ns += step_ns
+        ahead_ns = left.begin_ns + number * 10 * TURN_NS - begin_ns
+        unit = replace(left, begin_ns=begin_ns, host_ns=left.host_ns + ahead_ns)
+        pieces += _turns(replace(unit, first_frame=5 + 10 * number), 10)
+        begin_ns += 10 * TURN_NS
+    records = [one for turn in pieces for one in turn.records]
+    write_pcap(folder / "jumps" / "drive.pcap", sorted(records))
+
+
+def _turns(unit: Unit, count: int) -> list[Unit]:
+    """Turns of a lidar, each with ranges of its own, so that no two scans are alike."""
+    return [
+        replace(
+            unit,
+            begin_ns=unit.begin_ns + turn * TURN_NS,
+            first_frame=unit.first_frame + turn,
+            turns=1,
+            range_mm=4000 + 16 * (turn + unit.first_frame),
+        )
+        for turn in range(count)
+    ]
+
+
+def _messages(left: Unit, right: Unit, turns: int) -> list[Recorded]:
+    """Packets of two lidars, an IMU, and large texts."""
+    kind, found = "ouster_sensor_msgs/PacketMsg", []
+    for name, unit in (("left", left), ("right", right)):
+        topic = f"/{name}/ouster/lidar_packets"
+        for turn in _turns(unit, turns):
+            found += [
+                Recorded(topic, kind, host_ns, packet_message("cdr", payload))
+                for host_ns, payload in turn.payloads
+            ]
+    for at in range(left.begin_ns, left.begin_ns + turns * TURN_NS, 10 * NS_PER_MS):
+        found.append(Recorded("/imu/data", "sensor_msgs/Imu", at, imu_message("cdr", at, "i", 9.8)))
+        text = Body("cdr").text(str(at) * 1500).done()
+        found.append(Recorded("/chatter", "std_msgs/String", at, text))
+    return sorted(found, key=lambda message: message.log_ns)
+
+
+@dataclass(slots=True)
+class End:
+    """When a process is to be killed: after so many seconds, or at a call; neither: not at all."""
+
+    after_s: float | None = None
+    at_call: int | None = None
+
+
+def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
+    """Convert in a process of its own; gives its exit code, -9 when it was killed.
+
+    With `at_call` 0 all calls are counted: the number is left in the file `calls`.
+    """
+    child = os.fork()
+    if not child:
+        _convert(folder, words, end, interval_s)
+    timer = None
+    if end.after_s is not None:
+        timer = threading.Timer(end.after_s, _kill, (child,))
+        timer.start()
+    _, status = os.waitpid(child, 0)
+    if timer is not None:
+        timer.cancel()
+        timer.join()
+    return os.waitstatus_to_exitcode(status)
+
+
+def _kill(child: int) -> None:
+    # It may have ended by itself.
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+
+
+def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoReturn:
+    os.chdir(folder)
+    with open("said", "a") as said:
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+    resume.INTERVAL_S = interval_s
+    sys.argv = ["mlbatch", *words]
+    calls = 0
+
+    def count(frame: FrameType, event: str, call: Any) -> None:
+        nonlocal calls
+        if event == "c_call" and call.__name__ in TOUCHES:
+            calls += 1
+            if calls == end.at_call:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    if end.at_call is not None:
+        sys.setprofile(count)
+    code = 99
+    try:
+        mlbatch()
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 0
+    finally:
+        sys.setprofile(None)
+        if end.at_call == 0:
+            Path("calls").write_text(str(calls))
+        os._exit(code)
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """All that an output consists of; reports without timings."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.rglob("out*/**/*")) + sorted(folder.glob("out*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_dir():
+            found[name] = None
+        elif path.name.endswith("report.json"):
+            found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+class Storm:
+    """Kills conversions, and compares what they leave in the end."""
+
+    def __init__(self, folder: Path, seed: int, turns: int) -> None:
+        self._folder = folder
+        self._chance = random.Random(seed)
+        self.kills = self.resumed = 0
+        write_recordings(folder / "in", turns)
+        self._whole: dict[str, tuple[dict[str, object], int, float]] = {}
+
+    def strike(self, name: str) -> str:
+        """One output of the case: killed, resumed, compared; gives what is wrong."""
+        whole, calls, wall_s = self._whole.get(name) or self._measure(name)
+        place = self._folder / "work"
+        place.mkdir()
+        self._kill(place, name, calls, wall_s)
+        for _ in range(self._chance.choice((0, 0, 1, 2))):
+            self._kill(place, name, calls, wall_s)
+            self._tear(place)
+        code = run(place, [*self._words(name), "--resume"], End(), 0.0)
+        said = (place / "said").read_text()
+        self.resumed += "resumed after" in said
+        if code:
+            return f"{name}: exit code {code}: {said}"
+        wrong = self._differences(contents(place), whole)
+        shutil.rmtree(place)
+        return f"{name}: {wrong}: {said}" if wrong else ""
+
+    def _words(self, name: str) -> list[str]:
+        case = CASES[name]
+        return ["convert", f"../in/{case.recording}", "-o", case.output, *case.options]
+
+    def _measure(self, name: str) -> tuple[dict[str, object], int, float]:
+        """An uninterrupted run: its output, its calls and its time."""
+        place = self._folder / "whole"
+        place.mkdir()
+        began_s = time.perf_counter()
+        code = run(place, self._words(name), End(), 0.5)
+        wall_s = time.perf_counter() - began_s
+        if code:
+            raise SystemExit(f"{name}: exit code {code}: {(place / 'said').read_text()}")
+        whole = contents(place)
+        run(place, [*self._words(name), "--overwrite"], End(at_call=0), 0.0)
+        calls = int((place / "calls").read_text())
+        shutil.rmtree(place)
+        self._whole[name] = whole, calls, wall_s
+        return self._whole[name]
+
+    def _kill(self, place: Path, name: str, calls: int, wall_s: float) -> None:
+        words = [*self._words(name), "--resume"]
+        chance = self._chance.random()
+        if self._chance.random() < 0.5:
+            end = End(after_s=chance * wall_s)
+        else:
+            # The last calls complete the output and are fewer than those before.
+            late = self._chance.random() < 0.3
+            end = End(at_call=max(1, calls - int(40 * chance) if late else int(calls * chance)))
+        code = run(place, words, end, self._chance.choice((0.0, 0.0, 0.02)))
+        self.kills += code == -signal.SIGKILL
+
+    def _tear(self, place: Path) -> None:
+        """Cut off the end of a state file, as if its last line had not been written whole."""
+        for state in place.glob("*.state"):
+            size, text = state.stat().st_size, state.read_bytes()
+            last = size - text.rfind(b"\n", 0, -1)
+            if self._chance.random() < 0.3:
+                os.truncate(state, size - self._chance.randrange(max(1, last)))
+
+    def _differences(self, found: dict[str, object], wanted: dict[str, object]) -> str:
+        names = sorted(found.keys() ^ wanted.keys())
+        if names:
+            return f"files that are only in one of both: {', '.join(names)}"
+        return ", ".join(name for name in wanted if found[name] != wanted[name])
+
+
+@contextlib.contextmanager
+def storm(seed: int, turns: int) -> Iterator[Storm]:
+    """A storm in a temporary folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Storm(Path(folder), seed, turns)
+
+
+def main() -> None:
+    """Strike the cases in turn until there were `--count` kills."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=200, help="kills")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--turns", type=int, default=40, help="length of recordings, 0.1 s")
+    given = parser.parse_args()
+    outputs, wrong = 0, list[str]()
+    names = list(CASES)
+    with storm(given.seed, given.turns) as one:
+        while one.kills < given.count and len(wrong) < 5:
+            fault = one.strike(names[outputs % len(names)])
+            outputs += 1
+            if fault:
+                wrong.append(fault)
+                print(fault, flush=True)
+                break
+        print(
+            f"{one.kills} kills, {outputs} outputs, {one.resumed} of them resumed after scans, "
+            f"{len(wrong)} not as in one piece"
+        )
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()
