@@ -57,7 +57,11 @@ class Table:
 
 def read_table(judge: Judge, where: str, text: str) -> Table | None:
     """Parse scans.csv; what cannot be used is blamed."""
-    lines = list(csv.reader(text.splitlines()))
+    try:
+        lines = list(csv.reader(text.splitlines()))
+    except csv.Error as err:
+        judge.blame("table", where, "lines of comma-separated values", str(err))
+        return None
     if not lines or tuple(lines[0][: len(START)]) != START:
         judge.blame(
             "table", f"{where} line 1", ",".join(START), ",".join(lines[0] if lines else [])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tests.fuzz import messages, packets, readers, sessions, texts
+from tests.fuzz import messages, outputs, packets, readers, sessions, texts
 from tests.fuzz.harness import Target
 
 TARGETS: Sequence[Target] = (
@@ -12,5 +12,6 @@ TARGETS: Sequence[Target] = (
     *messages.TARGETS,
     *packets.TARGETS,
     *texts.TARGETS,
+    *outputs.TARGETS,
     *sessions.TARGETS,
 )

@@ -20,7 +20,7 @@ from tests.fuzz.harness import (
 from tests.fuzz.targets import TARGETS
 
 # Inputs of a target by its share; the seeds themselves come first.
-_PER_SHARE = 14
+_PER_SHARE = 12
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name.replace(" ", "-"))

@@ -134,6 +134,13 @@ _TYPED: Sequence[tuple[Callable[[str], object], tuple[str, ...]]] = (
         lambda text: check_options(dict(pair.partition("=")[::2] for pair in text.split(";"))),
         ("packet_stamp=end", "crc=check;optical_centre=on"),
     ),
+    (
+        lambda text: values.faults(text.split(" ")),
+        (
+            *("drop:left:5%", "stall:left:5s-8s", "delay:left:60ms", "jump:left:37s@10s"),
+            *("dup:left:1%", "reorder", "bitflip:*:0.1%", "drift:left:50ppm", "late:left:3s"),
+        ),
+    ),
     (lambda text: values.choice("--layout", text, ("dense", "organized")), ("dense",)),
 )
 
