@@ -14,9 +14,10 @@ import numpy as np
 
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import FOREVER, NEVER, Arrival, Delivery, Intake
+from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Arrival, Delivery, Intake
 from mlbatch.batching.jumps import JumpGuard
 from mlbatch.batching.windows import Policy, Schedule, Window
+from mlbatch.errors import ClockJump
 from mlbatch.types import BoolArray, Columns, I64Array
 from mlbatch.units import NS_PER_MS
 
@@ -76,13 +77,7 @@ class Batcher:
 
         arrivals: one for each sensor; host_ns: (P,) arrival times of the whole batch, by position.
         """
-        accepted = [
-            None if arrival is None else track.intake.accept(arrival)
-            for track, arrival in zip(self._tracks, arrivals, strict=True)
-        ]
-        for guard, delivery in zip(self._guards, accepted, strict=False):
-            if delivery is not None:
-                guard.check(delivery)
+        accepted = self._accept(arrivals)
         events = [
             np.empty(0, np.int64) if delivery is None else delivery.packets.position
             for delivery in accepted
@@ -192,6 +187,31 @@ class Batcher:
         return self._schedule.is_past_end(self._watermark)
 
     # -- steps --------------------------------------------------------------------------------
+
+    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Delivery | None]:
+        """What the sensors' doors let in; ClockJump where clocks jump.
+
+        Clocks that jump together are cut at the first packet of any of them, also of one whose
+        next packet is not here yet: else it would depend on the batch where a recording is cut.
+        """
+        accepted: list[Delivery | None] = []
+        jumps: list[ClockJump] = []
+        for number, (track, arrival) in enumerate(zip(self._tracks, arrivals, strict=True)):
+            delivery = None
+            try:
+                if arrival is not None:
+                    delivery = track.intake.accept(arrival)
+                    for guard in self._guards[number : number + 1]:
+                        guard.check(delivery)
+            except ClockJump as jump:
+                jumps.append(jump)
+            accepted.append(delivery)
+        if jumps:
+            first = min(jumps, key=lambda jump: jump.host_ns)
+            held_ns = [track.intake.held_host_ns for track in self._tracks]
+            near_ns = [at for at in held_ns if at is not None and first.host_ns - at <= STEP_NS]
+            raise ClockJump(str(first), min([first.host_ns, *near_ns]))
+        return accepted
 
     def _check_clocks(self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array]) -> None:
         """As soon as two sensors have a packet, their stamps must be comparable."""

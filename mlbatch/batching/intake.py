@@ -201,6 +201,11 @@ class Intake:
         )
 
     @property
+    def held_host_ns(self) -> int | None:
+        """Arrival of the packet that is held, if any."""
+        return None if self._held is None else int(self._held.host_ns[0])
+
+    @property
     def held_place(self) -> int | None:
         """Ring place of the packet that is held, if any; its pixels must not be overwritten."""
         return None if self._held is None else int(self._held.place[0])
