@@ -1,0 +1,200 @@
+"""What small lidars of four makers send, from the encoders: bytes, arrivals and true stamps.
+
+Stamps are what packets say, whole us for Velodyne, HESAI and ROBOSENSE (the encoders' sheets);
+arrivals are whole steps of 10 us, so that drifts by whole ppm of 100 add whole ns.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.types import I64Array
+from tests.builders import hesai, robosense, velodyne
+from tests.builders.hesai_angles import angles_csv
+from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
+
+NS_PER_S, NS_PER_MS, NS_PER_US = 10**9, 10**6, 10**3
+HOUR_NS = 3600 * NS_PER_S
+# One reading in so many has a return.
+SPARSE = 16
+ARRIVAL_STEP_NS = 10_000
+
+OUSTER = OusterSpec(beams=16, columns_per_frame=512, serial=111)
+OUSTER_STEP_NS = 100 * NS_PER_MS // OUSTER.columns_per_frame
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """Packets of one lidar, in their order.
+
+    host_ns: (P,) arrival; stamp_ns: (P, C) of the columns; points: (P, C) their returns.
+    """
+
+    maker: str
+    payloads: tuple[bytes, ...]
+    host_ns: I64Array
+    stamp_ns: I64Array
+    points: I64Array
+
+    def where(self, stays: I64Array) -> Sent:
+        """The packets at these places."""
+        payloads = tuple(self.payloads[at] for at in stays.tolist())
+        return replace(
+            self,
+            payloads=payloads,
+            host_ns=self.host_ns[stays],
+            stamp_ns=self.stamp_ns[stays],
+            points=self.points[stays],
+        )
+
+    def then(self, later: Sent) -> Sent:
+        """These packets, and then others of the same lidar."""
+        return replace(
+            self,
+            payloads=self.payloads + later.payloads,
+            host_ns=np.concatenate([self.host_ns, later.host_ns]),
+            stamp_ns=np.concatenate([self.stamp_ns, later.stamp_ns]),
+            points=np.concatenate([self.points, later.points]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Spell:
+    """When a lidar measures, ns by its clock; count: its packet number (Ouster: frame) at first.
+
+    ahead_ns: what the recorder's clock adds to the lidar's.
+    """
+
+    begin_ns: int
+    length_ns: int
+    count: int = 1000
+    ahead_ns: int = 0
+
+
+def _readings(seed: int, *shape: int) -> tuple[I64Array, I64Array]:
+    """Counts of range (0: nothing came back) and levels."""
+    rng = np.random.default_rng(seed)
+    hit = rng.integers(0, SPARSE, shape) == 0
+    ranges = np.where(hit, rng.integers(1000, 4000, shape) // 8 * 8, 0)
+    return ranges, np.where(hit, rng.integers(1, 256, shape), 0)
+
+
+def _sent(
+    maker: str, spell: Spell, payloads: list[bytes], stamp_ns: I64Array, ranges: I64Array
+) -> Sent:
+    """A packet arrives 0.3 ms after its last column."""
+    shape = len(payloads), -1
+    stamps = stamp_ns.reshape(shape)
+    arrival = stamps[:, -1] + 300_000 + spell.ahead_ns
+    host_ns = -(-arrival // ARRIVAL_STEP_NS) * ARRIVAL_STEP_NS
+    points = np.count_nonzero(ranges.reshape(len(stamp_ns), -1), axis=1).reshape(shape)
+    return Sent(maker, tuple(payloads), host_ns, stamps, points)
+
+
+def ouster(spell: Spell) -> Sent:
+    """320 packets a second of 16 columns; turns begin with the spell."""
+    count = spell.length_ns // OUSTER_STEP_NS // 16 * 16
+    number = np.arange(count)
+    stamps = spell.begin_ns + number * OUSTER_STEP_NS
+    ranges, levels = _readings(1, count, 16)
+    payloads = encode_packets(
+        OUSTER,
+        stamps,
+        number % 512,
+        spell.count + number // 512,
+        {"RANGE": ranges, "REFLECTIVITY": levels},
+    )
+    return _sent("ouster", spell, payloads, stamps, ranges)
+
+
+def velodyne_vlp16(spell: Spell) -> Sent:
+    """754 packets a second of 24 columns; no count of packets."""
+    hour, past_ns = divmod(spell.begin_ns, HOUR_NS)
+    spec = velodyne.VelodyneSpec("VLP-16", start_azimuth_deg=93.0, start_us=past_ns / 1000)
+    spec = replace(spec, hour=hour)
+    packets = int(spell.length_ns / (spec.row_us * spec.rows_per_packet * 1000))
+    columns = np.arange(packets * spec.columns_per_packet)
+    ranges, levels = _readings(2, len(columns), 16, 1)
+    sent = velodyne.encode(spec, ranges, levels)
+    true_ns = velodyne.firing_times_ns(spec, columns).min(axis=1)
+    # Packets tell the time of their first firing, in whole us.
+    first_ns = true_ns[:: spec.columns_per_packet]
+    said_ns = sent.payloads[:, 1200:1204].copy().view("<u4")[:, 0].astype(np.int64) * 1000
+    off_ns = (said_ns - first_ns % HOUR_NS + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+    stamps = true_ns + off_ns.repeat(spec.columns_per_packet)
+    payloads = [row.tobytes() for row in sent.payloads]
+    return _sent("velodyne", spell, payloads, stamps, ranges)
+
+
+def hesai_xt16(spell: Spell) -> Sent:
+    """2500 packets a second of 8 columns."""
+    spec = hesai.HesaiSpec(
+        "PandarXT-16", start_deg=351.3, start_ns=spell.begin_ns, sequence=spell.count
+    )
+    packets = int(spell.length_ns / (spec.row.step_ns * spec.groups))
+    ranges, levels = _readings(3, packets * spec.groups, 16, 1)
+    payloads = hesai.encode_packets(spec, ranges, levels)
+    stamps = hesai.firing_times_ns(spec, packets * spec.groups).min(axis=1)
+    return _sent("hesai", spell, payloads, stamps, ranges)
+
+
+def robosense_helios16(spell: Spell) -> Sent:
+    """750 packets a second of 24 columns."""
+    spec = robosense.RobosenseSpec(
+        "Helios 16", start_deg=301.66, start_ns=spell.begin_ns, first_counter=spell.count
+    )
+    per_packet = int(spec.columns_per_packet)
+    packets = spell.length_ns // (spec.round_ns * per_packet)
+    ranges, levels = _readings(4, packets * per_packet, 16, 1)
+    payloads = [payload for _, payload in robosense.msop(spec, ranges, levels)]
+    columns = np.arange(packets * per_packet)
+    stamps = robosense.firing_times_ns(spec, columns).min(axis=1)
+    return _sent("robosense", spell, payloads, stamps, ranges)
+
+
+@dataclass(frozen=True, slots=True)
+class Maker:
+    """A lidar of the matrix; modulus: its own count of packets wraps there, 0: it has none.
+
+    begin_ns: its first turn after the others'; wrap: count at the begin of a spell of 0.25 s in
+    which it wraps.
+    """
+
+    send: Callable[[Spell], Sent]
+    ip: str
+    port: int
+    topic: str
+    metadata: str
+    begin_ns: int
+    modulus: int = 0
+    wrap: int = 0
+
+
+MAKERS: Mapping[str, Maker] = {
+    "ouster": Maker(
+        *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
+        *(0, 2**16 * 32, 2**16 - 1),
+    ),
+    "velodyne": Maker(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
+    "hesai": Maker(
+        *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
+        *(5_700_000, 2**32, 2**32 - 100),
+    ),
+    "robosense": Maker(
+        *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
+        7_300_000,
+    ),
+}
+
+
+def write_metadata(folder: Path) -> None:
+    """What the rig names."""
+    (folder / "front.json").write_text(json.dumps(metadata_json(OUSTER)), encoding="utf-8")
+    (folder / "unit.csv").write_bytes(angles_csv([15.0 - 2 * n for n in range(16)], [0.0] * 16))
+    lines = [f"{n - 8}.0,0.5\n" for n in range(16)]
+    (folder / "angles.csv").write_text("".join(lines), encoding="utf-8")

@@ -1,0 +1,309 @@
+"""Every fault in rigs of one to four makers, in every container: the declared result, and proof.
+
+The rows of the table stand in `cells.py`, the law of windows in `law.py`. Every maker is once the
+victim of every fault, since the rigs of one to four lidars begin with another maker each.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mlbatch.verify import verify
+from tests.builders.run import (
+    Told,
+    command,
+    csv_without_arrival,
+    load,
+    scan_files,
+)
+from tests.matrix.cells import KINDS, Kind, Session, plain
+from tests.matrix.containers import CONTAINERS, rig_text, span_ns
+from tests.matrix.law import PERIOD_NS, law
+from tests.matrix.lidars import MAKERS, Sent, write_metadata
+
+SIZES = (1, 2, 3, 4)
+WARNING = "mlbatch: warning: "
+Report = dict[str, Any]
+Print = tuple[object, ...]
+
+
+@functools.cache
+def session_of(name: str, size: int) -> Session:
+    """The rig of a kind; the last lidar is the victim."""
+    first = list(KINDS).index(name)
+    makers = [list(MAKERS)[(first + number) % len(MAKERS)] for number in range(size)]
+    return tuple((KINDS[name].session or plain)(maker) for maker in makers)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A fault in a rig in a container, in a folder of its own."""
+
+    name: str
+    size: int
+    container: str
+    folder: Path
+
+    @property
+    def kind(self) -> Kind:
+        """The row of the table."""
+        return KINDS[self.name]
+
+    @property
+    def session(self) -> Session:
+        """What the lidars send."""
+        return session_of(self.name, self.size)
+
+    @property
+    def victim(self) -> str:
+        """Whom the fault befalls."""
+        return self.session[-1].maker
+
+    @property
+    def begin_ns(self) -> int:
+        """Arrival of the first packet."""
+        return span_ns(self.session)[0]
+
+    def prepare(self, session: Session, clock: str = "") -> None:
+        """The recording, its rig, and what that names; clock: of the victim."""
+        write_metadata(self.folder)
+        for before in self.folder.glob("drive.*"):
+            before.unlink()
+        CONTAINERS[self.container](self.folder, session)
+        clocks = {self.victim: clock} if clock else None
+        text = rig_text(session, self.container, clocks)
+        (self.folder / "rig.yaml").write_text(text, encoding="utf-8")
+
+    def convert(self, *words: str, faulty: bool = True, output: str = "out") -> Told:
+        """Run the command."""
+        (recording,) = self.folder.glob("drive.*")
+        rig, target = self.folder / "rig.yaml", self.folder / output
+        fault = self.kind.fault.format(v=self.victim)
+        faults = ["--fault", fault] if fault and faulty else []
+        return command(
+            *("convert", recording, "-o", target, "--rig", rig, "--quiet"), *faults, *words
+        )
+
+
+# -- what holds for every output ------------------------------------------------------------------
+
+
+def report_of(folder: Path) -> Report:
+    report: Report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    return report
+
+
+def check_proof(folder: Path) -> Report:
+    """`verify` finds nothing, ledgers balance, and no scan holds what is older than its period."""
+    verdict = verify(folder)
+    assert verdict.violations == ()
+    assert verdict.scans
+    report = report_of(folder)
+    capture = report["capture"]
+    assert capture["frames"] == capture["datagrams"] + sum(capture["skipped"].values())
+    for sensor in report["sensors"]:
+        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        assert packets["read"] == packets["accepted"] + sum(packets["rejected"].values())
+        assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
+        assert points.pop("slots") == sum(points.values())
+    for path in scan_files(folder):
+        scan = load(path)
+        stamps = scan["column_stamp_ns"].astype(np.int64)
+        start_ns = int(scan["start_ns"])
+        assert int(scan["end_ns"]) - start_ns == PERIOD_NS
+        assert (stamps >= start_ns).all()
+        assert (stamps < start_ns + PERIOD_NS).all()
+        assert (np.diff(stamps) >= 0).all()
+    return report
+
+
+def check_law(folder: Path, session: Session, wait_ns: int, report: Report) -> None:
+    """Exactly these columns in these windows, and everything else counted by its reason."""
+    wanted = law(session, wait_ns)
+    files = scan_files(folder)
+    assert [int(path.stem) for path in files] == list(wanted.windows)
+    for path, window in zip(files, wanted.windows.values(), strict=True):
+        scan = load(path)
+        assert int(scan["start_ns"]) == window.start_ns
+        assert bool(scan["complete"]) == window.complete, path.name
+        assert np.array_equal(scan["column_stamp_ns"], window.stamp_ns)
+        assert np.array_equal(scan["column_lidar_id"], window.sensor)
+        assert len(scan["xyz"]) == window.points
+    assert int(report["grid"]["t_init_ns"]) == wanted.t_init_ns
+    assert [one["columns"]["dropped"] for one in report["sensors"]] == list(wanted.dropped)
+    scans = report["scans"]
+    assert (scans["written"], scans["incomplete"], scans["empty"]) == (
+        len(wanted.windows),
+        wanted.incomplete,
+        wanted.empty,
+    )
+
+
+def check_counts(cell: Cell, report: Report) -> None:
+    """The victim's packets are counted as declared; nothing befell the others."""
+    (fault,) = report["faults"]
+    assert fault["packets"] > 0
+    for sent, sensor in zip(cell.session, report["sensors"], strict=True):
+        packets, total = sensor["packets"], len(sent.payloads)
+        found = {"lost": packets["lost"], "reordered": packets["reordered"], "duplicate": 0}
+        found |= {"read": packets["read"], "accepted": packets["accepted"], **packets["rejected"]}
+        if sent.maker != cell.victim:
+            assert (found["read"], found["accepted"]) == (total, total)
+            assert (found["lost"], found["reordered"]) == (0, 0)
+            continue
+        counts = dict(cell.kind.counts or {})
+        if MAKERS[sent.maker].modulus:
+            counts.update(cell.kind.counted or {})
+        for name, declared in counts.items():
+            low, high = declared(total, fault["packets"])
+            assert low <= found.get(name, 0) <= high, name
+
+
+# -- what a run leaves, and what others leave -----------------------------------------------------
+
+
+def prints(folder: Path) -> Print:
+    """All that identity covers (CONTRACT.md section 1), and all ledgers."""
+    report = report_of(folder)
+    files = tuple((path.name, sha256(path.read_bytes()).digest()) for path in scan_files(folder))
+    table = csv_without_arrival((folder / "scans.csv").read_text(encoding="utf-8"))
+    parts = ("packets", "columns", "points")
+    ledgers = [[sensor[part] for part in parts] for sensor in report["sensors"]]
+    return files, table, json.dumps(ledgers), json.dumps(report.get("faults"))
+
+
+def scans_of(folder: Path) -> Print:
+    """Scans alone."""
+    return prints(folder)[:2]
+
+
+def outputs(folder: Path) -> list[Path]:
+    """What a run left, in order."""
+    return sorted(path for path in folder.glob("out*") if path.is_dir())
+
+
+@functools.cache
+def faultless(name: str, size: int) -> Print:
+    """Scans of the capture without the fault."""
+    with tempfile.TemporaryDirectory() as folder:
+        cell = Cell(name, size, "pcap", Path(folder))
+        cell.prepare(cell.session)
+        told = cell.convert(faulty=False)
+        assert (told.code, told.err) == (0, "")
+        return scans_of(cell.folder / "out")
+
+
+# What the first container of a fault and a rig gave, in this process.
+first_prints: dict[tuple[str, int], tuple[Print, ...]] = {}
+
+
+# -- the matrix -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", KINDS)
+def test_cell(name: str, size: int, container: str, tmp_path: Path) -> None:
+    cell = Cell(name, size, container, tmp_path)
+    cell.prepare(cell.session)
+    kind = cell.kind
+    if kind.pieces is not None:
+        check_split(cell)
+    elif kind.refused_together and size > 1:
+        check_refused(cell, kind.refused_together)
+        assert not outputs(tmp_path)
+    else:
+        check_merged(cell)
+    if kind.remedied is not None:
+        check_remedied(cell, *kind.remedied)
+    found = tuple(prints(path) for path in outputs(tmp_path))
+    assert found == first_prints.setdefault((name, size), found)
+
+
+def check_merged(cell: Cell) -> None:
+    """One output of all sensors."""
+    kind, out = cell.kind, cell.folder / "out"
+    told = cell.convert(*kind.words)
+    assert told.code == 0, told.err
+    for line in told.err.splitlines():
+        assert line.startswith(WARNING)
+        assert line.removeprefix(WARNING).split(":")[0] in kind.warnings, line
+    report = check_proof(out)
+    check_counts(cell, report)
+    if kind.subset:
+        check_subset(cell, report)
+        return
+    session = cell.session if kind.change is None else kind.change(cell.session, cell.begin_ns)
+    check_law(out, session, kind.wait_ns, report)
+    if kind.change is None:
+        assert scans_of(out) == faultless(cell.name, cell.size)
+
+
+def check_subset(cell: Cell, report: Report) -> None:
+    """Packets are missing or damaged, the others are where they belong."""
+    wanted, (fault,) = law(cell.session), report["faults"]
+    files = scan_files(cell.folder / "out")
+    assert [int(path.stem) for path in files] == list(wanted.windows)
+    astray = 0
+    for path, window in zip(files, wanted.windows.values(), strict=True):
+        scan, last = load(path), cell.size - 1
+        assert bool(scan["complete"]) == window.complete
+        hurt, was_hurt = scan["column_lidar_id"] == last, window.sensor == last
+        assert np.array_equal(scan["column_stamp_ns"][~hurt], window.stamp_ns[~was_hurt])
+        astray += len(np.setxor1d(scan["column_stamp_ns"][hurt], window.stamp_ns[was_hurt]))
+    columns = cell.session[-1].stamp_ns.shape[1]
+    # Where a packet's stamps are damaged its columns are missing in one place, and in another.
+    assert astray <= 2 * columns * fault["packets"]
+
+
+def check_refused(cell: Cell, words: Sequence[str], *, faulty: bool = True) -> None:
+    """One line on stderr, and nothing written."""
+    told = cell.convert(faulty=faulty)
+    assert told.code == 1
+    assert told.err.startswith("mlbatch: error: ")
+    assert told.err.count("\n") == 1
+    for word in words:
+        assert word in told.err
+
+
+def check_remedied(cell: Cell, send: Callable[[str], Sent], clock: str) -> None:
+    """A sensor that really is off: refused, until its rig tells by how much."""
+    session = (*cell.session[:-1], send(cell.victim))
+    cell.prepare(session)
+    if cell.size > 1:
+        check_refused(cell, cell.kind.refused_together, faulty=False)
+    cell.prepare(session, clock)
+    told = cell.convert(faulty=False, output="remedied")
+    assert (told.code, told.err) == (0, "")
+    check_proof(cell.folder / "remedied")
+    assert scans_of(cell.folder / "remedied") == faultless(cell.name, cell.size)
+
+
+def check_split(cell: Cell) -> None:
+    """An error, or an output for each stretch."""
+    kind = cell.kind
+    assert kind.pieces is not None
+    check_refused(cell, kind.error)
+    assert not outputs(cell.folder)
+    told = cell.convert("--on-jump", "split")
+    assert told.code == 0, told.err
+    pieces = kind.pieces(cell.session, cell.begin_ns)
+    folders = outputs(cell.folder)
+    assert [path.name for path in folders] == [f"out.seg{n + 1}" for n in range(len(pieces))]
+    for folder, piece in zip(folders, pieces, strict=True):
+        report = check_proof(folder)
+        check_law(folder, piece, kind.wait_ns, report)
+        for sent, sensor in zip(piece, report["sensors"], strict=True):
+            packets = sensor["packets"]
+            assert packets["accepted"] == packets["read"] == len(sent.payloads)
+            assert (packets["lost"], packets["reordered"]) == (0, 0)
