@@ -41,34 +41,51 @@ class ImuQueue:
     def take(
         self, until_ns: int | None, limits_ns: tuple[int | None, int | None]
     ) -> list[ImuSamples]:
-        """Samples that begin before `until_ns` (None: all) and lie inside the limits, by stamp."""
-        ready: list[ImuSamples] = []
-        later: list[ImuSamples] = []
-        for samples in self._waiting:
-            due = until_ns is None or int(samples.stamp_ns[0]) < until_ns
-            (ready if due else later).append(samples)
-        self._waiting = later
+        """Samples before `until_ns` (None: all) and inside the limits, by stamp."""
         low, high = limits_ns
-        taken = []
-        for samples in ready:
-            inside = np.ones(len(samples.stamp_ns), bool)
+        taken, later = [], []
+        for number in sorted({samples.sensor for samples in self._waiting}):
+            samples = _in_order([one for one in self._waiting if one.sensor == number])
+            upto = len(samples.stamp_ns)
+            if until_ns is not None:
+                upto = int(np.searchsorted(samples.stamp_ns, until_ns))
+                later.append(_part(samples, slice(upto, None)))
+            samples = _part(samples, slice(0, upto))
+            inside = np.ones(upto, bool)
             if low is not None:
                 inside &= samples.stamp_ns >= low
             if high is not None:
                 inside &= samples.stamp_ns < high
             samples = self._kept(samples, inside, "outside_time")
             if len(samples.stamp_ns):
-                self._counts[samples.sensor].written += len(samples.stamp_ns)
+                self._counts[number].written += len(samples.stamp_ns)
                 taken.append(samples)
+        self._waiting = [samples for samples in later if len(samples.stamp_ns)]
         return sorted(taken, key=lambda samples: (int(samples.stamp_ns[0]), samples.sensor))
 
     def _kept(self, samples: ImuSamples, keep: BoolArray, reason: str) -> ImuSamples:
         if keep.all():
             return samples
         self._counts[samples.sensor].drop(reason, int(np.count_nonzero(~keep)))
-        return ImuSamples(
-            samples.sensor,
-            samples.stamp_ns[keep],
-            samples.acceleration[keep],
-            samples.angular_velocity[keep],
-        )
+        return _part(samples, keep)
+
+
+def _in_order(parts: Sequence[ImuSamples]) -> ImuSamples:
+    """Samples of one sensor as one, by stamp: packets may have overtaken each other."""
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    order = np.argsort(stamp_ns, kind="stable")
+    return ImuSamples(
+        parts[0].sensor,
+        stamp_ns[order],
+        np.concatenate([part.acceleration for part in parts])[order],
+        np.concatenate([part.angular_velocity for part in parts])[order],
+    )
+
+
+def _part(samples: ImuSamples, which: BoolArray | slice) -> ImuSamples:
+    return ImuSamples(
+        samples.sensor,
+        samples.stamp_ns[which],
+        samples.acceleration[which],
+        samples.angular_velocity[which],
+    )

@@ -23,7 +23,6 @@ _FOOTER_BYTES = _HEAD.size + 20
 _HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 1, 3, 4, 5, 6, 7
 _ATTACHMENT, _METADATA, _DATA_END = 9, 12, 15
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_ATTACHMENT_TIMES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +104,13 @@ class McapFile:
             raise VerifyError(f"{self._path}: byte {record.at}: {err}; convert again") from err
 
     def _attachment(self, cursor: Cursor, record: _Record) -> None:
-        cursor.raw(_ATTACHMENT_TIMES)
+        log_ns, create_ns = cursor.whole("Q"), cursor.whole("Q")
         name, media = cursor.text(), cursor.text()
         data = bytes(cursor.raw(cursor.whole("Q")))
         crc = zlib.crc32(cursor.data[: cursor.at])
         self._judge.equal("container", f"{self._where} {name} CRC", crc, cursor.whole("I"))
         self.attachments[name] = data
-        row = (record.at, record.size, len(data), name, media)
+        row = (record.at, record.size, log_ns, create_ns, len(data), name, media)
         self._found.attachments.append(row)
 
     def _body(self, file: BinaryIO, record: _Record) -> memoryview:

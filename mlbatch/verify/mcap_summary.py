@@ -59,7 +59,7 @@ class Found:
 
     chunks: list[ChunkPlace] = field(default_factory=list)
     metadata: list[tuple[int, int, str]] = field(default_factory=list)
-    attachments: list[tuple[int, int, int, str, str]] = field(default_factory=list)
+    attachments: list[tuple[int, int, int, int, int, str, str]] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
     first_ns: int | None = None
     last_ns: int = 0
@@ -165,9 +165,7 @@ def _statistics(cursor: Cursor) -> object:
 
 
 def _attachment_index(cursor: Cursor) -> object:
-    """Without its two times, which mean nothing for scans.csv."""
-    at, size, _, _, content = (cursor.whole("Q") for _ in range(5))
-    return at, size, content, cursor.text(), cursor.text()
+    return (*(cursor.whole("Q") for _ in range(5)), cursor.text(), cursor.text())
 
 
 def _metadata_index(cursor: Cursor) -> object:

@@ -129,7 +129,15 @@ class Container:
         # Time 0 means unknown: files must not depend on when they were written.
         data = encoded(Attachment(0, log_ns, name, media_type, content))
         self._attachments.append(
-            AttachmentIndex(self._at, len(data), 0, log_ns, len(content), name, media_type)
+            AttachmentIndex(
+                self._at,
+                len(data),
+                log_time=log_ns,
+                create_time=0,
+                data_size=len(content),
+                name=name,
+                media_type=media_type,
+            )
         )
         self._put(data)
 
