@@ -236,8 +236,8 @@ def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Pat
         options = ["--rig", rig]
     assert refused(bag, *options) == (
         "--clock host: sensor roof: wanted the arrival time of each packet, got only that of whole "
-        "messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source), or record "
-        "the packets with tcpdump"
+        "messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source) "
+        "without --align-clocks, or record the packets with tcpdump"
     )
     assert convert(tmp_path / "scans", bag).report["sensors"][0]["packets"]["read"] == 96
 
