@@ -28,7 +28,10 @@ def main() -> None:
     except MlbatchError as err:
         _fail(str(err), EXIT_ERROR)
     except KeyboardInterrupt:
-        _fail("interrupted; what was written stays under .partial", EXIT_INTERRUPTED)
+        _fail(
+            "interrupted; what was written stays under .partial, where --resume goes on",
+            EXIT_INTERRUPTED,
+        )
     except BrokenPipeError:
         # Whoever read our output closed it: nothing to say, and nowhere to say it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

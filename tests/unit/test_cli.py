@@ -187,8 +187,12 @@ def test_an_interrupted_run_leaves_nothing_under_the_final_name(tmp_path: Path) 
         out, err = process.communicate(timeout=20)
     assert process.returncode == 130
     assert out == ""
-    assert err == "mlbatch: error: interrupted; what was written stays under .partial\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    assert err == (
+        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
+        "on\n"
+    )
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["out.partial", "out.partial.state"]
 
 
 def test_a_reader_that_goes_away_is_no_error_worth_a_traceback() -> None:

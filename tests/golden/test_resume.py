@@ -1,0 +1,82 @@
+"""Killed and refused conversions of whole sessions, resumed: byte for byte those in one piece.
+
+`python -m tests.resume_storm` does the same with hundreds of kills.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.resume_storm import CASES, contents, write_recordings
+from tests.unit.sessions import REPOSITORY
+
+KILLS, SEED = 12, 3
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
+from mlbatch import cli, resume
+resume.INTERVAL_S = 0.0
+cli.main()
+"""
+
+
+def _run(*words: str, cwd: Path = REPOSITORY) -> subprocess.CompletedProcess[str]:
+    """Python in a process of its own: a fork of this one would inherit its threads."""
+    return subprocess.run(
+        [sys.executable, *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_a_small_storm() -> None:
+    options = ("--count", str(KILLS), "--seed", str(SEED), "--turns", "10", "--again", "0")
+    done = _run("-m", "tests.resume_storm", *options)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    counts = re.findall(r"\d+", done.stdout)
+    kills, outputs, resumed, wrong = map(int, counts)
+    assert (kills, wrong) == (KILLS, 0)
+    assert outputs >= len(CASES)
+    assert resumed >= 1
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the cases convert."""
+    folder = tmp_path_factory.mktemp("storm")
+    write_recordings(folder / "in", 24)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "limit_bytes"), [("mcap", 9_000_000), ("rosbag1", 5_000_000), ("rosbag2", 9_000_000)]
+)
+def test_a_file_that_may_not_grow_is_continued(
+    recordings: Path, name: str, limit_bytes: int
+) -> None:
+    """A disk that refuses in the midst of a file, as a full one does."""
+    case = CASES[name]
+    words = ("convert", f"../in/{case.recording}", "-o", case.output, *case.options)
+    whole, place = recordings / f"{name} whole", recordings / name
+    whole.mkdir()
+    place.mkdir()
+    assert _run("-m", "mlbatch", *words, cwd=whole).returncode == 0
+    refused = _run("-c", LIMITED, str(limit_bytes), *words, cwd=place)
+    assert refused.returncode == 1
+    assert re.search(
+        r"partial: wanted to write it, got 'File too large'; raise the limit of file sizes or "
+        r"choose another disk; then --resume goes on after the \d+ scans that are safe\n$",
+        refused.stderr,
+    )
+    resumed = _run("-m", "mlbatch", *words, "--resume", cwd=place)
+    assert resumed.returncode == 0
+    assert re.search(r"resumed after \d+ scans\n", resumed.stderr)
+    assert contents(place) == contents(whole)
