@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from mlbatch.errors import one_line
+
 
 def inspect(
     recordings: Annotated[
@@ -47,6 +49,6 @@ def inspect(
     if found.clocks is not None:
         typer.echo("\n" + "\n".join(found.clock_lines()))
     for note in found.notes:
-        typer.echo(f"note: {note}")
+        typer.echo(one_line(f"note: {note}"))
     if write_rig is not None:
         typer.echo(f"wrote {write_rig}")

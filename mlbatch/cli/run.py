@@ -13,7 +13,7 @@ import typer
 from mlbatch.cli import checks, interrupted
 from mlbatch.clipping import Part
 from mlbatch.converting import Last, OpenWriter, convert
-from mlbatch.errors import ClockJump, MlbatchError, NoScanError
+from mlbatch.errors import ClockJump, MlbatchError, NoScanError, one_line
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, report_text, summary_lines
@@ -126,7 +126,7 @@ def _convert(job: Job, wanted: Wanted) -> None:
     with _progress(wanted.quiet) as progress:
         conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
     for note in conversion.notes:
-        typer.echo(f"mlbatch: warning: {note.code}: {note.message}", err=True)
+        typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
     if opener is None and report_path is not None:
         write_text(report_path, report_text(inputs))
     elif wanted.dry_run and report_path is None:
@@ -137,7 +137,7 @@ def _convert(job: Job, wanted: Wanted) -> None:
             _tell(conversion)
         for line in summary_lines(inputs):
             if not line.startswith("warning "):
-                typer.echo(line)
+                typer.echo(one_line(line))
         if wanted.output is not None and not wanted.dry_run:
             typer.echo(f"wrote {wanted.output}, report {report_path}")
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mlbatch.errors import one_line
+
 if TYPE_CHECKING:
     from mlbatch.verify import Verdict
 
@@ -33,7 +35,7 @@ def verify(
         typer.echo(json.dumps(_values(verdict), indent=1))
     else:
         for line in _lines(verdict):
-            typer.echo(line)
+            typer.echo(one_line(line))
     if not verdict.ok:
         broken = sum(check.violations > 0 for check in verdict.checks)
         raise VerifyError(

@@ -18,8 +18,9 @@ from mlbatch.readers import decode_transforms, open_recording
 from mlbatch.readers._envelopes import Unpacker
 from mlbatch.rig import read_rig
 from mlbatch.types import StreamTable, Topic
-from tests.builders.bags import packet_message
+from tests.builders.bags import Recorded, packet_message
 from tests.builders.rosbag2 import write_folder, write_rosbag2
+from tests.builders.run import command
 from tests.fuzz import packets, readers
 from tests.fuzz.framing import Part, joined, parts_of
 from tests.fuzz.harness import Target, campaign, fault_of_line
@@ -268,6 +269,17 @@ def test_a_capture_of_very_many_kinds_takes_seconds() -> None:
     ]
     target = next(one for one in packets.TARGETS if one.name == "packets livox")
     held([joined(sent)], target.run)
+
+
+def test_names_of_topics_cannot_command_a_terminal(tmp_path: Path) -> None:
+    message = packet_message("cdr", bytes(100))
+    name = "/left\x1b]0;owned\x07\nnote: all is well"
+    path = write_rosbag2(tmp_path / "a.db3", [Recorded(name, OUSTER, 10**18, message)] * 2)
+    told = command("inspect", path)
+    assert told.code == 0
+    assert "owned" in told.out
+    assert "\x1b" not in told.out
+    assert not any(line.startswith("note: all") for line in told.out.splitlines())
 
 
 def test_lines_hold_nothing_that_a_terminal_obeys() -> None:
