@@ -25,14 +25,14 @@ def of_job(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
     found["point layout"] = options.point_layout
     for key, value in _options(job):
         found[key.replace("_", " ")] = _text(value)
-    for number, path in enumerate(job.recordings):
-        found[f"recording {number + 1}"] = f"{path.name} ({_size_and_time(path)})"
     return found
 
 
-def of_sensors(run: Conversion) -> dict[str, str]:
-    """Digest of what points are made with: calibrations, poses, limits, rig."""
+def of_inputs(run: Conversion) -> dict[str, str]:
+    """What the recordings are, and digests of what points are made with."""
     found = {}
+    for number, path in enumerate(run.job.recordings):
+        found[f"recording {number + 1}"] = f"{path.name} ({_size_and_time(path)})"
     for sensor in run.setup.sensors:
         lidar = sensor.found.lidar
         what = (lidar.model, lidar.mode, lidar.beams, lidar.firing_ns, lidar.channel)

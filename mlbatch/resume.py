@@ -106,7 +106,7 @@ class Course:
 
     def join(self, run: Conversion) -> None:
         """Refuse to continue what another job began, and tell the run which scans are done."""
-        self._identity |= identities.of_sensors(run)
+        self._identity |= identities.of_inputs(run)
         self._totals = [[0] * len(POINT_FATES) for _ in run.feeds]
         if self._state is None:
             return

@@ -9,39 +9,40 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO, cast
 
 from mlbatch.errors import ExportError
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
 
 
 def open_output(path: Path, kept_bytes: int | None) -> BinaryIO:
     """A new file, or what an existing one holds up to `kept_bytes`, to be written again."""
-    return path.open("wb") if kept_bytes is None else KeptFile(path, kept_bytes)
+    if kept_bytes is None:
+        return path.open("wb")
+    # What is written in order needs no more of a file than this.
+    return cast(BinaryIO, KeptFile(path, kept_bytes))
 
 
-class KeptFile(io.BufferedWriter):
+class KeptFile:
     """Skips the first `kept_bytes` that are written; `tell` counts them nevertheless."""
 
     def __init__(self, path: Path, kept_bytes: int) -> None:
-        super().__init__(io.FileIO(path, "r+b"))
         self._path = path
         self._left = kept_bytes
-        size = super().seek(0, io.SEEK_END)
+        self._file = path.open("r+b")
+        size = self._file.seek(0, io.SEEK_END)
         if size < kept_bytes:
+            self._file.close()
             raise ExportError(
                 f"{path}: wanted {kept_bytes} bytes of the interrupted run to go on after them, "
                 f"got {size}; leave out --resume to begin anew"
             )
-        self.truncate(kept_bytes)
-        super().seek(kept_bytes)
+        self._file.truncate(kept_bytes)
+        self._file.seek(kept_bytes)
 
-    def write(self, data: ReadableBuffer, /) -> int:
+    def write(self, data: bytes | bytearray | memoryview) -> int:
         """Write what goes beyond the kept bytes; these must end where a piece of data ends."""
         if not self._left:
-            return super().write(data)
+            return self._file.write(data)
         size = memoryview(data).nbytes
         if size > self._left:
             raise ExportError(
@@ -53,4 +54,16 @@ class KeptFile(io.BufferedWriter):
 
     def tell(self) -> int:
         """Where the next byte would lie in an uninterrupted writing."""
-        return super().tell() - self._left
+        return self._file.tell() - self._left
+
+    def seek(self, offset: int) -> int:
+        """Go to a byte that is to be written over."""
+        return self._file.seek(offset)
+
+    def flush(self) -> None:
+        """Hand what was written to the system."""
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

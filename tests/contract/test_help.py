@@ -50,7 +50,6 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--strict": "error",
         "--overwrite": "existing",
         "--resume": "interrupted.*OUTPUT",
-        "--resume": "interrupted.*OUTPUT",
         "--quiet": "progress",
         "--verbose": "chosen",
     },
