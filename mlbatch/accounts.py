@@ -64,8 +64,9 @@ def report_inputs(run: Conversion) -> ReportInputs:
 
 # A note, not a fault: what the times of clouds were taken for.
 CLOUDS = "clouds"
-# Share of a sensor's packets that is worth a warning: a change of mode, a wrong calibration.
-MANY_REJECTED = 0.01
+# Share of a sensor's packets, or columns, that is worth a warning: a change of mode, a wrong
+# calibration; one damaged stamp that lies ahead makes those that follow it late.
+MANY = 0.01
 
 
 def late_notes(run: Conversion) -> list[Note]:
@@ -86,10 +87,17 @@ def late_notes(run: Conversion) -> list[Note]:
         # What was captured twice is no loss.
         reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
         rejected = sum(reasons_of.values())
-        if rejected > MANY_REJECTED * packets.read:
+        if rejected > MANY * packets.read:
             reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
             text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
             notes.append(Note("rejected", sensor.name, text))
+        decoded, late = feed.ledger.columns.decoded, feed.ledger.columns.dropped.get("late", 0)
+        if late > MANY * decoded:
+            text = (
+                f"{sensor.name}: {late} of {decoded} columns came too late for their scans, after "
+                "a stamp that lay ahead (damaged?) or a stall; see --decode crc=check, --max-wait"
+            )
+            notes.append(Note("late", sensor.name, text))
     table, seen = run.setup.sampler.table, run.setup.sampler.samples
     for kind in sorted(run.feeder.samples):
         what = _what(run, kind)

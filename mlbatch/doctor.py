@@ -175,9 +175,11 @@ class ClockWatch:
         self._last: int | None = None
         self._pending: Pending | None = None
         self._unsteady = False
+        self._told: ClockFinding | None = None
 
     def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
         """Add packets (P,) in order of arrival: newest stamp of each, and its arrival."""
+        self._told = None
         sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS) & (host_ns >= 0) & (host_ns < LIMIT_NS)
         if not sane.all():
             self.damaged += int(np.count_nonzero(~sane))
@@ -215,6 +217,11 @@ class ClockWatch:
 
     def finding(self) -> ClockFinding | None:
         """What is known so far; None before the first packet."""
+        if self._told is None:
+            self._told = self._found()
+        return self._told
+
+    def _found(self) -> ClockFinding | None:
         course = self.course()
         if course is None:
             return None

@@ -122,3 +122,13 @@ def test_mistakes(shell: Shell, arguments: str, words: str) -> None:
     assert outcome.code == 2
     assert words in outcome.err
     assert outcome.err.count("\n") == 1
+
+
+def test_many_late_columns_are_warned_of(shell: Shell) -> None:
+    report = _report(shell, "delay:left:300ms", more="--max-wait 0.1")
+    left, right = report["sensors"]
+    late, decoded = left["columns"]["dropped"]["late"], left["columns"]["decoded"]
+    assert late > decoded / 2
+    (warning,) = [one for one in report["warnings"] if one["code"] == "late"]
+    assert warning["message"].startswith(f"left: {late} of {decoded} columns came too late")
+    assert "late" not in right["columns"]["dropped"]
