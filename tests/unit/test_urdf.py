@@ -105,15 +105,15 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name=
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="1 2"/>')),
-            ", joint mount, origin xyz: wanted 3 finite numbers, got 1 2",
+            ", joint mount, origin xyz: wanted 3 numbers of at most 1e+09, got 1 2",
         ),
         (
             _robot(_joint(LINKS + '<origin rpy="0 0 ${pi/2}"/>')),
-            ", joint mount, origin rpy: wanted 3 finite numbers, got 0 0 ${pi/2}",
+            ", joint mount, origin rpy: wanted 3 numbers of at most 1e+09, got 0 0 ${pi/2}",
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="0 0 nan"/>', name="")),
-            ", joint (no name), origin xyz: wanted 3 finite numbers, got 0 0 nan",
+            ", joint (no name), origin xyz: wanted 3 numbers of at most 1e+09, got 0 0 nan",
         ),
     ],
 )
