@@ -58,6 +58,8 @@ HARD_NS = NS_PER_S
 LIMIT_NS = 2**31 * NS_PER_S
 # A clock that steps more often tells no time.
 MOST_STRETCHES = 64
+# Packets are looked at so many at a time: one by one they would cost a hundred times as much.
+_AT_ONCE = 4096
 # What also the fastest packet may have taken from its stamp to the recorder.
 SHORTEST_WAY_NS = NS_PER_MS
 # What a queue may hold packets back for; recordings as short as that show no fast packet.
@@ -176,10 +178,26 @@ class ClockWatch:
         self._pending: Pending | None = None
         self._unsteady = False
         self._told: ClockFinding | None = None
+        self._queue: list[tuple[I64Array, I64Array]] = []
+        self._queued = 0
 
     def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
-        """Add packets (P,) in order of arrival: newest stamp of each, and its arrival."""
+        """Add packets (P,) in order of arrival: newest stamp of each, and its arrival.
+
+        The arrays are kept for a while: they must not be changed.
+        """
         self._told = None
+        self._queue.append((stamp_ns, host_ns))
+        self._queued += len(stamp_ns)
+        if self._queued >= _AT_ONCE:
+            self._look()
+
+    def _look(self) -> None:
+        """Take in what was added; what is known does not depend on how it was grouped."""
+        if not self._queue:
+            return
+        stamp_ns, host_ns = (np.concatenate(parts) for parts in zip(*self._queue, strict=True))
+        self._queue, self._queued = [], 0
         sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS) & (host_ns >= 0) & (host_ns < LIMIT_NS)
         if not sane.all():
             self.damaged += int(np.count_nonzero(~sane))
@@ -259,6 +277,7 @@ class ClockWatch:
 
     def course(self) -> Course | None:
         """Parts, envelopes and steps; None before the first packet."""
+        self._look()
         tracks = [track for track in (one.track() for one in self._bins) if track is not None]
         if not tracks and self._pending is not None:
             alone = Bins()
