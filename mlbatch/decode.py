@@ -6,6 +6,7 @@ leave the tile lays their columns between those of other kinds.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -102,7 +103,9 @@ class Decoder:
         boxes_m: F64Array,
         extras: Extras = EXTRAS,
         only: int | None = None,
+        buffers: int = 1,
     ) -> None:
+        """buffers: the arrays of so many scans are valid at a time."""
         self._info = info
         self._only = only
         self._extras = extras
@@ -134,6 +137,7 @@ class Decoder:
             source.lidar.has_reflectivity for source in sources
         )
         self._buffer = self._new_buffer(0)
+        self._others = deque(self._new_buffer(0) for _ in range(buffers - 1))
 
     @property
     def counts(self) -> list[PointCounts]:
@@ -141,12 +145,14 @@ class Decoder:
         return [self._projectors[which].counts[member] for which, member in self._seat]
 
     def scan(self, due: Due, label: Label, fates: Fates | None = None) -> Scan:
-        """Decode the columns of one window; the arrays are valid until the next call.
+        """Decode the columns of one window; the arrays are valid until as many calls as buffers.
 
         fates: given where an output already holds the points; their arrays then mean nothing.
         """
         if fates is not None:
             return self._outline(due, label, fates)
+        self._others.append(self._buffer)
+        self._buffer = self._others.popleft()
         self._fit(len(due))
         points = 0
         for begin in range(0, len(due), self._columns):

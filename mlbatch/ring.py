@@ -16,7 +16,7 @@ class RawRing:
     A packet takes a whole number of rows, so row r of the packet in slot p begins at byte
     `(p * rows + r) * stride + start`: gathering columns is one `take` of rows (or of pieces of
     them), and a packet is copied once. Places number columns and count up for ever; the buffer
-    holds the newest.
+    holds the newest. One thread may `store` while others `gather` places that are still needed.
     """
 
     def __init__(self, packet_size: int, records: Records) -> None:
@@ -27,8 +27,7 @@ class RawRing:
         self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
-        self._bytes = np.empty(0, np.uint8)
-        self._allocate(_FIRST_PACKETS)
+        self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
 
     @property
     def nbytes(self) -> int:
@@ -59,19 +58,26 @@ class RawRing:
 
     def gather(self, place: I64Array, out: U8Array) -> None:
         """Copy the columns at `place` (n,) to the rows of `out` (n, records.size)."""
+        # Looked up once, since another thread may put larger ones in their place.
+        rows, pieces = self._rows, self._pieces
         if self._is_plain:
-            self._rows.take(place % len(self._rows), axis=0, out=out, mode="clip")
+            rows.take(place % len(rows), axis=0, out=out, mode="clip")
             return
         row, part = np.divmod(place, self._records.per_row)
-        row %= len(self._pieces)
-        out.view(self._pieces.dtype)[:, 0] = self._pieces[row, part]
+        row %= len(pieces)
+        out.view(pieces.dtype)[:, 0] = pieces[row, part]
 
-    def _allocate(self, packets: int) -> None:
-        self._capacity = packets
+    def _allocate(self, packets: int) -> U8Array:
+        """Room for so many packets, all zero."""
         rows, records = packets * self._rows_per_packet, self._records
         # More than the slots need, since rows begin later and columns may be longer than rows.
         spare = records.start + records.size + records.per_row * records.step
-        self._bytes = np.zeros(rows * records.stride + spare, np.uint8)
+        return np.zeros(rows * records.stride + spare, np.uint8)
+
+    def _use(self, data: U8Array, packets: int) -> None:
+        """Look for packets in `data` from now on."""
+        self._bytes, self._capacity = data, packets
+        rows, records = packets * self._rows_per_packet, self._records
         begin, end = records.start, records.start + rows * records.stride
         self._rows = self._bytes[begin:end].reshape(rows, -1)
         # As bytes of one element each, pieces may overlap and still move in one go.
@@ -96,11 +102,14 @@ class RawRing:
     def _grow(self, oldest: int, count: int) -> None:
         old, capacity = self._bytes, self._capacity
         live = np.arange(oldest, self._next)
-        self._allocate(max(2 * capacity, 1 << int(np.ceil(np.log2(2 * count + 1)))))
+        larger = max(2 * capacity, 1 << int(np.ceil(np.log2(2 * count + 1))))
+        new = self._allocate(larger)
         stride = self._rows_per_packet * self._records.stride
         before = old[: capacity * stride].reshape(capacity, stride)
-        after = self._bytes[: self._capacity * stride].reshape(self._capacity, stride)
-        after[live % self._capacity] = before[live % capacity]
+        after = new[: larger * stride].reshape(larger, stride)
+        after[live % larger] = before[live % capacity]
+        # Only now, since other threads gather columns all the time.
+        self._use(new, larger)
 
 
 def _copy_evenly(data: U8Array, start: I64Array, packets: U8Array) -> bool:
