@@ -32,11 +32,17 @@ BAD_CRC = FAULTS.index("bad_crc")
 _ID_OFFSET, _ID_BYTES = 8, 2
 # Firmware before 2.3 leaves the footer empty, 2.3 and 2.4 write DE C0 00 00 EF BE AD DE.
 _NO_CRC = (0, 0xDEADBEEF0000C0DE)
+# The smallest number of the machine that holds one of so many bytes.
+_WORDS = [np.dtype(f"<u{size}") for size in (1, 1, 2, 4, 4, 8, 8, 8)]
 
 
 def unsigned(packets: U8Array, place: tuple[int, int]) -> I64Array:
     """The little-endian number (P,) at `place` (first byte, bytes) of all packets."""
     first, size = place
+    word = _WORDS[size]
+    if first + word.itemsize <= packets.shape[1]:
+        words = packets[:, first : first + word.itemsize].view(word)[:, 0].astype(np.int64)
+        return words if word.itemsize == size else words & ((1 << 8 * size) - 1)
     value = np.zeros(len(packets), np.int64)
     for byte in reversed(range(size)):
         value <<= 8
@@ -158,15 +164,15 @@ class PacketHeaders:
         return self._read(packets, "serial")
 
     def _read(self, packets: U8Array, field: str) -> I64Array:
-        other = FUSA if self.header == STANDARD else STANDARD
         value = _header_field(packets, HEADERS[self.header], field)
         if self.serial == 0:
             return value
-        told = _header_field(packets, HEADERS[self.header], "serial") == self.serial
-        moved = _header_field(packets, HEADERS[other], "serial") == self.serial
-        if not (moved & ~told).any():
+        here = _header_field(packets, HEADERS[self.header], "serial") == self.serial
+        if here.all():
             return value
-        return np.where(moved & ~told, _header_field(packets, HEADERS[other], field), value)
+        other = FUSA if self.header == STANDARD else STANDARD
+        moved = ~here & (_header_field(packets, HEADERS[other], "serial") == self.serial)
+        return np.where(moved, _header_field(packets, HEADERS[other], field), value)
 
 
 def _header_field(packets: U8Array, header: HeaderLayout, field: str) -> I64Array:
