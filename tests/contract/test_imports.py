@@ -48,7 +48,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ),
     ),
     (("lidar",), ("transforms",), ("verify",)),
-    (("geometry",),),
+    (("geometry",), ("kernels",)),
     (("types",), ("leap_seconds",)),
     (("rate",), ("units",)),
     (("errors",),),
