@@ -101,6 +101,11 @@ class Tracer:
         word = np.array(cursor.words, np.int64)
         found = (places.start, places.room, places.size_at, places.stamp_at)
         start, room, size_at, stamp_at = (np.concatenate([_NONE, *part]) for part in found)
+        if not {len(size_at), len(stamp_at)} <= {0, len(start)}:
+            raise MessageError(
+                f"wanted a size and a stamp of each packet in {self._root}, got a definition with "
+                "several; this variant of the message is not known"
+            )
         return Shape(
             word - begin, u32(data, word), start - begin, room, size_at - begin, stamp_at - begin
         )

@@ -70,6 +70,7 @@ DEFINITIONS = {
     "of itself": "uint8[] buf\n{0} inner",
     "of itself, first": "{0} inner\nuint8[] buf",
     "of nothing, often": "std_msgs/Empty[4000000000] a\nuint8[] buf\n===\nMSG: std_msgs/Empty\n",
+    "several sizes": "uint8[] buf\nuint8[] buf\nuint32 size",
     "too many": "uint8[99999999999999999999] buf",
     "too many digits": "uint8[" + "9" * 5000 + "] buf",
     "too long": "uint8[] buf\n" + "# \n" * 400_000,
@@ -116,6 +117,16 @@ def test_idl_that_never_ends_is_passed_over(text: str) -> None:
             ).find(np.zeros(200, np.uint8), 0, 70, 0)
 
     held([text.encode()], run)
+
+
+@pytest.mark.parametrize(
+    "text", ["time stamp\ntime stamp\nuint8[] data", "time stamp\nuint8[] data\n" * 2]
+)
+def test_packets_have_one_time_each_whatever_a_definition_says(text: str) -> None:
+    topic = Topic("/a", "nebula_msgs/NebulaPacket", "ros1", text, "ros1msg")
+    message = np.zeros(400, np.uint8)
+    found = Unpacker(topic).find_many(message, *(np.array([value]) for value in (0, 60, 0)))
+    assert len(found.start) == len(found.host_ns)
 
 
 def test_transforms_of_another_definition_are_an_error() -> None:
