@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 import mlbatch
+from mlbatch.cli.bench import bench
 from mlbatch.cli.compare import compare
 from mlbatch.cli.convert import convert
 from mlbatch.cli.inspect import inspect
@@ -46,3 +47,4 @@ app.command()(inspect)
 app.command()(compare)
 app.command()(sensors)
 app.command()(verify)
+app.command()(bench)

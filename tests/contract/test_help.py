@@ -70,6 +70,16 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "sensors": {"--json": "JSON"},
     "verify": {"--report": "JSON.*beside", "--json": "JSON"},
+    "bench": {
+        "--seconds": r"\bs\b",
+        "--repeat": "program",
+        "--case": "repeatable",
+        "--engine": "numpy, numba",
+        "--peer-python": "ouster-sdk or velodyne-decoder.*repeatable",
+        "--keep": "recordings",
+        "--against": "Earlier.*JSON",
+        "--json": "JSON",
+    },
 }
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 

@@ -47,7 +47,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
             *("clock_compare", "clock_fit"),
         ),
     ),
-    (("lidar",), ("transforms",), ("verify",)),
+    (("lidar",), ("transforms",), ("verify",), ("bench",)),
     (("geometry",), ("kernels",)),
     (("types",), ("leap_seconds",)),
     (("rate",), ("units",)),
