@@ -8,7 +8,6 @@ stands for the merge. `reference.py` is the same law in plain loops; tests compa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Arrival, Delivery, Intake
 from mlbatch.batching.jumps import JumpGuard
+from mlbatch.batching.tracks import Progress, Track, chained, ranked
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.errors import ClockJump
 from mlbatch.types import BoolArray, Columns, I64Array
@@ -23,33 +23,6 @@ from mlbatch.units import NS_PER_MS
 
 # A window closes this long after its end in stamps, so that packets swapped by the network count.
 SLACK_NS = 10 * NS_PER_MS
-
-
-@dataclass(slots=True)
-class _Track:
-    """What is known of one sensor so far, and its columns that wait."""
-
-    intake: Intake
-    first_ns: int = NEVER
-    newest_ns: int = NEVER
-    offset_ns: int | None = None
-    gaps: list[tuple[int, int]] = field(default_factory=list)
-    waiting: list[Columns] = field(default_factory=list)
-    decoded: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-
-    def drop(self, reason: str, count: int) -> None:
-        if count:
-            self.dropped[reason] = self.dropped.get(reason, 0) + count
-
-
-@dataclass(slots=True)
-class _Progress:
-    """State of all sensors after each delivery of a batch; newest (S, E) int64, the others (E,)."""
-
-    newest: I64Array
-    watermark: I64Array
-    host_ns: I64Array
 
 
 class Batcher:
@@ -66,8 +39,10 @@ class Batcher:
         self._grid = grid
         self._policy = policy
         self._schedule = Schedule(grid, policy)
-        self._tracks = [_Track(intake) for intake in intakes]
+        self._tracks = [Track(intake) for intake in intakes]
         self._watermark = NEVER
+        # All that was waiting before this stamp was published.
+        self._until = NEVER
         self._guards = tuple(guards)
 
     # -- what came in -------------------------------------------------------------------------
@@ -78,26 +53,16 @@ class Batcher:
         arrivals: one for each sensor; host_ns: (P,) arrival times of the whole batch, by position.
         """
         accepted = self._accept(arrivals)
-        events = [
-            np.empty(0, np.int64) if delivery is None else delivery.packets.position
-            for delivery in accepted
-        ]
-        order = np.argsort(np.concatenate(events), kind="stable")
-        if not len(order):
+        ranks, position = ranked(accepted)
+        if not len(position):
             return
-        rank = np.empty(len(order), np.int64)
-        rank[order] = np.arange(len(order))
-        cuts = np.cumsum([len(event) for event in events])[:-1]
-        ranks = np.split(rank, cuts)
         self._check_clocks(accepted, ranks)
-        position = np.concatenate(events)[order]
         progress = self._advance(accepted, ranks, host_ns[position])
-        before = np.concatenate([[self._watermark], progress.watermark[:-1]])
         for number, delivery in enumerate(accepted):
             if delivery is not None:
-                self._wait(number, delivery.packets, before[ranks[number]])
-        for number, track in enumerate(self._tracks):
-            track.newest_ns = int(progress.newest[number, -1])
+                self._wait(number, delivery.packets, progress.watermark[:-1][ranks[number]])
+        for track, newest_ns in zip(self._tracks, progress.newest[:, -1].tolist(), strict=True):
+            track.newest_ns = newest_ns
         self._watermark = int(progress.watermark[-1])
         yield from self._publish(progress)
 
@@ -112,9 +77,9 @@ class Batcher:
             self._schedule.begin(max(firsts))
         self._watermark = FOREVER
         yield from self._publish(
-            _Progress(
-                np.array([[track.newest_ns] for track in self._tracks]),
-                np.array([FOREVER]),
+            Progress(
+                np.array([[track.newest_ns] * 2 for track in self._tracks]),
+                np.array([NEVER, FOREVER]),
                 np.array([host_ns]),
             ),
             last_of_all=max(track.newest_ns for track in self._tracks),
@@ -171,10 +136,9 @@ class Batcher:
     def oldest_place(self, sensor: int) -> int | None:
         """First ring place whose pixels are still needed; None: nothing waits."""
         track = self._tracks[sensor]
-        places = [int(columns.place.min()) for columns in track.waiting if len(columns)]
-        if track.intake.held_place is not None:
-            places.append(track.intake.held_place)
-        return min(places, default=None)
+        held = track.intake.held_place
+        oldest = track.oldest_place if held is None else min(track.oldest_place, held)
+        return None if oldest == FOREVER else oldest
 
     @property
     def limits_ns(self) -> tuple[int | None, int | None]:
@@ -234,43 +198,48 @@ class Batcher:
 
     def _advance(
         self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array], host_ns: I64Array
-    ) -> _Progress:
-        """Newest stamps and the watermark after each delivery; evaluates eq. (1)."""
-        shape = (len(self._tracks), len(host_ns))
-        newest, first = np.full(shape, NEVER), np.full(shape, FOREVER)
-        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
+    ) -> Progress:
+        """Newest stamps and the watermark before and after each delivery; evaluates eq. (1)."""
+        newest = np.full((len(self._tracks), len(host_ns) + 1), NEVER)
+        newest[:, 0] = [track.newest_ns for track in self._tracks]
+        for number, delivery in enumerate(accepted):
             if delivery is not None:
-                newest[number, ranks[number]] = delivery.newest_ns
-            newest[number, 0] = max(newest[number, 0], track.newest_ns)
-            np.maximum.accumulate(newest[number], out=newest[number])
-            first[number, newest[number] > NEVER] = track.first_ns
-        stalled = self._stalled(newest, first.min(axis=0))
-        watermark = np.where(stalled, FOREVER, newest).min(axis=0) - SLACK_NS
-        began = 0
+                newest[number, 1:][ranks[number]] = delivery.newest_ns
+        np.maximum.accumulate(newest, axis=1, out=newest)
+        stalled = self._stalled(newest)
+        waited = newest if stalled is None else np.where(stalled, FOREVER, newest)
+        watermark: I64Array = waited.min(axis=0) - SLACK_NS
+        began = 1
         if self.t_init_ns is None:
-            began = self._begin(newest > NEVER, stalled)
-        watermark[:began] = NEVER
-        watermark[0] = max(watermark[0], self._watermark)
+            began += self._begin(newest[:, 1:], None if stalled is None else stalled[:, 1:])
+        watermark[:began] = self._watermark
         np.maximum.accumulate(watermark, out=watermark)
-        return _Progress(newest, watermark, host_ns)
+        return Progress(newest, watermark, host_ns)
 
-    def _stalled(self, newest: I64Array, first_of_all: I64Array) -> BoolArray:
-        """Which sensors are not waited for, after each delivery: (S, E)."""
-        if self._policy.max_wait_ns is None:
-            return np.zeros(newest.shape, bool)
+    def _stalled(self, newest: I64Array) -> BoolArray | None:
+        """Which sensors are not waited for, (S, E + 1); None: all are."""
+        wait_ns = self._policy.max_wait_ns
+        if wait_ns is None:
+            return None
         leading = newest.max(axis=0)
-        own = np.where(newest > NEVER, newest, first_of_all)
-        behind: BoolArray = np.greater(leading - own, self._policy.max_wait_ns)
+        if newest[:, 0].min() > NEVER and bool((leading - newest.min(axis=0) <= wait_ns).all()):
+            return None
+        present = newest > NEVER
+        first_ns = np.array([[track.first_ns] for track in self._tracks])
+        first_of_all = np.where(present, first_ns, FOREVER).min(axis=0)
+        behind: BoolArray = np.greater(leading - np.where(present, newest, first_of_all), wait_ns)
         behind &= leading > NEVER
         return behind
 
-    def _begin(self, present: BoolArray, stalled: BoolArray) -> int:
+    def _begin(self, newest: I64Array, stalled: BoolArray | None) -> int:
         """Evaluate eq. (1) at the first delivery that allows it; its number, or past the end."""
-        ready: BoolArray = np.logical_and((present | stalled).all(axis=0), present.any(axis=0))
+        present = newest > NEVER
+        away = np.zeros_like(present) if stalled is None else stalled
+        ready: BoolArray = np.logical_and((present | away).all(axis=0), present.any(axis=0))
         if not ready.any():
             return len(ready)
         at = int(np.argmax(ready))
-        live = present[:, at] & ~stalled[:, at]
+        live = present[:, at] & ~away[:, at]
         self._schedule.begin(
             max(track.first_ns for track, use in zip(self._tracks, live, strict=True) if use)
         )
@@ -285,26 +254,31 @@ class Batcher:
         track.drop("invalid", len(valid) - count)
         if not count:
             return
-        place = arrival.place[:, None] + np.arange(heads.valid.shape[1])
+        per_packet = heads.valid.shape[1]
+        place = arrival.place[:, None] + np.arange(per_packet)
         columns = Columns(heads.stamp_ns.reshape(-1), place.reshape(-1), heads.encoder.reshape(-1))
-        published = np.repeat(published, heads.valid.shape[1])
+        published = published.repeat(per_packet)
         if count < len(valid):
             columns, published = columns.take(valid), published[valid]
-        stamp = columns.stamp_ns
-        running = np.maximum.accumulate(np.concatenate([[track.newest_ns], stamp]))
+        running = np.empty(count + 1, np.int64)
+        running[0], running[1:] = track.newest_ns, columns.stamp_ns
+        np.maximum.accumulate(running, out=running)
         self._note_gaps(track, running)
-        limit = np.maximum(running[:-1] - SLACK_NS, published)
-        late = self._late(stamp, limit)
+        late = self._late(columns.stamp_ns, np.maximum(running[:-1] - SLACK_NS, published))
         if late.any():
             track.drop("late", int(np.count_nonzero(late)))
             columns = columns.take(~late)
-        track.waiting.append(columns)
+        if len(columns):
+            track.waiting.append(columns)
+            track.oldest_place = min(track.oldest_place, int(columns.place.min()))
 
-    def _note_gaps(self, track: _Track, running: I64Array) -> None:
-        wait = self._policy.max_wait_ns
-        if wait is None:
+    def _note_gaps(self, track: Track, running: I64Array) -> None:
+        wait_ns = self._policy.max_wait_ns
+        # Stamps that never step back span at least their widest step.
+        if wait_ns is None or int(running[-1]) - int(running[0]) <= wait_ns:
             return
-        wide = np.flatnonzero((np.diff(running) > wait) & (running[:-1] > NEVER))
+        steps = running[1:] - running[:-1]
+        wide = np.flatnonzero((steps > wait_ns) & (running[:-1] > NEVER))
         track.gaps += [(int(running[at]), int(running[at + 1])) for at in wide]
 
     def _late(self, stamp: I64Array, limit: I64Array) -> BoolArray:
@@ -317,7 +291,7 @@ class Batcher:
 
     # -- windows ------------------------------------------------------------------------------
 
-    def _publish(self, progress: _Progress, last_of_all: int | None = None) -> Iterator[Window]:
+    def _publish(self, progress: Progress, last_of_all: int | None = None) -> Iterator[Window]:
         if self.t_init_ns is None:
             return
         until = FOREVER
@@ -325,6 +299,9 @@ class Batcher:
             if self._watermark <= 0:
                 return
             until = self._grid.floor_bound(self._watermark)
+        if until <= self._until:
+            return
+        self._until = until
         stamp, sensor, place, encoder = self._take_until(until)
         done = 0
         while done < len(stamp):
@@ -344,7 +321,7 @@ class Batcher:
                 start_ns=start,
                 end_ns=end,
                 complete=self._complete(progress, closed_by, start, end),
-                ready_host_ns=int(progress.host_ns[closed_by]),
+                ready_host_ns=int(progress.host_ns[closed_by - 1]),
                 stamp_ns=stamp[part],
                 sensor=sensor[part],
                 place=place[part],
@@ -357,13 +334,15 @@ class Batcher:
         """Take waiting columns before `until`, merged: by stamp, then sensor, then arrival."""
         taken = []
         for track in self._tracks:
-            columns = _chained(track.waiting)
+            columns = chained(track.waiting)
             due = columns.stamp_ns < until
             taken.append(columns.take(due))
-            track.waiting = [columns.take(~due)]
-        merged = _chained(taken)
-        sensor = np.repeat(np.arange(len(taken)), [len(columns) for columns in taken])
-        order = np.argsort(merged.stamp_ns, kind="stable")
+            left = columns.take(~due)
+            track.waiting = [left] if len(left) else []
+            track.oldest_place = int(left.place.min(initial=FOREVER))
+        merged = chained(taken)
+        sensor = np.arange(len(taken)).repeat([len(columns) for columns in taken])
+        order = merged.stamp_ns.argsort(kind="stable")
         return (
             merged.stamp_ns[order],
             sensor[order],
@@ -371,7 +350,7 @@ class Batcher:
             merged.encoder[order],
         )
 
-    def _complete(self, progress: _Progress, at: int, start: int, end: int) -> bool:
+    def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:
         """Every sensor began at or before the start and came past the end, and none stalled."""
         return bool((progress.newest[:, at] >= end).all()) and not any(
             track.first_ns > start
@@ -382,16 +361,3 @@ class Batcher:
     def _drop(self, sensor: I64Array, reason: str) -> None:
         for number, count in enumerate(np.bincount(sensor, minlength=len(self._tracks))):
             self._tracks[number].drop(reason, int(count))
-
-
-def _chained(parts: Sequence[Columns]) -> Columns:
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        nothing = np.empty(0, np.int64)
-        return Columns(nothing, nothing, nothing)
-    return Columns(
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.place for part in parts]),
-        np.concatenate([part.encoder for part in parts]),
-    )
