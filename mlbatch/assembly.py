@@ -24,11 +24,13 @@ def feed_of(sensor: Mounted) -> Feed:
 
 def intake_of(sensor: Mounted, *, host_clock: bool) -> Intake:
     """The door of a sensor, with what the rig says of its clock."""
+    lidar = sensor.found.lidar
     return Intake(
         sensor.name,
         host_clock=host_clock,
         offset_ns=sensor.offset_ns,
-        modulus=sensor.found.lidar.sequence_modulus,
+        modulus=lidar.sequence_modulus,
+        packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
     )
 
 

@@ -110,6 +110,11 @@ def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:
     return angle, speed, words >> (_ANGLE_BITS + _SPEED_BITS)
 
 
+def rotor_ticks(words: I64Array) -> I64Array:
+    """Angles of rotor words, in 2**-32 turns."""
+    return words & ((1 << _ANGLE_BITS) - 1)
+
+
 # Of a turn; wide enough that columns of slow lidars leave none out.
 SECTORS = 120
 
@@ -121,7 +126,7 @@ def sectors(encoder: I64Array, positions: int | None) -> I64Array:
     """
     if positions is not None:
         return encoder * SECTORS // positions
-    return (encoder & ((1 << _ANGLE_BITS) - 1)) * SECTORS >> _ANGLE_BITS
+    return rotor_ticks(encoder) * SECTORS >> _ANGLE_BITS
 
 
 class Projection(Protocol):

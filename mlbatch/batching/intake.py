@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.batching.loss import Loss
+from mlbatch.batching.loss import PacketLoss
 from mlbatch.errors import ClockJump
 from mlbatch.types import BoolArray, Heads, I64Array
 from mlbatch.units import NS_PER_S
@@ -75,10 +75,17 @@ class Intake:
     """The door of one sensor; `rejected` counts what stays outside."""
 
     def __init__(
-        self, name: str, *, host_clock: bool = False, offset_ns: int = 0, modulus: int = 0
+        self,
+        name: str,
+        *,
+        host_clock: bool = False,
+        offset_ns: int = 0,
+        modulus: int = 0,
+        packet_ns: float = 0.0,
     ) -> None:
+        """modulus, packet_ns: as in PacketLoss."""
         self.name = name
-        self.loss = Loss(modulus)
+        self.loss = PacketLoss(modulus, packet_ns)
         self.rejected: dict[str, int] = {}
         self._host_clock = host_clock
         self._offset_ns = offset_ns
@@ -107,7 +114,7 @@ class Intake:
             low, high = extremes(arrival.heads)
         else:
             self._newest = max(self._newest, int(high.max(initial=NEVER)))
-        self.loss.add(arrival.key)
+        self.loss.add(arrival.key, arrival.heads, arrival.host_ns)
         if self._host_clock and len(high):
             stamp, known = arrival.heads.stamp_ns, high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)

@@ -1,14 +1,45 @@
-"""Packets lost and reordered on the way, from the sensor's own count."""
+"""Packets lost and reordered on the way: by the sensor's own count, else by the pace of stamps."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.types import I64Array
+from mlbatch.batching.pace import PaceLoss
+from mlbatch.types import Heads, I64Array
 
 # A longer step is believed only if the next packet goes on from there: one flipped bit in a frame
 # number must not count as a million lost packets.
 BELIEVED_STEP = 1024
+
+
+class PacketLoss:
+    """What one sensor's packets tell of others that did not come, or came late.
+
+    By their numbers where they bear a count, else by the pace of their stamps; a sensor of which
+    neither is known loses nothing that we know of.
+    """
+
+    def __init__(self, modulus: int, packet_ns: float = 0.0) -> None:
+        """modulus: where the count wraps, 0 none; packet_ns: time of a packet, 0 unknown."""
+        self._numbers = Loss(modulus)
+        self._pace = PaceLoss(packet_ns) if packet_ns and not modulus else None
+
+    @property
+    def lost(self) -> int:
+        """Packets missing between those that came."""
+        return self._numbers.lost if self._pace is None else self._pace.lost
+
+    @property
+    def reordered(self) -> int:
+        """Packets that came after a later one."""
+        return self._numbers.reordered if self._pace is None else self._pace.reordered
+
+    def add(self, sequence: I64Array, heads: Heads, host_ns: I64Array) -> None:
+        """Count accepted packets (P,), in order of arrival, by the sensor's own clock."""
+        if self._pace is None:
+            self._numbers.add(sequence)
+        elif len(host_ns):
+            self._pace.add(heads, host_ns)
 
 
 class Loss:
