@@ -89,7 +89,11 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A whole benchmark; machine: texts and numbers by name; notes: what was left out, and why."""
+    """A whole benchmark.
+
+    machine: texts and numbers by name; notes: what was left out, and why; failed: conversions that
+    ended with an error.
+    """
 
     date: str
     machine: Mapping[str, Json]
@@ -98,6 +102,7 @@ class Result:
     rows: tuple[Row, ...]
     ratios: tuple[Ratio, ...]
     notes: tuple[str, ...]
+    failed: tuple[str, ...] = ()
     changes: tuple[Changed, ...] = ()
 
 
@@ -113,6 +118,7 @@ def document(result: Result) -> dict[str, Json]:
         "ratios": [asdict(ratio) for ratio in result.ratios],
         "changes": [{**asdict(one), "ratio": one.ratio} for one in result.changes],
         "notes": list(result.notes),
+        "failed": list(result.failed),
     }
 
 

@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import partial
@@ -67,17 +67,20 @@ class Program:
 def bench(settings: Settings) -> Result:
     """Make the recordings, measure all cases, compare; raises BenchError where it cannot."""
     before = {} if settings.against is None else read_document(settings.against)
+    # First, since the load is to be that of others.
+    told = machine()
     with _place(settings) as folder, TemporaryDirectory(dir=folder, prefix="run-") as scratch:
         session = Session(settings, folder, Path(scratch))
         rows = [row for case in settings.cases for row in session.measure(case)]
         return Result(
             datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
-            machine(),
+            told,
             settings.seconds,
             settings.repeat,
             tuple(rows),
             tuple(ratios(rows)),
             (*settings.notes, *session.notes),
+            tuple(session.failed),
             tuple(changes(rows, before)),
         )
 
@@ -114,6 +117,7 @@ class Session:
         self.folder = folder
         self.scratch = scratch
         self.notes: list[str] = []
+        self.failed: list[str] = []
         self._converted = Counted()
         self._peers = self._find_peers()
 
@@ -138,10 +142,9 @@ class Session:
         try:
             run = program.run()
         except BenchError as err:
-            # Others may fail; what is to be measured may not.
-            if program.role == OURS:
-                raise
             self.notes.append(f"{case.name}: {err}")
+            if program.role == OURS:
+                self.failed.append(f"{case.name}: {program.name}")
             del runs[program.name]
             return
         earlier = runs[program.name]
@@ -157,8 +160,9 @@ class Session:
         conversions = case.conversions(self.settings.engines)
         for conversion in conversions:
             if conversion.engine == NUMBA:
-                # Kernels are compiled when they are first needed.
-                self._convert(conversion)
+                # Kernels are compiled when they are first needed; errors come again.
+                with contextlib.suppress(BenchError):
+                    self._convert(conversion)
         found = [Program(c.name, OURS, partial(self._convert, c), c.base) for c in conversions]
         found += [Program(name, FLOOR, partial(self._floor, name)) for name in case.floors]
         found += [
@@ -248,12 +252,3 @@ def _taken_away(scratch: Path) -> int:
             size += path.stat().st_size
             path.unlink()
     return size
-
-
-def wanted_cases(names: Sequence[str], known: Sequence[Case]) -> tuple[Case, ...]:
-    """The cases of these names, all for none; raises BenchError for a name that is unknown."""
-    by_name = {case.name: case for case in known}
-    for name in names:
-        if name not in by_name:
-            raise BenchError(f"--case: wanted one of {', '.join(by_name)}, got {name!r}")
-    return tuple(by_name[name] for name in names or by_name)

@@ -45,6 +45,7 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
     """Measure conversions of standard recordings: CPU, time, memory, beside floors and peers."""
+    from mlbatch.bench.measure import BenchError
     from mlbatch.bench.results import document
     from mlbatch.bench.runner import bench as measure
     from mlbatch.bench.table import lines
@@ -57,6 +58,10 @@ def bench(
     else:
         for line in lines(result):
             typer.echo(line)
+    if result.failed:
+        raise BenchError(
+            f"{len(result.failed)} conversion(s) failed, {result.failed[0]} first; see the notes"
+        )
 
 
 def _settings(
@@ -70,17 +75,23 @@ def _settings(
 ) -> Settings:
     """The options as values, or a UsageError."""
     from mlbatch.bench.cases import CASES
-    from mlbatch.bench.runner import Settings, wanted_cases
-    from mlbatch.cli import values
+    from mlbatch.bench.runner import Settings
 
     if not 1 <= seconds <= MOST_SECONDS:
         raise UsageError(f"--seconds: wanted 1 to {MOST_SECONDS:g}, got {seconds:g}; write 12")
     if not 1 <= repeat <= MOST_RUNS:
         raise UsageError(f"--repeat: wanted 1 to {MOST_RUNS}, got {repeat}; write 5")
-    values.choice("--engine", engine, ENGINES)
+    # Not by the helpers of other commands: they load numpy, which would count as memory of all
+    # processes that are measured (measure.py).
+    if engine not in ENGINES:
+        raise UsageError(f"--engine: wanted one of {', '.join(ENGINES)}, got {engine!r}")
+    cases = {known.name: known for known in CASES}
+    for name in case:
+        if name not in cases:
+            raise UsageError(f"--case: wanted one of {', '.join(cases)}, got {name!r}")
     engines, notes = _engines(engine)
     return Settings(
-        *(wanted_cases(case, CASES), engines, seconds, repeat),
+        *(tuple(cases[name] for name in case or cases), engines, seconds, repeat),
         # Not resolved: the python of an environment is a link, and its place says which one.
         peer_pythons=tuple(str(path.absolute()) for path in peer_python),
         keep=keep,
