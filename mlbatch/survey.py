@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.batching.loss import Loss
+from mlbatch.batching.loss import PacketLoss
 from mlbatch.clock import timescale
 from mlbatch.clock_compare import Comparison, compare
 from mlbatch.clouds import CloudRecording
@@ -83,7 +83,7 @@ class _Count:
     """What a pass over the first seconds shows of one sensor."""
 
     ring: RawRing
-    loss: Loss
+    loss: PacketLoss
     watch: ClockWatch
     first: tuple[int, int] | None = None
 
@@ -225,9 +225,7 @@ def _count(
     *,
     whole: bool,
 ) -> list[_Count]:
-    counts = [
-        _Count(_ring(s.lidar), Loss(s.lidar.sequence_modulus), watch_of(s.lidar)) for s in found
-    ]
+    counts = [_counting(sensor.lidar) for sensor in found]
     for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
             for sensor, count in zip(found, counts, strict=True):
@@ -235,9 +233,9 @@ def _count(
                     continue
                 packets, _ = count.ring.store(batch.data, batch.start[index], None)
                 good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
-                count.loss.add(sensor.lidar.sequence(packets[good]))
                 hosts_ns = batch.host_ns[index[good]]
                 heads = sensor.lidar.heads(packets[good], hosts_ns)
+                count.loss.add(sensor.lidar.sequence(packets[good]), heads, hosts_ns)
                 _, newest_ns = extremes(heads)
                 if not is_untimed(untimed, sensor):
                     count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
@@ -271,8 +269,11 @@ def _as_json(clocks: Comparison) -> dict[str, object]:
     }
 
 
-def _ring(lidar: Lidar) -> RawRing:
-    return RawRing(lidar.packet_size, lidar.records)
+def _counting(lidar: Lidar) -> _Count:
+    """Nothing counted yet."""
+    packet_ns = lidar.columns_per_packet * lidar.column_period_ns
+    ring = RawRing(lidar.packet_size, lidar.records)
+    return _Count(ring, PacketLoss(lidar.sequence_modulus, packet_ns), watch_of(lidar))
 
 
 def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router) -> str:
