@@ -21,6 +21,9 @@ STAMP_LIMIT_NS = 2**31 * NS_PER_S
 DUPLICATE_REACH = 1024
 NEVER = -(2**62)
 FOREVER = 2**62
+# Keys are kept in so many pieces at most.
+_MOST_PIECES = 32
+_NONE = np.empty(0, np.int64)
 
 
 @dataclass(slots=True)
@@ -91,7 +94,8 @@ class Intake:
         self._offset_ns = offset_ns
         self._newest = NEVER
         self._held: Arrival | None = None
-        self._recent: I64Array = np.empty(0, np.int64)
+        # Keys of the newest packets, DUPLICATE_REACH or more where there were so many.
+        self._recent: list[I64Array] = []
         self._largest_key = -1
 
     def accept(self, arrival: Arrival) -> Delivery:
@@ -103,23 +107,41 @@ class Intake:
         if self._offset_ns:
             heads.stamp_ns = heads.stamp_ns + self._offset_ns
         low, high = extremes(heads)
-        measured = high > NEVER
-        sane = (low >= 0) & (high < STAMP_LIMIT_NS) | ~measured
-        sane[sane] &= (high[sane] - low[sane] <= STEP_NS) | ~measured[sane]
-        self._reject("bad_stamp", len(sane) - int(np.count_nonzero(sane)))
-        if not sane.all():
-            arrival, low, high = arrival.take(sane), low[sane], high[sane]
-        if self._held is not None or self._steps(low, high).any():
-            arrival = self._judge(arrival)
-            low, high = extremes(arrival.heads)
+        lowest, highest = int(low.min(initial=FOREVER)), int(high.max(initial=NEVER))
+        if self._held is None and self._is_calm(lowest, highest):
+            self._newest = max(self._newest, highest)
         else:
-            self._newest = max(self._newest, int(high.max(initial=NEVER)))
+            arrival, low, high = self._sift(arrival, low, high)
         self.loss.add(arrival.key, arrival.heads, arrival.host_ns)
         if self._host_clock and len(high):
             stamp, known = arrival.heads.stamp_ns, high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
             high = np.where(known, arrival.host_ns, NEVER)
         return Delivery(arrival, high)
+
+    def _is_calm(self, lowest: int, highest: int) -> bool:
+        """Whether stamps between these limits are sane, and no packet of them can be a step."""
+        return (
+            lowest >= 0
+            and highest < STAMP_LIMIT_NS
+            and max(highest, self._newest) - lowest <= STEP_NS
+            and (self._newest == NEVER or highest - self._newest <= STEP_NS)
+        )
+
+    def _sift(
+        self, arrival: Arrival, low: I64Array, high: I64Array
+    ) -> tuple[Arrival, I64Array, I64Array]:
+        """The packets whose stamps are sane and whose steps are confirmed; their extremes."""
+        # Where nothing was measured, low lies far above and high far below: such packets pass.
+        sane = (low >= 0) & (high < STAMP_LIMIT_NS) & (high - low <= STEP_NS)
+        if not sane.all():
+            self._reject("bad_stamp", len(sane) - int(np.count_nonzero(sane)))
+            arrival, low, high = arrival.take(sane), low[sane], high[sane]
+        if self._held is not None or self._steps(low, high).any():
+            arrival = self._judge(arrival)
+            return arrival, *extremes(arrival.heads)
+        self._newest = max(self._newest, int(high.max(initial=NEVER)))
+        return arrival, low, high
 
     def finish(self) -> None:
         """End of input: a packet that is still held was never confirmed."""
@@ -133,26 +155,33 @@ class Intake:
 
     def _distinct(self, key: I64Array) -> BoolArray:
         """Which packets are not a repetition of one of the last DUPLICATE_REACH packets."""
-        known = len(self._recent)
-        keys = np.concatenate([self._recent, key])
         if len(key) and key[0] > self._largest_key and bool((key[1:] > key[:-1]).all()):
             # As nearly always: every number is larger than all before it.
-            self._recent, self._largest_key = keys[-DUPLICATE_REACH:], int(key[-1])
+            self._remember(key)
+            self._largest_key = int(key[-1])
             return np.ones(len(key), bool)
-        order = np.argsort(keys, kind="stable")
-        ordered = keys[order]
-        again = (ordered[1:] == ordered[:-1]) & (ordered[1:] >= 0)
-        again &= order[1:] - order[:-1] <= DUPLICATE_REACH
-        fresh = np.ones(len(keys), bool)
-        fresh[order[1:][again]] = False
-        self._recent = keys[-DUPLICATE_REACH:]
-        self._largest_key = int(self._recent.max(initial=-1))
-        self._reject("duplicate", int(np.count_nonzero(~fresh[known:])))
-        return fresh[known:]
+        recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
+        if len(key) == 1:
+            # Numbers without an order that come one by one: a look at all is cheaper than a sort.
+            fresh = (key < 0) | ~(recent == key).any(keepdims=True)
+        else:
+            fresh = _first_of_kind(recent, key)
+        self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
+        self._recent = [recent]
+        self._remember(key)
+        self._reject("duplicate", len(key) - int(np.count_nonzero(fresh)))
+        return fresh
+
+    def _remember(self, key: I64Array) -> None:
+        self._recent.append(key)
+        if len(self._recent) > _MOST_PIECES:
+            self._recent = [np.concatenate(self._recent)[-DUPLICATE_REACH:]]
 
     def _steps(self, low: I64Array, high: I64Array) -> BoolArray:
         """Which packets step more than 1 s from the newest stamp before them, if none were held."""
-        newest = np.maximum.accumulate(np.concatenate([[self._newest], high]))[:-1]
+        newest = np.empty_like(high)
+        newest[:1], newest[1:] = self._newest, high[:-1]
+        np.maximum.accumulate(newest, out=newest)
         # The first packet of all has nothing to step from.
         known, measured = newest > NEVER, high > NEVER
         return known & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
@@ -216,6 +245,18 @@ class Intake:
     def held_place(self) -> int | None:
         """Ring place of the packet that is held, if any; its pixels must not be overwritten."""
         return None if self._held is None else int(self._held.place[0])
+
+
+def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:
+    """Which keys (n,) repeat none of the DUPLICATE_REACH before them; recent: those before all."""
+    keys = np.concatenate([recent, key])
+    order = keys.argsort(kind="stable")
+    ordered = keys[order]
+    again = (ordered[1:] == ordered[:-1]) & (ordered[1:] >= 0)
+    again &= order[1:] - order[:-1] <= DUPLICATE_REACH
+    fresh = np.ones(len(keys), bool)
+    fresh[order[1:][again]] = False
+    return fresh[len(recent) :]
 
 
 def _copied(rows: Arrival, row: int) -> Arrival:

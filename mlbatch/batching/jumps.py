@@ -43,12 +43,23 @@ class JumpGuard:
         """Look at the next packets, in order of delivery."""
         if not self._has_clock:
             return
-        measured = delivery.newest_ns > NEVER
-        stamp_ns, host_ns = delivery.newest_ns[measured], delivery.packets.host_ns[measured]
+        stamp_ns, host_ns = delivery.newest_ns, delivery.packets.host_ns
+        measured = stamp_ns > NEVER
+        if not measured.all():
+            stamp_ns, host_ns = stamp_ns[measured], host_ns[measured]
         if not len(stamp_ns):
             return
         if self._newest_ns == NEVER:
             self._newest_ns, self._host_ns = int(stamp_ns[0]), int(host_ns[0])
+        newest_ns = max(self._newest_ns, int(stamp_ns.max()))
+        if newest_ns - self._newest_ns > STEP_NS:
+            self._refuse_jump(stamp_ns, host_ns)
+        self._newest_ns, self._host_ns = newest_ns, int(host_ns[-1])
+        if self._watch is not None:
+            self._watch.add(stamp_ns, host_ns)
+
+    def _refuse_jump(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
+        """Look for a step of more than a second in the stamps that arrivals do not show."""
         newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], stamp_ns]))
         hosts = np.concatenate([[self._host_ns], host_ns])
         steps, passed = newest[1:] - newest[:-1], hosts[1:] - hosts[:-1]
@@ -56,9 +67,6 @@ class JumpGuard:
         jumps = (steps > STEP_NS) & (passed > 0) & (steps - passed > STEP_NS)
         if jumps.any():
             raise self._jump(newest, hosts, int(np.argmax(jumps)))
-        self._newest_ns, self._host_ns = int(newest[-1]), int(host_ns[-1])
-        if self._watch is not None:
-            self._watch.add(stamp_ns, host_ns)
 
     def _jump(self, newest: I64Array, hosts: I64Array, at: int) -> ClockJump:
         before, after = int(newest[at]), int(newest[at + 1])

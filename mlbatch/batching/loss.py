@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from mlbatch.batching.pace import PaceLoss
 from mlbatch.types import Heads, I64Array
 
@@ -56,19 +54,22 @@ class Loss:
 
     def add(self, sequence: I64Array) -> None:
         """Count accepted packets (n,), in order of arrival; negative: outside the count."""
-        sequence = sequence[sequence >= 0]
         if not self._modulus or not len(sequence):
             return
-        if self._newest is None:
-            self._newest = int(sequence[0])
-            sequence = sequence[1:]
-        steps = np.diff(sequence, prepend=self._newest) % self._modulus
-        if self._doubtful is None and bool((steps == 1).all()):
-            if len(sequence):
-                self._newest, self._is_sure = int(sequence[-1]), True
+        if self._is_sure and self._doubtful is None and self._goes_on(sequence):
+            self._newest = int(sequence[-1])
             return
-        for number in sequence.tolist():
-            self._step(number)
+        for number in sequence[sequence >= 0].tolist():
+            if self._newest is None:
+                self._newest = number
+            else:
+                self._step(number)
+
+    def _goes_on(self, sequence: I64Array) -> bool:
+        """Whether every number is one more than that before, as nearly always."""
+        if self._newest is None or int(sequence[0]) != (self._newest + 1) % self._modulus:
+            return False
+        return bool((sequence[1:] == (sequence[:-1] + 1) % self._modulus).all())
 
     def _step(self, number: int) -> None:
         step = self._signed(number - (self._newest or 0))
