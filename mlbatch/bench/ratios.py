@@ -21,6 +21,7 @@ _MEASURES: Final[Mapping[str, Callable[[Run], float]]] = {
     WALL: lambda run: run.wall_s,
     MEMORY: lambda run: run.rss_mb,
 }
+OFS: Final = tuple(_MEASURES)
 # What is compared with a peer, with the program that another one extends, and with a floor.
 _WITH_PEER: Final = (CPU, OWN_CPU)
 _WITH_BASE: Final = (CPU, WALL)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import TypeAlias
 
 from mlbatch.bench.measure import BenchError
@@ -115,7 +116,7 @@ def document(result: Result) -> dict[str, Json]:
         "seconds": result.seconds,
         "repeat": result.repeat,
         "rows": [_row(row) for row in result.rows],
-        "ratios": [asdict(ratio) for ratio in result.ratios],
+        "ratios": [{**asdict(one), "median": median(one.values)} for one in result.ratios],
         "changes": [{**asdict(one), "ratio": one.ratio} for one in result.changes],
         "notes": list(result.notes),
         "failed": list(result.failed),

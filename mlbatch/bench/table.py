@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import median
 
+from mlbatch.bench.ratios import OFS
 from mlbatch.bench.results import Changed, Ratio, Result, Row
 from mlbatch.errors import one_line
 from mlbatch.units import NS_PER_S
@@ -21,15 +22,15 @@ def lines(result: Result) -> list[str]:
     head = [
         f"{told['cpu']}, {told['cores']} cores, {told['memory_mb']} MB, {told['system']}",
         f"{result.date}, load {told['load']:.1f}, {', '.join(versions)}",
-        f"{result.seconds:g} s of recording, medians of {result.repeat}; own: CPU without start "
-        "and imports; stages in ns a slot",
+        f"{result.seconds:g} s of recording, medians of {result.repeat}, MB: largest; "
+        "own: CPU without start and imports; read to write: time of the stages, ns/slot",
     ]
     rows = aligned([_HEAD, *map(_row, result.rows)], _LEFT)
     parts = [head, rows]
     if result.ratios:
         parts.append(aligned([_RATIO_HEAD, *map(_ratio, result.ratios)], _LEFT_OF_RATIOS))
     if result.changes:
-        parts.append(aligned([_CHANGE_HEAD, *map(_change, result.changes)], _LEFT + 1))
+        parts.append(aligned([_CHANGE_HEAD, *_changes(result.changes)], _LEFT))
     if result.notes:
         parts.append([f"note: {note}" for note in result.notes])
     return [one_line(line) for part in parts for line in (*part, "")][:-1]
@@ -37,7 +38,7 @@ def lines(result: Result) -> list[str]:
 
 _MACHINE = ("cpu", "cores", "memory_mb", "system", "load")
 _RATIO_HEAD = ("case", "program", "to", "of", "ratio", "least", "most")
-_CHANGE_HEAD = ("case", "program", "of", "before", "now", "ratio")
+_CHANGE_HEAD = ("case", "program", *(f"{of}, now/before" for of in OFS))
 
 
 def _row(row: Row) -> tuple[str, ...]:
@@ -74,15 +75,14 @@ def _ratio(ratio: Ratio) -> tuple[str, ...]:
     )
 
 
-def _change(one: Changed) -> tuple[str, ...]:
-    return (
-        one.case,
-        one.program,
-        one.of,
-        f"{one.before:.3f}",
-        f"{one.now:.3f}",
-        f"{one.ratio:.2f}",
-    )
+def _changes(found: Sequence[Changed]) -> Iterator[tuple[str, ...]]:
+    """A line a program."""
+    by_program: dict[tuple[str, str], dict[str, float]] = {}
+    for one in found:
+        by_program.setdefault((one.case, one.program), {})[one.of] = one.ratio
+    for (case, program), ratio in by_program.items():
+        cells = (f"{ratio[of]:.2f}" if of in ratio else "" for of in OFS)
+        yield (case, program, *cells)
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:

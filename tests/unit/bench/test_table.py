@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mlbatch.bench.ratios import CPU
+from mlbatch.bench.ratios import CPU, MEMORY
 from mlbatch.bench.results import Changed, Counted, Ratio
 from mlbatch.bench.table import aligned, lines
 from tests.unit.bench.made import STAGES, result, row, run
@@ -27,7 +27,7 @@ def test_the_machine_and_the_date_come_first() -> None:
     told = lines(result(row("numpy", [run(1.0)])))
     assert told[0] == "Abacus, 2 cores, 1000 MB, S"
     assert told[1] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
-    assert told[2].startswith("10 s of recording, medians of 3; ")
+    assert told[2].startswith("10 s of recording, medians of 3, ")
 
 
 def test_programs_that_count_nothing_leave_cells_empty() -> None:
@@ -40,12 +40,16 @@ def test_ratios_changes_and_notes_follow() -> None:
         replace(
             result(row("numpy", [run(1.0)])),
             ratios=(Ratio("dual-4", "numpy", "sdk", CPU, (0.5, 0.25, 4.0)),),
-            changes=(Changed("dual-4", "numpy", CPU, 4.0, 1.0),),
+            changes=(
+                Changed("dual-4", "numpy", CPU, 4.0, 1.0),
+                Changed("dual-4", "numpy", MEMORY, 50.0, 60.0),
+            ),
             notes=("no peers",),
         )
     )
     assert "dual-4  numpy    sdk  CPU   0.50   0.25  4.00" in told
-    assert "dual-4  numpy    CPU   4.000  1.000   0.25" in told
+    changed = next(line for line in told if "0.25 " in line and "sdk" not in line)
+    assert changed.split() == ["dual-4", "numpy", "0.25", "1.20"]
     assert told[-1] == "note: no peers"
 
 
