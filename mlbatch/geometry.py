@@ -103,11 +103,21 @@ def rotor_words(turns: F64Array, turns_per_s: F64Array, table: I64Array | int = 
 
 def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:
     """Angle in rad, speed in rad/ns and firing table of rotor words (n,)."""
-    angle = ((words & ((1 << _ANGLE_BITS) - 1)) * (2 * np.pi / _TURN)).astype(np.float64)
+    angle = _angles_rad(words)
     field = (words >> _ANGLE_BITS) & ((1 << _SPEED_BITS) - 1)
     steps = (field ^ (1 << (_SPEED_BITS - 1))) - (1 << (_SPEED_BITS - 1))
     speed = (steps * (2.0**-48 * 2 * np.pi)).astype(np.float64)
     return angle, speed, words >> (_ANGLE_BITS + _SPEED_BITS)
+
+
+def rotor_angles(words: I64Array) -> tuple[F32Array, F32Array]:
+    """Cosine and sine of the angles of rotor words (n,)."""
+    angle_rad = _angles_rad(words)
+    return np.cos(angle_rad).astype(np.float32), np.sin(angle_rad).astype(np.float32)
+
+
+def _angles_rad(words: I64Array) -> F64Array:
+    return (rotor_ticks(words) * (2 * np.pi / _TURN)).astype(np.float64)
 
 
 def rotor_ticks(words: I64Array) -> I64Array:
@@ -142,34 +152,38 @@ class Projection(Protocol):
 
 
 class Tabled:
-    """Sensors whose rotor positions are known beforehand: directions come from a table."""
+    """Sensors whose rotor positions are known beforehand: directions come from a table.
+
+    direction: (rows, 3, B), origin: (rows, 3, B or 1) float32, m, of all sensors one after the
+    other; first_position: (sensors,) first row of each; reaches_m: (sensors, B or 1).
+    """
 
     def __init__(self, tables: Sequence[BeamTable], columns: int) -> None:
         """tables: beams of each sensor, in the body frame; columns: the most aimed at once."""
-        self._direction = _stacked([table.directions() for table in tables])
-        self._origin = _stacked([table.origins() for table in tables])
+        self.direction = _stacked([table.directions() for table in tables])
+        self.origin = _stacked([table.origins() for table in tables])
         counts = [0 if one.angle_rad is None else len(one.angle_rad) for one in tables]
-        self._first_position = np.cumsum([0, *counts[:-1]]).astype(np.int64)
-        self._reaches_m = _reaches(tables)
-        self._taken = np.empty((columns, 3, self._direction.shape[2]), np.float32)
+        self.first_position = np.cumsum([0, *counts[:-1]]).astype(np.int64)
+        self.reaches_m = _reaches(tables)
+        self._taken = np.empty((columns, 3, self.direction.shape[2]), np.float32)
         self._moved = np.empty_like(self._taken)
-        self._reached_m = np.empty((columns, self._direction.shape[2]), np.float32)
+        self._reached_m = np.empty((columns, self.direction.shape[2]), np.float32)
         self._towards, self._from = self._taken, self._taken
-        self._reach_m = self._reaches_m[0]
+        self._reach_m = self.reaches_m[0]
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
         """Look up directions and origins."""
-        position = encoder + self._first_position[member]
+        position = encoder + self.first_position[member]
         first, count = int(position[0]), len(position)
-        alone = len(self._reaches_m) == 1
-        self._reach_m = self._reaches_m[0] if alone else self._reaches_m[member]
+        alone = len(self.reaches_m) == 1
+        self._reach_m = self.reaches_m[0] if alone else self.reaches_m[member]
         if bool((position[1:] - position[:-1] == 1).all()):
             turn = slice(first, first + count)
-            self._towards, self._from = self._direction[turn], self._origin[turn]
+            self._towards, self._from = self.direction[turn], self.origin[turn]
             return
         self._towards = self._taken[:count]
-        self._direction.take(position, axis=0, out=self._towards, mode="clip")
-        self._from = self._origin.take(position, axis=0, mode="clip")
+        self.direction.take(position, axis=0, out=self._towards, mode="clip")
+        self._from = self.origin.take(position, axis=0, mode="clip")
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
@@ -184,6 +198,8 @@ class Turning:
 
     What is the same for all columns lies repeated in planes (columns, B): loops over whole planes
     cost a fraction of loops over the few beams of a column.
+
+    direction, origin: (3 vectors, 3 axes, B) float32; reach_m: (B,) or (1,); firing_ns: (T, B).
     """
 
     def __init__(self, table: BeamTable, firing_ns: I64Array, columns: int) -> None:
@@ -191,17 +207,18 @@ class Turning:
         beams = table.direction.shape[1]
         self._direction = _planes(table.direction, columns, beams)
         self._origin = _planes(table.origin, columns, beams)
-        self._origin_turns = bool(table.origin[:2].any())
-        self._reach_m = table.reach_m.astype(np.float32)
-        self._has_reach = bool(table.reach_m.any())
-        self._firing_ns = firing_ns.astype(np.float32)
-        self._fires_at_once = not firing_ns.any()
-        self._repeated_ns = np.broadcast_to(self._firing_ns[0], (columns, beams)).copy()
+        self.direction, self.origin = self._direction[:, :, 0], self._origin[:, :, 0]
+        self.origin_turns = bool(table.origin[:2].any())
+        self.reach_m = table.reach_m.astype(np.float32)
+        self.has_reach = bool(table.reach_m.any())
+        self.firing_ns = firing_ns.astype(np.float32)
+        self.fires_at_once = not firing_ns.any()
+        self._repeated_ns = np.broadcast_to(self.firing_ns[0], (columns, beams)).copy()
         self._cosine, self._sine, self._turned, self._half, self._scratch = np.empty(
             (5, columns, beams), np.float32
         )
         self._towards = np.empty((3, columns, beams), np.float32)
-        self._from = np.empty_like(self._towards) if self._origin_turns else self._origin[2]
+        self._from = np.empty_like(self._towards) if self.origin_turns else self._origin[2]
         self._count = 0
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
@@ -211,19 +228,19 @@ class Turning:
         cosine, sine = self._cosine[:count], self._sine[:count]
         cosine[:] = np.cos(angle).astype(np.float32)[:, None]
         sine[:] = np.sin(angle).astype(np.float32)[:, None]
-        if not self._fires_at_once and speed.any():
+        if not self.fires_at_once and speed.any():
             self._turn_on(cosine, sine, speed, table)
         for axis in range(3):
             self._combine(self._direction, axis, self._towards[axis, :count])
-            if self._origin_turns:
+            if self.origin_turns:
                 self._combine(self._origin, axis, self._from[axis, :count])
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
         count = self._count
         moved = self._scratch[:count]
-        if self._has_reach:
-            range_m = np.add(range_m, self._reach_m, out=self._half[:count])
+        if self.has_reach:
+            range_m = np.add(range_m, self.reach_m, out=self._half[:count])
         for axis in range(3):
             np.multiply(range_m, self._towards[axis, :count], out=moved)
             np.add(moved, self._from[axis, :count], out=out[:, :, axis])
@@ -235,8 +252,8 @@ class Turning:
         d**3 / 6: 1e-7 rad at 600 rpm and 137 us.
         """
         count = len(speed)
-        one_table = len(self._firing_ns) == 1
-        firing_ns = self._repeated_ns[:count] if one_table else self._firing_ns[table]
+        one_table = len(self.firing_ns) == 1
+        firing_ns = self._repeated_ns[:count] if one_table else self.firing_ns[table]
         turned, half, scratch = self._turned[:count], self._half[:count], self._scratch[:count]
         turned[:] = speed.astype(np.float32)[:, None]
         np.multiply(turned, firing_ns, out=turned)

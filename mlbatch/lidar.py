@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from mlbatch.geometry import BeamTable, Projection
+from mlbatch.pixels import PixelTable
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, Stream, U8Array
 
 # Verdicts of `Lidar.faults`, in the order of their numbers; 0 is a good packet.
@@ -119,7 +120,8 @@ class Lidar(Protocol):
     the same rows as `firing_ns`:
     (T, channels) when each beam fires after its column's stamp, >= 0; rotor words choose the row,
     all else uses row 0. `sequence_modulus`: the sequence number wraps there (0: packets carry no
-    count). `pixel_layout`: equal for sensors whose records `read` decodes alike. `carries_serial`:
+    count). `pixel_layout`: equal for sensors whose records `read` decodes alike; `pixels`: where
+    they lie, None where only `read` knows. `carries_serial`:
     the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
     numbering of facts/outputs.md section 3 per return; `typed_by`: how those of two returns are
     told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at all).
@@ -143,6 +145,7 @@ class Lidar(Protocol):
     column_period_ns: float
     records: Records
     pixel_layout: tuple[str | int | bool, ...]
+    pixels: PixelTable | None
     sequence_modulus: int
     imu_port: int
     return_types: tuple[int, ...]

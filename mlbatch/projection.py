@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.buffers import LABEL, Labels
 from mlbatch.geometry import Projection, Tabled, Turning, read_rotor_words
 from mlbatch.ledger import PointCounts
 from mlbatch.lidar import Lidar
@@ -29,12 +30,8 @@ from mlbatch.types import (
 
 # Enough work for a call to be cheap, little enough for the planes to stay in the caches.
 TILE_SLOTS = 1 << 16
-# What a point is, in the bytes of one word, so that it moves as one: its time (ns after the start
-# of the scan, added as a number to the low half), ring, return type and sensor.
-LABEL = np.dtype([("time_ns", "<u4"), ("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
 _ONLY, _FIRST_STRONG, _BOTH = np.uint8(7), np.uint8(3), np.uint8(9)
 Extras: TypeAlias = frozenset[str]
-Labels: TypeAlias = npt.NDArray[np.void]
 
 
 @dataclass(slots=True)
@@ -103,6 +100,10 @@ class Projector:
     They are decoded together, in the order of the scan; `counts` has one ledger for each. Slots of
     a column are beams, in the order of the wire, times returns; `firing_order` and `number` tell
     where they belong.
+
+    labels: what the points of a column are, a row for each sensor or firing table; order: slots in
+    the order of firing, (tables, slots), None if that is the order of the wire; limits_m: of each
+    sensor.
     """
 
     def __init__(
@@ -115,26 +116,26 @@ class Projector:
         sources = [source for _, source in members]
         self.counts = [PointCounts() for _ in sources]
         self.slots = sources[0].slots
-        self._sources = sources
-        self._lidar = lidar = sources[0].lidar
-        self._boxes_m = boxes_m.astype(np.float32)
-        self._projection = _projection(sources, columns)
-        # A row for each sensor, or for each firing table of the only one.
+        self.extras = extras
+        self.sources = sources
+        self.lidar = lidar = sources[0].lidar
+        self.boxes_m = boxes_m.astype(np.float32)
+        self.projection = _projection(sources, columns)
         labels = [_labels(source, number) for number, source in members]
-        self._label = np.concatenate(labels).view(np.uint64)
+        self.labels = np.concatenate(labels).view(np.uint64)
         self._tables = len(lidar.firing_ns)
-        self._order = _firing_order(lidar)
+        self.order = _firing_order(lidar)
         self._elements = np.arange(columns * self.slots)
-        if self._order is not None and self._tables == 1:
+        if self.order is not None and self._tables == 1:
             self._elements = self._ordered(np.zeros(columns, np.int64)).reshape(-1)
         channel = lidar.channel if lidar.channel.ndim == 1 else np.arange(lidar.channels)
         number = channel[:, None] * lidar.returns + np.arange(lidar.returns)
         self.number: I64Array = number.reshape(-1)
         limits = [(source.min_range_m, source.max_range_m) for source in sources]
-        self._limits_m = np.array(limits, np.float32)
-        self._is_limited = any(low > 0 or high < float("inf") for low, high in limits)
-        self._needs_range = "range_m" in extras or self._is_limited
-        self._drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
+        self.limits_m = np.array(limits, np.float32)
+        self.is_limited = any(low > 0 or high < float("inf") for low, high in limits)
+        self._needs_range = "range_m" in extras or self.is_limited
+        self.drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
         self._records = np.empty((2, columns, lidar.records.size), np.uint8)
         self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
@@ -147,25 +148,25 @@ class Projector:
         member: (n,) which of the sensors each column is of; place, encoder: as in Columns;
         offset_ns: (n,) stamp minus start of the scan.
         """
-        lidar = self._lidar
+        lidar = self.lidar
         records = self._gathered(member, place)
-        self._projection.aim(member, encoder)
+        self.projection.aim(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
             # One return fills its plane in one piece; of several, each is every n-th slot.
             range_m = part.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
             reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
-            self._projection.points(range_m, part.point[:, slots, :3])
+            self.projection.points(range_m, part.point[:, slots, :3])
             if lidar.returns > 1 and self._needs_range:
                 part.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
         words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)[:, None]
-        if len(self._label) == 1:
-            np.add(self._label, offset, out=words)
+        if len(self.labels) == 1:
+            np.add(self.labels, offset, out=words)
         else:
-            self._label.take(self._row(member, encoder), axis=0, out=words, mode="clip")
+            self.labels.take(self._row(member, encoder), axis=0, out=words, mode="clip")
             words += offset
         if lidar.returns == 2:
             self._type_returns(part)
@@ -178,17 +179,17 @@ class Projector:
 
         (n * slots,); None where the order of the wire is that of firing.
         """
-        if self._order is None:
+        if self.order is None:
             return keep, None
         if self._tables == 1:
-            return keep.take(self._order[0], axis=1), self._elements[: keep.size]
+            return keep.take(self.order[0], axis=1), self._elements[: keep.size]
         _, _, table = read_rotor_words(encoder)
-        order = self._order[table]
+        order = self.order[table]
         return np.take_along_axis(keep, order, axis=1), self._ordered(table).reshape(-1)
 
     def _ordered(self, table: I64Array) -> I64Array:
         """Elements of a tile of these columns, each column in the order of firing."""
-        order = np.arange(self.slots)[None] if self._order is None else self._order[table]
+        order = np.arange(self.slots)[None] if self.order is None else self.order[table]
         return order + np.arange(len(table))[:, None] * self.slots
 
     def _row(self, member: I64Array, encoder: I64Array) -> I64Array:
@@ -197,11 +198,11 @@ class Projector:
     def _gathered(self, member: I64Array, place: I64Array) -> U8Array:
         """Records of all columns, in their order."""
         count = len(place)
-        if len(self._sources) == 1:
-            self._sources[0].ring.gather(place, self._records[0, :count])
+        if len(self.sources) == 1:
+            self.sources[0].ring.gather(place, self._records[0, :count])
             return self._records[0, :count]
         order, begin = np.empty(count, np.int64), 0
-        for number, source in enumerate(self._sources):
+        for number, source in enumerate(self.sources):
             rows = (member == number).nonzero()[0]
             end = begin + len(rows)
             source.ring.gather(place[rows], self._records[1, begin:end])
@@ -215,7 +216,7 @@ class Projector:
 
         3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: there is only one.
         """
-        lidar = self._lidar
+        lidar = self.lidar
         if not lidar.typed_by:
             return
         types = part.label["return_type"]
@@ -236,7 +237,7 @@ class Projector:
     def _keep(self, member: I64Array, part: Part) -> None:
         """Mark the points that are wanted, and count the others under their reason."""
         keep = part.keep
-        columns = np.bincount(member, minlength=len(self._sources))
+        columns = np.bincount(member, minlength=len(self.sources))
         found, left = self._mark(member, part)
         for counts, number, points, wanted in zip(
             self.counts, columns.tolist(), found, left, strict=True
@@ -244,12 +245,12 @@ class Projector:
             counts.slots += number * self.slots
             counts.no_return += number * self.slots - points
             counts.repeated += points - wanted
-        if self._is_limited:
-            limits_m = self._limits_m[member]
+        if self.is_limited:
+            limits_m = self.limits_m[member]
             keep &= part.range_m >= limits_m[:, :1]
             keep &= part.range_m <= limits_m[:, 1:]
             left = self._drop("range", member, keep, left)
-        if len(self._boxes_m):
+        if len(self.boxes_m):
             self._cut_boxes(part.point[..., :3], keep)
             left = self._drop("box", member, keep, left)
         for counts, points in zip(self.counts, left, strict=True):
@@ -257,10 +258,10 @@ class Projector:
 
     def _left(self, member: I64Array, keep: BoolArray) -> list[int]:
         """Points that are still wanted, of each sensor."""
-        if len(self._sources) == 1:
+        if len(self.sources) == 1:
             return [int(np.count_nonzero(keep))]
         # Sums of whole numbers far below 2**53 are exact in a float64.
-        left = np.bincount(member, weights=wanted_points(keep), minlength=len(self._sources))
+        left = np.bincount(member, weights=wanted_points(keep), minlength=len(self.sources))
         return [int(count) for count in left]
 
     def _drop(self, reason: str, member: I64Array, keep: BoolArray, before: list[int]) -> list[int]:
@@ -274,17 +275,17 @@ class Projector:
 
         Both for each sensor. A return that equals an earlier one of the same shot is not marked.
         """
-        keep, returns = part.keep, self._lidar.returns
+        keep, returns = part.keep, self.lidar.returns
         if returns == 1:
             np.greater(part.range_m, 0, out=keep)
             found = self._left(member, keep)
             return found, found
         ranges_m = self._range_m[:, : len(keep)]
-        found, left = [0] * len(self._sources), [0] * len(self._sources)
+        found, left = [0] * len(self.sources), [0] * len(self.sources)
         for which, range_m in enumerate(ranges_m):
             own = range_m > 0
             found = list(map(int.__add__, found, self._left(member, own)))
-            if self._drops_repeated:
+            if self.drops_repeated:
                 for earlier in ranges_m[:which]:
                     own &= range_m != earlier
             left = list(map(int.__add__, left, self._left(member, own)))
@@ -292,7 +293,7 @@ class Projector:
         return found, left
 
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
-        for box in self._boxes_m:
+        for box in self.boxes_m:
             inside = (xyz >= box[:3]) & (xyz <= box[3:])
             keep &= ~inside.all(axis=2)
 

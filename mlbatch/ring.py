@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.lidar import Records
 from mlbatch.types import I64Array, U8Array
@@ -28,6 +29,15 @@ class RawRing:
         self._next = 0
         self._capacity = 0
         self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
+
+    @property
+    def pieces(self) -> npt.NDArray[np.void]:
+        """Columns where they lie, (rows, columns of a row); that at `place` is number `place`.
+
+        Counted row by row, and modulo their number. Another thread may put a larger one in place.
+        """
+        pieces: npt.NDArray[np.void] = self._pieces
+        return pieces
 
     @property
     def nbytes(self) -> int:

@@ -73,3 +73,46 @@ u1_scratch = _scratch_of(types.uint8)
 i4_scratch = _scratch_of(types.int32)
 i8_scratch = _scratch_of(types.int64)
 f4_scratch = _scratch_of(types.float32)
+u2_scratch = _scratch_of(types.uint16)
+
+
+def _moved(typing_context: Any, pointer: Any, by: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.gep(args[0], [args[1]])
+
+    return pointer(pointer, types.int64), generate
+
+
+def _as_c16(typing_context: Any, pointer: Any) -> Any:
+    wanted = types.CPointer(types.complex128)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(wanted))
+
+    return wanted(pointer), generate
+
+
+def _bits(typing_context: Any, word: Any, shift: Any, mask: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value, by, kept = (
+            _in_32_bits(builder, number, kind.bitwidth)
+            for number, kind in zip(args, signature.args, strict=True)
+        )
+        return builder.and_(builder.lshr(value, by), kept)
+
+    return types.int32(word, shift, mask), generate
+
+
+def _in_32_bits(builder: Any, number: Any, width: int) -> Any:
+    if width == _NARROW.width:
+        return number
+    return (builder.trunc if width > _NARROW.width else builder.zext)(number, _NARROW)
+
+
+_NARROW = ir.IntType(32)
+# The pointer so many elements further on.
+moved = cast(Callable[[Pointer, int], Pointer], intrinsic(_moved))
+# `(word >> shift) & mask` in 32 bits: wider numbers would halve what a vector holds.
+bits = cast(Callable[[int, int, int], int], intrinsic(_bits))
+# The same place, as elements of sixteen bytes.
+as_c16 = cast(Callable[[Pointer], Pointer], intrinsic(_as_c16))

@@ -11,6 +11,7 @@ import numpy as np
 
 from mlbatch.geometry import rotor_words
 from mlbatch.lidar import FAULTS, Records
+from mlbatch.pixels import PixelTable, readings
 from mlbatch.sensors._hesai_crc import crc32
 from mlbatch.sensors._hesai_firing import NEVER
 from mlbatch.sensors._hesai_layout import CRC_SIZE, RETURN_MODES, SAFETY, SAFETY_SIZE, Layout
@@ -118,6 +119,21 @@ class PacketReader:
         if model.silent:
             out.range_m[distance <= model.silent] = 0
         out.intensity[...] = pixel["reflectivity"]
+
+    def pixels(self) -> PixelTable:
+        """The same for compiled loops."""
+        layout, unit_mm = self.layout, self.layout.unit_mm
+        firsts = tuple(
+            (which * layout.stride + layout.model.lead,) for which in range(layout.mode.returns)
+        )
+        is_whole = MM_PER_M % unit_mm == 0
+        return PixelTable(
+            layout.unit,
+            readings(firsts, layout.model.channels, "<u2"),
+            MM_PER_M // unit_mm if is_whole else MM_PER_M,
+            1 if is_whole else unit_mm,
+            layout.model.silent,
+        )
 
     def azimuth_turns(self, packets: U8Array) -> F64Array:
         """Azimuth of the first block of each packet, in turns."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.pixels import Bits, Echo, PixelTable, Run
 from mlbatch.sensors._ouster_profiles import Field, PacketLayout, Profile
 from mlbatch.types import F32Array, I32Array, Pixels, U8Array, U32Array
 from mlbatch.units import MM_PER_M
@@ -105,6 +106,31 @@ class PixelReader:
         if columns > len(self._words):
             self._words = np.empty((columns, self._words.shape[1]), np.uint32)
             self._floats = np.empty((columns, self._beams), np.float32)
+
+
+def pixel_table(layout: PacketLayout) -> PixelTable:
+    """The same for compiled loops, as numbers in words."""
+    fields, returns = layout.profile.fields, layout.profile.returns
+    runs = (Run(layout.column_header_size, 0, layout.beams),)
+    echoes = []
+    for suffix in ("", "2")[:returns]:
+        reflectivity = fields[f"REFLECTIVITY{suffix}"]
+        echoes.append(
+            Echo(
+                runs,
+                _bits(fields[f"RANGE{suffix}"]),
+                _bits(fields.get(f"SIGNAL{suffix}", reflectivity)),
+                _bits(reflectivity),
+            )
+        )
+    return PixelTable(
+        layout.profile.pixel_size, tuple(echoes), MM_PER_M / (1 << fields["RANGE"].shift)
+    )
+
+
+def _bits(field: Field) -> Bits:
+    word, shift = divmod(field.first_bit, _WORD_BITS)
+    return Bits(word * _WORD_BYTES, "<u4", shift, (1 << field.width) - 1)
 
 
 def _fields_of(profile: Profile, suffix: str) -> _Return:

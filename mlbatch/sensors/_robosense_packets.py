@@ -12,6 +12,7 @@ import numpy as np
 
 from mlbatch.geometry import rotor_words
 from mlbatch.lidar import FAULTS, Records
+from mlbatch.pixels import PixelTable, readings
 from mlbatch.sensors._recognise_bytes import number, starts
 from mlbatch.sensors._robosense_models import READING, Layout, Model
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
@@ -154,6 +155,19 @@ class PacketReader:
             np.divide(raw, self._units_per_m, out=out.range_m[:, channels])
             level = records[:, begin + 2 : begin + READING * per_block : READING]
             out.intensity[:, channels] = level
+
+    def pixels(self) -> PixelTable:
+        """The same for compiled loops."""
+        model, shape = self._model, self._shape
+        firsts = tuple(
+            tuple(
+                which * shape.return_step + part * model.layout.stride
+                for part in range(model.blocks_per_round)
+            )
+            for which in range(shape.returns)
+        )
+        echoes = readings(firsts, model.channels, ">u2", model.range_mask)
+        return PixelTable(READING, echoes, float(self._units_per_m))
 
     def _azimuths(self, packets: U8Array) -> tuple[I64Array, BoolArray]:
         """Azimuths of the rows (P, rows), 0.01 degree, and which rows are blocks at all."""

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Records
+from mlbatch.pixels import PixelTable
 from mlbatch.types import BoolArray, F64Array, I64Array, ImuSamples, U8Array
 
 
@@ -31,6 +32,7 @@ class TurningLidar:
     beams: BeamTable
     calibration: str
 
+    pixels: PixelTable | None = None
     serial: str = ""
     carries_serial: bool = False
     has_reflectivity: bool = False

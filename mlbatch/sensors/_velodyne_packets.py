@@ -12,6 +12,7 @@ import numpy as np
 
 from mlbatch.geometry import Projection, rotor_words
 from mlbatch.lidar import FAULTS
+from mlbatch.pixels import PixelTable, readings
 from mlbatch.sensors._recognise_velodyne import (
     DUAL,
     MODE_AT,
@@ -92,6 +93,12 @@ class VelodyneLidar(TurningLidar):
         dark = str(self._dark.tolist())
         kind = (MAKER, model.lasers, model.banks, model.units_per_m, returns, dark)
         self.pixel_layout: tuple[str | int | bool, ...] = kind
+        self.pixels = PixelTable(
+            3,
+            readings(self._layout.first_byte, model.lasers, "<u2"),
+            model.units_per_m,
+            dark=tuple(self._dark.tolist()),
+        )
         self.return_types = _RETURN_TYPES.get(measured.mode, (0,))
         self.firing_ns = model.firing_ns(measured.sequence_ns)
         self.firing_ns[:, self._dark] = -1

@@ -197,6 +197,7 @@ class HesaiLidar(TurningLidar):
         self.column_period_ns = model.timing.step_ns / model.timing.divisor
         self.records = self._reader.records
         self.pixel_layout = (MAKER, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
+        self.pixels = self._reader.pixels()
         self.return_types = layout.mode.types
         self.channel = np.arange(model.channels)
         self.firing_ns = self._reader.firing_ns

@@ -33,7 +33,7 @@ from mlbatch.sensors._ouster_packets import (
     PacketHeaders,
     first_measurement_ids,
 )
-from mlbatch.sensors._ouster_pixels import PixelReader
+from mlbatch.sensors._ouster_pixels import PixelReader, pixel_table
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
 from mlbatch.units import NS_PER_S
@@ -182,6 +182,7 @@ class OusterLidar:
         self._metadata = described
         self._headers = _headers(described, check_crc)
         self._pixels = PixelReader(layout)
+        self.pixels = pixel_table(layout)
         self._rank, in_window = _packet_ranks(described)
         self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
         self._packets_per_frame = in_window

@@ -247,6 +247,7 @@ class RobosenseLidar(TurningLidar):
         moving = options.get("firing_azimuth") != "off"
         self._packets = PacketReader(row, shape, steps_per_m, mirrored=mirrored, moving=moving)
         self._packets.learn_speed(points)
+        self.pixels = self._packets.pixels()
 
     def owns(self, packets: U8Array) -> BoolArray:
         """All point packets: device packets, which topics hold too, are nobody's."""

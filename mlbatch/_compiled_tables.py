@@ -1,0 +1,185 @@
+"""Tables of a kind of sensors, laid out for the kernels once (`kernels/frame.py`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.geometry import Tabled, Turning
+from mlbatch.kernels import frame as at
+from mlbatch.lidar import Lidar
+from mlbatch.pixels import Bits, PixelTable
+from mlbatch.projection import Projector
+from mlbatch.types import F32Array
+
+AnyArray = npt.NDArray[np.generic]
+
+_LEAST_PAD, _MOST_PAD, _MOST_RETURNS = 16, 256, 3
+_TYPED = {"": 0, "order": 1, "level": 2}
+_TYPE_BITS = np.uint64(0xFF << 48)
+_WORD_BYTES = 4
+# Of a pixel of two bytes of distance, and one of level.
+_READING_BYTES = 3
+
+
+class Tables:
+    """A frame, and the arrays whose addresses stand in it."""
+
+    def __init__(self, size: int) -> None:
+        self.frame = np.zeros(size, np.int64)
+        self._held: dict[int, AnyArray] = {}
+
+    def set(self, place: int, values: AnyArray) -> None:
+        """Put the address of an array there; it is kept until another one takes its place."""
+        held = np.ascontiguousarray(values)
+        self._held[place] = held
+        self.frame[place] = held.ctypes.data
+
+    def set_numbers(self, numbers: dict[int, int]) -> None:
+        """Put numbers there."""
+        for place, number in numbers.items():
+            self.frame[place] = number
+
+
+def is_compiled(projector: Projector) -> bool:
+    """Whether there is a kernel for sensors of this kind."""
+    lidar, projection = projector.lidar, projector.projection
+    known = isinstance(projection, Turning) or (
+        isinstance(projection, Tabled) and projection.origin.shape[2] == 1
+    )
+    fits = lidar.returns <= _MOST_RETURNS and padded(lidar.channels) <= _MOST_PAD
+    return known and fits and lidar.pixels is not None and _is_read(lidar, lidar.pixels)
+
+
+def _is_read(lidar: Lidar, table: PixelTable) -> bool:
+    """Whether the pixels are of the shapes that kernels read, and inside of the records."""
+    records = lidar.records
+    for echo in table.echoes:
+        fields = [one for one in (echo.distance, echo.intensity, echo.reflectivity) if one]
+        ends = [run.first_byte + run.channels * table.step for run in echo.runs]
+        if echo.distance.word == "<u4":
+            begins = (records.start, records.stride, records.step, echo.runs[0].first_byte)
+            aligned = all(number % _WORD_BYTES == 0 for number in (*begins, table.step))
+            good = aligned and len(echo.runs) == 1 and not table.dark
+            good &= all(
+                one.word == "<u4" and one.first + _WORD_BYTES <= table.step for one in fields
+            )
+        else:
+            level = Bits(2, "u1")
+            good = echo.distance.first == 0 and echo.intensity == level and len(fields) == 2
+            ends = [end - table.step + _READING_BYTES for end in ends]
+        if not good or max(ends) > records.size:
+            return False
+    return True
+
+
+def padded(channels: int) -> int:
+    """The number of channels that a kernel is compiled for."""
+    return max(_LEAST_PAD, 1 << (channels - 1).bit_length())
+
+
+def described(projector: Projector, table: PixelTable, wide: int) -> Tables:
+    """All that stays the same from window to window; wide: see `compiled.CompiledKind`."""
+    tables, pad = Tables(at.SIZE), padded(projector.lidar.channels)
+    _put_pixels(tables, projector, table)
+    if isinstance(projector.projection, Tabled):
+        _put_tabled(tables, projector, projector.projection, pad)
+    elif isinstance(projector.projection, Turning):
+        _put_turning(tables, projector.lidar.channels, projector.projection, pad)
+    _put_slots(tables, projector, pad)
+    if projector.is_limited:
+        tables.set(at.LIMITS, projector.limits_m)
+    tables.set(at.BOXES, projector.boxes_m)
+    tables.set_numbers({at.BOX_COUNT: len(projector.boxes_m), at.WIDTH: wide})
+    return tables
+
+
+def _put_pixels(tables: Tables, projector: Projector, table: PixelTable) -> None:
+    lidar = projector.lidar
+    runs = [
+        [(run.first_byte, run.channel, run.channels) for run in echo.runs] for echo in table.echoes
+    ]
+    fields = [
+        [*_field(echo.distance), *_field(echo.intensity), *_field(echo.reflectivity)]
+        for echo in table.echoes
+    ]
+    tables.set(at.RUNS, np.array(runs, np.int64))
+    tables.set(at.FIELDS, np.array(fields, np.int64))
+    tables.set(at.SCALE, np.array([table.factor, table.divisor], np.float32))
+    tables.set(at.DARK, np.array(table.dark, np.int64))
+    wanted = lidar.has_reflectivity and "reflectivity" in projector.extras
+    tables.set_numbers(
+        {
+            at.SLOTS: projector.slots,
+            at.RUN_COUNT: len(runs[0]),
+            at.SILENT: table.silent,
+            at.DARK_COUNT: len(table.dark),
+            at.HAS_REFLECTIVITY: wanted and table.echoes[0].reflectivity is not None,
+        }
+    )
+
+
+def _put_tabled(tables: Tables, projector: Projector, projection: Tabled, pad: int) -> None:
+    shape = len(projector.sources), projector.lidar.channels
+    tables.set(at.DIRECTION, _wide(projection.direction, pad))
+    tables.set(at.ORIGIN, projection.origin)
+    tables.set(at.FIRST_ROW, projection.first_position)
+    tables.set(at.REACH, _wide(np.broadcast_to(projection.reaches_m, shape), pad))
+    tables.set_numbers({at.ROWS: len(projection.direction), at.TABLES: 1})
+
+
+def _put_turning(tables: Tables, channels: int, projection: Turning, pad: int) -> None:
+    tables.set(at.DIRECTION, _wide(projection.direction, pad))
+    tables.set(at.ORIGIN, _wide(projection.origin, pad))
+    flags = _axes(projection.direction[:2]) | _axes(projection.direction[2:]) << 3
+    flags |= _axes(projection.origin[2:]) << 9
+    if projection.origin_turns:
+        flags |= _axes(projection.origin[:2]) << 6
+    tables.set_numbers({at.VECTORS: flags, at.TABLES: len(projection.firing_ns)})
+    if projection.has_reach:
+        tables.set(at.REACH, _wide(np.broadcast_to(projection.reach_m, (channels,)), pad))
+    if not projection.fires_at_once:
+        tables.set(at.FIRING, _wide(projection.firing_ns, pad))
+
+
+def _put_slots(tables: Tables, projector: Projector, pad: int) -> None:
+    lidar, returns = projector.lidar, projector.lidar.returns
+    slot = np.arange(projector.slots)
+    element = slot % returns * pad + slot // returns
+    labels = np.zeros((len(projector.labels), returns * pad), np.int64)
+    typed = _TYPED[lidar.typed_by] if returns == 2 else 0
+    # Types that the kernel tells stand in no table.
+    words = projector.labels & ~_TYPE_BITS if typed else projector.labels
+    labels[:, element] = words.view(np.int64)
+    tables.set(at.LABELS, labels)
+    place = np.zeros(returns * pad, np.int64)
+    place[element] = projector.number
+    tables.set(at.SLOT, place)
+    if projector.order is not None:
+        tables.set(at.ORDER, element[projector.order])
+    elif returns > 1:
+        tables.set(at.ORDER, element)
+    several = projector.order is not None and len(projector.order) > 1
+    tables.set_numbers(
+        {
+            at.ORDER_STEP: projector.slots if several else 0,
+            at.TYPED: typed,
+            at.SENT_TWICE: lidar.sends_twice,
+            at.DROPS_REPEATED: projector.drops_repeated,
+        }
+    )
+
+
+def _field(field: Bits | None) -> tuple[int, int, int]:
+    return (0, 0, 0) if field is None else (field.first // _WORD_BYTES, field.shift, field.mask)
+
+
+def _axes(vectors: F32Array) -> int:
+    """Bits of the axes in which (k, 3, B) vectors are not zero for all beams."""
+    return sum(1 << axis for axis in range(3) if vectors[:, axis].any())
+
+
+def _wide(values: F32Array, pad: int) -> F32Array:
+    """Planes (..., B) as (..., P)."""
+    missing = pad - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values

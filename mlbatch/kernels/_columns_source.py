@@ -1,0 +1,83 @@
+"""The decoding kernel: columns of one kind, from raw records to points in their final rows.
+
+All that a column needs lies in scratch that fits into the first cache; each of its pixels is read
+once and written once. The frame is that of `frame.py`; the result is the number of points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mlbatch.kernels import frame as at
+from mlbatch.kernels._emit_source import emitting
+from mlbatch.kernels._keep_source import labelling, marking
+from mlbatch.kernels._points_source import projecting
+from mlbatch.kernels._primitives import (
+    Pointer,
+    as_c16,
+    f4_scratch,
+    i8_at,
+    i8_scratch,
+    moved,
+    piece,
+    u1_scratch,
+    u2_scratch,
+)
+from mlbatch.kernels._read_source import reader_of
+
+_TABLE_AT = 56
+_RING = 5
+
+
+def build(word: str, step: int, pad: int, returns: int, kind: str) -> Callable[[Pointer], int]:
+    """word, step: of the pixels; pad: channels, up to a power of 2; kind: see `projecting`."""
+    read, project = reader_of(word, step, pad), projecting(kind, pad, returns)
+    mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting()
+    elements, four, seven = returns * pad, 4 * returns * pad, 7 * pad
+    record_of = _record_of()
+
+    def kernel(frame: Pointer) -> int:
+        ranges, levels, keep = f4_scratch(elements), f4_scratch(elements), u1_scratch(elements)
+        points, labels, scratch = f4_scratch(four), i8_scratch(elements), f4_scratch(seven)
+        others = u2_scratch(elements)
+        for element in range(elements):
+            ranges[element] = np.float32(0)
+            levels[element] = np.float32(0)
+            others[element] = 0
+        members, sensors = i8_at(frame[at.MEMBER]), i8_at(frame[at.SENSOR])
+        stamps_ns, words = i8_at(frame[at.STAMP_NS]), i8_at(frame[at.ENCODER])
+        row, number, last_table = 0, 0, frame[at.TABLES] - 1
+        for column in range(frame[at.COLUMNS]):
+            member = members[sensors[column]]
+            if member < 0:
+                continue
+            record = record_of(frame, column, member)
+            for which in range(returns):
+                read(frame, record, which, ranges, levels, others)
+            table = min(max(words[column] >> _TABLE_AT, 0), last_table)
+            place = (member, words[column], table, number)
+            project(frame, place, ranges, levels, points, scratch)
+            mark(frame, member, ranges, points, keep)
+            offset_ns = stamps_ns[column] - frame[at.START_NS]
+            label(frame, table if last_table else member, offset_ns, ranges, levels, labels)
+            row = emit(frame, column, table, row, as_c16(points), labels, ranges, others, keep)
+            number += 1
+        return row
+
+    return kernel
+
+
+def _record_of() -> Callable[[Pointer, int, int], int]:
+    @piece
+    def record_of(frame: Pointer, column: int, member: int) -> int:
+        """Address of the first byte of a column's record."""
+        ring = moved(i8_at(frame[at.RINGS]), member * _RING)
+        place, part = i8_at(frame[at.PLACE])[column], 0
+        if ring[2] != 1:
+            part = place % ring[2]
+            place = place // ring[2]
+        return int(ring[0] + place % ring[1] * ring[3] + part * ring[4])
+
+    return record_of
