@@ -23,18 +23,20 @@ _SETTLED_NS = 3 * NS_PER_S // 2
 _CHUNK = 16384
 # Longer silences must have passed at the recorder too, up to this (as in `jumps.py`).
 _STEP_NS = NS_PER_S
-# Rows of the angles at which columns were seen, of a turn: 0.09 degrees each.
-_BIN_BITS = 12
-_BINS = 1 << _BIN_BITS
+# Places on a turn at which columns were seen: half of what packets count, 0.01 degrees.
+_PLACE_BITS = 16
+_PLACES = 1 << _PLACE_BITS
 _TURNS_PER_TICK = 2.0**-32
 # Columns leave holes between them; a dark sector is wider than so many of their steps.
 _HOLE_STEPS = 2.5
 # So many turns without one column of a sector are no chance, if not half of all packets are lost.
 _PASSES = 12
+# Angles are rounded: a column may seem to lie as much behind an edge, in steps of columns.
+_GRID_OFF = 0.03
 # The rotor of a sensor goes on while packets are lost: turns that it may be off by.
 _ROTOR_OFF = 0.1
 # Steps from which the pace is taken, and how far they may lie from each other.
-_FEWEST_STEPS, _NEAR = 16, 0.1
+_FEWEST_STEPS, _LOW, _NEAR, _SHARE = 16, 0.05, 0.1, 0.08
 _BACK_TURNS = 1 / 360
 # Packets over which the speed of the rotor is taken.
 _SPEED_OVER = 64
@@ -64,6 +66,11 @@ class _Packets:
             self.last[index],
             self.places[index],
         )
+
+    def mirrored(self) -> _Packets:
+        """Those of a rotor that turns the other way."""
+        first, last = -self.first % 1.0, -self.last % 1.0
+        return _Packets(self.stamp_ns, self.host_ns, first, last, ~self.places)
 
 
 class PaceLoss:
@@ -100,7 +107,7 @@ class PaceLoss:
             host_ns,
             ticks[:, 0].astype(np.float64) * _TURNS_PER_TICK,
             ticks[:, -1].astype(np.float64) * _TURNS_PER_TICK,
-            (ticks >> (32 - _BIN_BITS)).astype(np.uint16),
+            (ticks >> (32 - _PLACE_BITS)).astype(np.uint16),
         )
         if len(measured) < len(packets):
             packets = packets.take(measured)
@@ -176,21 +183,25 @@ def _missing(packets: _Packets, packet_ns: float) -> int:
     if not len(gap):
         return 0
     speed = _speed(packets, step_ns, pace_ns)[gap]
-    usual = float(np.median(speed))
-    step_ns, angle = step_ns[gap], packets.first[gap]
-    turned = packets.first[gap + 1] - angle
-    whole = np.rint(speed * step_ns - turned)
-    turned += whole
+    if float(np.median(speed)) < 0:
+        packets, speed = packets.mirrored(), -speed
+    step_ns, begin, end = step_ns[gap], packets.first[gap], packets.first[gap + 1]
+    turned = end - begin + np.rint(speed * step_ns - (end - begin))
     passed_ns = packets.host_ns[gap + 1] - packets.host_ns[gap]
     is_silence = np.where(
         step_ns > _STEP_NS,
         passed_ns >= step_ns - _STEP_NS,
         np.abs(speed * step_ns - turned) < _ROTOR_OFF,
     )
-    dark = _dark_turns(packets, angle, turned, usual * pace_ns)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dark_ns = np.where(dark > 0, dark / np.abs(speed), 0.0)
-    missing = np.rint((step_ns - dark_ns) / pace_ns) - 1
+    due = step_ns / pace_ns
+    columns = packets.places.shape[1]
+    column_turns = np.maximum(speed * (pace_ns / columns), 0.0)
+    dark = _dark_sectors(packets, begin, turned, float(np.median(column_turns)))
+    across = np.flatnonzero(dark.passes(begin, turned).any(axis=1) & (column_turns > 0))
+    if len(across):
+        seen = dark.columns(begin[across], turned[across], column_turns[across])
+        due[across] = seen / columns
+    missing = np.rint(due) - 1
     return int(missing[is_silence & (missing > 0)].sum())
 
 
@@ -203,10 +214,10 @@ def _pace_ns(step_ns: F64Array, packet_ns: float) -> float:
     pair_ns = (step_ns[1:] + step_ns[:-1]) / 2
     if len(pair_ns) < _FEWEST_STEPS:
         return packet_ns
-    low_ns = float(np.quantile(pair_ns, 0.1))
+    low_ns = float(np.quantile(pair_ns, _LOW))
     near = pair_ns[np.abs(pair_ns - low_ns) <= _NEAR * low_ns]
     # Where most packets are lost, what is left does not tell.
-    return float(near.mean()) if 4 * len(near) >= len(pair_ns) else packet_ns
+    return float(near.mean()) if len(near) >= _SHARE * len(pair_ns) else packet_ns
 
 
 def _speed(packets: _Packets, step_ns: F64Array, pace_ns: float) -> F64Array:
@@ -224,44 +235,66 @@ def _speed(packets: _Packets, step_ns: F64Array, pace_ns: float) -> F64Array:
     return np.where(took_ns > 0, (turns[high] - turns[low]) / np.maximum(took_ns, 1.0), usual)
 
 
-def _dark_turns(
-    packets: _Packets, angle: F64Array, turned: F64Array, packet_turns: float
-) -> F64Array:
-    """(g,) turns of dark sectors in steps that begin at `angle` and turn by `turned`, in turns.
+@dataclass(slots=True)
+class _Sectors:
+    """Sectors of a turn, (k,) each: from where to where the rotor passes them, in turns."""
 
-    packet_turns: by which the rotor turns while a packet is filled, negative if backwards.
+    begin: F64Array
+    width: F64Array
+
+    def take(self, index: BoolArray) -> _Sectors:
+        return _Sectors(self.begin[index], self.width[index])
+
+    def passes(self, begin: F64Array, turned: F64Array) -> F64Array:
+        """(g, k) how often rotors pass them that turn from `begin` on by `turned`."""
+        ahead = begin[:, None] - (self.begin + self.width / 2)
+        return np.floor(ahead + turned[:, None]) - np.floor(ahead)
+
+    def columns(self, begin: F64Array, turned: F64Array, column_turns: F64Array) -> F64Array:
+        """(g,) columns that a sensor measures while it turns so, from one at `begin` on.
+
+        Columns lie on a grid: at both edges the last one in the light is known.
+        """
+        lit = turned - self.passes(begin, turned) @ self.width
+        before = self.begin - begin[:, None]
+        after = (begin + turned)[:, None] - self.begin - self.width
+        at_edges = 1 + _beyond_grid(before, column_turns) + _beyond_grid(after, column_turns)
+        return np.asarray(lit / column_turns + at_edges, np.float64)
+
+
+def _beyond_grid(turns: F64Array, column_turns: F64Array) -> F64Array:
+    """(g,) down to a whole number of columns, from the least of the ways (g, k) along a turn."""
+    off = _GRID_OFF * column_turns
+    columns = ((turns + off[:, None]) % 1.0).min(axis=1) / column_turns
+    return np.asarray(np.floor(columns) + _GRID_OFF - columns, np.float64)
+
+
+def _dark_sectors(
+    packets: _Packets, begin: F64Array, turned: F64Array, column_turns: float
+) -> _Sectors:
+    """Where no column ever lies, though the rotor passed: in steps (g,) from `begin` by `turned`.
+
+    That is known where it passed often, or within a packet, where nothing can be lost.
     """
-    column_turns = abs(packet_turns) / packets.places.shape[1]
-    middle, width = _holes(packets.places, column_turns)
-    begin, end = angle[:, None] - middle, (angle + turned)[:, None] - middle
-    passes = np.abs(np.floor(end) - np.floor(begin))
-    is_dark = np.count_nonzero(passes, axis=0) >= _PASSES
+    holes = _holes(packets.places, column_turns)
+    is_dark = np.count_nonzero(holes.passes(begin, turned), axis=0) >= _PASSES
     if not is_dark.all():
-        is_dark |= _within_packets(packets, middle, np.sign(packet_turns))
-    return np.asarray(passes[:, is_dark] @ width[is_dark], np.float64)
+        span = (packets.last - packets.first) % 1.0
+        # A rotor that jitters or rests may seem to step back.
+        span[span > 1 - _BACK_TURNS] = 0.0
+        wide = np.flatnonzero(span > 1.5 * np.median(span))
+        is_dark |= holes.passes(packets.first[wide], span[wide]).any(axis=0)
+    return holes.take(is_dark)
 
 
-def _holes(places: U16Array, column_turns: float) -> tuple[F64Array, F64Array]:
-    """Middle and width, in turns, of sectors in which no column lies."""
-    bare = np.bincount(places.ravel(), minlength=_BINS) == 0
+def _holes(places: U16Array, column_turns: float) -> _Sectors:
+    """Sectors in which no column lies."""
+    bare = np.bincount(places.ravel(), minlength=_PLACES) == 0
     # Turned so that none passes the end.
     first = int(np.argmin(bare))
     edge = np.diff(np.roll(bare, -first).astype(np.int8), append=np.int8(0))
     begin, end = np.flatnonzero(edge == 1) + 1, np.flatnonzero(edge == -1) + 1
-    # On average half of the row at each edge is dark as well.
-    width = (end - begin + 1) / _BINS
+    # On average half of the place at each edge is dark as well.
+    width = (end - begin + 1) / _PLACES
     wide = width > _HOLE_STEPS * column_turns
-    return ((begin + end) / (2 * _BINS) + first / _BINS)[wide] % 1.0, width[wide]
-
-
-def _within_packets(packets: _Packets, middle: F64Array, sense: float) -> BoolArray:
-    """Which sectors lie between the columns of one packet, where nothing can be lost.
-
-    sense: 1 or -1, by which the rotor turns.
-    """
-    span = sense * (packets.last - packets.first) % 1.0
-    # A rotor that jitters or rests may seem to step back.
-    span[span > 1 - _BACK_TURNS] = 0.0
-    wide = np.flatnonzero(span > 1.5 * np.median(span))
-    ahead = sense * (middle - packets.first[wide, None]) % 1.0
-    return np.asarray((ahead < span[wide, None]).any(axis=0), np.bool_)
+    return _Sectors(((begin + first - 0.5) / _PLACES % 1.0)[wide], width[wide])
