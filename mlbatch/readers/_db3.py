@@ -84,7 +84,7 @@ class Database:
                 self.topics = _topics(connection)
                 self._indexed = _has_time_index(connection)
                 self.first_ns = self._first_ns(connection)
-        except (sqlite3.Error, KeyError, TypeError, ValueError) as err:
+        except (sqlite3.Error, LookupError, TypeError, ValueError) as err:
             raise RecordingError(
                 f"{path}: wanted a ROS 2 bag (tables topics and messages), got a database that "
                 f"cannot be read ({err}); record or copy it again, or try `sqlite3 .recover`"
