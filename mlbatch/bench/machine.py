@@ -22,7 +22,7 @@ def machine() -> dict[str, Json]:
         "cpu": _cpu(),
         "cores": os.cpu_count() or 0,
         "memory_mb": memory_bytes // _BYTES_PER_MB,
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "system": f"{platform.system()} {platform.release().split('-')[0]} {platform.machine()}",
         "load": os.getloadavg()[0],
         "mlbatch": mlbatch.__version__,
         "python": platform.python_version(),

@@ -69,8 +69,8 @@ def bench(settings: Settings) -> Result:
     before = {} if settings.against is None else read_document(settings.against)
     # First, since the load is to be that of others.
     told = machine()
-    with _place(settings) as folder, TemporaryDirectory(dir=folder, prefix="run-") as scratch:
-        session = Session(settings, folder, Path(scratch))
+    with _place(settings) as (folder, scratch):
+        session = Session(settings, folder, scratch)
         rows = [row for case in settings.cases for row in session.measure(case)]
         return Result(
             datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
@@ -86,27 +86,28 @@ def bench(settings: Settings) -> Result:
 
 
 @contextlib.contextmanager
-def _place(settings: Settings) -> Iterator[Path]:
-    """Where recordings and outputs lie, with enough room."""
+def _place(settings: Settings) -> Iterator[tuple[Path, Path]]:
+    """Where recordings lie, with enough room, and a folder in it for outputs."""
     with contextlib.ExitStack() as stack:
         folder = settings.keep
         try:
             if folder is None:
                 folder = Path(stack.enter_context(TemporaryDirectory(prefix="mlbatch-bench-")))
             folder.mkdir(parents=True, exist_ok=True)
+            scratch = stack.enter_context(TemporaryDirectory(dir=folder, prefix="run-"))
+            free = shutil.disk_usage(folder).free
         except OSError as err:
             raise BenchError(
                 f"{folder or 'temporary folder'}: wanted a folder to write to, got "
                 f"{err.strerror}; choose another with --keep"
             ) from err
         wanted = disk_bytes(settings.cases, settings.seconds)
-        free = shutil.disk_usage(folder).free
         if free < wanted:
             raise BenchError(
                 f"{folder}: wanted about {wanted // _BYTES_PER_MB} MB of free disk, got "
                 f"{free // _BYTES_PER_MB} MB; choose another with --keep, fewer --seconds or --case"
             )
-        yield folder.resolve()
+        yield folder.resolve(), Path(scratch).resolve()
 
 
 class Session:
@@ -146,6 +147,7 @@ class Session:
             if program.role == OURS:
                 self.failed.append(f"{case.name}: {program.name}")
             del runs[program.name]
+            _taken_away(self.scratch)
             return
         earlier = runs[program.name]
         if earlier and earlier[-1].counted != run.counted:
@@ -240,9 +242,9 @@ class Session:
 
 
 def _taken_away(scratch: Path) -> int:
-    """Delete outputs; returns the bytes of scans in them."""
+    """Delete all but documents; returns the bytes of that."""
     size = 0
-    for path in [*scratch.glob("out*"), *scratch.glob("floor.*")]:
+    for path in scratch.iterdir():
         if path.suffix == ".json":
             continue
         if path.is_dir():
