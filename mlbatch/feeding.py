@@ -88,8 +88,9 @@ class Feeder:
                 fed.arrivals[number] = self._arrive(
                     number, batch, index, owned, oldest_places[number]
                 )
-        for kind, index in shared:
-            self._unassign(kind, batch, index[~owned[index]])
+        if not owned.all():
+            for kind, index in shared:
+                self._unassign(kind, batch, index[~owned[index]])
         return fed
 
     def owners(self, batch: PacketBatch) -> I64Array:
@@ -126,14 +127,14 @@ class Feeder:
         feed = self._feeds[number]
         lidar, counts = feed.lidar, feed.ledger.packets
         packets, place = feed.ring.store(batch.data, batch.start[index], oldest_place)
-        mine = lidar.owns(packets) & ~owned[index]
-        owned[index[mine]] = True
+        good = lidar.owns(packets) & ~owned[index]
+        counts.read += int(np.count_nonzero(good))
+        owned[index] |= good
         faults = lidar.faults(packets)
-        counts.read += int(np.count_nonzero(mine))
-        for fault, count in enumerate(np.bincount(faults[mine])):
-            if fault:
-                counts.reject(FAULTS[fault], int(count))
-        good = mine & (faults == 0)
+        if faults.any():
+            for fault, count in enumerate(np.bincount(faults[good])[1:].tolist(), 1):
+                counts.reject(FAULTS[fault], count)
+            good &= faults == 0
         if not good.all():
             packets, place, index = packets[good], place[good], index[good]
         host_ns = batch.host_ns[index]

@@ -163,7 +163,7 @@ class Intake:
         recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
         if len(key) == 1:
             # Numbers without an order that come one by one: a look at all is cheaper than a sort.
-            fresh = (key < 0) | ~(recent == key).any(keepdims=True)
+            fresh = np.array([key[0] < 0 or not (recent == key).any()])
         else:
             fresh = _first_of_kind(recent, key)
         self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))

@@ -167,7 +167,8 @@ class PacketHeaders:
         value = _header_field(packets, HEADERS[self.header], field)
         if self.serial == 0:
             return value
-        here = _header_field(packets, HEADERS[self.header], "serial") == self.serial
+        told = value if field == "serial" else _header_field(packets, HEADERS[self.header], "serial")
+        here = told == self.serial
         if here.all():
             return value
         other = FUSA if self.header == STANDARD else STANDARD
