@@ -14,8 +14,8 @@ from mlbatch.job import Job
 from mlbatch.pipeline import Conversion
 from mlbatch.writers import WriterOptions
 
-# Said by the files themselves, by the sensors, or not by options.
-_ELSEWHERE = frozenset({"recordings", "wishes", "part", "extras", "fault_begin_ns"})
+# Said by the files themselves, by the sensors, or not by options; or outputs do not depend on it.
+_ELSEWHERE = frozenset({"recordings", "wishes", "part", "extras", "fault_begin_ns", "jobs"})
 _DIGITS = 12
 
 

@@ -1,23 +1,34 @@
-"""A conversion with its writer: every scan is written, or nothing under a final name."""
+"""A conversion with its writer: every scan is written, or nothing under a final name.
+
+One thread reads, batches and decodes, another writes. With `--jobs N` one thread reads and batches,
+and N of them decode and write, each a scan.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch import accounts
+from mlbatch.decoding import Bench, Decoded, Task
 from mlbatch.errors import RecordingError
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.resume import Course
-from mlbatch.types import RunInfo, Summary
+from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.workers import Steps, Workers
 from mlbatch.writers import ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Given what the report is made of, and the complete output before it gets its final name.
 Last = Callable[[ReportInputs, Path], None]
+# Scans that one thread decodes ahead of the one that writes.
+_AHEAD = 2
+# Tasks that several threads find waiting, when they are done with theirs.
+_WAITING = 2
 
 
 def convert(
@@ -31,43 +42,140 @@ def convert(
 
     course: of the output, so that an interrupted run can be resumed.
     """
-    run = Conversion(job)
+    # One more than wait to be written: the one that is being decoded.
+    run = Conversion(job, buffers=_AHEAD + 1 if job.jobs == 1 else 1)
     if course is not None:
         course.join(run)
-    writer: ScanWriter | None = None
+    output = _Output(run, open_writer, course)
     try:
-        for number, (scan, only) in enumerate(run.scans(progress)):
-            began_s = time.perf_counter()
-            if writer is None and open_writer is not None:
-                writer = open_writer(scan.info)
-                if course is not None:
-                    course.begin()
-            run.hand_over(writer, scan.end_ns)
-            if writer is not None and course is not None and number < course.done:
-                writer.pass_over(scan, only)
-            elif writer is not None:
-                writer.write(scan, only)
-            if writer is not None and course is not None:
-                course.note(run, writer)
-            run.stages.write_s += time.perf_counter() - began_s
+        output.make(progress)
+        run.close()
         if course is not None:
             course.complete()
-        inputs = _finish(run, writer, last)
+        inputs = _finish(run, output.writer, last)
         if course is not None:
             course.remove()
-        writer = None
+        output.writer = None
     finally:
-        if writer is not None:
-            writer.abandon()
+        if output.writer is not None:
+            output.writer.abandon()
             if course is not None:
                 course.settle()
     return run, inputs
 
 
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """A scan on its way into the output.
+
+    is_kept: a continued output holds it; before: what comes before it; decoded: None where that is
+    still to be done.
+    """
+
+    task: Task
+    is_kept: bool
+    before: list[ImuSamples | Message]
+    decoded: Decoded | None
+
+
+class _Output:
+    """The output under construction; `writer` is None as long as it is not begun, or never."""
+
+    def __init__(
+        self, run: Conversion, open_writer: OpenWriter | None, course: Course | None
+    ) -> None:
+        self.writer: ScanWriter | None = None
+        self._run = run
+        self._open_writer = open_writer
+        self._course = course
+        self._jobs = run.job.jobs
+        self._idle: list[Bench] = []
+
+    def make(self, progress: Progress | None) -> None:
+        """Decode and write all scans."""
+        run, alone = self._run, self._jobs == 1
+        ahead = _AHEAD if alone else self._jobs + _WAITING
+        with Workers(self._steps, self._jobs, ahead) as workers:
+            for number, task in enumerate(run.tasks(progress)):
+                before = run.take_passing(task.label.end_ns)
+                if not number:
+                    self._begin()
+                is_kept = self._course is not None and number < self._course.done
+                decoded = None
+                if alone:
+                    began_s = time.perf_counter()
+                    decoded = run.benches[0].decode(task)
+                    run.stages.decode_s += time.perf_counter() - began_s
+                workers.put(_Piece(task, is_kept, before, decoded))
+            workers.finish()
+
+    def _begin(self) -> None:
+        """Open the output, now that it is known what its scans say of themselves."""
+        self._idle.extend(self._run.benches)
+        if self._open_writer is not None and self._run.info is not None:
+            self.writer = self._open_writer(self._run.info)
+            if self._course is not None:
+                self._course.begin()
+
+    def _steps(self, piece: _Piece) -> Steps:
+        """What a thread does for a scan; see `Workers`."""
+        bench, decoded, began_s = None, piece.decoded, time.perf_counter()
+        if decoded is None:
+            bench = self._idle.pop()
+            decoded = bench.decode(piece.task)
+        decode_s = time.perf_counter() - began_s
+        watch, writing = _Watch(), self._writing(piece, decoded.scan)
+        watch.do(writing)
+        yield
+        self._run.account(decoded.scan)
+        for item in piece.before:
+            _hand_over(item, self.writer)
+        watch.do(writing)
+        yield
+        watch.do(writing)
+        yield
+        watch.do(writing)
+        if self._course is not None and self.writer is not None:
+            self._course.note(decoded.fates, self.writer)
+        self._run.stages.write_s += watch.spent_s
+        if bench is not None:
+            self._run.stages.decode_s += decode_s
+            self._idle.append(bench)
+
+    def _writing(self, piece: _Piece, scan: Scan) -> Steps:
+        if self.writer is None:
+            return iter(())
+        write = self.writer.pass_over if piece.is_kept else self.writer.write
+        return write(scan, piece.task.only)
+
+
+@dataclass(slots=True)
+class _Watch:
+    """Measures the time that parts of a task take, without the waiting between them."""
+
+    spent_s: float = 0.0
+
+    def do(self, steps: Steps) -> None:
+        """Do the next part."""
+        began_s = time.perf_counter()
+        next(steps, None)
+        self.spent_s += time.perf_counter() - began_s
+
+
+def _hand_over(item: ImuSamples | Message, writer: ScanWriter | None) -> None:
+    if writer is None:
+        return
+    if isinstance(item, Message):
+        writer.write_message(item)
+    else:
+        writer.write_imu(item)
+
+
 def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> ReportInputs:
     """Hand over what is left, close the ledgers and complete the output."""
     began_s = time.perf_counter()
-    run.hand_over(writer, None)
+    for item in run.take_passing(None):
+        _hand_over(item, writer)
     run.tell_of_passed()
     inputs = accounts.report_inputs(run)
     broken = imbalances(inputs)

@@ -25,7 +25,8 @@ class Job:
     that a window must hold; max_wait_ns None: for ever; boxes_m: (k, 6); extras: those of EXTRAS
     that the output has a place for; fault_begin_ns: arrival from which times of faults count, None:
     the first packet; part: of the session, by arrival; passed: patterns of topics to pass through;
-    align_clocks_to: host or first, "" where clocks are taken as they are.
+    align_clocks_to: host or first, "" where clocks are taken as they are; jobs: scans that are made
+    at the same time.
     """
 
     recordings: tuple[Path, ...]
@@ -52,3 +53,4 @@ class Job:
     part: Part = field(default_factory=Part)
     passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS
+    jobs: int = 1

@@ -16,7 +16,8 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clipping import ClippedRecording, Part
 from mlbatch.clock import common_timescale, timescale
-from mlbatch.decode import Decoder, Due, Label
+from mlbatch.decode import Decoder, Source
+from mlbatch.decoding import Bench, Benches, Task, with_own_lidars
 from mlbatch.discover import Note, Setup, absent, discover, untimed
 from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
 from mlbatch.faults import FaultReplay
@@ -31,6 +32,8 @@ from mlbatch.timekeeping import Timekeeper
 from mlbatch.types import (
     IMU,
     MESSAGE_ENCODINGS,
+    ImuSamples,
+    Message,
     PacketBatch,
     Recording,
     RunInfo,
@@ -38,7 +41,6 @@ from mlbatch.types import (
     StreamTable,
 )
 from mlbatch.units import NS_PER_S
-from mlbatch.writers import ScanWriter
 
 
 @dataclass(slots=True)
@@ -55,9 +57,10 @@ Progress = Callable[[int, int], None]
 
 
 class Conversion:
-    """One run; `scans` drives it, the rest tells what came of it."""
+    """One run; `scans` or `tasks` drive it, the rest tells what came of it."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, buffers: int = 1) -> None:
+        """buffers: so many scans of a bench are valid at a time."""
         self.job = job
         self.stages = Stages()
         self.table: ScanTable | None = None
@@ -66,6 +69,7 @@ class Conversion:
         self.dropped_incomplete = 0
         # Of scans that a continued output holds: the fates of the slots of all sensors.
         self.finished: Iterator[Sequence[Sequence[int]]] = iter(())
+        self._buffers = buffers
         self._started_s = (time.perf_counter(), time.process_time())
         self._hosts_ns: tuple[int, int] | None = None
         self._notes: list[Note] = []
@@ -105,7 +109,7 @@ class Conversion:
         self.feeder = Feeder(
             self.setup, self.feeds, host_clocks, self.clocks.retime if retimes else None
         )
-        self._decoders: list[Decoder] = []
+        self._work = Benches()
         self._imu = ImuQueue(
             [feed.ledger.imu_samples for feed in self.feeds],
             [self._offset_ns(sensor) for sensor in self.setup.sensors],
@@ -125,20 +129,31 @@ class Conversion:
 
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with split, the sensor it is of; arrays live until the next."""
+        for task in self.tasks(progress):
+            with self._timed("decode_s"):
+                scan = self.benches[0].decode(task).scan
+            self.account(scan)
+            yield scan, task.only
+        self.close()
+
+    def tasks(self, progress: Progress | None = None) -> Iterator[Task]:
+        """Yield what is to be decoded, scan by scan; `close` has to follow the last.
+
+        Each may be given to any of the benches, by any thread, while the next are made.
+        """
         size = sum(recording.size_bytes for recording in self.recordings)
         self.passed.keep(self.recordings)
         batches = merge(self.recordings)
         if self.job.faults:
             batches = self.replay.batches(batches, self.feeder.owners)
         while (batch := self._read(batches)) is not None:
-            yield from self._windows(self._push(batch))
+            yield from self._due(self._push(batch))
             if progress is not None:
                 progress(sum(r.position_bytes for r in self.recordings), size)
             if self.batcher.past_end:
                 break
         last = self._hosts_ns[1] if self._hosts_ns is not None else 0
-        yield from self._windows(self.batcher.finish(last))
-        self._close()
+        yield from self._due(self.batcher.finish(last))
 
     def _read(self, batches: Iterator[PacketBatch]) -> PacketBatch | None:
         with self._timed("read_s"):
@@ -151,7 +166,10 @@ class Conversion:
 
     def _push(self, batch: PacketBatch) -> Iterator[Window]:
         with self._timed("merge_s"):
-            places = [self.batcher.oldest_place(number) for number in range(len(self.feeds))]
+            places = [
+                self._work.oldest_place(number, self.batcher.oldest_place(number))
+                for number in range(len(self.feeds))
+            ]
             fed = self.feeder.feed(batch, places)
             for samples in fed.imu:
                 self._imu.add(samples)
@@ -160,7 +178,7 @@ class Conversion:
                 self._refuse_rejected()
         return self.batcher.push(fed.arrivals, batch.host_ns)
 
-    def _windows(self, windows: Iterator[Window]) -> Iterator[tuple[Scan, int | None]]:
+    def _due(self, windows: Iterator[Window]) -> Iterator[Task]:
         while True:
             with self._timed("merge_s"):
                 window = next(windows, None)
@@ -168,36 +186,8 @@ class Conversion:
                 return
             if self.info is None:
                 self._begin()
-            yield from self._decode(window)
-
-    def _decode(self, window: Window) -> Iterator[tuple[Scan, int | None]]:
-        if self._is_too_incomplete(window):
-            return
-        label = Label(
-            window.index,
-            window.slice,
-            window.start_ns,
-            window.end_ns,
-            window.complete,
-            window.ready_host_ns,
-        )
-        for number, decoder in enumerate(self._decoders):
-            only = number if self.job.split else None
-            due = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
-            if only is not None:
-                own = window.sensor == only
-                if not own.any():
-                    continue
-                due = Due(
-                    window.stamp_ns[own],
-                    np.zeros(int(np.count_nonzero(own)), np.int64),
-                    window.place[own],
-                    window.encoder[own],
-                )
-            with self._timed("decode_s"):
-                scan = decoder.scan(due, label, next(self.finished, None))
-            self._account(scan)
-            yield scan, only
+            if not self._is_too_incomplete(window):
+                yield from self._work.open(window, self.job.split, self.finished)
 
     def _is_too_incomplete(self, window: Window) -> bool:
         """Whether --drop-incomplete leaves a window out; its columns are counted."""
@@ -215,7 +205,8 @@ class Conversion:
         self.dropped_incomplete += 1
         return True
 
-    def _account(self, scan: Scan) -> None:
+    def account(self, scan: Scan) -> None:
+        """Take a scan that is written into the books; in the order of the scans."""
         for feed, count in zip(self.feeds, scan.columns_per_sensor, strict=True):
             feed.ledger.columns.written += count
         if self.table is not None:
@@ -230,19 +221,27 @@ class Conversion:
         self._check_dates(shared)
         self.info = run_info(self.setup, self.job, self.grid, shared)
         self.table = ScanTable(self.info, self._columns_per_s)
-        boxes_m, extras = boxes_of(self.setup, self.job), self.job.extras
+        info, boxes_m, extras = self.info, boxes_of(self.setup, self.job), self.job.extras
+
+        def decoder(sources: Sequence[Source], only: int | None) -> Decoder:
+            return Decoder(info, sources, boxes_m, extras, only, self._buffers)
+
         sources = [
-            source_of(sensor, feed, info.ring_base, self.job)
-            for sensor, feed, info in zip(
-                self.setup.sensors, self.feeds, self.info.sensors, strict=True
+            source_of(sensor, feed, known.ring_base, self.job)
+            for sensor, feed, known in zip(
+                self.setup.sensors, self.feeds, info.sensors, strict=True
             )
         ]
-        if self.job.split:
-            for number, source in enumerate(sources):
-                source.ring_base = 0
-                self._decoders.append(Decoder(self.info, [source], boxes_m, extras, number))
-        else:
-            self._decoders = [Decoder(self.info, sources, boxes_m, extras)]
+        several = self.job.jobs > 1
+        for _ in range(self.job.jobs):
+            # Lidars also read the heads of packets, in the thread that feeds the batching.
+            own = with_own_lidars(sources) if several else sources
+            self.benches.append(Bench(own, self.job.split, decoder))
+
+    @property
+    def benches(self) -> list[Bench]:
+        """Who decodes: one for each of the jobs, once the first task is there."""
+        return self._work.benches
 
     def _timescales(self) -> list[str]:
         """Timescale of each sensor that gave a stamp."""
@@ -283,15 +282,13 @@ class Conversion:
             return timescale(host_ns, host_ns)
         return timescale(stamp_ns, host_ns)
 
-    def hand_over(self, writer: ScanWriter | None, end_ns: int | None) -> None:
-        """Write what goes past the batching and is older than `end_ns` (None: all)."""
+    def take_passing(self, end_ns: int | None) -> list[ImuSamples | Message]:
+        """What goes past the batching and is older than `end_ns` (None: all)."""
         limits_ns = self.batcher.limits_ns
-        for samples in self._imu.take(end_ns, limits_ns):
-            if writer is not None:
-                writer.write_imu(samples)
-        for message in self.passed.take(end_ns, limits_ns, self._clock_offset_ns()):
-            if writer is not None:
-                writer.write_message(message)
+        return [
+            *self._imu.take(end_ns, limits_ns),
+            *self.passed.take(end_ns, limits_ns, self._clock_offset_ns()),
+        ]
 
     def _clock_offset_ns(self) -> int | None:
         """Scan clock minus arrival; None where scans are not on an epoch clock."""
@@ -304,7 +301,7 @@ class Conversion:
 
     # -- the end ------------------------------------------------------------------------------
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Bring the ledgers together, and refuse what the contract calls no result."""
         for number, feed in enumerate(self.feeds):
             ledger = feed.ledger
@@ -333,11 +330,7 @@ class Conversion:
 
     def points(self, number: int) -> accounts.PointCounts:
         """What became of the pixels of a sensor so far."""
-        if not self._decoders:
-            return accounts.PointCounts()
-        if self.job.split:
-            return self._decoders[number].counts[0]
-        return self._decoders[0].counts[number]
+        return self._work.points(number)
 
     def _refuse_rejected(self) -> None:
         for number, sensor in enumerate(self.setup.sensors):

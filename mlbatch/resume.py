@@ -89,7 +89,6 @@ class Course:
         self._state = state
         self._file: StateFile | None = None
         self._waiting: deque[Row] = deque()
-        self._totals: Row = []
         self._given = 0
         self.recorded = self.done
         self._due_s = 0.0
@@ -107,7 +106,6 @@ class Course:
     def join(self, run: Conversion) -> None:
         """Refuse to continue what another job began, and tell the run which scans are done."""
         self._identity |= identities.of_inputs(run)
-        self._totals = [[0] * len(POINT_FATES) for _ in run.feeds]
         if self._state is None:
             return
         difference = identities.difference(self._state.identity, self._identity)
@@ -125,15 +123,15 @@ class Course:
         self._file = StateFile(state_path(self._target), state, is_new=is_new)
         self._due_s = time.monotonic() + INTERVAL_S
 
-    def note(self, run: Conversion, writer: ScanWriter) -> None:
-        """Take notice of a scan that was written or gone past."""
-        before = self._totals
-        self._totals = [run.points(number).fates for number in range(len(run.feeds))]
+    def note(self, fates: Row, writer: ScanWriter) -> None:
+        """Take notice of a scan that was written or gone past, in the order of the scans.
+
+        fates: of the slots of every sensor in it.
+        """
         self._given += 1
         if self._given <= self.done:
             return
-        pairs = zip(self._totals, before, strict=True)
-        self._waiting.append([[b - a for b, a in zip(now, was, strict=True)] for now, was in pairs])
+        self._waiting.append(fates)
         if time.monotonic() >= self._due_s:
             self._record(writer)
             self._due_s = time.monotonic() + INTERVAL_S

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
+from mlbatch.writers._chunk import Chunk
+from mlbatch.writers._gathered import taken
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
 from mlbatch.writers._options import Safe, WriterOptions
 from mlbatch.writers._ros_messages import (
@@ -33,12 +36,29 @@ class Sink(Protocol):
     """A file of messages under construction, in chunks."""
 
     @property
-    def chunks(self) -> int:
+    def ended(self) -> int:
         """Chunks that are complete."""
         ...
 
+    @property
+    def chunks(self) -> int:
+        """Chunks that are written."""
+        ...
+
     def flush(self) -> int:
-        """Hand complete chunks to the system; gives the bytes up to their end."""
+        """Hand written chunks to the system; gives the bytes up to their end."""
+        ...
+
+    def take(self) -> list[Chunk]:
+        """The chunks that are complete since the last call, if they are not written at once."""
+        ...
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Make chunks ready to be written; by any thread."""
+        ...
+
+    def put(self, chunks: Sequence[Chunk]) -> None:
+        """Write sealed chunks, in the order in which they were taken."""
         ...
 
     def send(
@@ -89,10 +109,11 @@ class BagWriter:
     ) -> None:
         self._info = info
         self._wire = wire
-        self._cloud = CloudMessage(layout_of(options), info.frame_id, wire)
+        self._layout = layout_of(options)
+        self._idle: list[CloudMessage] = []
         self._waiting: list[ImuSamples | Message] = []
         self._begun = False
-        # The chunk that each scan lies in whose chunk is not complete, and how many lie before.
+        # The chunk that each scan lies in whose chunk is not written, and how many lie before.
         self._open_scans: deque[int] = deque()
         self._safe_scans = 0
         self._topics: dict[int | None, str] = {None: "/points"}
@@ -104,24 +125,27 @@ class BagWriter:
         with export_errors(output.partial):
             self._sink = sink(output.partial, options.kept_bytes)
 
-    def write(self, scan: Scan, sensor: int | None = None) -> None:
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Write one scan as a PointCloud2, after what waited for it."""
         dense = scan.info.layout != "organized"
-        with export_errors(self._output.partial):
-            self._begin(scan.start_ns)
-            message = self._cloud.assemble(points_of(scan), scan.start_ns, dense)
-            self._send_scan(scan, sensor, message)
+        cloud = taken(self._idle, self._new_cloud)
+        message = cloud.assemble(points_of(scan), scan.start_ns, dense)
+        yield
+        yield from self._send_scan(scan, sensor, message)
+        self._idle.append(cloud)
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Send what is as long as the scan: it lies in what is kept of the file."""
         dense = scan.info.layout != "organized"
-        with export_errors(self._output.partial):
-            self._begin(scan.start_ns)
-            shape = (scan.points,) if dense else scan.time_ns.T.shape
-            self._send_scan(scan, sensor, self._cloud.blank(shape, scan.start_ns))
+        shape = (scan.points,) if dense else scan.time_ns.T.shape
+        cloud = taken(self._idle, self._new_cloud)
+        message = cloud.blank(shape, scan.start_ns)
+        yield
+        yield from self._send_scan(scan, sensor, message)
+        self._idle.append(cloud)
 
     def safe(self) -> Safe:
-        """The scans in complete chunks."""
+        """The scans in written chunks."""
         with export_errors(self._output.partial):
             kept_bytes = self._sink.flush()
         while self._open_scans and self._open_scans[0] < self._sink.chunks:
@@ -161,10 +185,22 @@ class BagWriter:
         """Close the file; it has no index and stays under `.partial`."""
         self._sink.abandon()
 
-    def _send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
-        self._open_scans.append(self._sink.chunks)
-        topic = self._topics[sensor]
-        self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+    def _new_cloud(self) -> CloudMessage:
+        return CloudMessage(self._layout, self._info.frame_id, self._wire)
+
+    def _send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> Steps:
+        """Lay a scan in its chunk; then seal and write the chunks that are complete with it."""
+        with export_errors(self._output.partial):
+            self._begin(scan.start_ns)
+            self._open_scans.append(self._sink.ended)
+            topic = self._topics[sensor]
+            self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+            chunks = self._sink.take()
+        yield
+        self._sink.seal(chunks)
+        yield
+        with export_errors(self._output.partial):
+            self._sink.put(chunks)
 
     def _write_or_wait(self, item: ImuSamples | Message) -> None:
         with export_errors(self._output.partial):

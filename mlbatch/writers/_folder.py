@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, TypeAlias
+from typing import Protocol
 
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
+from mlbatch.writers._compression import refuse_compression
+from mlbatch.writers._gathered import taken
 from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
 
-Save: TypeAlias = Callable[[BinaryIO, Scan], None]
+
+class Saver(Protocol):
+    """Writes the files of scans, one after the other; owns what it packs them in."""
+
+    def save(self, file: io.FileIO, scan: Scan) -> None:
+        """Write the file of one scan."""
+        ...
 
 
 def scan_name(index: int, slice_: int, slices: int) -> str:
@@ -21,34 +31,45 @@ def scan_name(index: int, slice_: int, slices: int) -> str:
 
 
 class FolderWriter:
-    """Writes each scan by `save` into a file of its own."""
+    """Writes each scan by a saver into a file of its own."""
 
     def __init__(
-        self, target: Path, info: RunInfo, options: WriterOptions, suffix: str, save: Save
+        self,
+        target: Path,
+        info: RunInfo,
+        options: WriterOptions,
+        suffix: str,
+        saver: Callable[[], Saver],
     ) -> None:
+        """saver: makes one for each of the threads."""
         if options.point_layout != DEFAULT_POINT_LAYOUT:
             raise UsageError(
                 f"--point-layout: wanted {DEFAULT_POINT_LAYOUT} for {suffix} files, got "
                 f"{options.point_layout}; presets shape PointCloud2, write a .mcap output for them"
             )
+        refuse_compression(options.compression, f"{suffix} files")
         keep = options.kept_bytes is not None
         self._output = prepare(target, options.overwrite, folder=True, keep=keep)
         self._suffix = suffix
-        self._save = save
+        self._saver = saver
+        self._idle: list[Saver] = []
         self._written = 0
         self._folders: dict[int | None, Path] = {None: self._output.partial}
         if options.split:
             self._folders |= self._sensor_folders(info)
 
-    def write(self, scan: Scan, sensor: int | None = None) -> None:
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Write one scan into a file of its own."""
-        path = self._path(scan, sensor)
-        with export_errors(path), path.open("wb") as file:
-            self._save(file, scan)
+        path, saver = self._path(scan, sensor), taken(self._idle, self._saver)
+        with export_errors(path), path.open("wb", buffering=0) as file:
+            saver.save(file, scan)
+        self._idle.append(saver)
+        yield
         self._written += 1
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Leave a scan's file as it is."""
+        yield
         path = self._path(scan, sensor)
         if not path.is_file():
             raise ExportError(

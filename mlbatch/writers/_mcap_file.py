@@ -7,9 +7,8 @@ while here a large message goes from the buffer it was assembled in straight to 
 from __future__ import annotations
 
 import struct
-import zlib
-from collections.abc import Callable, Iterable
-from typing import BinaryIO
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -32,7 +31,11 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
+from mlbatch.errors import ExportError
 from mlbatch.types import Message, Topic
+from mlbatch.writers._chunk import Chunk, Compress
+from mlbatch.writers._compression import compression_of
+from mlbatch.writers._gathered import OutputFile, crc32, taken
 from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
 
 CHUNK_BYTES = 4 * 2**20
@@ -40,9 +43,11 @@ CHUNK_BYTES = 4 * 2**20
 LARGE_BYTES = 2**20
 # Opcode, length of what follows, channel, sequence, log time, publish time.
 _MESSAGE = struct.Struct("<BQHIQQ")
-# Opcode, length of what follows, first and last log time, size, CRC, empty name of a compression,
-# size again: that of the records, which are not compressed.
-_CHUNK = struct.Struct("<BQQQQIIQ")
+# Opcode, length of what follows, first and last log time, size and CRC of the records, length of
+# the name of a compression; then the name, and the size of the records as they are stored.
+_CHUNK = struct.Struct("<BQQQQII")
+_SIZE = struct.Struct("<Q")
+_RECORD = struct.Struct("<BQ")
 _RECORD_HEAD = 9  # opcode and length, not counted in the length
 # What the CRC of the summary covers of the footer: all but the CRC itself.
 _FOOTER_HEAD = struct.Struct("<BQQQ")
@@ -52,21 +57,29 @@ _FOOTER_LENGTH = 20
 class Container:
     """Topics, messages in chunks, metadata and attachments of one file."""
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: OutputFile, compression: str) -> None:
+        """compression: as `--compression` has it."""
         self._file = file
-        self._at = 0
+        self._compression, self._new_compress = compression_of(compression)
+        self._idle: list[Compress] = []
         self._schemas: dict[tuple[str, str, str], Schema] = {}
         self._channels: dict[str, Channel] = {}
         self._foreign: dict[Topic, Channel] = {}
         self._sent: dict[int, int] = {}
         self._span_ns = (0, 0)
         self._chunk = bytearray()
-        self._chunk_index: dict[int, MessageIndex] = {}
+        self._places: dict[int, list[tuple[int, int]]] = {}
+        # Chunks that are complete: so many in all, and those that nobody took so far.
+        self.ended = 0
+        self._ended: list[Chunk] = []
         self._chunks: list[ChunkIndex] = []
+        # Lengths of the chunks that a continued file holds.
+        self._kept = deque(self._kept_chunks())
+        self._kept_count = len(self._kept)
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._put(MCAP0_MAGIC)
-        self._put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
+        file.put(MCAP0_MAGIC)
+        file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
@@ -76,8 +89,7 @@ class Container:
         self._append(channel, log_ns, message)
 
     def _append(self, channel: Channel, log_ns: int, message: bytes | memoryview) -> None:
-        index = self._chunk_index.setdefault(channel.id, MessageIndex(channel.id, []))
-        index.records.append((log_ns, len(self._chunk)))
+        self._places.setdefault(channel.id, []).append((log_ns, len(self._chunk)))
         length = _MESSAGE.size - _RECORD_HEAD + len(message)
         sent = self._sent.get(channel.id, 0)
         self._sent[channel.id] = sent + 1
@@ -102,13 +114,8 @@ class Container:
 
     @property
     def chunks(self) -> int:
-        """Chunks that are complete."""
+        """Chunks that are written."""
         return len(self._chunks)
-
-    @property
-    def position_bytes(self) -> int:
-        """Bytes of the file so far."""
-        return self._at
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -117,20 +124,20 @@ class Container:
 
     def note(self, name: str, values: dict[str, str]) -> None:
         """Append a metadata record."""
-        self._end_chunk(b"")
+        self._settle()
         data = encoded(Metadata(name, values))
-        self._metadata.append(MetadataIndex(self._at, len(data), name))
-        self._put(data)
+        self._metadata.append(MetadataIndex(self._file.position_bytes, len(data), name))
+        self._file.put(data)
 
     def attach(self, name: str, media_type: str, log_ns: int, text: str) -> None:
         """Append a text as an attachment."""
-        self._end_chunk(b"")
+        self._settle()
         content = text.encode()
         # Time 0 means unknown: files must not depend on when they were written.
         data = encoded(Attachment(0, log_ns, name, media_type, content))
         self._attachments.append(
             AttachmentIndex(
-                self._at,
+                self._file.position_bytes,
                 len(data),
                 log_time=log_ns,
                 create_time=0,
@@ -139,13 +146,13 @@ class Container:
                 media_type=media_type,
             )
         )
-        self._put(data)
+        self._file.put(data)
 
     def finish(self) -> None:
         """Append the index; the file itself stays open."""
-        self._end_chunk(b"")
-        self._put(encoded(DataEnd(0)))
-        start, summary, offsets = self._at, b"", b""
+        self._settle()
+        self._file.put(encoded(DataEnd(0)))
+        start, summary, offsets = self._file.position_bytes, b"", b""
         for opcode, records in self._groups():
             data = b"".join(map(encoded, records))
             if data:
@@ -153,8 +160,9 @@ class Container:
             summary += data
         offsets_start = start + len(summary)
         head = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, offsets_start)
-        crc = zlib.crc32(summary + offsets + head)
-        self._put(summary + offsets + encoded(Footer(start, offsets_start, crc)) + MCAP0_MAGIC)
+        crc = crc32(summary + offsets + head, 0)
+        footer = encoded(Footer(start, offsets_start, crc))
+        self._file.put(summary, offsets, footer, MCAP0_MAGIC)
 
     def _open_topic(self, topic: str, kind: str, latched: bool) -> Channel:
         schema = self._schema(_ros2_name(kind), "ros2msg", definition(kind))
@@ -197,47 +205,97 @@ class Container:
         self._chunk += encoded(channel)
         return channel
 
-    def _end_chunk(self, tail: bytes | memoryview) -> None:
-        """Write the chunk under construction, `tail` being its last bytes, and its index."""
-        if not self._chunk_index:
+    # -- chunks -------------------------------------------------------------------------------
+
+    def take(self) -> list[Chunk]:
+        """The chunks that are complete since the last call; for `put`, once they are sealed."""
+        chunks, self._ended = self._ended, []
+        return chunks
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Make chunks ready to be written; by any thread."""
+        if self._new_compress is None:
+            for chunk in chunks:
+                chunk.seal(None)
             return
-        times_ns = [log_ns for index in self._chunk_index.values() for log_ns, _ in index.records]
-        first_ns, last_ns = min(times_ns), max(times_ns)
-        size = len(self._chunk) + len(tail)
-        length = _CHUNK.size - _RECORD_HEAD + size
-        crc = zlib.crc32(tail, zlib.crc32(self._chunk))
-        start = self._at
-        self._put(_CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, crc, 0, size))
-        self._put(self._chunk)
-        self._put(tail)
-        index_start = self._at
-        offsets = {}
-        for number, index in self._chunk_index.items():
-            offsets[number] = self._at
-            self._put(encoded(index))
-        self._note_chunk(
-            ChunkIndex(
-                chunk_length=index_start - start,
-                chunk_start_offset=start,
-                compression="",
-                compressed_size=size,
-                message_end_time=last_ns,
-                message_index_length=self._at - index_start,
-                message_index_offsets=offsets,
-                message_start_time=first_ns,
-                uncompressed_size=size,
+        compress = taken(self._idle, self._new_compress)
+        for chunk in chunks:
+            chunk.seal(compress)
+        self._idle.append(compress)
+
+    def put(self, chunks: Iterable[Chunk]) -> None:
+        """Write chunks and their indexes, in the order in which they were taken."""
+        for chunk in chunks:
+            start, size, (first_ns, last_ns) = self._file.position_bytes, chunk.size, chunk.span_ns
+            name = self._compression.encode()
+            around = _CHUNK.size + len(name) + _SIZE.size
+            if chunk.is_kept:
+                self._file.skip(self._kept.popleft())
+                stored_bytes = self._file.position_bytes - start - around
+            else:
+                stored_bytes = sum(map(len, chunk.stored))
+                length = around - _RECORD_HEAD + stored_bytes
+                times = (length, first_ns, last_ns, size, chunk.crc, len(name))
+                head = _CHUNK.pack(Opcode.CHUNK, *times) + name + _SIZE.pack(stored_bytes)
+                self._file.put(head, *chunk.stored)
+            index_start = self._file.position_bytes
+            index, offsets = b"", {}
+            for number, places in chunk.places.items():
+                offsets[number] = index_start + len(index)
+                index += encoded(MessageIndex(number, places))
+            self._file.put(index)
+            self._note_chunk(
+                ChunkIndex(
+                    chunk_length=index_start - start,
+                    chunk_start_offset=start,
+                    compression=self._compression,
+                    compressed_size=stored_bytes,
+                    message_end_time=last_ns,
+                    message_index_length=len(index),
+                    message_index_offsets=offsets,
+                    message_start_time=first_ns,
+                    uncompressed_size=size,
+                )
             )
-        )
+
+    def _end_chunk(self, tail: bytes | memoryview) -> None:
+        """Complete the chunk under construction, `tail` being its last bytes."""
+        if not self._places:
+            return
+        is_kept = self.ended < self._kept_count
+        self._ended.append(Chunk([self._chunk, tail], self._places, is_kept))
+        self._chunk, self._places = bytearray(), {}
+        self.ended += 1
+
+    def _settle(self) -> None:
+        """Complete and write all chunks."""
+        self._end_chunk(b"")
+        chunks = self.take()
+        self.seal(chunks)
+        self.put(chunks)
+
+    def _kept_chunks(self) -> Iterable[int]:
+        """Lengths of the chunks in what stays of a continued file."""
+        at, end = len(MCAP0_MAGIC), self._file.kept_bytes
+        while at < end:
+            head = self._file.look_at(at, _RECORD.size)
+            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, end)
+            at += _RECORD.size + length
+            if opcode == Opcode.CHUNK:
+                yield _RECORD.size + length
+        if end and at != end:
+            raise ExportError(
+                f"{self._file.path}: wanted the chunks of the interrupted run, got other bytes; "
+                "leave out --resume to begin anew"
+            )
 
     def _note_chunk(self, chunk: ChunkIndex) -> None:
-        """Keep what the summary needs of a chunk and start the next one."""
+        """Keep what the summary needs of a chunk."""
         first_ns, last_ns = chunk.message_start_time, chunk.message_end_time
         if self._chunks:
             first_ns, last_ns = min(first_ns, self._span_ns[0]), max(last_ns, self._span_ns[1])
         self._span_ns = (first_ns, last_ns)
         self._chunks.append(chunk)
-        self._chunk.clear()
-        self._chunk_index.clear()
 
     def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:
         """The records of the summary by their kind."""
@@ -260,10 +318,6 @@ class Container:
             (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
         ]
-
-    def _put(self, data: bytes | bytearray | memoryview) -> None:
-        self._file.write(data)
-        self._at += len(data)
 
 
 def encoded(record: McapRecord) -> bytes:

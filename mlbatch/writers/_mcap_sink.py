@@ -2,31 +2,48 @@
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from mlbatch.types import Message, Summary
 from mlbatch.writers._atomic import SCANS_CSV
-from mlbatch.writers._kept import open_output
+from mlbatch.writers._chunk import Chunk
+from mlbatch.writers._gathered import OutputFile
 from mlbatch.writers._mcap_file import Container
 
 
 class McapSink:
     """Messages, metadata records `mlbatch.grid` and `mlbatch.report`, attachment scans.csv."""
 
-    def __init__(self, path: Path, kept_bytes: int | None) -> None:
-        self._file = open_output(path, kept_bytes)
-        self.container = Container(self._file)
+    def __init__(self, path: Path, kept_bytes: int | None, compression: str) -> None:
+        self._file = OutputFile(path, kept_bytes)
+        self.container = Container(self._file, compression)
+
+    @property
+    def ended(self) -> int:
+        """Chunks that are complete."""
+        return self.container.ended
 
     @property
     def chunks(self) -> int:
-        """Chunks that are complete."""
+        """Chunks that are written."""
         return self.container.chunks
 
     def flush(self) -> int:
-        """Hand complete chunks to the system; gives the bytes up to their end."""
-        self._file.flush()
-        return self.container.position_bytes
+        """Bytes up to the end of the last written chunk; the system has them."""
+        return self._file.position_bytes
+
+    def take(self) -> list[Chunk]:
+        """The chunks that are complete since the last call."""
+        return self.container.take()
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Make chunks ready to be written; by any thread."""
+        self.container.seal(chunks)
+
+    def put(self, chunks: Sequence[Chunk]) -> None:
+        """Write sealed chunks, in the order in which they were taken."""
+        self.container.put(chunks)
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
@@ -49,6 +66,4 @@ class McapSink:
 
     def abandon(self) -> None:
         """Close the file as it is."""
-        # Closing flushes once more, onto the disk that has just refused.
-        with contextlib.suppress(OSError):
-            self._file.close()
+        self._file.close()

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+    from mlbatch.workers import Steps
 
 DEFAULT_POINT_LAYOUT = "standard"
 
@@ -20,13 +21,15 @@ class WriterOptions:
 
     point_layout: preset of a PointCloud2; overwrite: replace an existing output at the end;
     split: one output stream per sensor instead of merged scans; kept_bytes: what stays of the file
-    in an existing `.partial` that is continued (its scans, where they are files), None: start anew.
+    in an existing `.partial` that is continued (its scans, where they are files), None: start anew;
+    compression: none, lz4 or zstd[:level].
     """
 
     point_layout: str = DEFAULT_POINT_LAYOUT
     overwrite: bool = False
     split: bool = False
     kept_bytes: int | None = None
+    compression: str = "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +41,19 @@ class Safe:
 
 
 class ScanWriter(Protocol):
-    """Writes one run; nothing stands under the final name before `finish`."""
+    """Writes one run; nothing stands under the final name before `finish`.
 
-    def write(self, scan: Scan, sensor: int | None = None) -> None:
-        """Write one scan; its arrays are only valid during the call.
+    The steps of scans may be done by several threads; all else is called in turn (see `workers`).
+    """
+
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
+        """Write one scan; its arrays must be valid until the last of the steps.
 
         sensor: index of the only sensor in the scan with `--split`, None for a merged scan.
         """
         ...
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Go past a scan that the continued `.partial` holds; its point arrays mean nothing."""
         ...
 

@@ -5,11 +5,13 @@ Recorded messages are passed on as they are, also those of ROS 1: MCAP can hold 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RunInfo
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers._compression import compression_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
 
@@ -25,12 +27,13 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
     layout_of(options)
+    compression_of(options.compression)
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
-    return BagWriter(output, info, options, Cdr, _sink)
+    return BagWriter(output, info, options, Cdr, partial(_sink, options.compression))
 
 
-def _sink(path: Path, kept_bytes: int | None) -> Sink:
+def _sink(compression: str, path: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
     from mlbatch.writers._mcap_sink import McapSink
 
-    return McapSink(path, kept_bytes)
+    return McapSink(path, kept_bytes, compression)

@@ -7,25 +7,24 @@ copies arrays on the way.
 
 from __future__ import annotations
 
-import zipfile
+import io
 from pathlib import Path
-from typing import BinaryIO, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import EXTRAS, F32Array, RunInfo, Scan
+from mlbatch.types import EXTRAS, RunInfo, Scan
 from mlbatch.writers._folder import FolderWriter
+from mlbatch.writers._gathered import Bytes, write_all
 from mlbatch.writers._options import ScanWriter, WriterOptions
+from mlbatch.writers._zip import stored_zip
 
 FORMAT = "npz"
 SUFFIX: str | None = None
 SCHEMA = "mlbatch.scan/1"
 
 Array: TypeAlias = npt.NDArray[np.generic]
-
-# The earliest date a zip can hold: files must not depend on when they were written.
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
@@ -35,14 +34,14 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of npz files."""
-    return FolderWriter(target, info, options, ".npz", NpzSaver(info).save)
+    return FolderWriter(target, info, options, ".npz", lambda: NpzSaver(info))
 
 
 class NpzSaver:
-    """Saves scans of one run; owns the buffer that packs coordinates."""
+    """Saves scans of one run; owns the buffers in which arrays come without gaps."""
 
     def __init__(self, info: RunInfo) -> None:
-        self._xyz = np.empty((0, 3), dtype=np.float32)
+        self._packed: dict[str, Array] = {}
         self._constant: dict[str, Array] = {
             "slices": np.array(info.slices, dtype=np.int64),
             "sensors": np.array([sensor.name for sensor in info.sensors], dtype=np.str_),
@@ -52,16 +51,17 @@ class NpzSaver:
             "schema": np.array(SCHEMA, dtype=np.str_),
         }
 
-    def save(self, file: BinaryIO, scan: Scan) -> None:
+    def save(self, file: io.FileIO, scan: Scan) -> None:
         """Write the scan as a zip of npy files."""
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for key, array in (self._arrays(scan) | self._constant).items():
-                _write_npy(archive, key, array)
+        arrays = self._arrays(scan) | self._constant
+        write_all(
+            file, stored_zip((f"{key}.npy", self._npy(key, array)) for key, array in arrays.items())
+        )
 
     def _arrays(self, scan: Scan) -> dict[str, Array]:
         """The keys of the contract that change from scan to scan, in its order."""
         arrays: dict[str, Array | None] = {
-            "xyz": self._packed(scan.xyz),
+            "xyz": scan.xyz,
             "intensity": scan.intensity,
             "reflectivity": scan.reflectivity,
             "range_m": scan.range_m,
@@ -80,24 +80,25 @@ class NpzSaver:
         }
         return {key: array for key, array in arrays.items() if array is not None}
 
-    def _packed(self, xyz: F32Array) -> F32Array:
-        """The same coordinates without gaps between points."""
-        if xyz.flags.c_contiguous:
-            return xyz
-        rows = xyz.reshape(-1, 3)
-        if len(self._xyz) < len(rows):
-            self._xyz = np.empty((len(rows) * 5 // 4, 3), dtype=np.float32)
-        packed = self._xyz[: len(rows)]
+    def _npy(self, key: str, array: Array) -> list[Bytes]:
+        """The parts of an npy file."""
+        array = self._without_gaps(key, array)
+        head = io.BytesIO()
+        np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
+        return [head.getvalue(), array.reshape(-1).view(np.uint8).data]
+
+    def _without_gaps(self, key: str, array: Array) -> Array:
+        """The same values one after the other, in a buffer that is used for the next scan again."""
+        if array.flags.c_contiguous:
+            return array
+        buffer = self._packed.get(key)
+        if buffer is None or buffer.size < array.size:
+            buffer = self._packed[key] = np.empty(array.size * 5 // 4, array.dtype)
+        packed = buffer[: array.size].reshape(array.shape)
+        if key != "xyz":
+            packed[...] = array
+            return packed
+        # Axis by axis, since an innermost axis of three is slow to go through.
         for axis in range(3):
-            packed[:, axis] = rows[:, axis]
-        return packed.reshape(xyz.shape)
-
-
-def _write_npy(archive: zipfile.ZipFile, key: str, array: Array) -> None:
-    """Append one array to the zip without copying it."""
-    array = np.ascontiguousarray(array) if array.ndim else array
-    entry = zipfile.ZipInfo(f"{key}.npy", date_time=_ZIP_DATE)
-    with archive.open(entry, "w") as member:
-        header = np.lib.format.header_data_from_array_1_0(array)
-        np.lib.format.write_array_header_1_0(member, header)
-        member.write(array.data if array.dtype.kind != "U" else array.tobytes())
+            packed[..., axis] = array[..., axis]
+        return packed

@@ -5,8 +5,8 @@ The format: G. Turk, "The PLY Polygon File Format", 1994; one element `vertex`, 
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -14,6 +14,7 @@ import mlbatch
 from mlbatch.errors import UsageError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.writers._folder import FolderWriter
+from mlbatch.writers._gathered import write_all
 from mlbatch.writers._layouts import PLY_LAYOUT, points_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 
@@ -33,7 +34,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
     """Start a folder of PLY files."""
     if info.layout == "organized":
         raise UsageError("--layout organized: PLY has no organized form; use npz or mcap")
-    return FolderWriter(target, info, options, ".ply", PlySaver().save)
+    return FolderWriter(target, info, options, ".ply", PlySaver)
 
 
 class PlySaver:
@@ -42,15 +43,14 @@ class PlySaver:
     def __init__(self) -> None:
         self._vertices = np.zeros(0, dtype=PLY_LAYOUT.dtype)
 
-    def save(self, file: BinaryIO, scan: Scan) -> None:
+    def save(self, file: io.FileIO, scan: Scan) -> None:
         """Write the header and all points as vertices."""
         count = len(scan.time_ns)
         if len(self._vertices) < count:
             self._vertices = np.zeros(count * 5 // 4, dtype=PLY_LAYOUT.dtype)
         vertices = self._vertices[:count]
         PLY_LAYOUT.pack(points_of(scan), vertices)
-        file.write(header(scan, count).encode())
-        file.write(vertices.view(np.uint8).data)
+        write_all(file, [header(scan, count).encode(), vertices.view(np.uint8).data])
 
 
 def header(scan: Scan, count: int) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -14,6 +15,8 @@ from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary, Topic
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers._chunk import Chunk
+from mlbatch.writers._compression import refuse_compression
 from mlbatch.writers._kept import open_output
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Ros1
@@ -37,6 +40,7 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
     layout_of(options)
+    refuse_compression(options.compression, FORMAT)
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Ros1, _sink)
 
@@ -72,15 +76,30 @@ class _Rosbag1Sink:
         self._bag.bio.write(head)
 
     @property
-    def chunks(self) -> int:
+    def ended(self) -> int:
         """Chunks that are complete; the library's last one is open."""
         return len(self._bag.chunks) - 1
+
+    @property
+    def chunks(self) -> int:
+        """The same: the library writes them at once."""
+        return self.ended
 
     def flush(self) -> int:
         """Hand complete chunks to the system; gives the bytes up to their end."""
         file = self._file
         file.flush()
         return file.tell()
+
+    def take(self) -> list[Chunk]:
+        """None, as they are written already."""
+        return []
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Nothing to do."""
+
+    def put(self, chunks: Sequence[Chunk]) -> None:
+        """Nothing to do."""
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False

@@ -6,6 +6,7 @@ metadata.yaml is that of version 5 (Humble), which later players read as well.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,8 @@ from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers._chunk import Chunk
+from mlbatch.writers._compression import compression_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
 
@@ -35,15 +38,17 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
     layout_of(options)
+    compression_of(options.compression)
     output = prepare(target, options.overwrite, folder=True, keep=options.kept_bytes is not None)
-    return BagWriter(output, info, options, Cdr, partial(_sink, f"{target.name}_0.mcap"))
+    sink = partial(_sink, f"{target.name}_0.mcap", options.compression)
+    return BagWriter(output, info, options, Cdr, sink)
 
 
-def _sink(name: str, folder: Path, kept_bytes: int | None) -> Sink:
+def _sink(name: str, compression: str, folder: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
     from mlbatch.writers._mcap_sink import McapSink
 
-    return _BagSink(folder, name, McapSink(folder / name, kept_bytes))
+    return _BagSink(folder, name, McapSink(folder / name, kept_bytes, compression))
 
 
 class _BagSink:
@@ -55,13 +60,30 @@ class _BagSink:
         self._file = file
 
     @property
-    def chunks(self) -> int:
+    def ended(self) -> int:
         """Chunks that are complete."""
+        return self._file.ended
+
+    @property
+    def chunks(self) -> int:
+        """Chunks that are written."""
         return self._file.chunks
 
     def flush(self) -> int:
-        """Hand complete chunks to the system; gives the bytes up to their end."""
+        """Bytes up to the end of the last written chunk; the system has them."""
         return self._file.flush()
+
+    def take(self) -> list[Chunk]:
+        """The chunks that are complete since the last call."""
+        return self._file.take()
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Make chunks ready to be written; by any thread."""
+        self._file.seal(chunks)
+
+    def put(self, chunks: Sequence[Chunk]) -> None:
+        """Write sealed chunks, in the order in which they were taken."""
+        self._file.put(chunks)
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False

@@ -41,6 +41,7 @@ from mlbatch.types import (
     U16Array,
     U32Array,
 )
+from mlbatch.workers import Steps
 from mlbatch.writers import Safe, ScanWriter, WriterOptions, extras, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,12 +94,14 @@ class Memory:
     summary: Summary | None = None
     abandoned: bool = False
 
-    def write(self, scan: Scan, sensor: int | None = None) -> None:
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Keep a scan."""
+        yield
         self.scans.append((deepcopy(scan), sensor))
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> None:
+    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Nothing: what is in memory is never continued."""
+        yield
 
     def safe(self) -> Safe:
         """Nothing: see above."""

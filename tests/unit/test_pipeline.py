@@ -16,6 +16,7 @@ from mlbatch.job import Job
 from mlbatch.pipeline import Conversion
 from mlbatch.report import ReportInputs
 from mlbatch.types import RunInfo, Scan
+from mlbatch.workers import Steps
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.unit.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
 
@@ -142,10 +143,13 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
 class _FullDisk(Memory):
     """Fails at the second scan."""
 
-    def write(self, scan: Scan, sensor: int | None = None) -> None:
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
+        steps = super().write(scan, sensor)
+        next(steps)
+        yield
         if self.scans:
             raise ExportError("no space left")
-        super().write(scan, sensor)
+        yield from steps
 
 
 def test_a_writer_is_abandoned_when_the_run_fails() -> None:

@@ -17,6 +17,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from mlbatch.types import Scan, Summary
+from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .scans import (
@@ -37,7 +38,7 @@ def written(folder: Path, *scans: Scan, layout: str = "standard", split: bool = 
     writer = open_writer("mcap", target, scans[0].info, WriterOptions(layout, split=split))
     writer.write_imu(imu_samples())
     for number, scan in enumerate(scans):
-        writer.write(scan, number if split else None)
+        in_one_go(writer.write(scan, number if split else None))
     writer.write_imu(imu_samples(1, START_NS + PERIOD_NS // 2, 1))
     writer.finish(SUMMARY)
     return target

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.types import Scan
+from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .scans import SUMMARY, dense_scan, point_scan
@@ -17,7 +18,7 @@ from .scans import SUMMARY, dense_scan, point_scan
 def written(folder: Path, scan: Scan) -> bytes:
     """Write one scan; its file."""
     writer = open_writer("ply", folder, scan.info, WriterOptions())
-    writer.write(scan)
+    in_one_go(writer.write(scan))
     writer.finish(SUMMARY)
     return (folder / "000000.ply").read_bytes()
 

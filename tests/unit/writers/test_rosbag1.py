@@ -11,6 +11,7 @@ import pytest
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message
+from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .bags import ODD_TEXT, ROS1_NOTE, ROS1_ODD, ROS2_NOTE, note, odd, read_back, written
@@ -136,7 +137,7 @@ def test_the_table_of_scans_lies_beside(tmp_path: Path) -> None:
 
 def test_messages_of_ros_2_are_refused_by_name(tmp_path: Path) -> None:
     writer = open_writer("rosbag1", tmp_path / "out.bag", run_info(), WriterOptions())
-    writer.write(dense_scan())
+    in_one_go(writer.write(dense_scan()))
     with pytest.raises(ExportError, match=r"^/note: wanted messages of ROS 1 .* got 'cdr'"):
         writer.write_message(note(ROS2_NOTE, "x", 0))
     writer.abandon()
@@ -144,7 +145,7 @@ def test_messages_of_ros_2_are_refused_by_name(tmp_path: Path) -> None:
 
 def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     writer = open_writer("rosbag1", tmp_path / "out.bag", run_info(), WriterOptions())
-    writer.write(dense_scan())
+    in_one_go(writer.write(dense_scan()))
     for text in ("what ever this is !!", "other_msgs/Missing x\n"):
         topic = replace(ROS1_NOTE, definition=text, type="my_msgs/Lost")
         with pytest.raises(ExportError, match=r"^/note: wanted the definition of my_msgs/Lost"):

@@ -1,0 +1,112 @@
+"""Bytes to files as they lie in memory: checksums, and writes that gather what lies apart."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias, TypeVar, cast
+
+from mlbatch.errors import ExportError
+
+# Views have a byte for each of their items.
+Bytes: TypeAlias = bytes | bytearray | memoryview
+Checksum: TypeAlias = Callable[[Bytes, int], int]
+Scratch = TypeVar("Scratch")
+
+# POSIX promises that a write takes 16 pieces; all systems of today take 1024.
+_MOST_PIECES = 512
+# After so many bytes, what was written is dropped from the memory of the system.
+_STEP_BYTES = 64 << 20
+
+
+def taken(idle: list[Scratch], new: Callable[[], Scratch]) -> Scratch:
+    """Scratch that no thread uses, or new one."""
+    # Not by looking first: another thread may take the last one in between.
+    try:
+        return idle.pop()
+    except IndexError:
+        return new()
+
+
+def _best_checksum() -> Checksum:
+    """CRC-32 as zlib has it, of the fastest library that is installed."""
+    with contextlib.suppress(ImportError):
+        return cast(Checksum, importlib.import_module("isal.isal_zlib").crc32)
+    return zlib.crc32
+
+
+crc32 = _best_checksum()
+
+
+def write_all(file: io.FileIO, parts: Sequence[Bytes]) -> None:
+    """Write parts one after the other to an unbuffered file, without joining them."""
+    left = [memoryview(part) for part in parts if len(part)]
+    while left:
+        count = os.writev(file.fileno(), left[:_MOST_PIECES])
+        while left and count >= len(left[0]):
+            count -= len(left.pop(0))
+        if count:
+            left[0] = left[0][count:]
+
+
+class OutputFile:
+    """A large file that is written in order; what a continued one already holds is skipped.
+
+    kept_bytes: what it already holds; position_bytes: of the next byte, written or skipped.
+    """
+
+    def __init__(self, path: Path, kept_bytes: int | None) -> None:
+        """kept_bytes: what stays of an existing file, None: begin a new one."""
+        self.path = path
+        self._file = io.FileIO(path, "w" if kept_bytes is None else "r+")
+        self.kept_bytes = kept_bytes or 0
+        self.position_bytes = self._dropped_bytes = 0
+        if kept_bytes is not None:
+            self._cut(kept_bytes)
+
+    def _cut(self, kept_bytes: int) -> None:
+        size = self._file.seek(0, io.SEEK_END)
+        if size < kept_bytes:
+            self._file.close()
+            raise ExportError(
+                f"{self.path}: wanted {kept_bytes} bytes of the interrupted run to go on after "
+                f"them, got {size}; leave out --resume to begin anew"
+            )
+        self._file.truncate(kept_bytes)
+        self._file.seek(kept_bytes)
+
+    def look_at(self, place: int, count: int) -> bytes:
+        """Bytes anywhere in what stays of the file."""
+        return os.pread(self._file.fileno(), count, place)
+
+    def put(self, *parts: Bytes) -> None:
+        """Append parts, which must not begin before and end after the end of what stays."""
+        size = sum(map(len, parts))
+        if self.position_bytes < self.kept_bytes:
+            self.skip(size)
+            return
+        write_all(self._file, parts)
+        self.position_bytes += size
+        if self.position_bytes - self._dropped_bytes >= _STEP_BYTES:
+            self._drop()
+
+    def skip(self, size: int) -> None:
+        """Go past bytes that stay."""
+        self.position_bytes += size
+        if self.position_bytes > self.kept_bytes:
+            raise ExportError(
+                f"{self.path}: wanted the scans of the interrupted run to go on after them, got "
+                "others; leave out --resume to begin anew"
+            )
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _drop(self) -> None:
+        self._dropped_bytes = self.position_bytes
