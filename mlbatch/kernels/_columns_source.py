@@ -35,12 +35,12 @@ def build(word: str, step: int, pad: int, returns: int, kind: str) -> Callable[[
     """word, step: of the pixels; pad: channels, up to a power of 2; kind: see `projecting`."""
     read, project = reader_of(word, step, pad), projecting(kind, pad, returns)
     mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting()
-    elements, four, seven = returns * pad, 4 * returns * pad, 7 * pad
+    elements, four, eight = returns * pad, 4 * returns * pad, 8 * pad
     record_of = _record_of()
 
     def kernel(frame: Pointer) -> int:
         ranges, levels, keep = f4_scratch(elements), f4_scratch(elements), u1_scratch(elements)
-        points, labels, scratch = f4_scratch(four), i8_scratch(elements), f4_scratch(seven)
+        points, labels, scratch = f4_scratch(four), i8_scratch(elements), f4_scratch(eight)
         others = u2_scratch(elements)
         for element in range(elements):
             ranges[element] = np.float32(0)

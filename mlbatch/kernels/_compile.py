@@ -16,9 +16,18 @@ _SIGNATURE = (types.CPointer(types.int64),)
 def compiled(source: str, constants: tuple[Constant, ...]) -> tuple[str, bytes]:
     """Symbol and object code of the function that `build(*constants)` of a module makes."""
     function = importlib.import_module(source).build(*constants)
-    made = numba.njit(types.int64(*_SIGNATURE), error_model="numpy")(function)
+    # Without numba's own entry points, which would ask for its runtime.
+    made = numba.njit(
+        types.int64(*_SIGNATURE),
+        error_model="numpy",
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+    )(function)
     result = made.overloads[_SIGNATURE]
-    # What is left of numba's own entry points would ask for its runtime.
     module = llvm.parse_assembly(result.library.get_llvm_str())
     symbol = result.fndesc.mangled_name
+    for function in module.functions:
+        # Nobody would tell where it is: the call of it would end the process.
+        if function.is_declaration and not function.name.startswith("llvm."):
+            raise RuntimeError(f"kernel {source}{constants} calls {function.name}")
     return symbol, bytes(machine().emit_object(module))

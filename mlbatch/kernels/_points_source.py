@@ -3,7 +3,7 @@
 Source: the formulas of `mlbatch.geometry`, whose `Tabled` and `Turning` do the same in numpy, step
 by step in float32. Each piece is `(frame, place, ranges, levels, points, scratch)`: place is
 (member, encoder word, firing table, number among the columns of the kind); points are x, y, z and
-level; scratch is 7 * pad floats.
+level; scratch is 8 * pad floats.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _tabled(pad: int, returns: int) -> Projecting:
 
 
 def _turning(pad: int, returns: int) -> Projecting:
-    turn_on, combine = _turn_on(pad), _combine(pad)
+    turn_on, combine, lay = _turn_on(pad), _combine(pad), _lay(pad)
 
     @piece
     def project(
@@ -82,28 +82,39 @@ def _turning(pad: int, returns: int) -> Projecting:
             turn_on(cosine, sine, speed, moved(f4_at(frame[at.FIRING]), table * pad))
         directions, origins = f4_at(frame[at.DIRECTION]), f4_at(frame[at.ORIGIN])
         vectors = frame[at.VECTORS]
-        begin = moved(scratch, 6 * pad)
+        begin = moved(scratch, 5 * pad)
         for axis in range(_AXES):
-            along = moved(scratch, axis * pad)
-            combine(moved(directions, axis * pad), vectors >> axis, cosine, sine, along)
-        for axis in range(_AXES):
-            along = moved(scratch, axis * pad)
-            combine(moved(origins, axis * pad), vectors >> (axis + _ORIGINS), cosine, sine, begin)
-            for which in range(returns):
-                first = which * pad
-                if frame[at.REACH] != 0:
-                    reach = f4_at(frame[at.REACH])
-                    for beam in range(pad):
-                        reached = ranges[first + beam] + reach[beam]
-                        points[4 * (first + beam) + axis] = reached * along[beam] + begin[beam]
-                else:
-                    for beam in range(pad):
-                        reached = ranges[first + beam]
-                        points[4 * (first + beam) + axis] = reached * along[beam] + begin[beam]
-        for element in range(returns * pad):
-            points[4 * element + 3] = levels[element]
+            here = axis * pad
+            combine(moved(directions, here), vectors >> axis, cosine, sine, moved(scratch, here))
+            turning = vectors >> (axis + _ORIGINS)
+            combine(moved(origins, here), turning, cosine, sine, moved(begin, here))
+        for which in range(returns):
+            metres, level = moved(ranges, which * pad), moved(levels, which * pad)
+            if frame[at.REACH] != 0:
+                reach = f4_at(frame[at.REACH])
+                for beam in range(pad):
+                    cosine[beam] = metres[beam] + reach[beam]
+                lay(cosine, level, scratch, begin, moved(points, 4 * which * pad))
+            else:
+                lay(metres, level, scratch, begin, moved(points, 4 * which * pad))
 
     return project
+
+
+def _lay(pad: int) -> Callable[[Pointer, Pointer, Pointer, Pointer, Pointer], None]:
+    """Points of one return: r * direction + origin, all that belongs to a point at once."""
+
+    @piece
+    def lay(
+        metres: Pointer, level: Pointer, along: Pointer, begin: Pointer, points: Pointer
+    ) -> None:
+        for beam in range(pad):
+            points[4 * beam] = metres[beam] * along[beam] + begin[beam]
+            points[4 * beam + 1] = metres[beam] * along[pad + beam] + begin[pad + beam]
+            points[4 * beam + 2] = metres[beam] * along[2 * pad + beam] + begin[2 * pad + beam]
+            points[4 * beam + 3] = level[beam]
+
+    return lay
 
 
 def _turn_on(pad: int) -> Callable[[Pointer, Pointer, float, Pointer], None]:

@@ -167,7 +167,9 @@ class PacketHeaders:
         value = _header_field(packets, HEADERS[self.header], field)
         if self.serial == 0:
             return value
-        told = value if field == "serial" else _header_field(packets, HEADERS[self.header], "serial")
+        told = (
+            value if field == "serial" else _header_field(packets, HEADERS[self.header], "serial")
+        )
         here = told == self.serial
         if here.all():
             return value

@@ -327,8 +327,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "apart/drive.pcap --identity-extrinsics",
         1,
         "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
-        "ouster_111 and -3600.004 s for ouster_222, 3600.000 s apart (1 whole hour(s): a time zone, "
-        "or the wrong hour); wanted at most 1 s; use --align-clocks or --clock host, or give "
+        "ouster_111 and -3600.004 s for ouster_222, 3600.000 s apart (1 whole hour(s): a time "
+        "zone, or the wrong hour); wanted at most 1 s; use --align-clocks or --clock host, or give "
         "clock.offset_s or clock.epoch in the rig",
     ),
     "strict with a duplicate": (
