@@ -46,7 +46,6 @@ class Kind:
     refused_together: tuple[str, ...] = ()
     remedied: tuple[Callable[[str], Sent], str] | None = None
     counts: Counts | None = None
-    counted: Counts | None = None
     session: Callable[[str], Sent] | None = None
     warnings: tuple[str, ...] = ()
 
@@ -182,16 +181,19 @@ KINDS: Mapping[str, Kind] = {
     "drop": Kind(
         "drop:{v}:5%",
         subset=True,
-        counts={"read": _without, "accepted": _without, "reordered": _none},
-        counted={"lost": _between_others},
+        counts={
+            "read": _without,
+            "accepted": _without,
+            "lost": _between_others,
+            "reordered": _none,
+        },
     ),
     "stall": Kind(
         "stall:{v}:0.15s-0.3s",
         SHORT_WAIT,
         100 * NS_PER_MS,
         silent(150 * NS_PER_MS, 300 * NS_PER_MS),
-        counts={"read": _without, "accepted": _without, "reordered": _none},
-        counted={"lost": _touched},
+        counts={"read": _without, "accepted": _without, "lost": _touched, "reordered": _none},
     ),
     "late": Kind(
         "late:{v}:0.2s",
@@ -219,8 +221,7 @@ KINDS: Mapping[str, Kind] = {
     ),
     "reorder": Kind(
         "reorder:{v}:10%",
-        counts={"read": _all, "accepted": _all, "lost": _none},
-        counted={"reordered": _touched},
+        counts={"read": _all, "accepted": _all, "lost": _none, "reordered": _touched},
     ),
     "delay": Kind(
         "delay:{v}:60ms",
@@ -258,8 +259,7 @@ KINDS: Mapping[str, Kind] = {
     "wrap": Kind(
         "reorder:{v}:10%",
         session=wrapping,
-        counts={"read": _all, "accepted": _all, "lost": _none},
-        counted={"reordered": _touched},
+        counts={"read": _all, "accepted": _all, "lost": _none, "reordered": _touched},
     ),
     "restart": Kind(
         pieces=restarted,
@@ -281,8 +281,8 @@ KINDS: Mapping[str, Kind] = {
             "read": _all,
             "accepted": _without,
             "bad_size": _touched,
+            "lost": _between_others,
             "reordered": _none,
         },
-        counted={"lost": _between_others},
     ),
 }

@@ -159,10 +159,10 @@ def robosense_helios16(spell: Spell) -> Sent:
 
 @dataclass(frozen=True, slots=True)
 class Maker:
-    """A lidar of the matrix; modulus: its own count of packets wraps there, 0: it has none.
+    """A lidar of the matrix.
 
-    begin_ns: its first turn after the others'; wrap: count at the begin of a spell of 0.25 s in
-    which it wraps.
+    begin_ns: its first turn after the others'; wrap: its own count of packets at the begin of a
+    spell of 0.25 s in which it wraps, 0: it has none.
     """
 
     send: Callable[[Spell], Sent]
@@ -171,19 +171,18 @@ class Maker:
     topic: str
     metadata: str
     begin_ns: int
-    modulus: int = 0
     wrap: int = 0
 
 
 MAKERS: Mapping[str, Maker] = {
     "ouster": Maker(
         *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
-        *(0, 2**16 * 32, 2**16 - 1),
+        *(0, 2**16 - 1),
     ),
     "velodyne": Maker(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
     "hesai": Maker(
         *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
-        *(5_700_000, 2**32, 2**32 - 100),
+        *(5_700_000, 2**32 - 100),
     ),
     "robosense": Maker(
         *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
