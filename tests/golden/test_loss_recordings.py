@@ -1,0 +1,124 @@
+"""Loss on real recordings: none as they are, and of what is taken out of them exactly that.
+
+Their sheets say of none that packets are missing (recordings/MANIFEST.md): counts go on without a
+gap, the Pandar40P's and the Velodynes' packets follow at their pace, and the silence of the VLP-32C
+for half of each turn "is normal, not loss".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from mlbatch.batching.loss import PacketLoss
+from mlbatch.lidar import Lidar
+from mlbatch.looking import calibrations_for, look
+from mlbatch.matching import match
+from mlbatch.readers import merge, open_recording
+from mlbatch.streams import split_by_kind
+from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
+from tests.golden.test_doctor_recordings import CASES, RECORDINGS, Case, needs_recordings
+
+# Fewer tell no pace.
+FEWEST = 17
+every_case = pytest.mark.parametrize(
+    ("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value)
+)
+every_long_case = pytest.mark.parametrize(
+    ("maker", "case"),
+    [(maker, case) for maker, case in CASES if case.packets >= FEWEST],
+    ids=lambda value: getattr(value, "path", value),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Came:
+    """Packets (P,) of the lidar of a recording, in order of arrival."""
+
+    lidar: Lidar
+    sequence: I64Array
+    heads: Heads
+    host_ns: I64Array
+
+    def counted(self, came: BoolArray | slice = slice(None), size: int = 64) -> tuple[int, int]:
+        """Lost and reordered of those packets, told in batches of `size`."""
+        packet_ns = self.lidar.columns_per_packet * self.lidar.column_period_ns
+        loss = PacketLoss(self.lidar.sequence_modulus, packet_ns)
+        rows = np.arange(len(self.host_ns))[came]
+        for part in np.split(rows, range(size, len(rows), size)):
+            heads = self.heads
+            chosen = Heads(heads.stamp_ns[part], heads.encoder[part], heads.valid[part])
+            loss.add(self.sequence[part], chosen, self.host_ns[part])
+        return loss.lost, loss.reordered
+
+
+@lru_cache(maxsize=2)
+def _read(maker: str, path: str) -> Came:
+    """The packets of a recording of one lidar, found as the program finds them."""
+    place = RECORDINGS / maker / path
+    if place.is_dir():
+        (place,) = place.glob("*.db3")
+    table = StreamTable()
+    recordings = [open_recording(place, table)]
+    sampler, learner = look(recordings, table)
+    calibrations, _ = calibrations_for([place], ())
+    (sensor,) = match(sampler, [*calibrations, *learner.calibrations()], {}).sensors
+    lidar, payloads, hosts = sensor.lidar, [], []
+    for batch in merge(recordings):
+        for kind, index in split_by_kind(batch):
+            if kind in sensor.kinds:
+                payloads.append(batch.data[batch.start[index, None] + np.arange(kind[1])])
+                hosts.append(batch.host_ns[index])
+    packets, host_ns = np.concatenate(payloads), np.concatenate(hosts)
+    assert (lidar.faults(packets) == 0).all()
+    return Came(lidar, lidar.sequence(packets), lidar.heads(packets, host_ns), host_ns)
+
+
+@needs_recordings
+@every_case
+def test_nothing_is_lost(maker: str, case: Case) -> None:
+    packets = _read(maker, case.path)
+    assert len(packets.host_ns) == case.packets
+    assert packets.counted() == (0, 0)
+
+
+@needs_recordings
+@every_long_case
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.4])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_taken_out_is_what_is_lost(maker: str, case: Case, share: float, seed: int) -> None:
+    """All but the first and the last packet: nobody can tell what was before."""
+    came = np.random.default_rng(seed).random(case.packets) >= share
+    came[[0, -1]] = True
+    packets, missing = _read(maker, case.path), int(np.count_nonzero(~came))
+    assert packets.counted(came) == (missing, 0)
+    assert packets.counted(came, size=7) == (missing, 0)
+
+
+@needs_recordings
+@every_long_case
+def test_packets_lost_in_a_row(maker: str, case: Case) -> None:
+    """A quarter of the recording, from its middle on."""
+    silent = case.packets // 4
+    came = np.ones(case.packets, bool)
+    came[case.packets // 2 : case.packets // 2 + silent] = False
+    assert _read(maker, case.path).counted(came) == (silent, 0)
+
+
+@needs_recordings
+@every_long_case
+def test_packets_that_cross_are_not_lost(maker: str, case: Case) -> None:
+    packets = _read(maker, case.path)
+    order = np.arange(case.packets)
+    order[4:-4:10], order[5:-3:10] = order[5:-3:10].copy(), order[4:-4:10].copy()
+    heads = packets.heads
+    crossed = Came(
+        packets.lidar,
+        packets.sequence[order],
+        Heads(heads.stamp_ns[order], heads.encoder[order], heads.valid[order]),
+        packets.host_ns,
+    )
+    assert crossed.counted() == (0, len(order[4:-4:10]))
