@@ -6,6 +6,7 @@ and N of them decode and write, each a scan.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -95,8 +96,11 @@ class _Output:
         """Decode and write all scans."""
         run, alone = self._run, self._jobs == 1
         ahead = _AHEAD if alone else self._jobs + _WAITING
-        with Workers(self._steps, self._jobs, ahead) as workers:
-            for number, task in enumerate(run.tasks(progress)):
+        with (
+            contextlib.closing(run.tasks(progress)) as tasks,
+            Workers(self._steps, self._jobs, ahead) as workers,
+        ):
+            for number, task in enumerate(tasks):
                 before = run.take_passing(task.label.end_ns)
                 if not number:
                     self._begin()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -64,18 +65,19 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
     A capture is often started long before the lidars are.
     """
     until_ns: int | None = None
-    for batch in merge(recordings):
-        if until_ns is None:
-            began_ns = _lidars_begin_ns(batch)
-            until_ns = None if began_ns is None else began_ns + LOOK_NS
-        if until_ns is None:
+    with contextlib.closing(merge(recordings)) as batches:
+        for batch in batches:
+            if until_ns is None:
+                began_ns = _lidars_begin_ns(batch)
+                until_ns = None if began_ns is None else began_ns + LOOK_NS
+            if until_ns is None:
+                yield batch
+                continue
+            over = np.flatnonzero(batch.host_ns > until_ns)
+            if len(over):
+                yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
+                return
             yield batch
-            continue
-        over = np.flatnonzero(batch.host_ns > until_ns)
-        if len(over):
-            yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
-            return
-        yield batch
 
 
 def _lidars_begin_ns(batch: PacketBatch) -> int | None:

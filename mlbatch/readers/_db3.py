@@ -122,13 +122,14 @@ class Database:
         if log.is_file() and log.stat().st_size:
             # The last messages of a recorder that crashed are still in the log.
             with contextlib.suppress(sqlite3.Error):
-                connection = sqlite3.connect(uri, uri=True)
+                connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
                 self._logged = True
                 return connection
             note = f"{log.name}: cannot be read with the bag; its last messages are missing"
             self.notes += [note] if note not in self.notes else []
-        connection = sqlite3.connect(uri + "&immutable=1", uri=True)
+        # One thread at a time may go on with the reading; SQLite would insist on the first.
+        connection = sqlite3.connect(uri + "&immutable=1", uri=True, check_same_thread=False)
         # Without it, a file that was cut off would be refused as a whole.
         connection.execute("PRAGMA writable_schema = ON")
         return connection

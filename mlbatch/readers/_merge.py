@@ -6,7 +6,7 @@ times step back, its packets keep their order and count with the largest time so
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,13 @@ from mlbatch.readers._bytes import SLACK, copy_runs
 from mlbatch.types import I64Array, PacketBatch, Recording, U8Array
 
 
-def merge(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
+def close(packets: Iterator[PacketBatch]) -> None:
+    """End a reading now, in this thread, and not when its last reference goes."""
+    if isinstance(packets, Generator):
+        packets.close()
+
+
+def merge(recordings: Sequence[Recording]) -> Generator[PacketBatch, None, None]:
     """Yield all packets of all recordings; a single recording passes through untouched.
 
     A recording is opened when its time has come: memory holds those that overlap, not all.
@@ -24,6 +30,14 @@ def merge(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
         yield from recordings[0].packets()
         return
     feeds = [_Feed.peek(recording) for recording in recordings]
+    try:
+        yield from _merged(feeds)
+    finally:
+        for feed in feeds:
+            feed.close()
+
+
+def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
     out: U8Array = np.zeros(0, np.uint8)
     while waiting := [feed for feed in feeds if not feed.ended]:
         # The feed that ends first bounds what is known; of equals, the first in order.
@@ -65,12 +79,12 @@ class _Feed:
         """A feed that knows its first packet's time, but holds no buffer yet."""
         packets = recording.packets(until_ns=0)
         first = next((batch for batch in packets if len(batch) or batch.messages), None)
+        # Closing ends the look ahead, and gives its buffer back.
+        close(packets)
         if first is None:
             return cls(recording, ended=True)
         # A recording that holds messages only is no clock for the others: it goes first.
         known_until_ns = int(first.host_ns[0]) if len(first) else 0
-        # Closing ends the look ahead, and gives its buffer back.
-        del packets
         return cls(recording, known_until_ns)
 
     def take(self, bound_ns: int, inclusive: bool) -> tuple[PacketBatch, I64Array]:
@@ -95,6 +109,11 @@ class _Feed:
         self.batch, self.key_ns = batch, np.maximum(largest, self.known_until_ns)
         if len(batch):
             self.known_until_ns = int(self.key_ns[-1])
+
+    def close(self) -> None:
+        """End the reading."""
+        if self._source is not None:
+            close(self._source)
 
 
 def _interleave(
