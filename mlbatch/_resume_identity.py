@@ -15,7 +15,9 @@ from mlbatch.pipeline import Conversion
 from mlbatch.writers import WriterOptions
 
 # Said by the files themselves, by the sensors, or not by options; or outputs do not depend on it.
-_ELSEWHERE = frozenset({"recordings", "wishes", "part", "extras", "fault_begin_ns", "jobs"})
+_ELSEWHERE = frozenset(
+    {"recordings", "wishes", "part", "extras", "fault_begin_ns", "jobs", "engine"}
+)
 _DIGITS = 12
 
 
@@ -23,6 +25,7 @@ def of_job(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
     """Label and text of what a job says; name: of the format."""
     found = {"mlbatch": mlbatch.__version__, "numpy": np.__version__, "format": name}
     found["point layout"] = options.point_layout
+    found["compression"] = options.compression
     for key, value in _options(job):
         found[key.replace("_", " ")] = _text(value)
     return found

@@ -31,6 +31,7 @@ __all__ = [
     "Safe",
     "ScanWriter",
     "WriterOptions",
+    "check_compression",
     "check_free_space",
     "check_target",
     "choose_format",
@@ -96,6 +97,7 @@ def choose_format(target: Path, asked: str | None) -> str:
 
 def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the output `target` in the format called `name`."""
+    check_compression(name, options)
     return plugin(name).open_writer(target, info, options)
 
 
@@ -120,6 +122,17 @@ def report_paths(target: Path, name: str) -> ReportPaths:
 def extras(name: str, options: WriterOptions) -> frozenset[str]:
     """Those of `types.EXTRAS` that an output in the format called `name` holds."""
     return plugin(name).extras(options)
+
+
+def check_compression(name: str, options: WriterOptions) -> None:
+    """Refuse a compression that is none, or that the format called `name` has no place for."""
+    # Imported here, since it knows the types that need numpy.
+    from mlbatch.writers._compression import compression_of, refuse_compression
+
+    if plugin(name).COMPRESSES:
+        compression_of(options.compression)
+    else:
+        refuse_compression(options.compression, name)
 
 
 def check_target(name: str, target: Path, options: WriterOptions, layout: str) -> None:

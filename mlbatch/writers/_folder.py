@@ -11,7 +11,6 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
-from mlbatch.writers._compression import refuse_compression
 from mlbatch.writers._gathered import taken
 from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
 
@@ -47,7 +46,6 @@ class FolderWriter:
                 f"--point-layout: wanted {DEFAULT_POINT_LAYOUT} for {suffix} files, got "
                 f"{options.point_layout}; presets shape PointCloud2, write a .mcap output for them"
             )
-        refuse_compression(options.compression, f"{suffix} files")
         keep = options.kept_bytes is not None
         self._output = prepare(target, options.overwrite, folder=True, keep=keep)
         self._suffix = suffix

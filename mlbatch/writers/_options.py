@@ -84,11 +84,13 @@ class ScanWriter(Protocol):
 class WriterModule(Protocol):
     """A plug-in: a module of this package whose name has no leading underscore.
 
-    FORMAT equals the module's name; SUFFIX is that of an output file, None for a folder.
+    FORMAT equals the module's name; SUFFIX is that of an output file, None for a folder; COMPRESSES
+    tells whether there is a place for `--compression`.
     """
 
     FORMAT: str
     SUFFIX: str | None
+    COMPRESSES: bool
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
         """Those of `types.EXTRAS` that the output holds, `types.IMU`, `types.MESSAGE_ENCODINGS`."""

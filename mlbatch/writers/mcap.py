@@ -11,12 +11,12 @@ from pathlib import Path
 from mlbatch.types import RunInfo
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
-from mlbatch.writers._compression import compression_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
+COMPRESSES = True
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
@@ -27,7 +27,6 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
     layout_of(options)
-    compression_of(options.compression)
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Cdr, partial(_sink, options.compression))
 

@@ -22,6 +22,7 @@ from mlbatch.writers._zip import stored_zip
 
 FORMAT = "npz"
 SUFFIX: str | None = None
+COMPRESSES = False
 SCHEMA = "mlbatch.scan/1"
 
 Array: TypeAlias = npt.NDArray[np.generic]

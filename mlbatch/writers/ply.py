@@ -20,6 +20,7 @@ from mlbatch.writers._options import ScanWriter, WriterOptions
 
 FORMAT = "ply"
 SUFFIX: str | None = None
+COMPRESSES = False
 
 # Classic names of PLY types: some readers know no others.
 _TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}

@@ -16,7 +16,6 @@ from mlbatch.types import Message, RunInfo, Summary, Topic
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._compression import refuse_compression
 from mlbatch.writers._kept import open_output
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Ros1
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = "rosbag1"
 SUFFIX: str | None = ".bag"
+COMPRESSES = False
 
 # Not among the types that `rosbags` brings along.
 _TF = "tf2_msgs/msg/TFMessage"
@@ -40,7 +40,6 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
     layout_of(options)
-    refuse_compression(options.compression, FORMAT)
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
     return BagWriter(output, info, options, Ros1, _sink)
 

@@ -16,7 +16,6 @@ from mlbatch.types import Message, RunInfo, Summary
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._compression import compression_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
 
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = "rosbag2"
 SUFFIX: str | None = None
+COMPRESSES = True
 
 METADATA = "metadata.yaml"
 
@@ -38,7 +38,6 @@ def extras(options: WriterOptions) -> frozenset[str]:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
     layout_of(options)
-    compression_of(options.compression)
     output = prepare(target, options.overwrite, folder=True, keep=options.kept_bytes is not None)
     sink = partial(_sink, f"{target.name}_0.mcap", options.compression)
     return BagWriter(output, info, options, Cdr, sink)
