@@ -14,6 +14,7 @@ import numpy as np
 from mlbatch.discover import Wishes
 from mlbatch.errors import UsageError
 from mlbatch.job import Job
+from mlbatch.kernels import ENGINES
 from mlbatch.pipeline import Conversion
 from mlbatch.rate import parse_rate
 from mlbatch.types import Scan
@@ -40,6 +41,7 @@ def scans(
     keep_repeated: bool = False,
     decode: Mapping[str, str] | None = None,
     strict: bool = False,
+    engine: str = "auto",
 ) -> Iterator[Scan]:
     """Yield the merged scans of one session, each with arrays of its own.
 
@@ -49,6 +51,7 @@ def scans(
     for name, value, known in (
         ("layout", layout, ("dense", "organized")),
         ("clock", clock, ("sensor", "host")),
+        ("engine", engine, ENGINES),
     ):
         if value not in known:
             raise UsageError(f"{name}: wanted {' or '.join(known)}, got {value!r}; choose one")
@@ -73,6 +76,7 @@ def scans(
         min_range_m=min_range,
         max_range_m=max_range,
         strict=strict,
+        engine=engine,
     )
     for scan, _ in Conversion(job).scans():
         yield _owned(scan)

@@ -26,7 +26,7 @@ class Job:
     that the output has a place for; fault_begin_ns: arrival from which times of faults count, None:
     the first packet; part: of the session, by arrival; passed: patterns of topics to pass through;
     align_clocks_to: host or first, "" where clocks are taken as they are; jobs: scans that are made
-    at the same time.
+    at the same time; engine: one of `kernels.ENGINES`.
     """
 
     recordings: tuple[Path, ...]
@@ -54,3 +54,4 @@ class Job:
     passed: tuple[str, ...] = ()
     extras: frozenset[str] = EXTRAS
     jobs: int = 1
+    engine: str = "auto"

@@ -24,6 +24,7 @@ from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
+from mlbatch.kernels import choose_engine
 from mlbatch.mounting import Mounted
 from mlbatch.passing import PassQueue
 from mlbatch.readers import merge, open_recording
@@ -75,6 +76,7 @@ class Conversion:
         self._notes: list[Note] = []
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
+        self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
         if job.part != Part():
             opened = [ClippedRecording(recording, job.part) for recording in opened]
         self.setup: Setup = discover(opened, streams, job.wishes)
@@ -222,9 +224,10 @@ class Conversion:
         self.info = run_info(self.setup, self.job, self.grid, shared)
         self.table = ScanTable(self.info, self._columns_per_s)
         info, boxes_m, extras = self.info, boxes_of(self.setup, self.job), self.job.extras
+        buffers, engine = self._buffers, self.engine
 
         def decoder(sources: Sequence[Source], only: int | None) -> Decoder:
-            return Decoder(info, sources, boxes_m, extras, only, self._buffers)
+            return Decoder(info, sources, boxes_m, extras, only, buffers, engine)
 
         sources = [
             source_of(sensor, feed, known.ring_base, self.job)

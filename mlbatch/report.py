@@ -77,7 +77,7 @@ class SensorReport:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Costs of a run; recorded_s: length of the recording."""
+    """Costs of a run; recorded_s: length of the recording; engine: what decoded it."""
 
     wall_s: float
     cpu_s: float
@@ -88,6 +88,7 @@ class Timing:
     recorded_s: float
     points_per_s: float
     peak_rss_mb: float
+    engine: str
 
     @property
     def realtime_factor(self) -> float:
@@ -223,7 +224,7 @@ def summary_lines(run: ReportInputs) -> list[str]:
 def _timing(timing: Timing) -> Section:
     costs: Section = asdict(timing)
     # In the contract's place, before the rates that end the section.
-    tail = {key: costs.pop(key) for key in ("points_per_s", "peak_rss_mb")}
+    tail = {key: costs.pop(key) for key in ("points_per_s", "peak_rss_mb", "engine")}
     return {**costs, "realtime_factor": timing.realtime_factor, **tail}
 
 

@@ -111,7 +111,10 @@ def convert(
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
     jobs: Annotated[int, typer.Option(help="Processes; 1 in this version.")] = 1,
-    engine: Annotated[str, typer.Option(help="auto or numpy.")] = "auto",
+    engine: Annotated[
+        str,
+        typer.Option(help="What decodes: auto, numpy, or numba, which needs mlbatch[fast]."),
+    ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
     ] = False,
@@ -131,14 +134,15 @@ def convert(
     from mlbatch.cli.run import Wanted, run
     from mlbatch.discover import Wishes
     from mlbatch.job import Job
+    from mlbatch.kernels import ENGINES
 
     values.choices(
         layout=(layout, ("dense", "organized")),
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
+        engine=(engine, ENGINES),
     )
-    values.choice("--engine", engine, ("auto", "numpy"), later=("numba",))
     values.jobs(jobs)
     values.output(output, dry_run=dry_run)
     values.slices(slices)
@@ -175,6 +179,7 @@ def convert(
         fault_seed=values.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
+        engine=engine,
     )
     splits = on_jump == "split"
     run(

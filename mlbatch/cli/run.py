@@ -184,6 +184,7 @@ def _tell(conversion: Conversion) -> None:
             f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
             f"extrinsics from {sensor.origin}"
         )
+    typer.echo(f"decoded by {conversion.engine}")
 
 
 @contextlib.contextmanager

@@ -134,14 +134,11 @@ def decode_options(texts: Sequence[str]) -> dict[str, str]:
     return options
 
 
-def choice(option: str, text: str, allowed: Sequence[str], later: Sequence[str] = ()) -> str:
-    """One of a few words; `later` are announced, but not in this version."""
+def choice(option: str, text: str, allowed: Sequence[str]) -> str:
+    """One of a few words."""
     if text in allowed:
         return text
-    note = " (not in this version)" if text in later else ""
-    raise UsageError(
-        f"{option}: wanted {' or '.join(allowed)}, got {text!r}{note}; choose one of them"
-    )
+    raise UsageError(f"{option}: wanted {' or '.join(allowed)}, got {text!r}; choose one of them")
 
 
 def percent(option: str, value: float) -> float:

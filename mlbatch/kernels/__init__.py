@@ -19,9 +19,10 @@ AUTO_BYTES = 64 << 20
 
 
 def is_installed() -> bool:
-    """Whether numba can be imported; nothing is loaded for the answer."""
-    # Told to compile nothing, numba has no code to give.
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+    """Whether numba can be imported and used; nothing is loaded for the answer."""
+    # Told to compile nothing, numba has no code to give. On Windows, functions with more than a
+    # page of scratch call one of the compiler's runtime, which nothing here can name.
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0") or os.name == "nt":
         return False
     return all(importlib.util.find_spec(name) for name in ("numba", "llvmlite"))
 
@@ -33,7 +34,7 @@ def choose_engine(wanted: str, size_bytes: int) -> str:
     """
     if wanted == "numpy" or (wanted == "auto" and size_bytes < AUTO_BYTES):
         return "numpy"
-    trouble = _trouble()
+    trouble = _trouble(wanted)
     if not trouble:
         return "numba"
     if wanted == "auto":
@@ -44,14 +45,17 @@ def choose_engine(wanted: str, size_bytes: int) -> str:
     )
 
 
-def _trouble() -> str:
+def _trouble(wanted: str) -> str:
     """Why kernels cannot be used here; nothing where they can."""
     if not is_installed():
         return "which is not installed here"
-    from mlbatch.kernels.native import load
+    from mlbatch.kernels import native
 
+    if wanted == "auto" and native.cache_folder() is None:
+        # Each run would compile, which takes longer than most recordings.
+        return "no folder to keep kernels in"
     try:
-        load("mlbatch.kernels._probe_source")
+        native.load("mlbatch.kernels._probe_source")
     except ImportError as err:  # It may be too old for this numpy.
         return f"got {' '.join(str(err).split())}"
     return ""

@@ -8,7 +8,7 @@ import llvmlite.binding as llvm
 import numba
 from numba import types
 
-from mlbatch.kernels.native import Constant, machine
+from mlbatch.kernels.native import MEMORY_FUNCTIONS, Constant, machine
 
 _SIGNATURE = (types.CPointer(types.int64),)
 
@@ -28,6 +28,7 @@ def compiled(source: str, constants: tuple[Constant, ...]) -> tuple[str, bytes]:
     symbol = result.fndesc.mangled_name
     for function in module.functions:
         # Nobody would tell where it is: the call of it would end the process.
-        if function.is_declaration and not function.name.startswith("llvm."):
+        known = function.name.startswith("llvm.") or function.name in MEMORY_FUNCTIONS
+        if function.is_declaration and not known:
             raise RuntimeError(f"kernel {source}{constants} calls {function.name}")
     return symbol, bytes(machine().emit_object(module))

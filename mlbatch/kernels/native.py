@@ -30,7 +30,11 @@ _MAGIC = b"mlbatch kernel 1\n"
 _DIGEST_BYTES = 32
 _OPTIMISED = 3
 _OTHERS_MAY_WRITE = 0o022
-_MEMORY_FUNCTIONS = ("memcpy", "memmove", "memset")
+# What compilers put in by themselves, here and there: the last ones on macOS.
+MEMORY_FUNCTIONS = (
+    *("memcpy", "memmove", "memset"),
+    *("bzero", "__bzero", "memset_pattern4", "memset_pattern8", "memset_pattern16"),
+)
 # Of some tens of kilobytes each; other versions of the package leave theirs behind.
 _MOST_ENTRIES = 200
 
@@ -96,10 +100,11 @@ def machine() -> llvm.TargetMachine:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    # All that compilers put in by themselves; without numba, nothing else tells where they are.
-    library = ctypes.CDLL("msvcrt" if os.name == "nt" else None)
-    for name in _MEMORY_FUNCTIONS:
-        llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
+    # Without numba, nothing else tells where these are.
+    library = ctypes.CDLL(None)
+    for name in MEMORY_FUNCTIONS:
+        if hasattr(library, name):
+            llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
     target = llvm.Target.from_default_triple()
     cpu, features = _processor()
     return target.create_target_machine(cpu=cpu, features=features, opt=_OPTIMISED, jit=True)

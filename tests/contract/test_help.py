@@ -46,7 +46,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--dry-run": "report",
         "--report": "JSON",
         "--jobs": "this version",
-        "--engine": "auto or numpy",
+        "--engine": r"auto, numpy, or numba.*mlbatch\[fast\]",
         "--strict": "error",
         "--overwrite": "existing",
         "--resume": "interrupted.*OUTPUT",

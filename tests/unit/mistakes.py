@@ -221,9 +221,9 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "minimal, got 'loam'; choose one",
     ),
     "engine": (
-        f"{FIX} --engine numba",
+        f"{FIX} --engine cuda",
         2,
-        "--engine: wanted auto or numpy, got 'numba' (not in this version); choose one of them",
+        "--engine: wanted auto or numpy or numba, got 'cuda'; choose one of them",
     ),
     "jobs": (
         f"{FIX} --jobs 2",

@@ -69,10 +69,11 @@ def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
     quiet = shell(f"convert {FIX} -o quiet --quiet")
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
     verbose = shell(f"convert {FIX} -o verbose -v")
-    first, second = verbose.out.splitlines()[:2]
+    first, second, third = verbose.out.splitlines()[:3]
     assert first.startswith("left: OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16, calibration ")
     assert first.endswith("left.json, extrinsics from rig")
     assert second.startswith("right: OS-1-32-U1 512x10 RNG15_RFL8_NIR8, calibration ")
+    assert third == "decoded by numpy"
 
 
 def test_warnings_go_to_stderr_and_into_the_report(shell: Shell) -> None:

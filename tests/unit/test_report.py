@@ -70,7 +70,7 @@ def run() -> ReportInputs:
         sensors=(sensor,),
         scans=table.statistics(empty=3),
         unassigned=(Unassigned("10.0.0.9 > port 53", 2, "unknown"),),
-        timing=Timing(2.0, 1.9, 0.1, 0.2, 0.3, 0.4, 10.0, 1e6, 123.0),
+        timing=Timing(2.0, 1.9, 0.1, 0.2, 0.3, 0.4, 10.0, 1e6, 123.0, "numpy"),
         warnings=(Warned("loss", "left", "4 packets lost"),),
     )
 
@@ -203,7 +203,7 @@ def test_report_has_the_contract_s_form() -> None:
     assert report["scans"]["empty"] == 3
     assert list(report["timing"]) == [
         *("wall_s", "cpu_s", "read_s", "decode_s", "merge_s", "write_s", "recorded_s"),
-        *("realtime_factor", "points_per_s", "peak_rss_mb"),
+        *("realtime_factor", "points_per_s", "peak_rss_mb", "engine"),
     ]
     assert report["timing"]["realtime_factor"] == 5.0
     assert report["warnings"][0]["code"] == "loss"
@@ -217,7 +217,7 @@ def test_a_period_that_is_no_whole_number_is_a_fraction() -> None:
 def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
     text = report_text(run(), machine=False)
     moved = (InputReport("/elsewhere/b.pcap", 1000, "pcap"),)
-    other = replace(run(), inputs=moved, timing=Timing(*[9.0] * 9))
+    other = replace(run(), inputs=moved, timing=Timing(*[9.0] * 9, "numba"))
     assert report_text(other, machine=False) == text
     assert "timing" not in text
     assert "path" not in text
