@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,29 +131,32 @@ class Conversion:
 
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with split, the sensor it is of; arrays live until the next."""
-        for task in self.tasks(progress):
-            with self._timed("decode_s"):
-                scan = self.benches[0].decode(task).scan
-            self.account(scan)
-            yield scan, task.only
+        with contextlib.closing(self.tasks(progress)) as tasks:
+            for task in tasks:
+                with self._timed("decode_s"):
+                    scan = self.benches[0].decode(task).scan
+                self.account(scan)
+                yield scan, task.only
         self.close()
 
-    def tasks(self, progress: Progress | None = None) -> Iterator[Task]:
+    def tasks(self, progress: Progress | None = None) -> Generator[Task, None, None]:
         """Yield what is to be decoded, scan by scan; `close` has to follow the last.
 
         Each may be given to any of the benches, by any thread, while the next are made.
         """
         size = sum(recording.size_bytes for recording in self.recordings)
         self.passed.keep(self.recordings)
-        batches = merge(self.recordings)
-        if self.job.faults:
-            batches = self.replay.batches(batches, self.feeder.owners)
-        while (batch := self._read(batches)) is not None:
-            yield from self._due(self._push(batch))
-            if progress is not None:
-                progress(sum(r.position_bytes for r in self.recordings), size)
-            if self.batcher.past_end:
-                break
+        # Also after an error files are closed here, by the thread that opened them.
+        with contextlib.closing(merge(self.recordings)) as merged:
+            batches: Iterator[PacketBatch] = merged
+            if self.job.faults:
+                batches = self.replay.batches(batches, self.feeder.owners)
+            while (batch := self._read(batches)) is not None:
+                yield from self._due(self._push(batch))
+                if progress is not None:
+                    progress(sum(r.position_bytes for r in self.recordings), size)
+                if self.batcher.past_end:
+                    break
         last = self._hosts_ns[1] if self._hosts_ns is not None else 0
         yield from self._due(self.batcher.finish(last))
 

@@ -34,6 +34,10 @@ def convert(
     point_layout: Annotated[
         str, typer.Option(help="Fields of a PointCloud2 point (preset).")
     ] = "standard",
+    compression: Annotated[
+        str,
+        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 3)."),
+    ] = "none",
     slices: Annotated[int, typer.Option(help="Partial scans a window.")] = 1,
     split: Annotated[
         bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
@@ -110,7 +114,7 @@ def convert(
         bool, typer.Option("--dry-run", help="Do all but write; print the report.")
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
-    jobs: Annotated[int, typer.Option(help="Processes; 1 in this version.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Scans made at the same time, each in a thread.")] = 1,
     engine: Annotated[
         str,
         typer.Option(help="What decodes: auto, numpy, or numba, which needs mlbatch[fast]."),
@@ -143,7 +147,6 @@ def convert(
         on_jump=(on_jump, ("error", "split")),
         engine=(engine, ENGINES),
     )
-    values.jobs(jobs)
     values.output(output, dry_run=dry_run)
     values.slices(slices)
     values.ranges_m(min_range, max_range)
@@ -179,13 +182,14 @@ def convert(
         fault_seed=values.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
+        jobs=values.jobs(jobs),
         engine=engine,
     )
     splits = on_jump == "split"
     run(
         job,
         Wanted(
-            *(output, format_, point_layout, dry_run, report, splits),
+            *(output, format_, point_layout, compression, dry_run, report, splits),
             *(overwrite, values.resume(resume, dry_run=dry_run), quiet, verbose),
         ),
     )

@@ -22,6 +22,7 @@ from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,
+    check_compression,
     check_target,
     choose_format,
     extras,
@@ -38,6 +39,7 @@ class Wanted:
     output: Path | None
     format: str | None
     point_layout: str
+    compression: str
     dry_run: bool
     report: Path | None
     splits_jumps: bool
@@ -107,9 +109,12 @@ def _of_part(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 def _convert(job: Job, wanted: Wanted) -> None:
     opener, report_path, course = None, wanted.report, None
-    options = WriterOptions(wanted.point_layout, wanted.overwrite, job.split)
     # A dry run without an output decodes what a .mcap of this point layout would hold.
     name = choose_format(wanted.output or Path("scans.mcap"), wanted.format)
+    options = WriterOptions(
+        wanted.point_layout, wanted.overwrite, job.split, compression=wanted.compression
+    )
+    check_compression(name, options)
     job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
         checks.place(job, wanted.output)

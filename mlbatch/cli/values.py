@@ -18,6 +18,8 @@ from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
 
 MAX_SLICES = 10_000
+# Every job holds a few scans in memory.
+MAX_JOBS = 64
 # Nothing lasts longer, and ns of it still fit into int64.
 _MOST_S = 2**33
 
@@ -160,10 +162,13 @@ def seed(number: int) -> int:
     return number
 
 
-def jobs(number: int) -> None:
-    """`--jobs`, as far as this version goes."""
-    if number != 1:
-        raise UsageError(f"--jobs: wanted 1, got {number}; more than one is not in this version")
+def jobs(number: int) -> int:
+    """`--jobs`, scans that are made at the same time."""
+    if not 1 <= number <= MAX_JOBS:
+        raise UsageError(
+            f"--jobs: wanted 1 to {MAX_JOBS}, got {number}; give the number of free cores"
+        )
+    return number
 
 
 def output(path: Path | None, *, dry_run: bool) -> None:

@@ -226,9 +226,20 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "--engine: wanted auto or numpy or numba, got 'cuda'; choose one of them",
     ),
     "jobs": (
-        f"{FIX} --jobs 2",
+        f"{FIX} --jobs 0",
         2,
-        "--jobs: wanted 1, got 2; more than one is not in this version",
+        "--jobs: wanted 1 to 64, got 0; give the number of free cores",
+    ),
+    "level of compression": (
+        f"{FIX} -o x.mcap --compression zstd:23",
+        2,
+        "--compression: wanted none, lz4, zstd or zstd:1 to zstd:22, got 'zstd:23'; choose one",
+    ),
+    "compression of files of scans": (
+        f"{FIX} --compression lz4",
+        2,
+        "--compression: wanted none for npz, got 'lz4'; leave it out, or write a .mcap or rosbag2 "
+        "output",
     ),
     "decoder option": (
         f"{FIX} --decode crc=no",
