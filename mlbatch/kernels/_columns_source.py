@@ -7,6 +7,7 @@ once and written once. The frame is that of `frame.py`; the result is the number
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -69,6 +70,7 @@ def build(word: str, step: int, pad: int, returns: int, kind: str) -> Callable[[
     return kernel
 
 
+@cache
 def _record_of() -> Callable[[Pointer, int, int], int]:
     @piece
     def record_of(frame: Pointer, column: int, member: int) -> int:

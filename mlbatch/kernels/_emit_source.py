@@ -7,6 +7,7 @@ overwritten by the next point. There always is such a row, since rows are as man
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -28,6 +29,7 @@ _LIDAR_ID_BIT = 56
 _NAN = np.float32("nan")
 
 
+@cache
 def emitting() -> Emitting:
     """`(frame, column, table, row, points, labels, ranges, others, keep)` gives the next row.
 

@@ -7,6 +7,7 @@ numpy. Elements are `return * pad + beam`; those beyond the beams hold no return
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ Marking = Callable[[Pointer, int, Pointer, Pointer, Pointer], None]
 Labelling = Callable[[Pointer, int, int, Pointer, Pointer, Pointer], None]
 
 
+@cache
 def marking(pad: int, returns: int) -> Marking:
     """`(frame, member, ranges, points, keep)`: what is wanted, and the ledger of the others."""
     drop_repeated, cut_boxes, count = _drop_repeated(pad, returns), _cut_boxes(), _count()
@@ -92,6 +94,7 @@ def _cut_boxes() -> Callable[[Pointer, int, int, Pointer, Pointer], None]:
     return cut
 
 
+@cache
 def labelling(pad: int, returns: int) -> Labelling:
     """`(frame, row, offset_ns, ranges, levels, labels)`: time, ring, type, sensor of all elements.
 

@@ -9,6 +9,7 @@ level; scratch is 8 * pad floats.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -24,6 +25,7 @@ _FLAT, _LEVEL, _ORIGINS = 0, 3, 6
 _SPEED_AT, _SPEED_SIGN, _SPEED_STEP = 32, 1 << 23, 2.0**-48 * 2 * np.pi
 
 
+@cache
 def projecting(kind: str, pad: int, returns: int) -> Projecting:
     """kind: `tabled` or `turning`."""
     return _tabled(pad, returns) if kind == "tabled" else _turning(pad, returns)

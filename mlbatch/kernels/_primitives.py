@@ -24,7 +24,9 @@ Pointer = list[Any]
 
 def piece(function: Function) -> Function:
     """A part of kernels, always inlined; it may not allocate or raise."""
-    compiled = numba.njit(error_model="numpy", forceinline=True)(function)
+    compiled = numba.njit(
+        error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(function)
     return cast(Function, compiled)
 
 

@@ -7,6 +7,7 @@ words, fields are bits of these; else a distance is two bytes, with a byte for t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _RUN = 3
 Reader = Callable[[Pointer, int, int, Pointer, Pointer, Pointer], None]
 
 
+@cache
 def reader_of(word: str, step: int, pad: int) -> Reader:
     """`(frame, record, return, ranges, levels, reflectivities)` for pixels of `step` bytes."""
     return _words_reader(step // 4, pad) if word == "<u4" else _bytes_reader(word, step, pad)
