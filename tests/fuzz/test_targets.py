@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import random
+import threading
 from pathlib import Path
 
 import pytest
 
+from mlbatch.errors import MlbatchError
 from tests.fuzz import harness
 from tests.fuzz.harness import (
     LONGEST_S,
@@ -17,6 +21,7 @@ from tests.fuzz.harness import (
     campaign,
     make_input,
 )
+from tests.fuzz.mutation import Seeds
 from tests.fuzz.targets import TARGETS
 
 # Inputs of a target by its share; the seeds themselves come first.
@@ -48,16 +53,46 @@ def test_a_campaign_tells_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None
     def swell(data: bytes, folder: Path) -> None:
         bytearray(2 * MOST_BYTES)
 
-    def sleep(data: bytes, folder: Path) -> None:
+    def turn(data: bytes, folder: Path) -> None:
         while True:
             pass
 
+    def wait(data: bytes, folder: Path) -> None:
+        threading.Event().wait()
+
     monkeypatch.setattr(harness, "LONGEST_S", 0.2)
-    wanted = ((crash, "BrokenLaw: of thermodynamics"), (swell, "MemoryError"), (sleep, "TooLate"))
+    wanted = (
+        *((crash, "BrokenLaw: of thermodynamics"), (swell, "MemoryError")),
+        *((turn, "TooLate"), (wait, "TooLate")),
+    )
     for run, said in wanted:
         tally = campaign(Target(run.__name__, lambda: (b"x",), run), range(1))
         assert said in tally.failures[0].what
         assert "(1 bytes)" in str(tally.failures[0])
+
+
+def test_an_error_does_not_excuse_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the process held before, or took to make the input, is not held against it."""
+
+    def refuse(data: bytes, folder: Path) -> None:
+        raise MlbatchError(f"wanted less, got {len(b'1' * (len(data) * 80_000_000))} bytes")
+
+    def seeds() -> tuple[bytes, ...]:
+        return (b"", b"1") if len(before) == 80_000_000 else ()
+
+    def making(rng: random.Random, seeds: Seeds) -> bytes:
+        return (b"1" * 80_000_000)[:0]
+
+    before = b"1" * 80_000_000
+    monkeypatch.setattr(harness, "MOST_BYTES", 60_000_000)
+    monkeypatch.setattr(harness, "_in_memory", contextlib.nullcontext)
+    tally = campaign(Target("refuse", seeds, refuse), range(2))
+    (failure,) = tally.failures
+    assert (failure.number, failure.what[:7], tally.refused) == (1, "needed ", 1)
+    assert 70 < tally.peak_bytes / 1e6 < 90
+    tally = campaign(Target("make", seeds, refuse, making), range(2, 5))
+    assert (tally.failures, tally.refused) == ([], 3)
+    assert tally.peak_bytes < 10_000_000
 
 
 def test_tallies_of_parts_are_one() -> None:
