@@ -138,10 +138,12 @@ class Course:
 
     def _record(self, writer: ScanWriter) -> None:
         safe = writer.safe()
-        fresh = safe.scans - self.recorded
+        # With several jobs later scans may be safe, of which nothing is known so far.
+        scans = min(safe.scans, self._given)
+        fresh = scans - self.recorded
         if fresh > 0 and self._file is not None:
             self._file.add([self._waiting.popleft() for _ in range(fresh)], safe.kept_bytes)
-            self.recorded = safe.scans
+            self.recorded = scans
 
     def complete(self) -> None:
         """Refuse an output that holds more than the recording gives."""

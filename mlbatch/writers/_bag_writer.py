@@ -40,13 +40,8 @@ class Sink(Protocol):
         """Chunks that are complete."""
         ...
 
-    @property
-    def chunks(self) -> int:
-        """Chunks that are written."""
-        ...
-
-    def flush(self) -> int:
-        """Hand written chunks to the system; gives the bytes up to their end."""
+    def safe(self) -> tuple[int, int]:
+        """How many chunks the system has, and the bytes up to their end; while others are made."""
         ...
 
     def take(self) -> list[Chunk]:
@@ -146,9 +141,8 @@ class BagWriter:
 
     def safe(self) -> Safe:
         """The scans in written chunks."""
-        with export_errors(self._output.partial):
-            kept_bytes = self._sink.flush()
-        while self._open_scans and self._open_scans[0] < self._sink.chunks:
+        chunks, kept_bytes = self._sink.safe()
+        while self._open_scans and self._open_scans[0] < chunks:
             self._open_scans.popleft()
             self._safe_scans += 1
         return Safe(self._safe_scans, kept_bytes)

@@ -24,14 +24,9 @@ class McapSink:
         """Chunks that are complete."""
         return self.container.ended
 
-    @property
-    def chunks(self) -> int:
-        """Chunks that are written."""
-        return self.container.chunks
-
-    def flush(self) -> int:
-        """Bytes up to the end of the last written chunk; the system has them."""
-        return self._file.position_bytes
+    def safe(self) -> tuple[int, int]:
+        """Chunks that are written, and the bytes up to their end; nothing is buffered."""
+        return self.container.chunks, self._file.position_bytes
 
     def take(self) -> list[Chunk]:
         """The chunks that are complete since the last call."""

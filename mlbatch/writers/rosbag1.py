@@ -61,6 +61,7 @@ class _Rosbag1Sink:
         self._types = get_typestore(Stores.ROS1_NOETIC)
         self._types.register(get_types_from_msg(_TF_TEXT, _TF))
         self._connections: dict[str | Topic, Connection] = {}
+        self._safe = (0, 0)
         if kept_bytes is None:
             self._bag = Writer(path)
             self._bag.open()
@@ -79,16 +80,9 @@ class _Rosbag1Sink:
         """Chunks that are complete; the library's last one is open."""
         return len(self._bag.chunks) - 1
 
-    @property
-    def chunks(self) -> int:
-        """The same: the library writes them at once."""
-        return self.ended
-
-    def flush(self) -> int:
-        """Hand complete chunks to the system; gives the bytes up to their end."""
-        file = self._file
-        file.flush()
-        return file.tell()
+    def safe(self) -> tuple[int, int]:
+        """Chunks that the system has, and the bytes up to their end."""
+        return self._safe
 
     def take(self) -> list[Chunk]:
         """None, as they are written already."""
@@ -112,14 +106,21 @@ class _Rosbag1Sink:
                 topic, name, typestore=self._types, latching=latching
             )
             self._connections[topic] = connection
-        self._bag.write(connection, log_ns, message)
+        self._write(connection, log_ns, message)
 
     def forward(self, message: Message) -> None:
         """Append a message as it was recorded."""
         connection = self._connections.get(message.topic)
         if connection is None:
             connection = self._connections[message.topic] = self._adopt(message.topic)
-        self._bag.write(connection, message.host_ns, message.data)
+        self._write(connection, message.host_ns, message.data)
+
+    def _write(self, connection: Connection, log_ns: int, message: bytes | memoryview) -> None:
+        self._bag.write(connection, log_ns, message)
+        if self.ended > self._safe[0]:
+            # Noted here and not when it is asked: then another scan may be under way.
+            self._file.flush()
+            self._safe = (self.ended, self._file.tell())
 
     def finish(self, summary: Summary, grid: dict[str, str]) -> None:
         """Complete and close the file; a bag has no place for what tells of the run."""

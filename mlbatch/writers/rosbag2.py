@@ -63,14 +63,9 @@ class _BagSink:
         """Chunks that are complete."""
         return self._file.ended
 
-    @property
-    def chunks(self) -> int:
-        """Chunks that are written."""
-        return self._file.chunks
-
-    def flush(self) -> int:
-        """Bytes up to the end of the last written chunk; the system has them."""
-        return self._file.flush()
+    def safe(self) -> tuple[int, int]:
+        """Chunks that are written, and the bytes up to their end."""
+        return self._file.safe()
 
     def take(self) -> list[Chunk]:
         """The chunks that are complete since the last call."""

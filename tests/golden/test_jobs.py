@@ -1,0 +1,232 @@
+"""Threads change nothing: outputs of one, two and three jobs are the same bytes, and errors end.
+
+Recordings are those of `tests.resume_storm`: two lidars with an IMU, a bag, a clock that jumps.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mlbatch.decode import Decoder
+from mlbatch.errors import ExportError, PacketError
+from mlbatch.writers import _gathered
+from mlbatch.writers._chunk import Chunk
+from tests.builders.run import command
+from tests.resume_storm import CASES, TWO, Case, contents, write_recordings
+from tests.unit.sessions import REPOSITORY
+
+_HANGS_AFTER_S = 240
+_TURNS = 14
+_SESSION = "session/drive.pcap"
+_MORE = {
+    "mcap zstd": Case(_SESSION, "out.mcap", (*TWO, "--compression", "zstd:1")),
+    "mcap lz4 slices": Case(
+        _SESSION, "out.mcap", (*TWO, "--compression", "lz4", "--slices", "3", "--split")
+    ),
+    "rosbag2 zstd": Case(
+        "bag/drive.mcap",
+        "out",
+        (*TWO, "--format", "rosbag2", "--pass", "/chatter", "--compression", "zstd"),
+    ),
+    "faults": Case(
+        _SESSION,
+        "out",
+        (*TWO, "--fault", "drop:ouster_111:20%", "--fault", "stall:ouster_222:0.3s-0.6s"),
+    ),
+    "npz organized": Case(_SESSION, "out", (*TWO, "--layout", "organized", "--rate", "20")),
+    "limits": Case(_SESSION, "out.bag", (*TWO, "--start", "+0.3", "--end", "+0.9")),
+}
+ALL = CASES | _MORE
+JOBS = (1, 2, 3)
+
+
+@pytest.fixture(autouse=True)
+def _guard() -> Iterator[None]:
+    """What waits for ever ends the whole test run, and says where."""
+    faulthandler.dump_traceback_later(_HANGS_AFTER_S, exit=True)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the cases convert."""
+    folder = tmp_path_factory.mktemp("jobs")
+    write_recordings(folder / "in", _TURNS)
+    return folder
+
+
+def _words(name: str, *more: str) -> list[str]:
+    case = ALL[name]
+    return ["convert", f"../in/{case.recording}", "-o", case.output, *case.options, *more]
+
+
+def _place(recordings: Path, name: str) -> Path:
+    place = recordings / name
+    place.mkdir()
+    return place
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_outputs_do_not_depend_on_jobs(
+    recordings: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for jobs in JOBS:
+        place = _place(recordings, f"{name} {jobs}")
+        monkeypatch.chdir(place)
+        told = command(*_words(name, "--jobs", str(jobs)))
+        assert told.code == 0, told.err
+        found.append((contents(place), told.out.splitlines()[1:-1]))
+    for jobs, other in zip(JOBS[1:], found[1:], strict=True):
+        differ = [key for key in found[0][0] if found[0][0][key] != other[0].get(key)]
+        assert (jobs, differ) == (jobs, [])
+        assert other[0].keys() == found[0][0].keys()
+
+
+@pytest.mark.parametrize("name", ["mcap", "npz", "rosbag1"])
+def test_a_strict_run_fails_alike(
+    recordings: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A packet in the midst has another size; scans before it may be under way."""
+    monkeypatch.chdir(_place(recordings, f"{name} strict"))
+    words = ("--fault", "truncate:ouster_111:1%", "--strict", "--overwrite")
+    told = [command(*_words(name, *words, "--jobs", str(jobs))) for jobs in JOBS]
+    assert told[0].code == 1
+    assert told[0].err.count("\n") == 1
+    assert told[1:] == told[:1] * 2
+
+
+class Nth:
+    """Fails at one of its calls."""
+
+    def __init__(self, number: int, error: BaseException) -> None:
+        self._left, self._error = number, error
+
+    def call(self) -> None:
+        """Count a call."""
+        self._left -= 1
+        if not self._left:
+            raise self._error
+
+
+# What fails in a stage, and what is said of it.
+STAGES: dict[str, tuple[BaseException, str]] = {
+    "decode": (PacketError("spoilt"), "spoilt"),
+    "seal": (MemoryError(), "out of memory"),
+    "write": (OSError(28, "No space left on device"), "No space left on device"),
+}
+
+
+@pytest.mark.parametrize("jobs", JOBS)
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("number", [1, 3])
+def test_an_error_of_any_stage_ends_the_run(
+    recordings: Path, stage: str, jobs: int, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
+    error, wanted = STAGES[stage]
+    nth = Nth(number, error)
+    scan, seal, write_all = Decoder.scan, Chunk.seal, _gathered.write_all
+
+    def failing_scan(*given: object) -> object:
+        nth.call()
+        return scan(*given)  # type: ignore[arg-type]
+
+    def failing_seal(*given: object) -> None:
+        nth.call()
+        seal(*given)  # type: ignore[arg-type]
+
+    def failing_write(*given: object) -> None:
+        nth.call()
+        write_all(*given)  # type: ignore[arg-type]
+
+    if stage == "decode":
+        monkeypatch.setattr(Decoder, "scan", failing_scan)
+    elif stage == "seal":
+        monkeypatch.setattr(Chunk, "seal", failing_seal)
+    else:
+        monkeypatch.setattr(_gathered, "write_all", failing_write)
+    told = command(*_words("mcap", "--jobs", str(jobs)))
+    assert told.code == 1
+    assert told.err.count("\n") == 1
+    assert wanted in told.err
+    assert not Path("out.mcap").exists()
+
+
+def test_the_earliest_scan_that_fails_is_told(
+    recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fourth fails at once, the second after a while: one job never comes to the fourth."""
+    monkeypatch.chdir(_place(recordings, "earliest"))
+    scan = Decoder.scan
+
+    def failing(decoder: Decoder, *given: object) -> object:
+        found = scan(decoder, *given)  # type: ignore[arg-type]
+        if found.index == 1:
+            time.sleep(0.3)
+        if found.index in (1, 3):
+            raise ExportError(f"scan {found.index}")
+        return found
+
+    monkeypatch.setattr(Decoder, "scan", failing)
+    for jobs in JOBS:
+        told = command(*_words("npz", "--jobs", str(jobs), "--overwrite"))
+        assert told.err.splitlines()[-1] == "mlbatch: error: scan 1"
+
+
+SLOW = """
+import sys, time
+from mlbatch import cli, resume
+from mlbatch.writers import npz
+resume.INTERVAL_S = 0.0
+save = npz.NpzSaver.save
+def slow(*given):
+    save(*given)
+    time.sleep(0.2)
+npz.NpzSaver.save = slow
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("jobs", JOBS)
+def test_an_interrupt_ends_the_run_and_it_goes_on(
+    recordings: Path, jobs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _place(recordings, f"interrupt {jobs} whole")
+    monkeypatch.chdir(whole)
+    assert command(*_words("npz")).code == 0
+    place = _place(recordings, f"interrupt {jobs}")
+    words = _words("npz", "--jobs", str(jobs))
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW, *words],
+        cwd=place,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        while not (place / "out.partial" / "000001.npz").exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert said.endswith(
+        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
+        "on\n"
+    )
+    assert said.count("\n") == 1
+    monkeypatch.chdir(place)
+    told = command(*words, "--resume")
+    assert re.search(r"resumed after \d+ scans", told.err)
+    assert contents(place) == contents(whole)
