@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -82,6 +81,8 @@ def _size_and_time(path: Path) -> str:
 
 
 def _digest(value: object) -> str:
+    import hashlib
+
     digest = hashlib.sha256()
     for piece in _pieces(value):
         digest.update(piece)

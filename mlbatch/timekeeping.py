@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from mlbatch.assembly import feed_of
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.jumps import JumpGuard
 from mlbatch.clock_compare import Comparison, compare
-from mlbatch.clock_fit import ClockMap, fit
 from mlbatch.discover import Note, Setup
 from mlbatch.doctor import ClockFinding, ClockWatch
 from mlbatch.faults import FaultReplay
@@ -22,6 +22,9 @@ from mlbatch.lidar import Lidar
 from mlbatch.mounting import Mounted
 from mlbatch.streams import Found
 from mlbatch.types import I64Array, PacketBatch
+
+if TYPE_CHECKING:
+    from mlbatch.clock_fit import ClockMap
 
 SYNCHRONISED = "synchronised"
 # Codes of warnings by kind of jump.
@@ -61,6 +64,8 @@ class Timekeeper:
 
     def align(self, batches: Iterator[PacketBatch], setup: Setup, to: str) -> None:
         """Measure how the clocks run over a whole session, and map them from now on."""
+        from mlbatch.clock_fit import fit
+
         watches = [watch_of(sensor.found.lidar) for sensor in self.sensors]
         feeds = [feed_of(sensor) for sensor in self.sensors]
         # Arrivals of sensors on the recorder's clock are needed as their own stamps, too.

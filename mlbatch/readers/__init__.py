@@ -75,9 +75,17 @@ def holds_corrections(topic: Topic) -> bool:
 
 def readers() -> list[Reader]:
     """All plug-ins, by name."""
-    names = [info.name for info in pkgutil.iter_modules(__path__) if not info.name.startswith("_")]
-    modules = [importlib.import_module(f"{__name__}.{name}") for name in sorted(names)]
-    return [cast(Reader, module) for module in modules]
+    return [_reader(name) for name in _names()]
+
+
+def _names() -> list[str]:
+    """Names of the plug-ins; none is imported."""
+    modules = pkgutil.iter_modules(__path__)
+    return sorted(info.name for info in modules if not info.name.startswith("_"))
+
+
+def _reader(name: str) -> Reader:
+    return cast(Reader, importlib.import_module(f"{__name__}.{name}"))
 
 
 def open_recording(path: Path, streams: StreamTable) -> Recording:
@@ -90,11 +98,13 @@ def open_recording(path: Path, streams: StreamTable) -> Recording:
 def _reader_of(path: Path) -> Reader:
     """The plug-in that reads a file."""
     head = read_head(path)
-    known = readers()
-    for reader in known:
+    # Importing them all takes longer than a short recording: the one that is likely comes first.
+    likely = [suffix.lstrip(".") for suffix in path.suffixes]
+    for name in sorted(_names(), key=lambda name: name not in likely):
+        reader = _reader(name)
         if reader.recognises(head):
             return reader
-    containers = ", ".join(reader.CONTAINER for reader in known)
+    containers = ", ".join(reader.CONTAINER for reader in readers())
     raise RecordingError(
         f"{path}: wanted a recording ({containers}; also gzip or zstd of them), got a file that "
         f"begins with {head[:_SHOWN_BYTES].hex(' ')}; check that it is the right file"

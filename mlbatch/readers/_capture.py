@@ -217,8 +217,9 @@ class _Run:
 
     def _note_links(self, link: I64Array) -> None:
         if not self.known_links:
-            strange = [number for number in np.unique(link).tolist() if number not in _links.LINKS]
-            self.known_links = len(strange) < len(np.unique(link))
+            numbers = sorted(set(link.tolist()))
+            strange = [number for number in numbers if number not in _links.LINKS]
+            self.known_links = len(strange) < len(numbers)
             self.unknown_link = strange[0] if strange else self.unknown_link
 
     def check_links(self) -> None:

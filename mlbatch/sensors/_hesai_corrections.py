@@ -8,7 +8,6 @@ HesaiLidar_SDK_2.0 `correction/angle_correction`). A dat is binary and ends with
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from collections.abc import Iterator
@@ -138,7 +137,7 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
     if len(content) != _AT128_SIZE:
         _fail_at128(path, f"{_AT128_SIZE} bytes", f"{len(content)} bytes")
     body = content[: _AT128_BODY.itemsize]
-    if hashlib.sha256(body).digest() != content[_AT128_BODY.itemsize :]:
+    if _sha256(body) != content[_AT128_BODY.itemsize :]:
         _fail_at128(path, "content that agrees with its SHA-256", "content that was changed")
     values = np.frombuffer(body, _AT128_BODY)[0]
     angle = resolution * RAD_PER_DEG / _ANGLE_UNITS_PER_DEG
@@ -173,12 +172,19 @@ def _is_title(cells: list[str]) -> bool:
     return len(names) == 3 and names[0] in _CHANNEL_TITLES and has_angles
 
 
+def _sha256(content: bytes) -> bytes:
+    # Its library takes longer to load than most modules here.
+    import hashlib
+
+    return hashlib.sha256(content).digest()
+
+
 def _check_digest(path: Path, number: int, content: bytes, digest: str) -> None:
     """The digest was made of CRLF lines; transports may have changed them, or added a mark."""
     before = content[: content.index(digest.encode())]
     unix = before.replace(b"\r\n", b"\n").removeprefix(b"\xef\xbb\xbf")
     variants = (before, unix, unix.replace(b"\n", b"\r\n"))
-    if all(hashlib.sha256(one).hexdigest() != digest.lower() for one in variants):
+    if all(_sha256(one).hex() != digest.lower() for one in variants):
         _fail(path, number, "lines that agree with this SHA-256", "lines that were changed")
 
 

@@ -11,16 +11,19 @@ from __future__ import annotations
 
 import math
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mlbatch.errors import RigError
 from mlbatch.types import BoolArray, F64Array
 from mlbatch.units import RAD_PER_DEG
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 # The file of an HDL-64E has 27 kB, its db.xml about 100 kB.
 MAX_BYTES = 1_000_000
@@ -182,6 +185,8 @@ def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
 
 
 def _read_xml(path: Path, text: str) -> VelodyneFile | None:
+    import xml.etree.ElementTree as ET
+
     # Boost writes a bare document type; entities can only stand inside one with brackets.
     if re.search(r"<!ENTITY|<!DOCTYPE[^>]*(\[|SYSTEM|PUBLIC)", text):
         raise _error(path, "", "XML without entities and definitions", "some")
@@ -205,7 +210,7 @@ def _read_xml(path: Path, text: str) -> VelodyneFile | None:
     return _file(path, _XML, entries, enabled, unit_m)
 
 
-def _xml_entries(points: list[ET.Element]) -> Iterator[_Entry]:
+def _xml_entries(points: list[Element]) -> Iterator[_Entry]:
     for index, item in enumerate(points):
         laser = item.find("px")
         texts = {one.tag: one.text or "" for one in (item if laser is None else laser)}
