@@ -15,6 +15,7 @@ from typing import BinaryIO
 from mlbatch.verify.cursor import Cursor
 from mlbatch.verify.mcap_summary import ChunkPlace, Found, check_summary
 from mlbatch.verify.messages import Message
+from mlbatch.verify.unpacking import unpacked
 from mlbatch.verify.verdict import DamageError, Judge, VerifyError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -153,16 +154,16 @@ class McapFile:
         cursor = Cursor(body)
         first_ns, last_ns, size = cursor.whole("Q"), cursor.whole("Q"), cursor.whole("Q")
         crc, compression = cursor.whole("I"), cursor.text()
-        data = cursor.raw(cursor.whole("Q"))
+        stored = cursor.raw(cursor.whole("Q"))
         cursor.end("a chunk")
-        if compression:
-            raise DamageError("a chunk without compression, as mlbatch writes them", compression)
-        judge.equal("container", f"{where} size", len(data), size)
-        place = ChunkPlace(record.at, record.size, len(data))
+        place = ChunkPlace(record.at, record.size, size, compression, len(stored), is_broken=True)
         self._found.chunks.append(place)
+        data = unpacked(compression, stored, size)
+        place.content = len(data)
+        judge.equal("container", f"{where} size", len(data), size)
         if not judge.equal("container", f"{where} CRC", f"{zlib.crc32(data):08x}", f"{crc:08x}"):
-            place.is_broken = True
             return
+        place.is_broken = False
         at = 0
         while at < len(data):
             opcode, length = _HEAD.unpack_from(data, at) if at + 9 <= len(data) else (0, 0)

@@ -20,12 +20,15 @@ _FOOTER_BODY = struct.Struct("<QQI")
 class ChunkPlace:
     """A chunk as it was read; messages: (log time, offset) by channel; indexes: the same as said.
 
-    index_at: places of its message indexes by channel; index_bytes: of all of them.
+    content, stored: bytes of its records, and as they lie in the file; index_at: places of its
+    message indexes by channel; index_bytes: of all of them.
     """
 
     at: int
     size: int
     content: int
+    compression: str
+    stored: int
     messages: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     indexes: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     index_at: dict[int, int] = field(default_factory=dict)
@@ -121,7 +124,7 @@ def _check_records(judge: Judge, where: str, found: Found, summary: bytes) -> No
     if any(chunk.is_broken for chunk in found.chunks):
         return  # Its messages are not known.
     chunks = [
-        (*c.span_ns, c.at, c.size, c.index_at, c.index_bytes, "", c.content, c.content)
+        (*c.span_ns, c.at, c.size, c.index_at, c.index_bytes, c.compression, c.stored, c.content)
         for c in found.chunks
     ]
     statistics = (

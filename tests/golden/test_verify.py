@@ -43,7 +43,9 @@ FORMS: dict[str, tuple[str, ...]] = {
     "ply": ("--format", "ply"),
     "mcap": ("--format", "mcap"),
     "mcap organized": ("--format", "mcap", "--layout", "organized"),
+    "mcap zstd": ("--format", "mcap", "--compression", "zstd"),
     "rosbag2": ("--format", "rosbag2"),
+    "rosbag2 lz4": ("--format", "rosbag2", "--compression", "lz4"),
     "rosbag1": ("--format", "rosbag1"),
 }
 PRESETS = ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal")

@@ -34,6 +34,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "organized.mcap": ("--layout", "organized"),
     "autoware.mcap": ("--point-layout", "autoware", "--split"),
     "ouster.mcap": ("--point-layout", "ouster", "--split"),
+    "zstd.mcap": ("--compression", "zstd"),
+    "lz4.mcap": ("--compression", "lz4"),
     "minimal.mcap": ("--point-layout", "minimal"),
     "bag2": ("--format", "rosbag2"),
     "scans.bag": (),
