@@ -17,6 +17,7 @@ from mlbatch.looking import calibrations_for, fault_of, look, read_given, with_c
 from mlbatch.matching import Matched, match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.sharing import shared_by
 from mlbatch.streams import Found, Kind, Router, Sampler
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S
@@ -94,6 +95,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
     router = Router(table, chosen, sampler.samples)
+    if shared := next(filter(None, (shared_by(sampler, sensor) for sensor in chosen)), ""):
+        raise RecordingError(shared)
     _compare_clocks(sampler, chosen, rigged, wishes)
     mounted, mounting = mount(
         table,

@@ -24,6 +24,7 @@ from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import merge, open_recording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
+from mlbatch.sharing import shared_by
 from mlbatch.streams import Found, Kind, Role, Router, Sampler, split_by_kind
 from mlbatch.timekeeping import is_untimed, watch_of
 from mlbatch.transforms import from_rpy_deg
@@ -202,6 +203,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool 
         for text in recording.verdicts
     ]
     notes += [*learner.faults, *map(in_words, mounting.findings)]
+    notes += filter(None, (shared_by(sampler, sensor) for sensor in found))
     if not sampler.samples:
         notes.append("no UDP packet in the first 10 seconds")
     elif not found:

@@ -18,7 +18,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("feeding",), ("job",)),
     (("inertial",), ("passing",), ("discover",)),
     (("looking",), ("mounting",), ("clipping",), ("matching", "_rigged")),
-    (("learning",),),
+    (("learning",), ("sharing",)),
     (
         ("readers",),
         ("sensors",),
