@@ -182,7 +182,9 @@ def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> No
 def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
     known = [model.name for model in sensors.models()]
     if sensor.model is not None and sensor.model not in known:
-        near = difflib.get_close_matches(sensor.model, known, 1)
+        # A slip of case says more than a likeness of letters.
+        near = [name for name in known if name.lower() == sensor.model.lower()]
+        near = near or difflib.get_close_matches(sensor.model, known, 1)
         advice = f"did you mean {near[0]}?" if near else "see `mlbatch sensors`, or write auto"
         raise RigError(
             f"{origin}: sensor {sensor.name}: wanted a supported model, got {sensor.model!r}; "

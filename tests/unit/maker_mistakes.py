@@ -31,6 +31,7 @@ RIGS: dict[str, tuple[str, ...]] = {
     "vlp32c": ("name: top, model: VLP-32C",),
     "vlp32c_yml": ("name: top, metadata: files/vlp32c.yml",),
     "vlp61": ("name: top, model: VLP-61",),
+    "small": ("name: top, model: vls-128",),
     "xt16": ("name: top, model: PandarXT-16",),
     "xt16_csv": ("name: top, metadata: files/xt16.csv",),
     "folder": ("name: top, metadata: files",),
@@ -194,6 +195,11 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "files/cut.yml: lasers: wanted 16, 32, 64, 128 lasers, got 3 (Velodyne calibration); "
         "take the maker's file of this sensor",
+    ),
+    "model in small letters": (
+        "vlp16/drive.pcap --rig small.yaml",
+        1,
+        "small.yaml: sensor top: wanted a supported model, got 'vls-128'; did you mean VLS-128?",
     ),
     "misspelt model": (
         "vlp16/drive.pcap --rig vlp61.yaml",
