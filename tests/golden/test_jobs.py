@@ -29,14 +29,8 @@ _HANGS_AFTER_S = 240
 _TURNS = 14
 _SESSION = "session/drive.pcap"
 _MORE = {
-    "mcap zstd": Case(_SESSION, "out.mcap", (*TWO, "--compression", "zstd:1")),
     "mcap lz4 slices": Case(
         _SESSION, "out.mcap", (*TWO, "--compression", "lz4", "--slices", "3", "--split")
-    ),
-    "rosbag2 zstd": Case(
-        "bag/drive.mcap",
-        "out",
-        (*TWO, "--format", "rosbag2", "--pass", "/chatter", "--compression", "zstd"),
     ),
     "faults": Case(
         _SESSION,

@@ -16,7 +16,7 @@ import pytest
 from tests.resume_storm import CASES, contents, write_recordings
 from tests.unit.sessions import REPOSITORY
 
-KILLS, SEED = 12, 3
+KILLS, SEED = 18, 3
 LIMITED = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
@@ -34,6 +34,7 @@ def _run(*words: str, cwd: Path = REPOSITORY) -> subprocess.CompletedProcess[str
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
         capture_output=True,
         text=True,
+        timeout=300,
     )
 
 
@@ -57,7 +58,15 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "limit_bytes"), [("mcap", 9_000_000), ("rosbag1", 5_000_000), ("rosbag2", 9_000_000)]
+    ("name", "limit_bytes"),
+    [
+        ("mcap", 9_000_000),
+        ("mcap jobs", 9_000_000),
+        ("rosbag1", 5_000_000),
+        ("rosbag1 jobs", 5_000_000),
+        ("rosbag2", 9_000_000),
+        ("rosbag2 zstd", 4_000_000),
+    ],
 )
 def test_a_file_that_may_not_grow_is_continued(
     recordings: Path, name: str, limit_bytes: int
