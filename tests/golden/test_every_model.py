@@ -169,8 +169,8 @@ CASES: tuple[Case, ...] = (
 )
 
 
-def convert(sent: Sent, folder: Path) -> tuple[Result, Result]:
-    """All slots with returns that are sent twice, and the dense points without them."""
+def job_of(sent: Sent, folder: Path) -> Job:
+    """A job on a recording of it, which is written into the folder."""
     records = [
         (host_ns, udp_frame(payload, SOURCE, HOST, port, port)[0])
         for port, payloads in ((2368, sent.seen.payloads), (7788, sent.beside))
@@ -186,7 +186,12 @@ def convert(sent: Sent, folder: Path) -> tuple[Result, Result]:
         more = RIG_METADATA.format(metadata=sent.file) if sent.file else ""
         rig.write_text(RIG.format(model=sent.model, ip=SOURCE) + more, encoding="utf-8")
         wishes = Wishes(rig=rig)
-    job = Job((path,), wishes, rate=Fraction(20), keep_partial=True)
+    return Job((path,), wishes, rate=Fraction(20), keep_partial=True)
+
+
+def convert(sent: Sent, folder: Path) -> tuple[Result, Result]:
+    """All slots with returns that are sent twice, and the dense points without them."""
+    job = job_of(sent, folder)
     whole = replace(job, keep_repeated=True, layout="organized")
     return in_memory(whole), in_memory(job)
 

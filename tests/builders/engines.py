@@ -1,0 +1,99 @@
+"""Two engines side by side: the same columns decoded by both, all bytes compared."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from mlbatch import _compiled_tables
+from mlbatch.assembly import boxes_of, run_info, source_of
+from mlbatch.decode import Decoder, Due, Label
+from mlbatch.job import Job
+from mlbatch.kernels import is_installed
+from mlbatch.pipeline import Conversion
+from mlbatch.types import EXTRAS, Scan
+
+needs_numba = pytest.mark.skipif(
+    not is_installed(), reason="numba is not installed: pip install mlbatch[fast]"
+)
+ENGINES = ("numpy", "numba")
+# A kernel is made for a number of channels; with one for all numbers a third has to be compiled.
+_CHANNELS = 128
+
+# Layers of space, in which every sensor has some points.
+BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
+_CUT = Job((), min_range_m=2.0, max_range_m=5.0, boxes_m=BOXES_M)
+# What may be wanted of the same columns: all layouts, extras, and reasons to leave points out.
+WANTED = (
+    Job((), extras=EXTRAS),
+    Job((), extras=frozenset(), keep_repeated=True),
+    replace(_CUT, extras=frozenset({"range_m"})),
+    replace(_CUT, extras=frozenset({"column", "reflectivity"}), min_range_m=0.0, boxes_m=()),
+    Job((), extras=EXTRAS, layout="organized", keep_repeated=True),
+    replace(_CUT, extras=frozenset({"reflectivity"}), layout="organized"),
+)
+
+
+@contextlib.contextmanager
+def few_kernels(factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Kernels are kept in a folder of the session, and are made for 128 channels or more."""
+    base = factory.getbasetemp()
+    # Processes that share the tests of a session have folders of their own in one of all.
+    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    own = os.environ | {"XDG_CACHE_HOME": str(session / "kernels")}
+    with (
+        patch.dict(os.environ, own),
+        patch.object(_compiled_tables, "_LEAST_PAD", _CHANNELS),
+    ):
+        yield
+
+
+class Pair:
+    """The decoders of both engines, made for the same sensors and wishes."""
+
+    def __init__(self, one: Decoder, other: Decoder) -> None:
+        self.one, self.other = one, other
+
+    def check(self, due: Due, label: Label) -> Scan:
+        """Decode a window by both; all that they say is the same, byte by byte."""
+        one, other = self.one.scan(due, label), self.other.scan(due, label)
+        assert_same(one, other)
+        assert self.one.counts == self.other.counts
+        return one
+
+
+def assert_same(one: Scan, other: Scan) -> None:
+    """All fields of two scans have the same bytes."""
+    for part in fields(Scan):
+        first, second = getattr(one, part.name), getattr(other, part.name)
+        if isinstance(first, np.ndarray):
+            assert (first.dtype, first.shape) == (second.dtype, second.shape), part.name
+            assert first.tobytes() == second.tobytes(), part.name
+        else:
+            assert first == second, part.name
+
+
+def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
+    """Decode all windows of a job by both engines, in all ways that are wanted."""
+    run = Conversion(job)
+    pairs: list[Pair] = []
+    for task in run.tasks():
+        pairs = pairs or [Pair(*(_decoder(run, one, name) for name in ENGINES)) for one in wanted]
+        for pair in pairs:
+            pair.check(task.due, task.label)
+        task.is_decoded = True
+    return pairs
+
+
+def _decoder(run: Conversion, wanted: Job, engine: str) -> Decoder:
+    assert run.info is not None
+    info = run_info(run.setup, wanted, run.grid, run.info.timescale)
+    sensors = zip(run.setup.sensors, run.feeds, info.sensors, strict=True)
+    sources = [source_of(sensor, feed, one.ring_base, wanted) for sensor, feed, one in sensors]
+    return Decoder(info, sources, boxes_of(run.setup, wanted), wanted.extras, engine=engine)

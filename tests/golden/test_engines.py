@@ -1,0 +1,129 @@
+"""The engines give the same bytes: every model and mode, fixtures, and real recordings.
+
+What the engine `numpy` gives is judged elsewhere (`test_every_model.py` and others).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mlbatch.discover import Wishes
+from mlbatch.job import Job
+from mlbatch.report import report_text
+from tests.builders import four_makers
+from tests.builders.engines import WANTED, check_conversion, few_kernels, needs_numba
+from tests.builders.run import FIXTURE, RECORDINGS, command, in_memory, prints
+from tests.golden.test_every_model import CASES, Sent, job_of
+
+pytestmark = needs_numba
+
+MAKERS = Job(
+    (four_makers.FOLDER / "four_makers.pcap",),
+    Wishes(rig=four_makers.FOLDER / "rig.yaml"),
+    keep_partial=True,
+)
+REAL = (
+    "velodyne/vlp16_gps/sample_velodyne_vlp16_gps.pcap",
+    "velodyne/vlp16_ros2_dual/1673400471837873222",
+    "velodyne/vlp32c_ros2/1713492677464078412",
+    "ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10.pcap",
+    "ouster/os0-32_v2.2.0_rng19-dual/OS-0-32-U1_v2.2.0_1024x10.pcap",
+    "ouster/os1-32-g_v2.1.1_legacy/OS-1-32-G_v2.1.1_1024x10.pcap",
+    "ouster/os0-128_windowed",
+    "hesai/pandar40p",
+    "hesai/pandar64",
+    "hesai/pandarqt64",
+    "hesai/pandarxt16",
+    "hesai/pandarxt32",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with few_kernels(tmp_path_factory):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    CASES,
+    ids=[f"{make.__name__[:-5]} {' '.join(words)}" for make, words in CASES],
+)
+def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path: Path) -> None:
+    job = job_of(make(*words), tmp_path)
+    pairs = check_conversion(job)
+    everything, _, cut, *_ = (pair.one.counts[0] for pair in pairs)
+    assert 0 < cut.written < everything.written
+    assert cut.box > 0
+    still = {"firing_azimuth": "off"}
+    check_conversion(replace(job, wishes=replace(job.wishes, decode=still)), WANTED[:1])
+
+
+@pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
+def test_rigs(job: Job) -> None:
+    check_conversion(job)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"slices": 3},
+        {"split": True},
+        {"split": True, "slices": 2, "layout": "organized"},
+        {"jobs": 2},
+        {"keep_partial": False, "keep_repeated": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
+def test_whole_conversions(job: Job, change: dict[str, int]) -> None:
+    job = replace(job, **change)  # type: ignore[arg-type]
+    one, other = (in_memory(replace(job, engine=engine)) for engine in ("numpy", "numba"))
+    assert prints(one) == prints(other)
+    assert report_text(one.report, machine=False) == report_text(other.report, machine=False)
+    assert other.report.timing is not None
+    assert other.report.timing.engine == "numba"
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "folder"])
+def test_outputs_do_not_tell_the_engine(suffix: str, tmp_path: Path) -> None:
+    (recording,) = FIXTURE.recordings
+    for engine in ("numpy", "numba"):
+        target: list[str | Path] = ["-o", tmp_path / f"{engine}.{suffix}"]
+        words = [*target, "--engine", engine, "--quiet"]
+        told = command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words)
+        assert (told.code, told.err) == (0, "")
+    one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "numba"))
+    assert one == other
+
+
+def contents(output: Path) -> dict[str, bytes]:
+    """Files of an output by name, without the report."""
+    if output.is_file():
+        return {"": output.read_bytes()}
+    return {path.name: path.read_bytes() for path in output.iterdir() if path.stem != "report"}
+
+
+def test_the_report_tells_the_engine(tmp_path: Path) -> None:
+    (recording,) = FIXTURE.recordings
+    report = tmp_path / "report.json"
+    words: list[str | Path] = ["--dry-run", "--engine", "numba", "--report", report]
+    assert command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words).code == 0
+    assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "numba"
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings(name: str) -> None:
+    path = RECORDINGS / name
+    if not path.exists():
+        pytest.skip(f"no recordings: wanted ../shared/recordings/{name}")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        found = [*path.glob("*.pcap"), *(one.parent for one in path.glob("*/metadata.yaml"))]
+        (path,) = found
+    check_conversion(Job((path,), Wishes(identity_extrinsics=True), keep_partial=True))
