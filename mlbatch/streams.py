@@ -196,13 +196,12 @@ def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
     key = batch.stream << 17 | batch.size
     if bool((key == key[0]).all()):
         return [((int(batch.stream[0]), int(batch.size[0])), np.arange(len(batch)))]
-    kinds, inverse = np.unique(key, return_inverse=True)
-    order = np.argsort(inverse, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(inverse, minlength=len(kinds)))[:-1])
-    numbers = kinds.tolist()
+    order = key.argsort(kind="stable")
+    key = key[order]
+    edges = (np.flatnonzero(key[1:] != key[:-1]) + 1).tolist()
     return [
-        ((number >> 17, number & 0x1FFFF), part)
-        for number, part in zip(numbers, parts, strict=True)
+        ((int(key[begin]) >> 17, int(key[begin]) & 0x1FFFF), order[begin:end])
+        for begin, end in itertools.pairwise([0, *edges, len(key)])
     ]
 
 

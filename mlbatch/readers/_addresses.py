@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,7 +44,7 @@ class StreamNumbers:
         key = source << _PORT_BITS | port
         at = self._find(key)
         if at is None:
-            self._learn(np.setdiff1d(key, self._known), key)
+            self._learn(sorted(set(key.tolist()).difference(self._known.tolist())), key)
             at = np.searchsorted(self._known, key)
         return self._numbers[at]
 
@@ -53,9 +54,8 @@ class StreamNumbers:
         at = np.minimum(np.searchsorted(self._known, key), len(self._known) - 1)
         return at if np.array_equal(self._known[at], key) else None
 
-    def _learn(self, new: I64Array, key: I64Array) -> None:
-        first = np.array([np.argmax(key == one) for one in new])
-        for one in new[np.argsort(first)].tolist():
+    def _learn(self, new: Sequence[int], key: I64Array) -> None:
+        for one in sorted(new, key=lambda one: int(np.argmax(key == one))):
             stream = Stream(self.addresses.text(one >> _PORT_BITS), one & (1 << _PORT_BITS) - 1)
             self._known = np.append(self._known, one)
             self._numbers = np.append(self._numbers, self.table.number(stream))

@@ -33,6 +33,18 @@ IPV4 = np.dtype(
 )
 UDP = np.dtype([("source_port", ">u2"), ("port", ">u2"), ("length", ">u2"), ("checksum", ">u2")])
 UDP_PROTOCOL = 17
+# Ethernet, IPv4 and UDP as nearly all packets have them: no tag, no options.
+_ETHERNET = 1
+_USUAL = np.dtype(
+    {
+        "names": ["kind", "fragment", "protocol", "source", "port", "length"],
+        "formats": [">u4", ">u2", "u1", ">u4", ">u2", ">u2"],
+        "offsets": [12, 20, 23, 26, 36, 38],
+        "itemsize": 42,
+    }
+)
+# Ethertype 0800, version 4, five words of header, any service.
+_USUAL_KIND, _USUAL_MASK = 0x08004500, 0xFFFFFF00
 _MORE, _OFFSET = 0x2000, 0x1FFF
 
 # Verdicts on a frame; those with a name in _SKIPPED give nothing.
@@ -103,6 +115,13 @@ class Fragments:
     start: I64Array
     size: I64Array
 
+    @classmethod
+    def none(cls) -> Fragments:
+        """No fragments."""
+        empty = np.zeros(0, np.int64)
+        more = np.zeros(0, np.bool_)
+        return cls(empty, empty, empty, empty, empty, more, empty, empty)
+
     def __len__(self) -> int:
         return len(self.frame)
 
@@ -118,6 +137,37 @@ class Dissection:
 
 def dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:
     """Find the UDP content of all frames; datagrams and fragments come in file order."""
+    datagrams = _plain(data, frames)
+    if datagrams is not None:
+        return Dissection(datagrams, Fragments.none(), {})
+    return _dissect(data, frames, addresses)
+
+
+def _plain(data: U8Array, frames: Frames) -> Datagrams | None:
+    """What whole datagrams in usual headers hold; None where not all frames are such."""
+    if not bool((frames.link == _ETHERNET).all()):
+        return None
+    header = records(data, _USUAL, frames.start)
+    size = header["length"].astype(np.int64)
+    is_usual = (header["kind"] & _USUAL_MASK) == _USUAL_KIND
+    is_usual &= (header["fragment"] & (_MORE | _OFFSET)) == 0
+    is_usual &= header["protocol"] == UDP_PROTOCOL
+    is_usual &= size >= UDP.itemsize
+    is_usual &= size + (_USUAL.itemsize - UDP.itemsize) <= frames.captured
+    is_usual &= frames.captured >= frames.original
+    if not is_usual.all():
+        return None
+    return Datagrams(
+        frame=np.arange(len(frames)),
+        start=frames.start + _USUAL.itemsize,
+        size=size - UDP.itemsize,
+        source=header["source"].astype(np.int64),
+        port=header["port"].astype(np.int64),
+    )
+
+
+def _dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:
+    """The same, whatever the frames are."""
     stop = frames.start + frames.captured
     network, family = _links.locate(data, frames.start, stop, frames.link)
     verdict = np.full(len(frames), _NOT_IP, np.uint8)

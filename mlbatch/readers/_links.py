@@ -90,7 +90,7 @@ def locate(
     start, stop: (n,) first byte of each frame and the one after its last captured byte.
     Family: IPV4, IPV6, NOT_IP, or CUT where the capture ends before it can be told.
     """
-    kinds = np.unique(link).tolist()
+    kinds = sorted(set(link.tolist()))
     if len(kinds) == 1:
         return _locate_one(data, start, stop, kinds[0])
     network, family = start.copy(), np.full(len(start), NOT_IP, np.uint8)
