@@ -88,17 +88,21 @@ def spherical(
 
 
 def rotor_words(turns: F64Array, turns_per_s: F64Array, table: I64Array | int = 0) -> I64Array:
-    """What `Heads.encoder` holds for sensors without a table of angles; arrays of one shape.
+    """What `Heads.encoder` holds for sensors without a table of angles; arrays that broadcast.
 
     turns: angle of the rotor at the column's stamp, in turns (any whole number of them is left
     out); turns_per_s: its speed while the column's beams fire, 0 where it is not to count; table:
     number of the column's row in `Lidar.firing_ns`.
     """
-    angle = np.rint((turns - np.floor(turns)) * _TURN).astype(np.int64) & ((1 << _ANGLE_BITS) - 1)
-    speed = np.rint(turns_per_s * _SPEED_PER_HZ)
-    speed = np.clip(speed, -_SPEED_LIMIT, _SPEED_LIMIT).astype(np.int64)
+    ticks = turns - np.floor(turns)
+    ticks *= _TURN
+    angle = np.rint(ticks, out=ticks).astype(np.int64)
+    angle &= (1 << _ANGLE_BITS) - 1
+    steps = np.rint(turns_per_s * _SPEED_PER_HZ)
+    speed = np.minimum(np.maximum(steps, -_SPEED_LIMIT), _SPEED_LIMIT).astype(np.int64)
     speed &= (1 << _SPEED_BITS) - 1
-    return angle | speed << _ANGLE_BITS | np.asarray(table) << (_ANGLE_BITS + _SPEED_BITS)
+    speed <<= _ANGLE_BITS
+    return angle | (speed | np.asarray(table) << (_ANGLE_BITS + _SPEED_BITS))
 
 
 def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:

@@ -6,6 +6,7 @@ Source: facts/velodyne.md sections 1, 2 and 8; facts/others.md (LSLIDAR).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -131,6 +132,7 @@ def block_flags(packets: U8Array) -> I64Array:
     return np.stack([number(packets, STRIDE * n, 2) for n in range(BLOCKS)], axis=1)
 
 
+@lru_cache(maxsize=8)
 def expected_flags(banks: int, returns: int) -> I64Array:
     """Flags of the blocks that a packet uses, which may be fewer than it has.
 

@@ -138,7 +138,7 @@ class PacketReader:
         turned = azimuth[:, :, None] + speed[:, None, None] * (round_ns / NS_PER_S)
         turns = self._sense / _CDEG_PER_TURN * turned.reshape(flat)
         turns_per_s = (self._sense / _CDEG_PER_TURN * self._moving) * speed
-        words = rotor_words(turns, np.broadcast_to(turns_per_s[:, None], turns.shape))
+        words = rotor_words(turns, turns_per_s[:, None])
         valid = np.repeat(good, shape.columns, axis=1)
         return Heads(stamp_ns[:, None] + after_ns, words, valid)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -80,10 +82,15 @@ def content_keys(packets: U8Array) -> I64Array:
     """
     size = packets.shape[1]
     words = size // 8
-    whole = np.ascontiguousarray(packets[:, : words * 8]).view("<u8")
-    keys = (whole * _odd_numbers(words)).sum(axis=1, dtype=np.uint64)
-    for at in range(words * 8, size):
-        keys = keys * _ODD + packets[:, at]
+    # What is left beyond whole words stands in a last one, which may overlap the others.
+    if words and packets.strides[1] == 1:
+        keys = np.einsum("ij,j->i", packets[:, : words * 8].view("<u8"), _odd_numbers(words))
+        if size % 8:
+            keys = keys * _ODD + packets[:, size - 8 :].view("<u8")[:, 0]
+    else:
+        keys = np.zeros(len(packets), np.uint64)
+        for at in range(size):
+            keys = keys * _ODD + packets[:, at]
     keys ^= keys >> np.uint64(29)
     return np.asarray(keys * _ODD >> np.uint64(1), np.int64)
 
@@ -92,6 +99,7 @@ def content_keys(packets: U8Array) -> I64Array:
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
+@lru_cache(maxsize=16)
 def _odd_numbers(count: int) -> npt.NDArray[np.uint64]:
     numbers = np.arange(1, count + 1, dtype=np.uint64) * _ODD
     return np.asarray((numbers ^ numbers >> np.uint64(31)) | np.uint64(1), np.uint64)

@@ -39,6 +39,11 @@ _GAP_FACTOR, _GAP_CDEG = 3, 100
 # Manuals: 300 rpm and more. Below, no time can be told from an angle.
 _SLOWEST = 4 * TURN_CDEG / NS_PER_S
 _SPEED_TOLERANCE = 0.05
+# By the number of returns: which values of the mode's byte do not say another number.
+_MAY_BE_MODE = {
+    returns: np.array([(MODES.get(code, mode) == DUAL) == (returns == 2) for code in range(256)])
+    for returns, mode in ((1, ""), (2, DUAL))
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +131,7 @@ class VelodyneLidar(TurningLidar):
         stamp_ns = packet_ns[:, None] + delay_ns.repeat(halves, axis=1) + self._start_ns
         turns = (azimuth.repeat(halves, axis=1) + speed[:, None] * self._ahead_ns) / TURN_CDEG
         turning = speed if self._options.firing_azimuth else np.zeros_like(speed)
-        turns_per_s = np.broadcast_to((turning * (NS_PER_S / TURN_CDEG))[:, None], shape)
+        turns_per_s = (turning * (NS_PER_S / TURN_CDEG))[:, None]
         return Heads(stamp_ns, rotor_words(turns, turns_per_s), np.ones(shape, np.bool_))
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
@@ -186,12 +191,12 @@ def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:
     """Which packets are a model's, with this many returns: by flags, limits and return mode."""
     flags = expected_flags(model.banks, returns)
     used = len(flags)
-    good = (_block_words(packets, 0, used) == flags).all(axis=1)
-    good &= (_block_words(packets, _AZIMUTH_AT, used) < TURN_CDEG).all(axis=1)
+    blocks = _block_words(packets, 0, used) == flags
+    blocks &= _block_words(packets, _AZIMUTH_AT, used) < TURN_CDEG
+    good = blocks.all(axis=1)
     good &= top_of_hour_ns(packets) < HOUR_NS
     if model.banks == 1:  # Elsewhere the flags tell, and HDL-64E has its status there.
-        others = [code for code, mode in MODES.items() if (mode == DUAL) != (returns == 2)]
-        good &= ~np.isin(packets[:, MODE_AT], others)
+        good &= _MAY_BE_MODE[returns][packets[:, MODE_AT]]
     return np.asarray(good)
 
 
@@ -203,10 +208,8 @@ def first_azimuths(packets: U8Array, where: Layout) -> I64Array:
 def _block_words(packets: U8Array, at: int, count: int, every: int = 1) -> I64Array:
     """(P, count) numbers of two bytes at byte `at` of every n-th block."""
     step = STRIDE * every
-    end = at + step * (count - 1) + 1
-    words: I64Array = packets[:, at + 1 : end + 1 : step].astype(np.int64) << 8
-    words |= packets[:, at:end:step]
-    return words
+    blocks = packets[:, at : at + step * count].reshape(len(packets), count, step)
+    return np.asarray(blocks[:, :, :2].view("<u2")[..., 0], np.int64)
 
 
 def steps(azimuth: I64Array) -> tuple[I64Array, BoolArray]:
@@ -214,12 +217,17 @@ def steps(azimuth: I64Array) -> tuple[I64Array, BoolArray]:
 
     A rotor that jitters or rests may step back by less than a degree.
     """
-    step = (np.diff(azimuth, axis=1) + _GAP_CDEG) % TURN_CDEG - _GAP_CDEG
+    step = (azimuth[:, 1:] - azimuth[:, :-1] + _GAP_CDEG) % TURN_CDEG - _GAP_CDEG
+    is_wide = step > _GAP_CDEG
+    if not is_wide.any():
+        return step, is_wide
     middle = np.sort(step, axis=1)[:, (step.shape[1] - 1) // 2, None]
-    return step, (step > _GAP_FACTOR * middle) & (step > _GAP_CDEG)
+    return step, (step > _GAP_FACTOR * middle) & is_wide
 
 
 def mean_step(step: I64Array, gap: BoolArray) -> F64Array:
     """(P,) mean of the steps that are no gap; the middle one never is."""
+    if not gap.any():
+        return np.asarray(step.sum(axis=1) / step.shape[1], np.float64)
     total = np.where(gap, 0, step).sum(axis=1)
     return np.asarray(total / (~gap).sum(axis=1), np.float64)
