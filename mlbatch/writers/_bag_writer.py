@@ -17,8 +17,9 @@ from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
 from mlbatch.writers._chunk import Chunk
 from mlbatch.writers._gathered import taken
-from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout, points_of
+from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout
 from mlbatch.writers._options import Safe, WriterOptions
+from mlbatch.writers._points import points_of
 from mlbatch.writers._ros_messages import (
     CloudMessage,
     NewWire,

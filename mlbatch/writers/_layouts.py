@@ -7,82 +7,29 @@ writes of a block stay in the processor's cache.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.errors import ExportError
 from mlbatch.types import (
-    F32Array,
     F64Array,
     I64Array,
-    Scan,
-    SensorInfo,
-    U8Array,
-    U16Array,
     U32Array,
 )
 from mlbatch.units import MM_PER_M, NS_PER_S
+from mlbatch.writers._points import LABEL, PAIR, REALS, Points, Values
 
-Values: TypeAlias = npt.NDArray[np.generic]
 Records: TypeAlias = npt.NDArray[np.void]
+_Fill: TypeAlias = Callable[[Points], Values]
 
 BLOCK_POINTS = 8192
 # The lowest 29 of the 52 mantissa bits of a float64 are those a float32 has no room for.
 _FLOAT32_BITS = np.uint64(2**64 - 2**29)
 _MAX_U8 = 255
-
-
-@dataclass(frozen=True, slots=True)
-class Points:
-    """The point arrays of a scan in the order of the file: (p,), or (slots, n) when organized."""
-
-    sensors: tuple[SensorInfo, ...]
-    start_ns: int
-    xyz: F32Array
-    intensity: F32Array
-    reflectivity: U16Array | None
-    range_m: F32Array | None
-    time_ns: U32Array
-    ring: U16Array
-    return_type: U8Array
-    lidar_id: U8Array
-
-    def take(self, rows: slice) -> Points:
-        """The points in `rows` of the first axis."""
-        return Points(
-            self.sensors,
-            self.start_ns,
-            self.xyz[rows],
-            self.intensity[rows],
-            None if self.reflectivity is None else self.reflectivity[rows],
-            None if self.range_m is None else self.range_m[rows],
-            self.time_ns[rows],
-            self.ring[rows],
-            self.return_type[rows],
-            self.lidar_id[rows],
-        )
-
-
-def points_of(scan: Scan) -> Points:
-    """The points of a scan; organized ones are turned so that a column is a column of the image."""
-    turned = scan.info.layout == "organized"
-    reflectivity, range_m = scan.reflectivity, scan.range_m
-    return Points(
-        scan.info.sensors,
-        scan.start_ns,
-        scan.xyz.transpose(1, 0, 2) if turned else scan.xyz,
-        scan.intensity.T,
-        None if reflectivity is None else reflectivity.T,
-        None if range_m is None else range_m.T,
-        scan.time_ns.T,
-        scan.ring.T,
-        scan.return_type.T,
-        scan.lidar_id.T,
-    )
 
 
 def seconds(time_ns: U32Array) -> F64Array:
@@ -113,6 +60,56 @@ class Field:
 
 
 @dataclass(frozen=True, slots=True)
+class Wide:
+    """Several fields that move as one; `values` gives None where a scan does not allow it.
+
+    parts: name, offset and type of each; spoilt: that which is filled on its own after the move.
+    """
+
+    dtype: str
+    parts: tuple[tuple[str, int, str], ...]
+    values: Callable[[Points], Values | None]
+    spoilt: str = ""
+
+    def at(self, fields: Sequence[Field]) -> int | None:
+        """Offset in records of these fields, None where the parts do not lie so."""
+        places = {field.name: field for field in fields}
+        first = places.get(self.parts[0][0])
+        for name, offset, dtype in self.parts:
+            field = places.get(name)
+            if first is None or field is None:
+                return None
+            if (field.offset - first.offset, field.dtype) != (offset, dtype):
+                return None
+        return None if first is None else first.offset
+
+
+def _pair(points: Points) -> Values | None:
+    """Return type and sensor: the last two of the eight bytes of a label."""
+    if points.labels is None:
+        return None
+    last: Values = (points.labels >> np.uint64(48)).astype(PAIR)
+    return last
+
+
+_PAIR_PARTS = (("return_type", 0, "u1"), ("lidar_id", 1, "u1"))
+_WIDE = (
+    Wide(
+        REALS,
+        (("x", 0, "<f4"), ("y", 4, "<f4"), ("z", 8, "<f4"), ("intensity", 12, "<f4")),
+        lambda points: points.reals,
+    ),
+    Wide(
+        LABEL,
+        (("time", 0, "<f4"), ("ring", 4, "<u2"), ("return_type", 6, "u1"), ("lidar_id", 7, "u1")),
+        lambda points: points.labels,
+        spoilt="time",
+    ),
+    Wide(PAIR, _PAIR_PARTS, _pair),
+)
+
+
+@dataclass(frozen=True, slots=True)
 class Layout:
     """Fields of a point record of `step` bytes; bytes between fields are zero.
 
@@ -140,11 +137,35 @@ class Layout:
         """Fill `out`, records of this layout in the shape of the point arrays."""
         rows, *rest = points.time_ns.shape
         step = max(1, BLOCK_POINTS // max(1, math.prod(rest)))
+        moves = [(out.view(place)["value"], values) for place, values in self._moves(points)]
         for start in range(0, rows, step):
             block = points.take(slice(start, start + step))
-            target = out[start : start + step]
-            for field in self.fields:
-                target[field.name] = field.values(block)
+            for target, values in moves:
+                target[start : start + step] = values(block)
+
+    def _moves(self, points: Points) -> list[tuple[np.dtype[np.void], _Fill]]:
+        """What fills records one after the other: the place of a field in a record, its values."""
+        left = list(self.fields)
+        moves = []
+        for wide in _WIDE:
+            offset = wide.at(left)
+            if offset is None or wide.values(points.take(slice(0))) is None:
+                continue
+            names = {name for name, _, _ in wide.parts} - {wide.spoilt}
+            left = [field for field in left if field.name not in names]
+            moves.append((self._place(wide.dtype, offset), cast(_Fill, wide.values)))
+        return moves + [(self._place(f.dtype, f.offset), f.values) for f in left]
+
+    def _place(self, dtype: str, offset: int) -> np.dtype[np.void]:
+        """A record in which nothing but one place is known."""
+        return np.dtype(
+            {
+                "names": ["value"],
+                "formats": [dtype],
+                "offsets": [offset],
+                "itemsize": self.step,
+            }
+        )
 
 
 def _in_sensor(points: Points) -> list[F64Array]:

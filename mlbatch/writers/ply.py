@@ -15,8 +15,9 @@ from mlbatch.errors import UsageError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.writers._folder import FolderWriter
 from mlbatch.writers._gathered import write_all
-from mlbatch.writers._layouts import PLY_LAYOUT, points_of
+from mlbatch.writers._layouts import PLY_LAYOUT
 from mlbatch.writers._options import ScanWriter, WriterOptions
+from mlbatch.writers._points import points_of
 
 FORMAT = "ply"
 SUFFIX: str | None = None
