@@ -20,7 +20,7 @@ from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.resume import Course
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
-from mlbatch.workers import Steps, Workers
+from mlbatch.workers import Steps, Workers, in_one_go
 from mlbatch.writers import ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
@@ -44,7 +44,8 @@ def convert(
     course: of the output, so that an interrupted run can be resumed.
     """
     # One more than wait to be written: the one that is being decoded.
-    run = Conversion(job, buffers=_AHEAD + 1 if job.jobs == 1 else 1)
+    waits = job.jobs == 1 and open_writer is not None
+    run = Conversion(job, buffers=_AHEAD + 1 if waits else 1)
     if course is not None:
         course.join(run)
     output = _Output(run, open_writer, course)
@@ -110,7 +111,12 @@ class _Output:
                     began_s = time.perf_counter()
                     decoded = run.benches[0].decode(task)
                     run.stages.decode_s += time.perf_counter() - began_s
-                workers.put(_Piece(task, is_kept, before, decoded))
+                piece = _Piece(task, is_kept, before, decoded)
+                if alone and self._open_writer is None:
+                    # There is nothing to write that another thread could do meanwhile.
+                    in_one_go(self._steps(piece))
+                else:
+                    workers.put(piece)
             workers.finish()
 
     def _begin(self) -> None:
