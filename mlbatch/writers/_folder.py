@@ -11,7 +11,7 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
-from mlbatch.writers._gathered import taken
+from mlbatch.writers._gathered import Trail, forget, taken
 from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
 
 
@@ -52,6 +52,7 @@ class FolderWriter:
         self._saver = saver
         self._idle: list[Saver] = []
         self._written = 0
+        self._trail = Trail()
         self._folders: dict[int | None, Path] = {None: self._output.partial}
         if options.split:
             self._folders |= self._sensor_folders(info)
@@ -61,9 +62,12 @@ class FolderWriter:
         path, saver = self._path(scan, sensor), taken(self._idle, self._saver)
         with export_errors(path), path.open("wb", buffering=0) as file:
             saver.save(file, scan)
+            size = file.tell()
+            forget(file.fileno(), 0, size)
         self._idle.append(saver)
         yield
         self._written += 1
+        self._trail.add(path, size)
 
     def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
         """Leave a scan's file as it is."""

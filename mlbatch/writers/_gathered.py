@@ -7,6 +7,7 @@ import importlib
 import io
 import os
 import zlib
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias, TypeVar, cast
@@ -112,6 +113,25 @@ class OutputFile:
     def _drop(self) -> None:
         forget(self._file.fileno(), max(0, self._dropped_bytes - _LATE_BYTES), self.position_bytes)
         self._dropped_bytes = self.position_bytes
+
+
+class Trail:
+    """Files that were written one after the other, until the system has forgotten them."""
+
+    def __init__(self) -> None:
+        self._files: deque[tuple[Path, int]] = deque()
+        self._bytes = 0
+
+    def add(self, path: Path, size: int) -> None:
+        """Go on to the next file: those far enough behind should be on the disk by now."""
+        self._files.append((path, size))
+        self._bytes += size
+        while self._bytes > _LATE_BYTES:
+            path, size = self._files.popleft()
+            self._bytes -= size
+            # Whatever became of it, it was written well.
+            with contextlib.suppress(OSError), path.open("rb", buffering=0) as file:
+                forget(file.fileno(), 0, size)
 
 
 def forget(descriptor: int, begin: int, end: int) -> None:
