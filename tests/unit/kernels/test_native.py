@@ -113,7 +113,7 @@ def test_a_folder_that_cannot_be_written_to_is_no_error(
     def refused(*_: object, **__: object) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("mlbatch.kernels.native.tempfile.mkstemp", refused)
+    monkeypatch.setattr("tempfile.mkstemp", refused)
     assert total([2], 3) == 6
     assert not list(folder.iterdir())
 
