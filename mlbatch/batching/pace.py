@@ -31,13 +31,15 @@ _TURNS_PER_TICK = 2.0**-32
 _HOLE_STEPS = 2.5
 # So many turns without one column of a sector are no chance, if not half of all packets are lost.
 _PASSES = 12
-# Angles are rounded: a column may seem to lie as much behind an edge, in steps of columns.
-_GRID_OFF = 0.03
+# Angles are rounded: a column may seem to lie as much behind an edge, in turns.
+_GRID_OFF = 1 / _PLACES
 # The rotor of a sensor goes on while packets are lost: turns that it may be off by.
 _ROTOR_OFF = 0.1
 # Steps from which the pace is taken, and how far they may lie from each other.
 _FEWEST_STEPS, _LOW, _NEAR, _SHARE = 16, 0.05, 0.1, 0.08
 _BACK_TURNS = 1 / 360
+# Share of columns that lie where those before them do, if each return is one: half of them do.
+_TWICE = 0.25
 # Packets over which the speed of the rotor is taken.
 _SPEED_OVER = 64
 
@@ -199,10 +201,23 @@ def _missing(packets: _Packets, packet_ns: float) -> int:
     dark = _dark_sectors(packets, begin, turned, float(np.median(column_turns)))
     across = np.flatnonzero(dark.passes(begin, turned).any(axis=1) & (column_turns > 0))
     if len(across):
-        seen = dark.columns(begin[across], turned[across], column_turns[across])
+        together = _together(packets.places)
+        pitch = together * column_turns[across]
+        seen = together * dark.angles(begin[across], turned[across], pitch)
+        if together > 1:
+            # Packets may begin with the second column of an angle.
+            second = (packets.places[:, 0] != packets.places[:, 1]).astype(np.float64)
+            seen += second[gap[across] + 1] - second[gap[across]]
         due[across] = seen / columns
     missing = np.rint(due) - 1
     return int(missing[is_silence & (missing > 0)].sum())
+
+
+def _together(places: U16Array) -> int:
+    """Columns at one angle: 2 where each return is a column of its own, else 1."""
+    if places.shape[1] == 1:
+        return 1
+    return 2 if float(np.mean(places[:, 1:] == places[:, :-1])) > _TWICE else 1
 
 
 def _pace_ns(step_ns: F64Array, packet_ns: float) -> float:
@@ -250,23 +265,27 @@ class _Sectors:
         ahead = begin[:, None] - (self.begin + self.width / 2)
         return np.floor(ahead + turned[:, None]) - np.floor(ahead)
 
-    def columns(self, begin: F64Array, turned: F64Array, column_turns: F64Array) -> F64Array:
-        """(g,) columns that a sensor measures while it turns so, from one at `begin` on.
+    def angles(self, begin: F64Array, turned: F64Array, pitch: F64Array) -> F64Array:
+        """(g,) angles that a sensor measures at while it turns so, from `begin` on.
 
-        Columns lie on a grid: at both edges the last one in the light is known.
+        They lie on a grid: at both edges the last one in the light is known.
         """
         lit = turned - self.passes(begin, turned) @ self.width
         before = self.begin - begin[:, None]
         after = (begin + turned)[:, None] - self.begin - self.width
-        at_edges = 1 + _beyond_grid(before, column_turns) + _beyond_grid(after, column_turns)
-        return np.asarray(lit / column_turns + at_edges, np.float64)
+        at_edges = 1 + _beyond_grid(before, pitch) + _beyond_grid(after, pitch)
+        return np.asarray(lit / pitch + at_edges, np.float64)
 
 
-def _beyond_grid(turns: F64Array, column_turns: F64Array) -> F64Array:
-    """(g,) down to a whole number of columns, from the least of the ways (g, k) along a turn."""
-    off = _GRID_OFF * column_turns
-    columns = ((turns + off[:, None]) % 1.0).min(axis=1) / column_turns
-    return np.asarray(np.floor(columns) + _GRID_OFF - columns, np.float64)
+def _beyond_grid(turns: F64Array, pitch: F64Array) -> F64Array:
+    """(g,) down to a whole number of pitches, from the least of the ways (g, k) along a turn.
+
+    Where rounding may hide an angle, half of it.
+    """
+    high = ((turns + _GRID_OFF) % 1.0).min(axis=1)
+    low = np.maximum(high - 2 * _GRID_OFF, 0.0)
+    whole = (np.floor(high / pitch) + np.floor(low / pitch)) / 2
+    return np.asarray(whole - (high - _GRID_OFF) / pitch, np.float64)
 
 
 def _dark_sectors(
