@@ -20,7 +20,7 @@ from mlbatch.matching import best_fits, match
 from mlbatch.sensors import parse_calibration
 from mlbatch.types import BoolArray
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
-from tests.builders.hesai_angles import angles_csv
+from tests.builders.hesai_angles import MirrorAngles, angles_csv
 from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
 from tests.fuzz.decoding import sampled
@@ -32,8 +32,6 @@ from tests.golden.test_loss_recordings import Came
 LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000
 FIRST = 100
 DARK_DEG = {"": None, "dark": (100.0, 250.5), "dark through zero": (330.3, 29.7)}
-# Mirrors have no turn that a sector could be dark in; their packets bear a count.
-HESAI = [model for model in hesai_models.MODELS if model != "AT128"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +71,11 @@ def hesais(model: str, mode: str, flags: str) -> Spoken:
         strict=True,
     )
     elevation = np.linspace(14.9, -15.1, row.channels).round(3).tolist()
-    content = angles_csv(elevation, [0.0] * row.channels)
-    return Spoken(list(rows), (), "unit.csv", content)
+    azimuth = [0.0] * row.channels
+    if model == "AT128":
+        mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
+        return Spoken(list(rows), (), "unit.dat", mirrors.dat())
+    return Spoken(list(rows), (), "unit.csv", angles_csv(elevation, azimuth))
 
 
 def robosenses(model: str, mode: str, dark: str) -> Spoken:
@@ -101,7 +102,7 @@ CASES: tuple[Case, ...] = (
     ),
     *(
         (hesais, model, mode, flags)
-        for model in HESAI
+        for model in hesai_models.MODELS
         for mode in sorted({"37", "39"} & set(hesai_modes(model)))
         for flags in ("counted", "")
     ),
