@@ -15,7 +15,7 @@ from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Arrival, Delivery, Intake
 from mlbatch.batching.jumps import JumpGuard
-from mlbatch.batching.tracks import Progress, Track, chained, ranked
+from mlbatch.batching.tracks import Progress, Track, chained, parted, ranked
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.errors import ClockJump
 from mlbatch.types import BoolArray, Columns, I64Array
@@ -201,8 +201,8 @@ class Batcher:
     ) -> Progress:
         """Newest stamps and the watermark before and after each delivery; evaluates eq. (1)."""
         newest = np.full((len(self._tracks), len(host_ns) + 1), NEVER)
-        newest[:, 0] = [track.newest_ns for track in self._tracks]
-        for number, delivery in enumerate(accepted):
+        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
+            newest[number, 0] = track.newest_ns
             if delivery is not None:
                 newest[number, 1:][ranks[number]] = delivery.newest_ns
         np.maximum.accumulate(newest, axis=1, out=newest)
@@ -221,9 +221,11 @@ class Batcher:
         wait_ns = self._policy.max_wait_ns
         if wait_ns is None:
             return None
-        leading = newest.max(axis=0)
-        if newest[:, 0].min() > NEVER and bool((leading - newest.min(axis=0) <= wait_ns).all()):
+        # What was never further apart than from the first of these to the last is not told apart.
+        before_ns = min(track.newest_ns for track in self._tracks)
+        if before_ns > NEVER and int(newest[:, -1].max()) - before_ns <= wait_ns:
             return None
+        leading = newest.max(axis=0)
         present = newest > NEVER
         first_ns = np.array([[track.first_ns] for track in self._tracks])
         first_of_all = np.where(present, first_ns, FOREVER).min(axis=0)
@@ -260,17 +262,29 @@ class Batcher:
         published = published.repeat(per_packet)
         if count < len(valid):
             columns, published = columns.take(valid), published[valid]
-        running = np.empty(count + 1, np.int64)
+        if not self._goes_on(track, columns.stamp_ns, int(published[-1])):
+            columns = self._without_late(track, columns, published)
+        if len(columns):
+            track.waiting.append(columns)
+            track.oldest_place = min(track.oldest_place, int(columns.place.min()))
+
+    def _goes_on(self, track: Track, stamp: I64Array, published: int) -> bool:
+        """Whether, as in nearly all small batches, no column can be late, and none ends a gap."""
+        newest, wait_ns = max(track.newest_ns, int(stamp.max())), self._policy.max_wait_ns
+        is_near = wait_ns is None or newest - track.newest_ns <= wait_ns
+        return is_near and int(stamp.min()) >= max(newest - SLACK_NS, published)
+
+    def _without_late(self, track: Track, columns: Columns, published: I64Array) -> Columns:
+        """The columns that are not late; published: (n,) watermark before each of them."""
+        running = np.empty(len(columns) + 1, np.int64)
         running[0], running[1:] = track.newest_ns, columns.stamp_ns
         np.maximum.accumulate(running, out=running)
         self._note_gaps(track, running)
         late = self._late(columns.stamp_ns, np.maximum(running[:-1] - SLACK_NS, published))
-        if late.any():
-            track.drop("late", int(np.count_nonzero(late)))
-            columns = columns.take(~late)
-        if len(columns):
-            track.waiting.append(columns)
-            track.oldest_place = min(track.oldest_place, int(columns.place.min()))
+        if not late.any():
+            return columns
+        track.drop("late", int(np.count_nonzero(late)))
+        return columns.take(~late)
 
     def _note_gaps(self, track: Track, running: I64Array) -> None:
         wait_ns = self._policy.max_wait_ns
@@ -334,10 +348,8 @@ class Batcher:
         """Take waiting columns before `until`, merged: by stamp, then sensor, then arrival."""
         taken = []
         for track in self._tracks:
-            columns = chained(track.waiting)
-            due = columns.stamp_ns < until
-            taken.append(columns.take(due))
-            left = columns.take(~due)
+            due, left = parted(chained(track.waiting), until)
+            taken.append(due)
             track.waiting = [left] if len(left) else []
             track.oldest_place = int(left.place.min(initial=FOREVER))
         merged = chained(taken)

@@ -67,8 +67,8 @@ class Delivery:
 def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
     """Smallest and largest valid stamp of each packet; FOREVER and NEVER where none is valid."""
     stamp, valid = heads.stamp_ns, heads.valid
-    if valid.all():
-        return stamp.min(axis=1, initial=FOREVER), stamp.max(axis=1, initial=NEVER)
+    if valid.size and valid.all():
+        return stamp.min(axis=1), stamp.max(axis=1)
     low = np.where(valid, stamp, FOREVER).min(axis=1, initial=FOREVER)
     high = np.where(valid, stamp, NEVER).max(axis=1, initial=NEVER)
     return low, high
@@ -101,15 +101,14 @@ class Intake:
     def accept(self, arrival: Arrival) -> Delivery:
         """Let in the packets of a batch, as far as they are good."""
         fresh = self._distinct(arrival.key)
-        if not fresh.all():
+        if fresh is not None:
             arrival = arrival.take(fresh)
         heads = arrival.heads
         if self._offset_ns:
             heads.stamp_ns = heads.stamp_ns + self._offset_ns
         low, high = extremes(heads)
-        lowest, highest = int(low.min(initial=FOREVER)), int(high.max(initial=NEVER))
-        if self._held is None and self._is_calm(lowest, highest):
-            self._newest = max(self._newest, highest)
+        if self._held is None and len(high) and self._is_calm(int(low.min()), int(high.max())):
+            self._newest = max(self._newest, int(high.max()))
         else:
             arrival, low, high = self._sift(arrival, low, high)
         self.loss.add(arrival.key, arrival.heads, arrival.host_ns)
@@ -153,13 +152,14 @@ class Intake:
         if count:
             self.rejected[reason] = self.rejected.get(reason, 0) + count
 
-    def _distinct(self, key: I64Array) -> BoolArray:
-        """Which packets are not a repetition of one of the last DUPLICATE_REACH packets."""
-        if len(key) and key[0] > self._largest_key and bool((key[1:] > key[:-1]).all()):
+    def _distinct(self, key: I64Array) -> BoolArray | None:
+        """Which packets are not a repetition of one of the last DUPLICATE_REACH; None: all."""
+        rises = len(key) > 0 and int(key[0]) > self._largest_key
+        if rises and (len(key) == 1 or bool((key[1:] > key[:-1]).all())):
             # As nearly always: every number is larger than all before it.
             self._remember(key)
             self._largest_key = int(key[-1])
-            return np.ones(len(key), bool)
+            return None
         recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
         if len(key) == 1:
             # Numbers without an order that come one by one: a look at all is cheaper than a sort.
@@ -169,8 +169,9 @@ class Intake:
         self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
         self._recent = [recent]
         self._remember(key)
-        self._reject("duplicate", len(key) - int(np.count_nonzero(fresh)))
-        return fresh
+        again = len(key) - int(np.count_nonzero(fresh))
+        self._reject("duplicate", again)
+        return fresh if again else None
 
     def _remember(self, key: I64Array) -> None:
         self._recent.append(key)

@@ -69,7 +69,9 @@ class Loss:
         """Whether every number is one more than that before, as nearly always."""
         if self._newest is None or int(sequence[0]) != (self._newest + 1) % self._modulus:
             return False
-        return bool((sequence[1:] == (sequence[:-1] + 1) % self._modulus).all())
+        return len(sequence) == 1 or bool(
+            (sequence[1:] == (sequence[:-1] + 1) % self._modulus).all()
+        )
 
     def _step(self, number: int) -> None:
         step = self._signed(number - (self._newest or 0))

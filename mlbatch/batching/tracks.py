@@ -61,6 +61,16 @@ def ranked(accepted: Sequence[Delivery | None]) -> tuple[list[I64Array], I64Arra
     return np.split(rank, cuts), position[order]
 
 
+def parted(columns: Columns, until: int) -> tuple[Columns, Columns]:
+    """Columns with stamps before `until`, and the others; each in their order."""
+    stamp = columns.stamp_ns
+    if bool((stamp[1:] >= stamp[:-1]).all()):
+        at = int(stamp.searchsorted(until))
+        return columns.take(slice(None, at)), columns.take(slice(at, None))
+    due = stamp < until
+    return columns.take(due), columns.take(~due)
+
+
 def chained(parts: Sequence[Columns]) -> Columns:
     """Columns one after the other."""
     if len(parts) == 1:

@@ -137,19 +137,21 @@ class PacketHeaders:
     def owns(self, packets: U8Array) -> BoolArray:
         """Whether the serial number is the sensor's; 0 on either side is unknown and fits all."""
         found = self.serials(packets)
-        owned: BoolArray = (found == self.serial) | (found == 0) | (self.serial == 0)
-        return owned
+        owned: BoolArray = found == self.serial
+        if owned.all():
+            return owned
+        return np.asarray(owned | (found == 0) | (self.serial == 0))
 
     def faults(self, packets: U8Array) -> U8Array:
         """Packets that are not lidar packets; with `check_crc` also those that were changed."""
         bad = self._read(packets, "packet_type") != LIDAR_PACKET
-        verdict = np.where(bad, BAD_HEADER, 0)
+        verdict: U8Array = bad * np.uint8(BAD_HEADER)
         if self.check_crc and self.header == STANDARD:
             # A checksum is written by STANDARD headers only, and not by early firmware.
             told = np.ascontiguousarray(packets[:, -CRC_SIZE:]).view("<u8")[:, 0]
             wrong = (crc64(packets[:, :-CRC_SIZE]) != told) & ~np.isin(told, _no_crc())
             verdict[wrong & ~bad] = BAD_CRC
-        return verdict.astype(np.uint8)
+        return verdict
 
     def frame_ids(self, packets: U8Array) -> I64Array:
         """The frame of each packet."""

@@ -201,9 +201,12 @@ class OusterLidar:
         frame = self._headers.frame_ids(packets) % self._frame_ids
         first = first_measurement_ids(packets, self._metadata.layout)
         block = first // self.columns_per_packet
-        rank = self._rank[np.minimum(block, len(self._rank) - 1)]
-        outside = -1 - (frame * len(self._rank) + block)
-        return np.where(rank >= 0, frame * self._packets_per_frame + rank, outside)
+        rank = self._rank.take(block, mode="clip")
+        inside = frame * self._packets_per_frame + rank
+        is_inside = rank >= 0
+        if is_inside.all():
+            return inside
+        return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
         """Stamps, measurement ids and validity of all columns."""
