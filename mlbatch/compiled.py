@@ -15,11 +15,13 @@ from mlbatch._compiled_tables import AnyArray, Tables, described, is_compiled, p
 from mlbatch.buffers import Buffer, Due
 from mlbatch.geometry import Tabled, Turning, rotor_angles
 from mlbatch.kernels import frame as at
-from mlbatch.kernels.native import load
+from mlbatch.kernels.native import has_features, load
 from mlbatch.projection import Extras, Projector
 from mlbatch.tiles import Tiles
 from mlbatch.types import I64Array
 
+# Abilities of CPUs that pack eight lanes of a register by a mask.
+_LANES, _PACKS = 8, ("avx512f", "avx512bw", "avx512vl", "bmi2", "popcnt")
 _COLUMNS_SOURCE, _MERGE_SOURCE = "mlbatch.kernels._columns_source", "mlbatch.kernels._merge_source"
 
 
@@ -40,8 +42,9 @@ class CompiledKind:
         self._seat = seat
         word = table.echoes[0].distance.word
         kind = "tabled" if isinstance(projector.projection, Tabled) else "turning"
+        lanes = _LANES if has_features(*_PACKS) else 1
         self._kernel = load(
-            _COLUMNS_SOURCE, word, table.step, padded(lidar.channels), lidar.returns, kind
+            *(_COLUMNS_SOURCE, word, table.step, padded(lidar.channels), lidar.returns, kind, lanes)
         )
         self._tables = described(projector, table, wide)
         self._tables.set(at.MEMBER, seat)

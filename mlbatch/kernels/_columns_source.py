@@ -32,10 +32,15 @@ _TABLE_AT = 56
 _RING = 5
 
 
-def build(word: str, step: int, pad: int, returns: int, kind: str) -> Callable[[Pointer], int]:
-    """word, step: of the pixels; pad: channels, up to a power of 2; kind: see `projecting`."""
+def build(
+    word: str, step: int, pad: int, returns: int, kind: str, lanes: int
+) -> Callable[[Pointer], int]:
+    """word, step: of the pixels; pad: channels, up to a power of 2; kind: see `projecting`.
+
+    lanes: see `emitting`.
+    """
     read, project = reader_of(word, step, pad), projecting(kind, pad, returns)
-    mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting()
+    mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting(lanes)
     elements, four, eight = returns * pad, 4 * returns * pad, 8 * pad
     record_of = _record_of()
 
@@ -62,8 +67,12 @@ def build(word: str, step: int, pad: int, returns: int, kind: str) -> Callable[[
             project(frame, place, ranges, levels, points, scratch)
             mark(frame, member, ranges, points, keep)
             offset_ns = stamps_ns[column] - frame[at.START_NS]
-            label(frame, table if last_table else member, offset_ns, ranges, levels, labels)
-            row = emit(frame, column, table, row, as_c16(points), labels, ranges, others, keep)
+            known = table if last_table else member
+            if frame[at.ORDER] != 0 or frame[at.WIDTH] != 0:
+                label(frame, known, offset_ns, ranges, levels, labels)
+            words_of = moved(i8_at(frame[at.LABELS]), known * elements)
+            planes = as_c16(points), labels, ranges, others, keep
+            row = emit(frame, column, table, row, planes, (words_of, offset_ns))
             number += 1
         return row
 

@@ -24,18 +24,23 @@ from mlbatch.kernels._primitives import (
 )
 
 # Scratch of a column: points as pairs of doubles (16 bytes a point), and planes.
-Emitting = Callable[[Pointer, int, int, int, Pointer, Pointer, Pointer, Pointer, Pointer], int]
+Planes = tuple[Pointer, Pointer, Pointer, Pointer, Pointer]
+# Words of the labels that are not made yet, and what has to be added to them.
+Words = tuple[Pointer, int]
+Emitting = Callable[[Pointer, int, int, int, Planes, Words], int]
 _LIDAR_ID_BIT = 56
 _NAN = np.float32("nan")
 
 
 @cache
-def emitting() -> Emitting:
-    """`(frame, column, table, row, points, labels, ranges, others, keep)` gives the next row.
+def emitting(lanes: int) -> Emitting:
+    """`(frame, column, table, row, planes, words)` gives the next row; lanes: of the CPU, or 1.
 
-    others: reflectivities.
+    planes: points, labels, ranges, reflectivities, and what is wanted. Labels are looked at where
+    the frame has an order or a width, else made of the words.
     """
-    dense, ordered, organized = _dense(), _ordered(), _organized()
+    lay = _lay_many() if lanes > 1 else _lay_one()
+    dense, ordered, organized = _dense(lay, lanes), _ordered(), _organized()
 
     @piece
     def emit(
@@ -43,18 +48,16 @@ def emitting() -> Emitting:
         column: int,
         table: int,
         row: int,
-        points: Pointer,
-        labels: Pointer,
-        ranges: Pointer,
-        others: Pointer,
-        keep: Pointer,
+        planes: Planes,
+        words: Words,
     ) -> int:
+        points, labels, ranges, others, keep = planes
         if frame[at.WIDTH] != 0:
             return row + organized(frame, column, points, labels, ranges, others, keep)
         if frame[at.ORDER] != 0:
             after = ordered(frame, column, table, row, points, labels, ranges, others, keep)
         else:
-            after = dense(frame, row, points, labels, ranges, others, keep)
+            after = dense(frame, row, points, words, ranges, others, keep)
         if frame[at.COLUMN] != 0:
             out, number = u4_at(frame[at.COLUMN]), frame[at.FIRST_NUMBER] + column
             for place in range(row, after):
@@ -66,25 +69,79 @@ def emitting() -> Emitting:
     return emit
 
 
-def _dense() -> Callable[[Pointer, int, Pointer, Pointer, Pointer, Pointer, Pointer], int]:
+# `(frame, row, begin, end, points, words, keep)` gives the row after the slots from begin on.
+Laying = Callable[[Pointer, int, int, int, Pointer, Words, Pointer], int]
+
+
+def _lay_one() -> Laying:
+    """Points and labels, one after the other."""
+
+    @piece
+    def lay(
+        frame: Pointer,
+        row: int,
+        begin: int,
+        end: int,
+        points: Pointer,
+        words: Words,
+        keep: Pointer,
+    ) -> int:
+        point, label = c16_at(frame[at.POINT]), i8_at(frame[at.LABEL])
+        known, offset_ns = words
+        for slot in range(begin, end):
+            point[row] = points[slot]
+            label[row] = known[slot] + offset_ns
+            row += keep[slot]
+        return row
+
+    return lay
+
+
+def _lay_many() -> Laying:
+    """The same, as many as fit into a register at once; slots are whole registers."""
+    from mlbatch.kernels._lanes import LANES, packed
+
+    @piece
+    def lay(
+        frame: Pointer,
+        row: int,
+        begin: int,
+        end: int,
+        points: Pointer,
+        words: Words,
+        keep: Pointer,
+    ) -> int:
+        point, label = c16_at(frame[at.POINT]), i8_at(frame[at.LABEL])
+        known, offset_ns = words
+        for slot in range(begin, end, LANES):
+            own, told = moved(points, slot), moved(known, slot)
+            chosen, here, there = moved(keep, slot), moved(point, row), moved(label, row)
+            row += packed(chosen, own, told, offset_ns, here, there)
+        return row
+
+    return lay
+
+
+def _dense(
+    lay: Laying, lanes: int
+) -> Callable[[Pointer, int, Pointer, Words, Pointer, Pointer, Pointer], int]:
     """Elements as they lie; of sensors with one return."""
+    one = _lay_one()
 
     @piece
     def dense(
         frame: Pointer,
         row: int,
         points: Pointer,
-        labels: Pointer,
+        words: Words,
         ranges: Pointer,
         others: Pointer,
         keep: Pointer,
     ) -> int:
-        point, label = c16_at(frame[at.POINT]), i8_at(frame[at.LABEL])
-        after = row
-        for slot in range(frame[at.SLOTS]):
-            point[after] = points[slot]
-            label[after] = labels[slot]
-            after += keep[slot]
+        # No more than the slots of the column are written to, as rows are as many as slots.
+        whole = frame[at.SLOTS] // lanes * lanes
+        after = lay(frame, row, 0, whole, points, words, keep)
+        after = one(frame, after, whole, frame[at.SLOTS], points, words, keep)
         if frame[at.RANGE] != 0:
             out, place = f4_at(frame[at.RANGE]), row
             for slot in range(frame[at.SLOTS]):

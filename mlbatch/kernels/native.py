@@ -108,6 +108,14 @@ def machine() -> llvm.TargetMachine:
     return target.create_target_machine(cpu=cpu, features=features, opt=_OPTIMISED, jit=True)
 
 
+def has_features(*names: str) -> bool:
+    """Whether the CPU has all of these, by the names that llvm gives them."""
+    # Those that numba is told to compile for may have less.
+    if any(key.startswith("NUMBA_CPU") or key == "NUMBA_ENABLE_AVX" for key in os.environ):
+        return False
+    return {f"+{name}" for name in names} <= set(_processor()[1].split(","))
+
+
 @lru_cache(maxsize=1)
 def _processor() -> tuple[str, str]:
     """Name and abilities of the CPU, as llvm knows them."""
