@@ -1,4 +1,4 @@
-"""Targets: outputs of mlbatch that others changed, and `verify` has to judge."""
+"""Targets: outputs of mlbatch that others changed; `verify` has to judge, and readers to read."""
 
 from __future__ import annotations
 
@@ -9,15 +9,29 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 
+from mlbatch.readers import open_recording
+from mlbatch.types import StreamTable
 from mlbatch.verify import verify
 from tests.builders.run import command
 from tests.contract.tree import ROOT
 from tests.fuzz.framing import Part, joined, parts_of
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
+from tests.fuzz.readers import mutated_mcap, read_all
 
 _FIXTURE = ROOT / "fixtures" / "two_lidars"
-_FORMATS = {"mcap": "o.mcap", "npz": "n", "ply": "p", "rosbag1": "o.bag", "rosbag2": "r"}
+# Format, target, compression.
+_FORMS = {
+    "mcap": ("mcap", "o.mcap", "none"),
+    "mcap lz4": ("mcap", "lz4.mcap", "lz4"),
+    "mcap zstd": ("mcap", "zstd.mcap", "zstd:1"),
+    "npz": ("npz", "n", "none"),
+    "ply": ("ply", "p", "none"),
+    "rosbag1": ("rosbag1", "o.bag", "none"),
+    "rosbag2": ("rosbag2", "r", "none"),
+}
+_MAGIC = b"\x89MCAP"
+_MCAPS = ("mcap", "mcap lz4", "mcap zstd")
 _PER_OUTPUT = 4
 
 
@@ -35,9 +49,10 @@ def _whole() -> tempfile.TemporaryDirectory[str]:
         "4.5",
         "--exclude-box=-9,-9,0,9,9,9",
     )
-    for form, target in _FORMATS.items():
+    for form, target, compression in _FORMS.values():
         told = command(
-            "convert", *words, *limits, "--format", form, "-o", Path(place.name) / target
+            *("convert", *words, *limits, "--format", form, "--compression", compression),
+            *("-o", Path(place.name) / target),
         )
         if told.code:
             raise RuntimeError(told.err)
@@ -47,7 +62,7 @@ def _whole() -> tempfile.TemporaryDirectory[str]:
 def _files(form: str) -> list[Path]:
     """Files of an output, those of a folder from its front on; and what lies beside it."""
     place = Path(_whole().name)
-    target = place / _FORMATS[form]
+    target = place / _FORMS[form][1]
     inner = sorted(target.iterdir()) if target.is_dir() else sorted(place.glob(f"{target.name}*"))
     return [path.relative_to(place) for path in [*inner[:_PER_OUTPUT], *inner[-2:]]]
 
@@ -61,6 +76,8 @@ def _seeds(form: str) -> Seeds:
 
 def _mutated(rng: random.Random, seeds: Seeds) -> bytes:
     (part,) = parts_of(rng.choice(seeds))
+    if part.data.startswith(_MAGIC) and rng.random() < 0.6:
+        return joined([Part(part.kind, 0, mutated_mcap(rng, [part.data]))])
     # Texts are told by their first byte: report, table, metadata.
     change = mutated_text if part.data[:1] in b"{ir" and rng.random() < 0.9 else mutated
     return joined([Part(part.kind, 0, change(rng, [part.data]))])
@@ -75,12 +92,29 @@ def _verify(form: str, data: bytes, folder: Path) -> None:
     sound = path.read_bytes()
     path.write_bytes(part.data)
     try:
-        verify(copy / _FORMATS[form])
+        verify(copy / _FORMS[form][1])
     finally:
         path.write_bytes(sound)
 
 
-TARGETS: Sequence[Target] = tuple(
-    Target(f"verify {form}", partial(_seeds, form), partial(_verify, form), _mutated, 2)
-    for form in _FORMATS
+# -- as recordings --------------------------------------------------------------------------------
+
+
+def _mcaps() -> Seeds:
+    return tuple((Path(_whole().name) / _FORMS[form][1]).read_bytes() for form in _MCAPS)
+
+
+def _read(data: bytes, folder: Path) -> None:
+    path = folder / "a.mcap"
+    path.write_bytes(data)
+    streams = StreamTable()
+    read_all(open_recording(path, streams), streams)
+
+
+TARGETS: Sequence[Target] = (
+    *(
+        Target(f"verify {form}", partial(_seeds, form), partial(_verify, form), _mutated, 2)
+        for form in _FORMS
+    ),
+    Target("read outputs", _mcaps, _read, mutated_mcap, 3),
 )

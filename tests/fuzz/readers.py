@@ -178,7 +178,7 @@ def _mcaps() -> Seeds:
     return tuple(seeds)
 
 
-def _mutated_mcap(rng: random.Random, seeds: Seeds) -> bytes:
+def mutated_mcap(rng: random.Random, seeds: Seeds) -> bytes:
     """Bytes anywhere, or the records within a chunk, which is then packed and measured anew."""
     data = rng.choice(seeds)
     parts = _mcap_records(data)
@@ -292,9 +292,9 @@ TARGETS: Sequence[Target] = (
     _file_target("pcap", _pcaps, share=14),
     _file_target("pcapng", _pcapngs, share=14),
     _file_target("compressed", _containers, _compressed),
-    _file_target("mcap", _mcaps, _mutated_mcap, share=14),
+    _file_target("mcap", _mcaps, mutated_mcap, share=14),
     _file_target("bag", _bags, share=12),
     _file_target("db3", _databases, share=12),
     Target("read folder", _metadata, _read_folder, mutated_text, 3),
 )
-__all__ = ["TARGETS", "check_batch", "read_all"]
+__all__ = ["TARGETS", "check_batch", "mutated_mcap", "read_all"]

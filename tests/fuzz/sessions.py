@@ -1,27 +1,40 @@
-"""Target: whole conversions of mutated packets in sound frames, with every law of a run checked."""
+"""Targets: whole conversions of mutated packets in sound frames, with every law of a run checked.
+
+Threads and compiled kernels read and write where arrays tell them: they must give the same bytes.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import random
+import tempfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
+from unittest.mock import patch
 
+from mlbatch import _compiled_tables, compiled
 from mlbatch.discover import Wishes
+from mlbatch.errors import MlbatchError
 from mlbatch.job import Job
+from mlbatch.kernels import is_installed
+from mlbatch.kernels.native import Constant, Kernel, load
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.run import in_memory
+from tests.builders.run import in_memory, prints
+from tests.contract.tree import ROOT
 from tests.fuzz.framing import mutated_parts, parts_of
-from tests.fuzz.harness import Target
+from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds
 from tests.fuzz.packets import CALIBRATION, NAMES, seeds_of
 from tests.property.test_damage import check_ledgers, check_output
 
 _SOURCE, _HOST = "192.168.1.201", "192.168.1.10"
 _EVERY = 5
+_CHANNELS = 128
 _JOBS = (
     Job((), keep_partial=True),
     Job((), keep_partial=True, keep_repeated=True, layout="organized"),
@@ -38,7 +51,8 @@ def _seeds() -> Seeds:
     return tuple(seed for maker in makers for seed in seeds_of(maker)[::_EVERY])
 
 
-def _convert(data: bytes, folder: Path) -> None:
+def _job(data: bytes, folder: Path) -> Job:
+    """A conversion of the packets of an input, which are written into the folder."""
     records, metadata = [], list[Path]()
     for part in parts_of(data):
         if part.kind == CALIBRATION:
@@ -49,15 +63,102 @@ def _convert(data: bytes, folder: Path) -> None:
             frames = udp_frame(part.data, _SOURCE, _HOST, part.kind, part.kind)
             records += [(min(part.host_ns, _LAST_NS), frame) for frame in frames]
     capture = write_pcap(folder / "lidar.pcap", records)
-    rng = random.Random(zlib.crc32(data))
-    job = rng.choice(_JOBS)
+    job = random.Random(zlib.crc32(data)).choice(_JOBS)
     wishes = replace(job.wishes, metadata=tuple(metadata))
-    result = in_memory(replace(job, recordings=(capture,), wishes=wishes))
+    return replace(job, recordings=(capture,), wishes=wishes)
+
+
+def _convert(data: bytes, folder: Path) -> None:
+    result = in_memory(replace(_job(data, folder), engine="numpy"))
     check_ledgers(result.report)
     check_output(result)
+
+
+# -- others that must do the same -----------------------------------------------------------------
+
+
+def _outcome(job: Job) -> object:
+    """All that a run gives, or why it gives nothing."""
+    try:
+        return prints(in_memory(job))
+    except MlbatchError as err:
+        return str(err)
+
+
+def _compare(job: Job, other: Job) -> None:
+    if _outcome(job) != _outcome(other):
+        raise BrokenLaw(f"{other.jobs} jobs, {other.engine}: other scans than in one by numpy")
+
+
+def _share(data: bytes, folder: Path) -> None:
+    job = replace(_job(data, folder), engine="numpy")
+    _compare(job, replace(job, jobs=2))
+
+
+class _UnknownKernelError(Exception):
+    """An input that needs a kernel which its seeds do not."""
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> set[tuple[Constant, ...]]:
+    """Kernels of the seeds, compiled: that takes longer than an input may."""
+    known: set[tuple[Constant, ...]] = set()
+
+    def remembering(source: str, *constants: Constant) -> Kernel:
+        known.add((source, *constants))
+        return load(source, *constants)
+
+    with _few_kernels(remembering), tempfile.TemporaryDirectory() as folder:
+        for seed in _compiled_seeds():
+            in_memory(replace(_job(seed, Path(folder)), engine="numba"))
+    return known
+
+
+@contextlib.contextmanager
+def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
+    """Kernels are made for 128 channels or more, and kept from run to run."""
+    with (
+        patch.dict(os.environ, XDG_CACHE_HOME=str(ROOT / "build" / "fuzz" / "kernels")),
+        patch.object(_compiled_tables, "_LEAST_PAD", _CHANNELS),
+        patch.object(compiled, "load", loading),
+    ):
+        yield
+
+
+def _compile(data: bytes, folder: Path) -> None:
+    known = _kernels()
+
+    def loading(source: str, *constants: Constant) -> Kernel:
+        if (source, *constants) not in known:
+            raise _UnknownKernelError
+        return load(source, *constants)
+
+    job = replace(_job(data, folder), engine="numpy")
+    with _few_kernels(loading), contextlib.suppress(_UnknownKernelError):
+        _compare(job, replace(job, engine="numba"))
+
+
+@lru_cache(maxsize=1)
+def _compiled_seeds() -> Seeds:
+    """Few: every kind of packets and number of returns takes a kernel, and seconds to make it."""
+    makers = ("velodyne", "hesai", "robosense", "ouster")
+    return tuple(seed for maker in makers for seed in seeds_of(maker)[:: 2 * _EVERY])
+
+
+def _warm_seeds() -> Seeds:
+    _kernels()
+    return _compiled_seeds()
 
 
 # A pcap counts seconds in 32 bits.
 _LAST_NS = ((1 << 32) - 1) * 10**9
 
-TARGETS: Sequence[Target] = (Target("sessions", _seeds, _convert, mutated_parts, 2),)
+TARGETS: Sequence[Target] = (
+    Target("sessions", _seeds, _convert, mutated_parts, 2),
+    Target("sessions of two jobs", _seeds, _share, mutated_parts, 2),
+    *(
+        (Target("sessions, compiled", _warm_seeds, _compile, mutated_parts, 2),)
+        if is_installed()
+        else ()
+    ),
+)
