@@ -126,7 +126,7 @@ class Trail:
         """Go on to the next file: those far enough behind should be on the disk by now."""
         self._files.append((path, size))
         self._bytes += size
-        while self._bytes > _LATE_BYTES:
+        while self._bytes > _STEP_BYTES:
             path, size = self._files.popleft()
             self._bytes -= size
             # Whatever became of it, it was written well.
