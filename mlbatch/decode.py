@@ -18,7 +18,7 @@ from mlbatch.geometry import SECTORS, sectors
 from mlbatch.ledger import PointCounts
 from mlbatch.projection import Extras, Projector, Source, tile_columns
 from mlbatch.tiles import Tiles
-from mlbatch.types import EXTRAS, BoolArray, F64Array, I64Array, RunInfo, Scan, U8Array
+from mlbatch.types import EXTRAS, F64Array, I64Array, RunInfo, Scan, U8Array
 
 __all__ = ["Decoder", "Due", "Label", "Source"]
 
@@ -140,7 +140,7 @@ class Decoder:
     def _scan(self, due: Due, label: Label, points: int) -> Scan:
         rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
         lidar_id = self._lidar_id(due, slice(None))
-        passes = self._passes(due)
+        own = self._outlines(due)
         has_column = "column" in self._extras and not self._organized
         return Scan(
             info=self._info,
@@ -162,38 +162,53 @@ class Decoder:
             column_stamp_ns=due.stamp_ns,
             column_lidar_id=lidar_id,
             points=points,
-            columns_per_sensor=tuple(
-                np.bincount(lidar_id, minlength=len(self._info.sensors)).tolist()
-            ),
-            max_gap_ns=self._gaps(due.stamp_ns, lidar_id),
-            coverage=self._shares(passes >= 1),
-            overlap=self._shares(passes >= 2),
+            columns_per_sensor=tuple(one.columns for one in own),
+            max_gap_ns=tuple(one.max_gap_ns for one in own),
+            coverage=tuple(one.coverage for one in own),
+            overlap=tuple(one.overlap for one in own),
         )
 
-    def _passes(self, due: Due) -> I64Array:
-        """How often the rotor of each sensor entered each sector: (sensors, SECTORS)."""
-        passes = np.zeros((len(self._positions), SECTORS), np.int64)
-        for number, positions in enumerate(self._positions):
-            own = due.encoder if len(self._positions) == 1 else due.encoder[due.sensor == number]
-            if not len(own):
-                continue
-            sector = sectors(own, positions)
-            entered = np.flatnonzero(sector[1:] != sector[:-1]) + 1
-            passes[number] = np.bincount(sector[entered], minlength=SECTORS)
-            passes[number, sector[0]] += 1
-        return passes
+    def _outlines(self, due: Due) -> list[_Outline]:
+        """What the columns of each sensor are."""
+        if len(self._positions) == 1:
+            outline = _outline(due.stamp_ns, due.encoder, self._positions[0])
+            nothing = [_NO_COLUMNS] * (len(self._info.sensors) - 1)
+            return [*nothing[: self._only or 0], outline, *nothing[self._only or 0 :]]
+        # Sorted once, and as bytes: masks of each sensor cost more.
+        order = due.sensor.astype(np.uint8).argsort(kind="stable")
+        stamp_ns, encoder = due.stamp_ns[order], due.encoder[order]
+        ends = np.bincount(due.sensor, minlength=len(self._positions)).cumsum().tolist()
+        return [
+            _outline(stamp_ns[begin:end], encoder[begin:end], positions)
+            for begin, end, positions in zip([0, *ends], ends, self._positions, strict=False)
+        ]
 
-    def _shares(self, sectors_seen: BoolArray) -> tuple[float, ...]:
-        shares: list[float] = (np.count_nonzero(sectors_seen, axis=1) / SECTORS).tolist()
-        if self._only is None:
-            return tuple(shares)
-        return tuple(shares[0] if n == self._only else 0.0 for n in range(len(self._info.sensors)))
 
-    def _gaps(self, stamp_ns: I64Array, lidar_id: U8Array) -> tuple[int, ...]:
-        """Widest step between columns of each sensor, ns."""
-        numbers = range(len(self._info.sensors))
-        steps = (np.diff(stamp_ns[lidar_id == number]) for number in numbers)
-        return tuple(int(step.max(initial=0)) for step in steps)
+@dataclass(frozen=True, slots=True)
+class _Outline:
+    """The columns of a sensor in a scan, but for its points; shares are those of Scan."""
+
+    columns: int
+    max_gap_ns: int
+    coverage: float
+    overlap: float
+
+
+_NO_COLUMNS = _Outline(0, 0, 0.0, 0.0)
+
+
+def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> _Outline:
+    """Of the columns of one sensor, (n,) each; positions: see `sectors`."""
+    if not len(stamp_ns):
+        return _NO_COLUMNS
+    gap_ns = int((stamp_ns[1:] - stamp_ns[:-1]).max(initial=0))
+    # How often the rotor entered each sector.
+    sector = sectors(encoder, positions)
+    entered = sector[1:][sector[1:] != sector[:-1]]
+    passes = np.bincount(entered, minlength=SECTORS)
+    passes[sector[0]] += 1
+    once, again = np.count_nonzero(passes), np.count_nonzero(passes > 1)
+    return _Outline(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)
 
 
 def _alike(sources: Sequence[Source]) -> list[list[int]]:
