@@ -33,6 +33,7 @@ __all__ = [
     "merge",
     "open_recording",
     "readers",
+    "use_engine",
 ]
 
 _SHOWN_BYTES = 8
@@ -93,6 +94,20 @@ def open_recording(path: Path, streams: StreamTable) -> Recording:
     if path.is_dir():
         return _open_folder(path, streams)
     return _reader_of(path).open_packets(path, streams)
+
+
+@runtime_checkable
+class _Compilable(Protocol):
+    """A recording that compiled loops can read; `engine` says whether they do."""
+
+    engine: str
+
+
+def use_engine(recordings: Sequence[Recording], engine: str) -> None:
+    """Read from now on by the engine `numpy` or `numba`, where there is a choice."""
+    for recording in recordings:
+        if isinstance(recording, _Compilable):
+            recording.engine = engine
 
 
 def _reader_of(path: Path) -> Reader:

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.errors import RecordingError
+from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers import _links
 from mlbatch.readers._addresses import Addresses, StreamNumbers
 from mlbatch.readers._bytes import SLACK
@@ -101,16 +102,18 @@ class CaptureRecording:
     """A capture file; implements `Recording`.
 
     notes: what was wrong with the file, a line each; position_bytes: of `size_bytes` on disk, how
-    far reading has come; buffer_bytes and together: for tests, results do not depend on them.
+    far reading has come; engine: `numba` for compiled loops; buffer_bytes and together: for tests.
+    Results do not depend on these three.
     """
 
     path: Path
     container: str
     size_bytes: int
-    walker: Callable[[], Walker]
+    walker: Callable[[CaptureKernel | None], Walker]
     streams: StreamTable
     buffer_bytes: int = BUFFER_BYTES
     together: bool = True
+    engine: str = "numpy"
     counts: CaptureCounts = field(default_factory=CaptureCounts)
     notes: list[str] = field(default_factory=list)
     position_bytes: int = 0
@@ -158,10 +161,11 @@ class _Run:
 
     def __init__(self, recording: CaptureRecording) -> None:
         self.recording = recording
-        self.walker = recording.walker()
+        self.kernel = CaptureKernel() if recording.engine == "numba" else None
+        self.walker = recording.walker(self.kernel)
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
-        self.reassembler = Reassembler(recording.counts, recording.together)
+        self.reassembler = Reassembler(recording.counts, recording.together, self.kernel)
         self.unknown_link: int | None = None
         self.known_links = False
 
@@ -200,7 +204,7 @@ class _Run:
     def _batch(self, data: U8Array, frames: Frames) -> PacketBatch:
         """The packets that these frames hold or complete; everything else is counted."""
         self._note_links(frames.link)
-        found = dissect(data, frames, self.addresses)
+        found = dissect(data, frames, self.addresses, self.kernel)
         counts = self.recording.counts
         counts.frames += len(frames)
         for reason, count in found.skipped.items():

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers import _ipv6, _links
 from mlbatch.readers._addresses import Addresses
 from mlbatch.readers._bytes import Records, records
@@ -74,7 +75,7 @@ class Frames:
     def __len__(self) -> int:
         return len(self.start)
 
-    def take(self, rows: slice) -> Frames:
+    def take(self, rows: slice | I64Array) -> Frames:
         """The frames at `rows`."""
         return Frames(
             self.start[rows],
@@ -135,18 +136,32 @@ class Dissection:
     skipped: dict[str, int]
 
 
-def dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:
+def dissect(
+    data: U8Array, frames: Frames, addresses: Addresses, kernel: CaptureKernel | None = None
+) -> Dissection:
     """Find the UDP content of all frames; datagrams and fragments come in file order."""
-    datagrams = _plain(data, frames)
-    if datagrams is not None:
-        return Dissection(datagrams, Fragments.none(), {})
+    if bool((frames.link == _ETHERNET).all()):
+        found = _by_kernel(kernel, data, frames, addresses) if kernel else _plain(data, frames)
+        if found is not None:
+            return found
     return _dissect(data, frames, addresses)
 
 
-def _plain(data: U8Array, frames: Frames) -> Datagrams | None:
-    """What whole datagrams in usual headers hold; None where not all frames are such."""
-    if not bool((frames.link == _ETHERNET).all()):
+def _by_kernel(
+    kernel: CaptureKernel, data: U8Array, frames: Frames, addresses: Addresses
+) -> Dissection | None:
+    """What Ethernet frames hold; None where frames hold something that compiled loops leave out."""
+    found = kernel.dissect(data, frames.start, frames.captured, frames.original)
+    rest = _dissect(data, frames.take(found.others), addresses)
+    if len(rest.datagrams.frame) or len(rest.fragments):
         return None
+    frame, source, destination, ident, offset, more, start, size = found.fragments
+    parts = Fragments(frame, source, destination, ident, offset, more != 0, start, size)
+    return Dissection(Datagrams(*found.datagrams), parts, rest.skipped)
+
+
+def _plain(data: U8Array, frames: Frames) -> Dissection | None:
+    """What Ethernet frames hold that are whole datagrams in usual headers; None if not all are."""
     header = records(data, _USUAL, frames.start)
     size = header["length"].astype(np.int64)
     is_usual = (header["kind"] & _USUAL_MASK) == _USUAL_KIND
@@ -157,13 +172,14 @@ def _plain(data: U8Array, frames: Frames) -> Datagrams | None:
     is_usual &= frames.captured >= frames.original
     if not is_usual.all():
         return None
-    return Datagrams(
+    datagrams = Datagrams(
         frame=np.arange(len(frames)),
         start=frames.start + _USUAL.itemsize,
         size=size - UDP.itemsize,
         source=header["source"].astype(np.int64),
         port=header["port"].astype(np.int64),
     )
+    return Dissection(datagrams, Fragments.none(), {})
 
 
 def _dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:

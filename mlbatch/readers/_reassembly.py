@@ -6,10 +6,12 @@ chain is a run of fragments of one set in which each continues the one before.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers._bytes import copy_runs, records
 from mlbatch.readers._fragments import MAX_AGE_NS, MAX_DATAGRAM_BYTES, MAX_SETS, SetTable
 from mlbatch.readers._frames import UDP, Datagrams, Fragments, in_order
@@ -43,6 +45,7 @@ class Reassembler:
 
     counts: CaptureCounts
     together: bool = True
+    kernel: CaptureKernel | None = None
     sets: SetTable = field(init=False)
 
     def __post_init__(self) -> None:
@@ -62,7 +65,8 @@ class Reassembler:
             return self._one_by_one(data, fragments, host_ns, every, 0)
         self.sets.expire(int(host_ns[0]))
         usable = self._undisturbed(chains, fragments)
-        done, end = _assemble(data, fragments, chains, usable)
+        copy = copy_runs if self.kernel is None else self.kernel.copy_runs
+        done, end = _assemble(data, fragments, chains, usable, copy)
         lengths = chains.stop - chains.start
         self.counts.skip("fragment", int((lengths[usable] - 1).sum()))
         rest = np.sort(chains.order[np.repeat(~usable, lengths)])
@@ -135,7 +139,11 @@ def _find_chains(data: U8Array, fragments: Fragments, host_ns: I64Array) -> _Cha
 
 
 def _assemble(
-    data: U8Array, fragments: Fragments, chains: _Chains, usable: BoolArray
+    data: U8Array,
+    fragments: Fragments,
+    chains: _Chains,
+    usable: BoolArray,
+    copy: Callable[[U8Array, I64Array, I64Array, U8Array, I64Array], None],
 ) -> tuple[Datagrams, int]:
     """Copy the usable chains to the front of `data`; the datagrams and the first free byte."""
     lengths = (chains.stop - chains.start)[usable]
@@ -143,7 +151,7 @@ def _assemble(
     total = chains.total[usable]
     place = np.cumsum(total) - total
     target = np.repeat(place, lengths) + fragments.offset[rows]
-    copy_runs(data, fragments.start[rows], fragments.size[rows], data, target)
+    copy(data, fragments.start[rows], fragments.size[rows], data, target)
     last = chains.order[chains.stop[usable] - 1]
     datagrams = Datagrams(
         frame=fragments.frame[last],

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.errors import RecordingError
+from mlbatch.kernels.capture import NO_ROOM, TOO_LONG
+from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers import _links
 from mlbatch.readers._bytes import records
 from mlbatch.readers._capture import MAX_FRAME_BYTES, CaptureRecording, Walk
@@ -68,17 +70,23 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
 class _Walker:
     """Steps from record to record."""
 
-    def __init__(self, order: str, unit_ns: int, link: int) -> None:
+    def __init__(
+        self, order: str, unit_ns: int, link: int, kernel: CaptureKernel | None = None
+    ) -> None:
         names = ("seconds", "fraction", "captured", "original")
         self.layout = np.dtype([(name, order + "u4") for name in names])
         self.length = struct.Struct(order + "I")
         self.unit_ns = unit_ns
         self.link = link
+        self.kernel = kernel
+        self.is_swapped = order == ">"
         self.skip = _FILE_HEADER_BYTES
 
     def walk(self, data: U8Array, begin: int, end: int) -> Walk:
         """The frames in `data[begin:end]`, as far as their records are whole."""
         begin, self.skip = begin + self.skip, 0
+        if self.kernel is not None:
+            return self._walk_by(self.kernel, data, begin, end)
         starts = self._starts(data, begin, end)
         record = records(data, self.layout, starts)
         captured = record["captured"].astype(np.int64)
@@ -95,9 +103,24 @@ class _Walker:
         )
         place = int(after[count - 1]) if count else begin
         if len(lies):
-            fault = f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {captured[count]}"
-            return Walk(place, fault=fault, frames=frames)
+            return Walk(place, fault=_too_long(int(captured[count])), frames=frames)
         more = int(captured[count]) if count < len(starts) else 0
+        return Walk(place, _RECORD_BYTES + more, frames=frames)
+
+    def _walk_by(self, kernel: CaptureKernel, data: U8Array, begin: int, end: int) -> Walk:
+        """The same, by compiled loops; at most as many frames as they have room for."""
+        records, place, why = kernel.walk(
+            data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
+        )
+        start, captured, original, host_ns = records
+        link = np.full(len(start), self.link, np.int64)
+        frames = Frames(start, captured, original, link, host_ns)
+        if why == NO_ROOM:
+            return Walk(place, frames=frames)
+        is_told = place <= end - _RECORD_BYTES
+        more = self.length.unpack_from(data.data, place + _LENGTH_AT)[0] if is_told else 0
+        if why == TOO_LONG:
+            return Walk(place, fault=_too_long(more), frames=frames)
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
     def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
@@ -127,3 +150,7 @@ class _Walker:
         others = (lengths != length).nonzero()[0]
         run = int(others[0]) if len(others) else count
         return begin + step * np.arange(run)
+
+
+def _too_long(size: int) -> str:
+    return f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {size}"

@@ -43,7 +43,8 @@ def recognises(head: bytes) -> bool:
 def open_packets(path: Path, streams: StreamTable) -> Recording:
     """Open a pcapng file; its payloads come from streams (source IP, destination port)."""
     read_head(path)
-    return CaptureRecording(path, CONTAINER, path.stat().st_size, _Walker, streams)
+    size_bytes = path.stat().st_size
+    return CaptureRecording(path, CONTAINER, size_bytes, lambda _: _Walker(), streams)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ def open_capture(
     *,
     buffer_bytes: int | None = None,
     together: bool = True,
+    engine: str = "numpy",
     streams: StreamTable | None = None,
 ) -> CaptureRecording:
     """An opened capture with the buffer of a test."""
@@ -36,6 +37,7 @@ def open_capture(
     assert isinstance(recording, CaptureRecording)
     recording.buffer_bytes = buffer_bytes or recording.buffer_bytes
     recording.together = together
+    recording.engine = engine
     return recording
 
 
