@@ -1,6 +1,6 @@
 """How long a packet takes from its arrival to the partial scan that it completes.
 
-    python -m tests.bench.latency RECORDING --rig RIG --slices 10
+    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine numba
 
 Packets go one by one, as a driver on the vehicle would hand them over, through the classes that a
 conversion uses: `Feeder.feed`, `Batcher.push`, `Decoder.scan`. Memory is collected as ever. CPU
@@ -24,6 +24,7 @@ from mlbatch.assembly import boxes_of, run_info, source_of
 from mlbatch.decode import Decoder, Due, Label
 from mlbatch.discover import Wishes
 from mlbatch.job import Job
+from mlbatch.kernels import ENGINES
 from mlbatch.pipeline import Conversion
 from mlbatch.readers import merge
 from mlbatch.types import PacketBatch
@@ -81,7 +82,8 @@ class Driver:
             info = run_info(run.setup, job, run.grid, "utc")
             members = zip(run.setup.sensors, run.feeds, info.sensors, strict=True)
             sources = [source_of(one, feed, told.ring_base, job) for one, feed, told in members]
-            self._decoder = Decoder(info, sources, boxes_of(run.setup, job), job.extras)
+            boxes_m = boxes_of(run.setup, job)
+            self._decoder = Decoder(info, sources, boxes_m, job.extras, engine=run.engine)
         return self._decoder
 
 
@@ -141,11 +143,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("recording", type=Path)
     parser.add_argument("--rig", type=Path)
     parser.add_argument("--slices", type=int, default=10)
+    parser.add_argument("--engine", choices=ENGINES, default="numpy")
     parser.add_argument("--warm", type=int, default=2000, help="packets before the first measured")
     parser.add_argument("--packets", type=int, default=20_000, help="how many are measured")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    job = Job((options.recording,), Wishes(rig=options.rig), slices=options.slices)
+    wishes = Wishes(rig=options.rig)
+    job = Job((options.recording,), wishes, slices=options.slices, engine=options.engine)
     found = figures(measure(job, options.warm, options.packets))
     if options.json:
         print(json.dumps({name: asdict(one) for name, one in found.items()}))
