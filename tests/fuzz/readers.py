@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import importlib
+import os
 import random
 import struct
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import zstandard
 
-from mlbatch.readers import open_recording
+from mlbatch.errors import MlbatchError
+from mlbatch.kernels import is_installed
+from mlbatch.readers import open_recording, use_engine
 from mlbatch.readers._capture import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from tests.builders import mcaps, rosbag1
@@ -31,6 +36,7 @@ from tests.builders.captures import (
 )
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.traffic import frames
+from tests.contract.tree import ROOT
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 
@@ -76,6 +82,51 @@ def _read_file(name: str, data: bytes, folder: Path) -> None:
     if isinstance(recording, CaptureRecording):
         recording.buffer_bytes = _BUFFERS[len(data) % len(_BUFFERS)]
     read_all(recording, streams)
+
+
+def _both_engines(data: bytes, folder: Path) -> None:
+    """Compiled loops find in a capture what numpy finds."""
+    path = folder / "a.pcap"
+    path.write_bytes(data)
+    with kernels_kept():
+        one, other = (_told(path, engine) for engine in ("numpy", "numba"))
+    if one != other:
+        raise BrokenLaw("compiled loops read other packets than numpy")
+
+
+def _told(path: Path, engine: str) -> list[object]:
+    """All that a reader says of a capture; how it cuts batches is its own affair."""
+    streams = StreamTable()
+    recording = open_recording(path, streams)
+    use_engine([recording], engine)
+    if isinstance(recording, CaptureRecording):
+        recording.buffer_bytes = _BUFFERS[path.stat().st_size % len(_BUFFERS)]
+    told: list[object] = []
+    try:
+        for batch in recording.packets():
+            check_batch(batch, streams)
+            rows = zip(batch.start, batch.size, batch.stream, batch.host_ns, strict=True)
+            told += [
+                (int(stream), int(host_ns), batch.data[start : start + size].tobytes())
+                for start, size, stream, host_ns in rows
+            ]
+    except MlbatchError as err:
+        told.append(str(err))
+    return [*told, recording.counts, recording.notes]
+
+
+@contextlib.contextmanager
+def kernels_kept() -> Iterator[None]:
+    """Compiled kernels are kept from run to run, in a folder of their own."""
+    with patch.dict(os.environ, XDG_CACHE_HOME=str(ROOT / "build" / "fuzz" / "kernels")):
+        yield
+
+
+def _warm_pcaps() -> Seeds:
+    """To compile kernels takes longer than an input may."""
+    with tempfile.TemporaryDirectory() as folder:
+        _both_engines(_pcaps()[0], Path(folder))
+    return _pcaps()
 
 
 # -- captures -------------------------------------------------------------------------------------
@@ -291,10 +342,15 @@ def _file_target(
 TARGETS: Sequence[Target] = (
     _file_target("pcap", _pcaps, share=14),
     _file_target("pcapng", _pcapngs, share=14),
+    *(
+        (Target("read pcap, compiled", _warm_pcaps, _both_engines, mutated, 8),)
+        if is_installed()
+        else ()
+    ),
     _file_target("compressed", _containers, _compressed),
     _file_target("mcap", _mcaps, mutated_mcap, share=14),
     _file_target("bag", _bags, share=12),
     _file_target("db3", _databases, share=12),
     Target("read folder", _metadata, _read_folder, mutated_text, 3),
 )
-__all__ = ["TARGETS", "check_batch", "mutated_mcap", "read_all"]
+__all__ = ["TARGETS", "check_batch", "kernels_kept", "mutated_mcap", "read_all"]

@@ -6,7 +6,6 @@ Threads and compiled kernels read and write where arrays tell them: they must gi
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import tempfile
 import zlib
@@ -25,11 +24,11 @@ from mlbatch.kernels import is_installed
 from mlbatch.kernels.native import Constant, Kernel, load
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.run import in_memory, prints
-from tests.contract.tree import ROOT
 from tests.fuzz.framing import mutated_parts, parts_of
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds
 from tests.fuzz.packets import CALIBRATION, NAMES, seeds_of
+from tests.fuzz.readers import kernels_kept
 from tests.property.test_damage import check_ledgers, check_output
 
 _SOURCE, _HOST = "192.168.1.201", "192.168.1.10"
@@ -118,7 +117,7 @@ def _kernels() -> set[tuple[Constant, ...]]:
 def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
     """Kernels are made for 128 channels or more, and kept from run to run."""
     with (
-        patch.dict(os.environ, XDG_CACHE_HOME=str(ROOT / "build" / "fuzz" / "kernels")),
+        kernels_kept(),
         patch.object(_compiled_tables, "_LEAST_PAD", _CHANNELS),
         patch.object(compiled, "load", loading),
     ):
