@@ -48,12 +48,16 @@ def is_compiled(projector: Projector) -> bool:
         isinstance(projection, Tabled) and projection.origin.shape[2] == 1
     )
     fits = lidar.returns <= _MOST_RETURNS and padded(lidar.channels) <= _MOST_PAD
+    # What numpy would refuse as an index, a kernel would write beyond a row.
+    fits &= int(projector.number.max()) < projector.slots
     return known and fits and lidar.pixels is not None and _is_read(lidar, lidar.pixels)
 
 
 def _is_read(lidar: Lidar, table: PixelTable) -> bool:
     """Whether the pixels are of the shapes that kernels read, and inside of the records."""
     records = lidar.records
+    if any(channel >= lidar.channels for channel in table.dark):
+        return False
     for echo in table.echoes:
         fields = [one for one in (echo.distance, echo.intensity, echo.reflectivity) if one]
         ends = [run.first_byte + run.channels * table.step for run in echo.runs]
@@ -68,6 +72,7 @@ def _is_read(lidar: Lidar, table: PixelTable) -> bool:
             level = Bits(2, "u1")
             good = echo.distance.first == 0 and echo.intensity == level and len(fields) == 2
             ends = [end - table.step + _READING_BYTES for end in ends]
+        good &= all(run.channel + run.channels <= lidar.channels for run in echo.runs)
         if not good or max(ends) > records.size:
             return False
     return True
