@@ -3,7 +3,7 @@
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
 #   make test    formatting, lint, types, all tests, branch coverage
 #   make lint    the first three of them
-#   make bench   speed, memory and writers (needs the shared recordings and 10 GB in build/bench)
+#   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make clean   remove what the others made
 
@@ -35,11 +35,8 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/mypy
 
 bench: $(VENV)/dev.stamp
-	@mkdir -p build/bench
 	$(BIN)/python -m pytest -m slow
-	$(BIN)/python -m tests.bench.run speed --folder build/bench
-	$(BIN)/python -m tests.bench.run memory --folder build/bench
-	$(BIN)/python -m tests.bench.run writers --folder build/bench
+	$(BIN)/mlbatch bench $(BENCH)
 
 INPUTS ?= 1000000
 SEED ?= 1
