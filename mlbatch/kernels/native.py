@@ -121,7 +121,10 @@ def _processor() -> tuple[str, str]:
     """Name and abilities of the CPU, as llvm knows them."""
     import llvmlite.binding as llvm
 
-    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    features = llvm.get_host_cpu_features().flatten()
+    # Loads of lanes from many places are slower than single loads on many CPUs that have them.
+    slow = ",+prefer-no-gather" if "+avx2" in features.split(",") else ""
+    return llvm.get_host_cpu_name(), features + slow
 
 
 @lru_cache(maxsize=1)
