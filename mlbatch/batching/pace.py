@@ -105,7 +105,8 @@ class PaceLoss:
         measured = np.flatnonzero(heads.valid.any(axis=1))
         ticks = rotor_ticks(heads.encoder)
         packets = _Packets(
-            heads.stamp_ns[:, 0],
+            # A copy: else the stamps of all columns would be kept.
+            heads.stamp_ns[:, 0].copy(),
             host_ns,
             ticks[:, 0].astype(np.float64) * _TURNS_PER_TICK,
             ticks[:, -1].astype(np.float64) * _TURNS_PER_TICK,
@@ -263,7 +264,8 @@ class _Sectors:
     def passes(self, begin: F64Array, turned: F64Array) -> F64Array:
         """(g, k) how often rotors pass them that turn from `begin` on by `turned`."""
         ahead = begin[:, None] - (self.begin + self.width / 2)
-        return np.floor(ahead + turned[:, None]) - np.floor(ahead)
+        count: F64Array = np.floor(ahead + turned[:, None]) - np.floor(ahead)
+        return count
 
     def angles(self, begin: F64Array, turned: F64Array, pitch: F64Array) -> F64Array:
         """(g,) angles that a sensor measures at while it turns so, from `begin` on.
