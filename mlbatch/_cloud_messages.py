@@ -185,7 +185,7 @@ def _custom(message: Message) -> _Raw:
     count = cursor.number("I")
     step, size = _CUSTOM_STEPS[message.topic.encoding], _CUSTOM_POINT.itemsize
     at = cursor.place(step * (count - 1) + size if count else 0)
-    rows = np.ndarray((count,), _CUSTOM_POINT, message.data, at, (step,))
+    rows: Rows = np.ndarray((count,), _CUSTOM_POINT, message.data, at, (step,))
     if base_ns == 0:
         base_ns, base = stamp_ns, "the header's stamp"
     return _Raw(rows, Zero("offset_time (uint32)", base_ns, base), frame)
@@ -223,10 +223,10 @@ def _cloud2(message: Message) -> _Raw:
             "bytes of data; the cloud was cut off, or written wrongly"
         )
     layout, chosen = _layout(fields, step)
-    rows = np.ndarray((height, width), layout, message.data, at, (row_step, step)).reshape(-1)
+    rows: Rows = np.ndarray((height, width), layout, message.data, at, (row_step, step))
     type_name = np.dtype(_TYPES[chosen.type]).name
     zero = Zero(f"{chosen.name} ({type_name})", stamp_ns, "the header's stamp")
-    return _Raw(rows, zero, frame)
+    return _Raw(rows.reshape(-1), zero, frame)
 
 
 def _layout(fields: Mapping[str, _Field], step: int) -> tuple[np.dtype[np.void], _Field]:

@@ -170,7 +170,7 @@ def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:
     key = (points.stamp_ns - points.stamp_ns.min()) << 16
     if points.ring is not None:
         key |= points.ring
-    order = np.arange(len(key))
+    order: I64Array = np.arange(len(key))
     if bool((key[1:] < key[:-1]).any()):
         order = np.argsort(key, kind="stable")
     stamp_ns = points.stamp_ns[order]
@@ -182,7 +182,8 @@ def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:
 def _rank(is_first: BoolArray) -> I64Array:
     """Place of each element in its run; runs begin where `is_first`."""
     place = np.arange(len(is_first))
-    return place - np.maximum.accumulate(np.where(is_first, place, 0))
+    begin: I64Array = np.maximum.accumulate(np.where(is_first, place, 0))
+    return place - begin
 
 
 def _same_ring(ring: U16Array | I64Array, is_first: BoolArray) -> I64Array:

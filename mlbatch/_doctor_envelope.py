@@ -104,7 +104,7 @@ def groups(host_ns: I64Array, offset_ns: I64Array, part: Part, most: int) -> I64
     count = len(host_ns)
     wanted = min(part.span_ns // GROUP_NS, part.packets // GROUP_PACKETS, most, count)
     size = -(-count // max(wanted, 1))
-    starts = np.arange(0, count, size)
+    starts: I64Array = np.arange(0, count, size)
     if len(starts) > 1 and count - starts[-1] < size // 2:
         # A short rest may hold delayed packets alone.
         starts = starts[:-1]

@@ -320,7 +320,8 @@ def stretch_of(
 
 
 def _outside(value: I64Array, low: int, high: int) -> I64Array:
-    return np.maximum(low - value, 0) + np.maximum(value - high, 0)
+    away: I64Array = np.maximum(low - value, 0) + np.maximum(value - high, 0)
+    return away
 
 
 def _stretch(course: Course, number: int, period_ns: int) -> Stretch:

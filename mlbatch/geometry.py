@@ -102,7 +102,8 @@ def rotor_words(turns: F64Array, turns_per_s: F64Array, table: I64Array | int = 
     speed = np.minimum(np.maximum(steps, -_SPEED_LIMIT), _SPEED_LIMIT).astype(np.int64)
     speed &= (1 << _SPEED_BITS) - 1
     speed <<= _ANGLE_BITS
-    return angle | (speed | np.asarray(table) << (_ANGLE_BITS + _SPEED_BITS))
+    words: I64Array = angle | (speed | np.asarray(table) << (_ANGLE_BITS + _SPEED_BITS))
+    return words
 
 
 def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:
@@ -172,7 +173,8 @@ class Tabled:
         self._taken = np.empty((columns, 3, self.direction.shape[2]), np.float32)
         self._moved = np.empty_like(self._taken)
         self._reached_m = np.empty((columns, self.direction.shape[2]), np.float32)
-        self._towards, self._from = self._taken, self._taken
+        self._towards: F32Array = self._taken
+        self._from: F32Array = self._taken
         self._reach_m = self.reaches_m[0]
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:

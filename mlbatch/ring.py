@@ -91,7 +91,7 @@ class RawRing:
         begin, end = records.start, records.start + rows * records.stride
         self._rows = self._bytes[begin:end].reshape(rows, -1)
         # As bytes of one element each, pieces may overlap and still move in one go.
-        self._pieces = np.ndarray(
+        self._pieces: npt.NDArray[np.void] = np.ndarray(
             (rows, records.per_row),
             np.dtype((np.void, records.size)),
             buffer=self._bytes.data,

@@ -51,7 +51,7 @@ def ranked(accepted: Sequence[Delivery | None]) -> tuple[list[I64Array], I64Arra
     events = [_NONE if delivery is None else delivery.packets.position for delivery in accepted]
     delivering = [number for number, event in enumerate(events) if len(event)]
     if len(delivering) == 1:
-        ranks = [np.arange(len(event)) for event in events]
+        ranks: list[I64Array] = [np.arange(len(event)) for event in events]
         return ranks, events[delivering[0]]
     position = np.concatenate(events)
     order = position.argsort(kind="stable")

@@ -119,9 +119,9 @@ def _lay(pad: int) -> Callable[[Pointer, Pointer, Pointer, Pointer, Pointer], No
     return lay
 
 
-def _turn_on(pad: int) -> Callable[[Pointer, Pointer, float, Pointer], None]:
+def _turn_on(pad: int) -> Callable[[Pointer, Pointer, np.float32, Pointer], None]:
     @piece
-    def turn_on(cosine: Pointer, sine: Pointer, speed: float, firing_ns: Pointer) -> None:
+    def turn_on(cosine: Pointer, sine: Pointer, speed: np.float32, firing_ns: Pointer) -> None:
         for beam in range(pad):
             before, aside = cosine[beam], sine[beam]
             turned = speed * firing_ns[beam]

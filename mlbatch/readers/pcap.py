@@ -19,7 +19,7 @@ from mlbatch.readers._bytes import records
 from mlbatch.readers._capture import MAX_FRAME_BYTES, CaptureRecording, Walk
 from mlbatch.readers._frames import Frames
 from mlbatch.readers._source import read_head
-from mlbatch.types import I64Array, Recording, StreamTable, U8Array
+from mlbatch.types import I64Array, Recording, StreamTable, U8Array, U32Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 CONTAINER = "pcap"
@@ -146,7 +146,8 @@ class _Walker:
         """Where records begin that follow each other with frames of one length; none to many."""
         step = _RECORD_BYTES + length
         count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
-        lengths = np.ndarray(count, self.layout["captured"], data.data, begin + _LENGTH_AT, (step,))
+        at = begin + _LENGTH_AT
+        lengths: U32Array = np.ndarray(count, self.layout["captured"], data.data, at, (step,))
         others = (lengths != length).nonzero()[0]
         run = int(others[0]) if len(others) else count
         return begin + step * np.arange(run)

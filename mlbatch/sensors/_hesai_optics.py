@@ -45,7 +45,7 @@ class OffAxis:
         self._on_axis = Turning(on_axis.moved(body_from_sensor), firing_ns, columns)
         miss_m2 = (centre_m**2).sum() - _along(on_axis, centre_m) ** 2
         self._miss_m2 = miss_m2.astype(np.float32)
-        self._aimed = np.empty(0, np.int64), np.empty(0, np.int64)
+        self._aimed: tuple[I64Array, I64Array] = np.empty(0, np.int64), np.empty(0, np.int64)
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
         """Prepare for columns."""

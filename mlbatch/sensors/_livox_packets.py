@@ -77,7 +77,8 @@ def stamps_ns(packets: U8Array, points: int) -> I64Array:
     interval_ns = head["interval"].astype(np.int64)[:, None] * _NS_PER_INTERVAL
     # Times of damaged packets may be beyond int64: they turn negative, and are rejected as such.
     first_ns = head["stamp_ns"].astype(np.int64)[:, None]
-    return first_ns + interval_ns * np.arange(points) // points
+    stamp_ns: I64Array = first_ns + interval_ns * np.arange(points) // points
+    return stamp_ns
 
 
 def read_points(

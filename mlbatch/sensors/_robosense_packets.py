@@ -15,7 +15,7 @@ from mlbatch.lidar import FAULTS, Records
 from mlbatch.pixels import PixelTable, readings
 from mlbatch.sensors._recognise_bytes import number, starts
 from mlbatch.sensors._robosense_models import READING, Layout, Model
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CDEG_PER_TURN = 36000
@@ -149,7 +149,7 @@ class PacketReader:
         for part in range(self._model.blocks_per_round if count else 0):
             begin = which * self._shape.return_step + part * self._model.layout.stride
             channels = slice(part * per_block, (part + 1) * per_block)
-            raw = np.ndarray((count, per_block), ">u2", records, begin, (size, READING))
+            raw: U16Array = np.ndarray((count, per_block), ">u2", records, begin, (size, READING))
             if self._model.range_mask != 0xFFFF:
                 raw = raw & np.uint16(self._model.range_mask)
             np.divide(raw, self._units_per_m, out=out.range_m[:, channels])

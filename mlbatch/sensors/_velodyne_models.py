@@ -96,7 +96,8 @@ def beam_table(model: Model, file: VelodyneFile | None, *, raised: bool) -> Beam
         azimuth_rad = np.array(model.clockwise_deg) * RAD_PER_DEG
         elevation_rad = np.array(model.elevation_deg) * RAD_PER_DEG
         height_m = np.array(model.height_mm) * M_PER_MM
-        side_m, reach_m = np.zeros(model.lasers), np.zeros(1)
+        side_m: F64Array = np.zeros(model.lasers)
+        reach_m: F64Array = np.zeros(1)
     else:
         azimuth_rad, elevation_rad = -file.azimuth_rad, file.elevation_rad
         height_m, side_m = file.vert_offset_m, file.horiz_offset_m

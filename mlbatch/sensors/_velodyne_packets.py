@@ -27,7 +27,7 @@ from mlbatch.sensors._velodyne_calibration import VelodyneFile
 from mlbatch.sensors._velodyne_clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors._velodyne_hdl64 import hdl64_projection
 from mlbatch.sensors._velodyne_models import Layout, Model, beam_table, layout, ranks
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S
 
 MAKER = "Velodyne"
@@ -139,7 +139,7 @@ class VelodyneLidar(TurningLidar):
         count, lasers = len(records), self._layout.lasers_per_bank
         for bank, byte in enumerate(self._layout.first_byte[which]):
             place = slice(bank * lasers, (bank + 1) * lasers)
-            raw = np.ndarray(
+            raw: U16Array = np.ndarray(
                 (count, lasers), "<u2", buffer=records, offset=byte, strides=(records.strides[0], 3)
             )
             np.divide(raw, np.float32(self._model.units_per_m), out=out.range_m[:, place])
@@ -175,7 +175,8 @@ class VelodyneLidar(TurningLidar):
         group_ns = self._measured.sequence_ns * self._model.halves
         speed = mean_step(step, gap) / group_ns
         delay_ns = np.zeros(azimuth.shape, np.int64)
-        rows = gap.any(axis=1).nonzero()[0]
+        some: BoolArray = np.logical_or.reduce(gap, axis=1)
+        rows = some.nonzero()[0]
         if len(rows):
             own = speed[rows]
             # Over half a turn the speed of many packets is surer than that of a few blocks.

@@ -88,7 +88,7 @@ def _pair(points: Points) -> Values | None:
     """Return type and sensor: the last two of the eight bytes of a label."""
     if points.labels is None:
         return None
-    last: Values = (points.labels >> np.uint64(48)).astype(PAIR)
+    last: Values = np.right_shift(points.labels, np.uint64(48)).astype(PAIR)
     return last
 
 
