@@ -27,7 +27,7 @@ from mlbatch.job import Job
 from mlbatch.kernels import ENGINES
 from mlbatch.pipeline import Conversion
 from mlbatch.readers import merge
-from mlbatch.types import PacketBatch
+from mlbatch.types import BoolArray, PacketBatch
 from mlbatch.units import NS_PER_US
 
 QUANTILES: Final = (0.5, 0.99, 1.0)
@@ -126,9 +126,7 @@ def _times(taken: Taken) -> Sequence[Sequence[int]]:
     return taken.cpu_ns, taken.wall_ns
 
 
-def _us(
-    values_ns: Sequence[int], rows: np.ndarray[tuple[int], np.dtype[np.bool_]]
-) -> tuple[float, ...]:
+def _us(values_ns: Sequence[int], rows: BoolArray) -> tuple[float, ...]:
     chosen = np.array(values_ns)[rows] / NS_PER_US
     return tuple(np.quantile(chosen, QUANTILES, method="inverted_cdf").tolist())
 

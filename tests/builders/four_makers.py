@@ -252,7 +252,8 @@ def _datagrams(place: Place) -> list[_Datagram]:
 def _beside(place: Place) -> list[tuple[int, int, bytes]]:
     """Arrival, port and payload of what sensors send besides points."""
     if place is VELODYNE:
-        times_us = np.arange(2_000, (END_NS - START_NS) // 1000 - 5_000, 1e-3 * POSITION_STEP_NS)
+        end_us, step_us = (END_NS - START_NS) // 1000 - 5_000, 1e-3 * POSITION_STEP_NS
+        times_us = np.arange(2_000, end_us, step_us, dtype=np.float64)
         sent = velodyne.position_packets(VELODYNE_SPEC, times_us)
         rows: Payloads = [
             (int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)

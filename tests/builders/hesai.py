@@ -125,12 +125,13 @@ def azimuths_deg(spec: HesaiSpec, columns: int) -> F64Array:
 
 def offsets_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n, channels) firing of each beam after its block's time; NEVER where it does not fire."""
+    number: I64Array = np.arange(columns)
     if spec.model == "QT128C2X":
         # Column 0 is of loop 1; a packet says 1 for loop 1 first.
-        return TABLES["QT128C2X"][np.arange(columns) % 2]
+        return TABLES["QT128C2X"][number % 2]
     if spec.model in STATES:
         tables = [STATES[spec.model][spec.operation, state] for state in range(_states(spec))]
-        return np.stack(tables)[np.arange(columns) % len(tables)]
+        return np.stack(tables)[number % len(tables)]
     return np.broadcast_to(TABLES[spec.model], (columns, spec.row.channels))
 
 

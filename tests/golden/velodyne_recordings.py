@@ -56,7 +56,8 @@ class Case:
     def known_well(self, theirs: Decoded) -> BoolArray:
         """Their points in packets without a blind sector, which they misplace by 50 ms."""
         packet: I64Array = theirs.column // self.columns
-        return np.isin(packet, theirs.behind_jump.any(axis=1).nonzero()[0], invert=True)
+        blind = np.flatnonzero(theirs.behind_jump.any(axis=1))
+        return np.isin(packet, blind, invert=True)
 
 
 SINGLE = "strongest return"

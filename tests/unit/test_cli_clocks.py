@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mlbatch.types import I64Array
 from tests.unit.sessions import FIXTURE, NS_PER_S, Shell, Unit, twin, write_session
 
 Report = dict[str, Any]
@@ -87,9 +88,9 @@ def test_an_epoch_in_the_rig_makes_them_comparable(shell: Shell, tmp_path: Path)
     assert [sensor["columns"]["written"] for sensor in report["sensors"]] == [1024, 1024]
 
 
-def _stamps(folder: Path, sensor: int) -> np.ndarray[Any, Any]:
+def _stamps(folder: Path, sensor: int) -> I64Array:
     """Stamps of the last columns of a sensor; how many come before depends on the first window."""
-    stamps = []
+    stamps: list[I64Array] = []
     for path in sorted(folder.glob("[0-9]*.npz")):
         with np.load(path) as scan:
             own = scan["column_lidar_id"] == sensor

@@ -69,7 +69,7 @@ def _write_velodyne(folder: Path) -> None:
     for name, model in (("vlp32c", "VLP-32C"), ("hdl64", "HDL-64E S3")):
         payloads = velodyne_payloads(replace(VLP16, model=model), FEW)
         write_capture(folder / name, framed(payloads, IP, PORT))
-    positions = listed(position_packets(VLP16, np.arange(0.0, 4e5, 1e5)))
+    positions = listed(position_packets(VLP16, np.arange(0.0, 4e5, 1e5, dtype=np.float64)))
     write_capture(folder / "positions", framed(positions, IP, 8308))
     alike = [(host_ns, payload + bytes(6)) for host_ns, payload in few]
     write_capture(folder / "alike", framed(alike, IP, PORT))

@@ -42,7 +42,7 @@ def _by_hand(axis: str, beam: int, range_m: float, angle: float, lens_m: float) 
 @pytest.mark.parametrize("rotor_hz", [0.0, 10.0, -20.0])
 def test_beams_fire_while_the_rotor_goes_on(axis: str, lens_m: float, rotor_hz: float) -> None:
     turning = Turning(_beams(axis, lens_m).moved(POSE), FIRING_NS, 64)
-    turns = np.linspace(-0.3, 1.4, 41)
+    turns = np.linspace(-0.3, 1.4, 41, dtype=np.float64)
     table = np.arange(41) % 2
     turning.aim(np.zeros(41, np.int64), rotor_words(turns, np.full(41, rotor_hz), table))
     range_m = np.linspace(0.5, 120, 41 * 4).reshape(41, 4).astype(np.float32)

@@ -125,7 +125,8 @@ def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArra
 
 def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[RawRing, I64Array]:
     """A ring that was gone around, and the places of columns that it still holds."""
-    ring, places = RawRing(lidar.packet_size, lidar.records), np.empty(0, np.int64)
+    ring = RawRing(lidar.packet_size, lidar.records)
+    places: I64Array = np.empty(0, np.int64)
     for _ in range(4):
         count = int(rng.integers(20, 45))
         start = np.arange(count) * lidar.packet_size

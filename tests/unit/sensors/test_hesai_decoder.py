@@ -13,7 +13,7 @@ from mlbatch.geometry import Turning
 from mlbatch.lidar import FAULTS
 from mlbatch.sensors import _hesai_crc as crc
 from mlbatch.sensors import hesai
-from mlbatch.types import U8Array
+from mlbatch.types import F64Array, I64Array, U8Array
 from tests.builders import hesai as builder
 from tests.builders.hesai import HesaiSpec, angles_csv, encode_packets
 from tests.builders.hesai_angles import Angles, Beams, MirrorAngles
@@ -42,7 +42,7 @@ def _beams(channels: int, model: str = "") -> tuple[Beams, bytes]:
     return Angles(elevation, azimuth), angles_csv(elevation, azimuth)
 
 
-def _encoded(spec: HesaiSpec) -> tuple[U8Array, np.ndarray, np.ndarray]:
+def _encoded(spec: HesaiSpec) -> tuple[U8Array, I64Array, I64Array]:
     """Packets, and the ranges and levels that they hold."""
     random = np.random.default_rng(7)
     shape = (COLUMNS // spec.groups * spec.groups, spec.row.channels, spec.returns)
@@ -234,7 +234,7 @@ def test_return_types(mode: int, types: tuple[int, ...], text: str) -> None:
 
 
 @pytest.mark.parametrize("body", [np.eye(4), None], ids=["sensor frame", "body frame"])
-def test_optical_centre(body: np.ndarray | None) -> None:
+def test_optical_centre(body: F64Array | None) -> None:
     """Section 6, refinement 2, beam by beam: point = k u + c, turned, with its range unchanged."""
     spec = HesaiSpec("Pandar64", rpm=600, start_deg=33.0)
     packets, _, _ = _encoded(spec)

@@ -106,7 +106,8 @@ class TestHours:
         spec = VelodyneSpec("VLP-16", host_ahead_ns=-7 * HOUR_NS - 1234)
         sent = random_packets(spec, 16)
         for valid, hours in ((True, 0), (False, -7)):
-            beside = beside_of(position_packets(spec, np.arange(0, 4e6, 1e6), valid=valid))
+            times_us = np.arange(0, 4e6, 1e6, dtype=np.float64)
+            beside = beside_of(position_packets(spec, times_us, valid=valid))
             offset_ns = clock_offset_ns(sent.payloads, sent.host_ns, [beside])
             away_ns = -spec.host_ahead_ns + hours * HOUR_NS
             assert offset_ns == pytest.approx(away_ns, abs=3_000_000)
@@ -117,7 +118,8 @@ class TestHours:
 
 def test_what_positions_say_of_the_pulse() -> None:
     spec = VelodyneSpec("VLP-16")
-    sent = [position_packets(spec, np.arange(3.0), pps=state) for state in range(4)]
+    times_us = np.arange(3, dtype=np.float64)
+    sent = [position_packets(spec, times_us, pps=state) for state in range(4)]
     words = [pulse([beside_of(one)]) for one in sent]
     assert words == ["no PPS", "PPS synchronising", "PPS locked", "PPS error"]
     assert pulse([]) == ""

@@ -113,7 +113,8 @@ def columns_of(told: dict[str, npt.NDArray[Any]]) -> dict[str, F64Array]:
 
 
 def heading_deg(x: F64Array, y: F64Array) -> F64Array:
-    return np.degrees(np.arctan2(-y, x))
+    heading: F64Array = np.degrees(np.arctan2(-y, x))
+    return heading
 
 
 def turned_deg(one: F64Array, other: F64Array) -> F64Array:
