@@ -121,8 +121,7 @@ class Tally:
 
     def _add_points(self, scan: HeldScan, points: Points) -> bool:
         """Count points by sensor; whether they tell theirs."""
-        owner = points.lidar_id
-        alone = scan.sensor if self._sensors > 1 else 0
+        owner, alone = points.lidar_id, self._alone(scan)
         if alone is not None:
             self.points_of[alone] += points.count
             self.rings.add(alone, scan, points)
@@ -135,6 +134,10 @@ class Tally:
             self.rings.add(sensor, scan, points)
         return True
 
+    def _alone(self, scan: HeldScan) -> int | None:
+        """The one sensor that gave all of a scan, where that is known."""
+        return 0 if self._sensors == 1 else scan.sensor
+
     def _columns_of(self, scan: HeldScan) -> I64Array | None:
         if scan.column_lidar_id is None:
             self.knows_owners = False
@@ -142,11 +145,12 @@ class Tally:
                 self.knows_columns = False
                 return None
             self.columns += len(scan.xyz)
-            if scan.sensor is None and self._sensors > 1:
+            alone = self._alone(scan)
+            if alone is None:
                 return None
-            alone = np.zeros(self._sensors, np.int64)
-            alone[scan.sensor or 0] = len(scan.xyz)
-            return alone
+            own = np.zeros(self._sensors, np.int64)
+            own[alone] = len(scan.xyz)
+            return own
         found = np.bincount(scan.column_lidar_id, minlength=self._sensors)
         counts: I64Array = found[: self._sensors]
         self.columns += len(scan.column_lidar_id)

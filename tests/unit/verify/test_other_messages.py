@@ -125,6 +125,12 @@ OTHERS: dict[str, tuple[str, Edit, str, str]] = {
     ),
     "IMU in a bag": ("scans.bag", bag(only("/left/imu", 3, gone)), "imu", "sensors.0"),
     "table beside a bag": ("scans.bag", row(1, "points", 1), "table", "line 3 points"),
+    "sensors of the report beside a bag": (
+        "scans.bag",
+        report("sensors", to=[]),
+        "metadata",
+        "scans.csv sensors",
+    ),
     "report beside a bag": ("scans.bag", report("scans", "points", to=1), "report", "points"),
 }
 
