@@ -23,6 +23,8 @@ _HEAD = struct.Struct("<BQ")
 _FOOTER_BYTES = _HEAD.size + 20
 _HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 1, 3, 4, 5, 6, 7
 _ATTACHMENT, _METADATA, _DATA_END = 9, 12, 15
+# Parts of the data whose damage is told with their place.
+_NAMES = {_CHUNK: "chunk", _INDEX: "message index"}
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 
 
@@ -131,14 +133,12 @@ class McapFile:
             for record in self._records:
                 if record.opcode in (_CHUNK, _DATA_END) and self._found.chunks:
                     self._found.chunks[-1].settle(self._judge, self._where)
-                if record.opcode == _CHUNK:
+                if record.opcode in _NAMES:
                     try:
-                        yield from self._chunk(self._body(file, record), record)
+                        yield from self._part(self._body(file, record), record)
                     except DamageError as err:
-                        where = f"{self._where} chunk at byte {record.at}"
+                        where = f"{self._where} {_NAMES[record.opcode]} at byte {record.at}"
                         self._judge.blame("container", where, err.wanted, err.got)
-                elif record.opcode == _INDEX:
-                    self._found.index(Cursor(self._body(file, record)), record.at, record.size)
                 elif record.opcode == _MESSAGE:
                     where = f"{self._where} byte {record.at}"
                     self._judge.blame("container", where, "messages in chunks", "one outside")
@@ -148,6 +148,12 @@ class McapFile:
         self._found.channels = len(self._channels)
         self._found.schemas = len(self._types)
         check_summary(self._judge, self._where, self._found, summary, end.at + end.size)
+
+    def _part(self, body: memoryview, record: _Record) -> Iterator[Message]:
+        if record.opcode == _CHUNK:
+            yield from self._chunk(body, record)
+        else:
+            self._found.index(Cursor(body), record.at, record.size)
 
     def _chunk(self, body: memoryview, record: _Record) -> Iterator[Message]:
         judge, where = self._judge, f"{self._where} chunk at byte {record.at}"

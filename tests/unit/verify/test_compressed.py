@@ -15,7 +15,7 @@ import zstandard
 from mlbatch.verify import verify
 from mlbatch.verify.unpacking import unpacked
 from mlbatch.verify.verdict import DamageError
-from tests.unit.verify.made import forget, made, spoiled
+from tests.unit.verify.made import forget, found, made, spoiled, spoiled_places
 
 MB = 1 << 20
 NAMES = ("zstd", "lz4")
@@ -125,3 +125,16 @@ def test_what_is_said_bounds_what_is_held(name: str) -> None:
         tracemalloc.stop()
     assert most < 8 * MB
     assert len(unpacked(name, stored, 256 * MB)) == 256 * MB
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_message_index_that_claims_more_than_it_has(name: str, tmp_path: Path) -> None:
+    def lie(path: Path) -> None:
+        data, at = bytearray(path.read_bytes()), _MAGIC_BYTES
+        while data[at] != 7:
+            at += _HEAD.size + _HEAD.unpack_from(data, at)[1]
+        # The length of its entries stands behind the number of the channel.
+        struct.pack_into("<I", data, at + _HEAD.size + 2, 19_849)
+        path.write_bytes(data)
+
+    found(spoiled_places(f"{name}.mcap", tmp_path, lie), "container", "message index at byte")
