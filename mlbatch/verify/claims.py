@@ -10,6 +10,9 @@ from mlbatch.rate import parse_rate
 from mlbatch.verify.grid import Lines
 from mlbatch.verify.verdict import Judge, VerifyError
 
+# More than `--slices` takes; larger claims are damage.
+_MOST_SLICES = 1_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class Claims:
@@ -42,6 +45,7 @@ class Claims:
             rate: Fraction = parse_rate(self.rate)
         except UsageError as err:
             raise VerifyError(f"{where}: {err}") from err
-        if slices < 1:
-            raise VerifyError(f"{where}: wanted 1 or more slices a window, got {slices}")
+        if not 1 <= slices <= _MOST_SLICES:
+            wanted = f"1 to {_MOST_SLICES} slices a window"
+            raise VerifyError(f"{where}: wanted {wanted}, got {slices}")
         return Lines(rate, slices)

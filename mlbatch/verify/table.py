@@ -142,7 +142,8 @@ def check_table(judge: Judge, table: Table, lines: Lines | None, first: int | No
         return
     if first is None:
         first = lines.number(int(table.start_ns[0])) // lines.slices - int(table.index[0])
-    numbers = (key + first * lines.slices).tolist()
+    # Whole numbers of any size: what is claimed may lie anywhere.
+    numbers = [number + first * lines.slices for number in key.tolist()]
     for name, column, after in (("start_ns", table.start_ns, 0), ("end_ns", table.end_ns, 1)):
         bounds = np.array([lines.bound(q + after) for q in numbers])
         wrong = column != bounds

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.verify import verify
+from mlbatch.verify.verdict import VerifyError
 from tests.unit.verify.made import Edit, copied, forget, found, report, row, spoiled_places, text
 from tests.unit.verify.remade import (
     Change,
@@ -180,3 +181,11 @@ def test_bags_that_others_write_again_are_clean(tmp_path: Path) -> None:
     path = copied("scans.bag", tmp_path)
     bag(lambda sent: [sent])(path)
     assert verify(path).ok
+
+
+@pytest.mark.parametrize("slices", [0, 2_000_000, 10**19])
+def test_slices_that_no_run_has_are_damage(slices: int, tmp_path: Path) -> None:
+    path = copied("scans.bag", tmp_path)
+    report("grid", "slices", to=slices)(path)
+    with pytest.raises(VerifyError, match="wanted 1 to 1000000 slices a window, got"):
+        verify(path)
