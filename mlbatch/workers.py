@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import TracebackType
 from typing import Generic, TypeAlias, TypeVar
 
@@ -124,13 +125,17 @@ class Workers(Generic[Task]):
         for turn in range(_TURNS):
             next(steps)
             with self._changed:
-                self._wait(lambda turn=turn: self._past[turn] == number)  # type: ignore[misc]
+                self._wait(partial(self._is_turn, turn, number))
                 if self._error is not None:
                     raise _Stopped
             next(steps, None)
             with self._changed:
                 self._past[turn] += 1
                 self._changed.notify_all()
+
+    def _is_turn(self, turn: int, number: int) -> bool:
+        """Whether all earlier tasks are past this part."""
+        return self._past[turn] == number
 
     def _fail(self, number: int, error: BaseException) -> None:
         """Stop all, once earlier tasks are through: one of them may fail as well."""
