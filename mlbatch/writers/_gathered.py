@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias, TypeVar, cast
 
-from mlbatch.errors import ExportError
+from mlbatch.writers._kept import cut, not_as_before
 
 # Views have a byte for each of their items.
 Bytes: TypeAlias = bytes | bytearray | memoryview
@@ -69,18 +69,7 @@ class OutputFile:
         self.kept_bytes = kept_bytes or 0
         self.position_bytes = self._dropped_bytes = 0
         if kept_bytes is not None:
-            self._cut(kept_bytes)
-
-    def _cut(self, kept_bytes: int) -> None:
-        size = self._file.seek(0, io.SEEK_END)
-        if size < kept_bytes:
-            self._file.close()
-            raise ExportError(
-                f"{self.path}: wanted {kept_bytes} bytes of the interrupted run to go on after "
-                f"them, got {size}; leave out --resume to begin anew"
-            )
-        self._file.truncate(kept_bytes)
-        self._file.seek(kept_bytes)
+            cut(self._file, path, kept_bytes)
 
     def look_at(self, place: int, count: int) -> bytes:
         """Bytes anywhere in what stays of the file."""
@@ -101,10 +90,7 @@ class OutputFile:
         """Go past bytes that stay."""
         self.position_bytes += size
         if self.position_bytes > self.kept_bytes:
-            raise ExportError(
-                f"{self.path}: wanted the scans of the interrupted run to go on after them, got "
-                "others; leave out --resume to begin anew"
-            )
+            raise not_as_before(self.path)
 
     def close(self) -> None:
         """Close the file."""

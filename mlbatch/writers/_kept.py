@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import IO, BinaryIO, cast
 
 from mlbatch.errors import ExportError
 
@@ -22,6 +22,27 @@ def open_output(path: Path, kept_bytes: int | None) -> BinaryIO:
     return cast(BinaryIO, KeptFile(path, kept_bytes))
 
 
+def cut(file: IO[bytes], path: Path, kept_bytes: int) -> None:
+    """Leave a file that is open for reading and writing what stays of it, and go to its end."""
+    size = file.seek(0, io.SEEK_END)
+    if size < kept_bytes:
+        file.close()
+        raise ExportError(
+            f"{path}: wanted {kept_bytes} bytes of the interrupted run to go on after them, "
+            f"got {size}; leave out --resume to begin anew"
+        )
+    file.truncate(kept_bytes)
+    file.seek(kept_bytes)
+
+
+def not_as_before(path: Path) -> ExportError:
+    """The error about pieces that do not end where those of the interrupted run did."""
+    return ExportError(
+        f"{path}: wanted the scans of the interrupted run to go on after them, got others; leave "
+        "out --resume to begin anew"
+    )
+
+
 class KeptFile:
     """Skips the first `kept_bytes` that are written; `tell` counts them nevertheless."""
 
@@ -29,15 +50,7 @@ class KeptFile:
         self._path = path
         self._left = kept_bytes
         self._file = path.open("r+b")
-        size = self._file.seek(0, io.SEEK_END)
-        if size < kept_bytes:
-            self._file.close()
-            raise ExportError(
-                f"{path}: wanted {kept_bytes} bytes of the interrupted run to go on after them, "
-                f"got {size}; leave out --resume to begin anew"
-            )
-        self._file.truncate(kept_bytes)
-        self._file.seek(kept_bytes)
+        cut(self._file, path, kept_bytes)
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
         """Write what goes beyond the kept bytes; these must end where a piece of data ends."""
@@ -45,10 +58,7 @@ class KeptFile:
             return self._file.write(data)
         size = memoryview(data).nbytes
         if size > self._left:
-            raise ExportError(
-                f"{self._path}: wanted the scans of the interrupted run to go on after them, got "
-                "others; leave out --resume to begin anew"
-            )
+            raise not_as_before(self._path)
         self._left -= size
         return size
 
