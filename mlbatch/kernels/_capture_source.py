@@ -50,6 +50,8 @@ def _high(byte: Pointer, place: int, count: int) -> int:
 
 
 def _walk() -> Callable[[Pointer], int]:
+    """From record to record of a pcap file: where frames lie, until something is not usual."""
+
     low, high = _low, _high
 
     @piece
@@ -87,6 +89,8 @@ def _walk() -> Callable[[Pointer], int]:
 
 
 def _dissect() -> Callable[[Pointer], int]:
+    """Frames of Ethernet, IPv4 and UDP to datagrams and fragments; all others are left over."""
+
     high, add_datagram, add_fragment = _high, _add_datagram, _add_fragment
 
     @piece
@@ -153,6 +157,8 @@ def _add_fragment(frame: Pointer, number: int, packet: int, body: int, stop: int
 
 
 def _copy() -> Callable[[Pointer], int]:
+    """Fragments to their places; nothing is looked at."""
+
     @piece
     def copy(frame: Pointer) -> int:
         source_at, target_at = i8_at(frame[at.SOURCE_AT]), i8_at(frame[at.TARGET_AT])

@@ -57,6 +57,8 @@ def marking(pad: int, returns: int) -> Marking:
 
 
 def _drop_repeated(pad: int, returns: int) -> Callable[[Pointer, Pointer], None]:
+    """Returns that an earlier return of their beam equals in range are not wanted."""
+
     @piece
     def drop(ranges: Pointer, keep: Pointer) -> None:
         for which in range(1, returns):
@@ -69,6 +71,8 @@ def _drop_repeated(pad: int, returns: int) -> Callable[[Pointer, Pointer], None]
 
 
 def _count() -> Callable[[Pointer, int], int]:
+    """How many elements are wanted."""
+
     @piece
     def count(keep: Pointer, elements: int) -> int:
         total = 0
@@ -80,6 +84,8 @@ def _count() -> Callable[[Pointer, int], int]:
 
 
 def _cut_boxes() -> Callable[[Pointer, int, int, Pointer, Pointer], None]:
+    """Points inside of boxes are not wanted."""
+
     @piece
     def cut(boxes: Pointer, count: int, elements: int, points: Pointer, keep: Pointer) -> None:
         for number in range(count):

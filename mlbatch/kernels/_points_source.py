@@ -32,6 +32,8 @@ def projecting(kind: str, pad: int, returns: int) -> Projecting:
 
 
 def _tabled(pad: int, returns: int) -> Projecting:
+    """Directions and origins from rows of a table; a sensor fires all beams at once."""
+
     @piece
     def project(
         frame: Pointer,
@@ -62,6 +64,8 @@ def _tabled(pad: int, returns: int) -> Projecting:
 
 
 def _turning(pad: int, returns: int) -> Projecting:
+    """Directions and origins from the rotor's angle as each beam fires."""
+
     turn_on, combine, lay = _turn_on(pad), _combine(pad), _lay(pad)
 
     @piece
@@ -120,6 +124,8 @@ def _lay(pad: int) -> Callable[[Pointer, Pointer, Pointer, Pointer, Pointer], No
 
 
 def _turn_on(pad: int) -> Callable[[Pointer, Pointer, np.float32, Pointer], None]:
+    """Cosines and sines go on to the angle at which their beam fires; see `geometry.Turning`."""
+
     @piece
     def turn_on(cosine: Pointer, sine: Pointer, speed: np.float32, firing_ns: Pointer) -> None:
         for beam in range(pad):

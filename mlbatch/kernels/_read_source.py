@@ -28,6 +28,8 @@ def reader_of(word: str, step: int, pad: int) -> Reader:
 
 
 def _words_reader(step: int, pad: int) -> Reader:
+    """Fields are bits of whole words, `step` words from channel to channel."""
+
     @piece
     def read(
         frame: Pointer, record: int, which: int, ranges: Pointer, levels: Pointer, others: Pointer
@@ -57,6 +59,8 @@ def _words_reader(step: int, pad: int) -> Reader:
 
 
 def _bytes_reader(word: str, step: int, pad: int) -> Reader:
+    """A distance of two bytes and a level behind it, in several runs of channels."""
+
     low, high = (0, 1) if word == "<u2" else (1, 0)
 
     @piece
