@@ -34,7 +34,7 @@ class _Stopped(Exception):
 class Workers(Generic[Task]):
     """Runs the steps of tasks; what fails first, in the order of tasks, fails here.
 
-    Then no later task has done more than the first of its parts, as if they were done one by one.
+    Then no later task has done its last part, nor its second if that or an earlier one failed.
     """
 
     def __init__(self, steps: Callable[[Task], Steps], threads: int, ahead: int) -> None:
