@@ -45,6 +45,8 @@ def measure(name: str, command: Sequence[str], folder: Path) -> Usage:
     """
     paths = filter(None, [_PACKAGE_PLACE, os.environ.get("PYTHONPATH")])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    # What is installed was compiled then; else each run compiles the modules it loads.
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with tempfile.TemporaryFile("w+", errors="replace") as err:
         began_s = time.perf_counter()
         try:

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from mlbatch.bench import peers
-from mlbatch.bench.cases import NUMBA, Case, Conversion, disk_bytes
+from mlbatch.bench.cases import Case, Conversion, disk_bytes
 from mlbatch.bench.machine import machine
 from mlbatch.bench.measure import BenchError, measure
 from mlbatch.bench.ratios import COPY, LIBRARY, START, WRITE, changes, ratios
@@ -161,10 +161,9 @@ class Session:
         """Conversions first: floors copy and write as much as they did."""
         conversions = case.conversions(self.settings.engines)
         for conversion in conversions:
-            if conversion.engine == NUMBA:
-                # Kernels are compiled when they are first needed; errors come again.
-                with contextlib.suppress(BenchError):
-                    self._convert(conversion)
+            # Modules and kernels are compiled when they are first needed; errors come again.
+            with contextlib.suppress(BenchError):
+                self._convert(conversion)
         found = [Program(c.name, OURS, partial(self._convert, c), c.base) for c in conversions]
         found += [Program(name, FLOOR, partial(self._floor, name)) for name in case.floors]
         found += [

@@ -48,6 +48,15 @@ def test_the_measuring_process_stays_small() -> None:
     assert loaded.strip() == "[]"
 
 
+def test_bytecode_is_kept_as_of_an_installed_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    (tmp_path / "module.py").write_text("")
+    measure("program", [sys.executable, "-c", "import module"], tmp_path)
+    assert list((tmp_path / "__pycache__").glob("module.*.pyc"))
+
+
 def test_a_failure_is_told_by_its_last_line(tmp_path: Path) -> None:
     code = "import sys; sys.exit('no\\nmore paper')"
     with pytest.raises(BenchError, match="printer: wanted exit code 0, got 1: more paper"):
