@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.learning import teaches
 from mlbatch.types import BoolArray, CaptureCounts, Message, PacketBatch, Recording, Topic
 
 
@@ -24,7 +25,7 @@ class ClippedRecording:
     """The packets and messages of a recording that arrived within a part; `Recording`.
 
     What lies outside is left out of the counts, too: it belongs to another part. Messages from
-    before the part are kept as long as sensors are looked for, since metadata stand at the start.
+    before the part come only if they teach of sensors, since metadata stand at the start.
     """
 
     inner: Recording
@@ -41,7 +42,7 @@ class ClippedRecording:
     def __post_init__(self) -> None:
         self.path, self.container = self.inner.path, self.inner.container
         self.size_bytes = self.inner.size_bytes
-        self._follow(0)
+        self._follow()
 
     def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
         """Yield the packets of the part, in file order; may be called again (counts restart).
@@ -50,12 +51,12 @@ class ClippedRecording:
         """
         self.inner.keep = self.keep
         batches = self.inner.packets()
-        outside, first_ns = 0, None
+        first_ns = None
         try:
             for batch in batches:
                 inside = self._inside(batch)
-                outside += len(batch) - int(np.count_nonzero(inside))
-                self._follow(outside)
+                self._leave_out(len(batch) - int(np.count_nonzero(inside)))
+                self._follow()
                 clipped = batch if inside.all() else batch.take(np.flatnonzero(inside))
                 clipped = replace(clipped, messages=self._messages(batch))
                 if len(clipped) or clipped.messages:
@@ -67,7 +68,7 @@ class ClippedRecording:
         finally:
             if isinstance(batches, Generator):
                 batches.close()
-            self._follow(outside)
+            self._follow()
 
     def _inside(self, batch: PacketBatch) -> BoolArray:
         low, high = self.part.begin_ns, self.part.end_ns
@@ -79,16 +80,21 @@ class ClippedRecording:
         return inside
 
     def _messages(self, batch: PacketBatch) -> tuple[Message, ...]:
-        high = self.part.end_ns
-        return tuple(m for m in batch.messages if high is None or m.host_ns < high)
+        return tuple(message for message in batch.messages if self._is_due(message))
 
-    def _follow(self, outside: int) -> None:
-        """Take over what the inner recording says of itself, but for what lies outside."""
+    def _is_due(self, message: Message) -> bool:
+        low, high = self.part.begin_ns, self.part.end_ns
+        if high is not None and message.host_ns >= high:
+            return False
+        return low is None or message.host_ns >= low or teaches(message.topic)
+
+    def _leave_out(self, count: int) -> None:
+        """Take packets out of the inner counts: what clouds become is counted there as well."""
+        self.inner.counts.frames -= count
+        self.inner.counts.datagrams -= count
+
+    def _follow(self) -> None:
+        """Take over what the inner recording says of itself."""
         inner = self.inner
-        self.topics, self.notes = inner.topics, inner.notes
+        self.topics, self.notes, self.counts = inner.topics, inner.notes, inner.counts
         self.position_bytes = inner.position_bytes
-        self.counts = replace(
-            inner.counts,
-            frames=inner.counts.frames - outside,
-            datagrams=inner.counts.datagrams - outside,
-        )

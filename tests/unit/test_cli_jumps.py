@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.builders.bags import Body, Recorded
+from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
+from tests.builders.sessions_of_bags import unit_messages, write_mcap
 from tests.unit.sessions import (
     EPOCH_NS,
     NS_PER_MS,
@@ -147,3 +150,39 @@ def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path
     ]
     assert [one["timescale"] for one in reports] == ["uptime", "utc"]
     assert [one["scans"]["empty"] for one in reports] == [0, 0]
+
+
+def test_passed_messages_go_to_one_part(shell: Shell, tmp_path: Path) -> None:
+    """The metadata, which stand at the start, are known in both."""
+    one, two = _pieces(Unit(), FORWARD)
+    messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
+    first_ns, last_ns = messages[0].log_ns, messages[-1].log_ns
+    messages += [
+        Recorded("/note", "std_msgs/String", at, Body("cdr").text("here").done())
+        for at in range(first_ns, last_ns, 20 * NS_PER_MS)
+    ]
+    write_mcap(tmp_path / "drive.mcap", sorted(messages, key=lambda message: message.log_ns))
+    outcome = shell("convert drive.mcap -o out.mcap --on-jump split --pass /note --keep-partial")
+    assert outcome.code == 0, outcome.err
+    reports = [json.loads((tmp_path / f"out.seg{n}.mcap.report.json").read_text()) for n in (1, 2)]
+    assert [one["messages"] for one in reports] == 2 * [
+        [{"topic": "/note", "read": 30, "written": 30, "dropped": {}}]
+    ]
+
+
+def test_decoded_clouds_are_cut_where_their_clock_jumps(shell: Shell, tmp_path: Path) -> None:
+    columns, clouds = 100, 10
+    turn = [(5, 1, ring, 9, at * 10**6, ring) for at in range(columns) for ring in (0, 1)]
+    stamps_ns = [STAMP_NS + n * TURN_NS + FORWARD * (n >= clouds) for n in range(2 * clouds)]
+    messages = [cloud_message(OUSTER, turn, stamp_ns) for stamp_ns in stamps_ns]
+    write_mcap(tmp_path / "drive.mcap", write_points("/points", messages))
+    outcome = shell("convert drive.mcap -o out --on-jump split --keep-partial")
+    assert outcome.code == 0, outcome.err
+    for number in (1, 2):
+        report = json.loads((tmp_path / f"out.seg{number}" / "report.json").read_text())
+        assert report["sensors"][0]["packets"]["read"] == clouds * columns
+        assert report["capture"] == {
+            "frames": clouds * columns,
+            "datagrams": clouds * columns,
+            "skipped": {},
+        }
