@@ -32,18 +32,6 @@ from mlbatch.types import I64Array
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 __all__ = [
-    "LIMIT_NS",
-    "ClockFinding",
-    "ClockWatch",
-    "Jump",
-    "Stretch",
-    "in_seconds",
-    "steady",
-    "stretch_of",
-    "whole_ns",
-]
-
-__all__ = [
     "ClockFinding",
     "ClockWatch",
     "Jump",
