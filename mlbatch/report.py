@@ -183,7 +183,10 @@ def report_text(run: ReportInputs, machine: bool = True) -> str:
     report = build_report(run)
     if not machine:
         report = without_machine(report, run.inputs)
-    return json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    # Names of files need not be text: their odd bytes stand as escapes of JSON, which give the name
+    # back, where UTF-8 has no place for them.
+    return text.encode("utf-8", "backslashreplace").decode() + "\n"
 
 
 def imbalances(run: ReportInputs) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -221,6 +222,13 @@ def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
     assert report_text(other, machine=False) == text
     assert "timing" not in text
     assert "path" not in text
+
+
+def test_names_that_are_no_text_come_back() -> None:
+    """A file called by two bytes that UTF-8 does not know."""
+    name = os.fsdecode(b"/data/\xff\xfe.pcap")
+    text = report_text(replace(run(), inputs=(InputReport(name, 1000, "pcap"),)))
+    assert json.loads(text.encode("utf-8"))["inputs"][0]["path"] == name
 
 
 def test_summary_names_sensors_scans_and_warnings() -> None:
