@@ -13,12 +13,11 @@ import numpy as np
 
 from mlbatch.discover import Wishes
 from mlbatch.errors import UsageError
-from mlbatch.job import Job
+from mlbatch.job import Job, check_ranges_m, wait_ns
 from mlbatch.kernels import ENGINES
 from mlbatch.pipeline import Conversion
 from mlbatch.rate import parse_rate
 from mlbatch.types import Scan
-from mlbatch.units import NS_PER_S
 
 PathLike: TypeAlias = str | Path
 
@@ -55,6 +54,7 @@ def scans(
     ):
         if value not in known:
             raise UsageError(f"{name}: wanted {' or '.join(known)}, got {value!r}; choose one")
+    check_ranges_m("min_range", min_range, "max_range", max_range)
     job = Job(
         recordings=tuple(Path(path) for path in recordings),
         wishes=Wishes(
@@ -72,7 +72,7 @@ def scans(
         layout=layout,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
-        max_wait_ns=None if math.isinf(max_wait) else round(max_wait * NS_PER_S),
+        max_wait_ns=wait_ns("max_wait", max_wait, max_wait),
         min_range_m=min_range,
         max_range_m=max_range,
         strict=strict,

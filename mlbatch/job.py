@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -9,12 +10,15 @@ from pathlib import Path
 from mlbatch.batching.windows import Limit
 from mlbatch.clipping import Part
 from mlbatch.discover import Wishes
+from mlbatch.errors import UsageError
 from mlbatch.faults import Fault
 from mlbatch.types import EXTRAS
 from mlbatch.units import NS_PER_S
 
 DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S
+# Nothing lasts longer, and ns of it still fit into int64.
+MOST_S = 2**33
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,3 +59,20 @@ class Job:
     extras: frozenset[str] = EXTRAS
     jobs: int = 1
     engine: str = "auto"
+
+
+def wait_ns(option: str, seconds: float, given: object) -> int | None:
+    """`max_wait_ns` of a job from seconds; given: what the user wrote."""
+    if math.isnan(seconds) or seconds <= 0:
+        raise UsageError(f"{option}: wanted seconds above 0, or inf, got {given!r}; write 1.0")
+    return None if seconds > MOST_S else round(seconds * NS_PER_S)
+
+
+def check_ranges_m(low_option: str, low: float, high_option: str, high: float) -> None:
+    """Refuse limits of ranges between which none lies."""
+    if not 0 <= low < math.inf:
+        raise UsageError(f"{low_option}: wanted 0 or more metres, got {low}; write 0.5")
+    if not high > low:
+        raise UsageError(
+            f"{high_option}: wanted more than {low_option} ({low} m), got {high} m; write 100"
+        )

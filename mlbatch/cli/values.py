@@ -13,6 +13,7 @@ from pathlib import Path
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
 from mlbatch.faults import Fault, parse_fault
+from mlbatch.job import MOST_S, check_ranges_m, wait_ns
 from mlbatch.rate import parse_rate
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
@@ -20,8 +21,6 @@ from mlbatch.units import NS_PER_S
 MAX_SLICES = 10_000
 # Every job holds a few scans in memory.
 MAX_JOBS = 64
-# Nothing lasts longer, and ns of it still fit into int64.
-_MOST_S = 2**33
 
 
 def rate(text: str) -> Fraction:
@@ -40,12 +39,7 @@ def slices(count: int) -> None:
 
 def ranges_m(low: float, high: float) -> None:
     """`--min-range` and `--max-range`."""
-    if not 0 <= low < math.inf:
-        raise UsageError(f"--min-range: wanted 0 or more metres, got {low}; write 0.5")
-    if not high > low:
-        raise UsageError(
-            f"--max-range: wanted more than --min-range ({low} m), got {high} m; write 100"
-        )
+    check_ranges_m("--min-range", low, "--max-range", high)
 
 
 def in_order(first: Limit | None, last: Limit | None) -> None:
@@ -67,7 +61,7 @@ def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
     try:
         seconds = Decimal(text)
         # Compared, not computed: even the absolute value of 1e999999999 overflows.
-        if seconds.is_finite() and -_MOST_S <= seconds <= _MOST_S:
+        if seconds.is_finite() and -MOST_S <= seconds <= MOST_S:
             return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
     except InvalidOperation:
         pass
@@ -97,9 +91,7 @@ def max_wait_ns(text: str) -> int | None:
         seconds = float(text)
     except ValueError:
         seconds = math.nan
-    if math.isnan(seconds) or seconds <= 0:
-        raise UsageError(f"--max-wait: wanted seconds above 0, or inf, got {text!r}; write 1.0")
-    return None if seconds > _MOST_S else round(seconds * NS_PER_S)
+    return wait_ns("--max-wait", seconds, text)
 
 
 def box_m(text: str) -> tuple[float, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -199,6 +200,17 @@ def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
         next(iter(mlbatch.scans(CAPTURE, clock="gps")))
     with pytest.raises(RecordingError, match=r"none\.pcap: wanted a recording, got no such file"):
         next(iter(mlbatch.scans("none.pcap")))
+    for seconds in (math.nan, 0.0, -1.0, -math.inf):
+        with pytest.raises(UsageError, match="max_wait: wanted seconds above 0, or inf, got "):
+            next(iter(mlbatch.scans(CAPTURE, max_wait=seconds)))
+    for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan)):
+        with pytest.raises(UsageError, match=r"m(in|ax)_range: wanted "):
+            next(iter(mlbatch.scans(CAPTURE, min_range=low_m, max_range=high_m)))
+
+
+def test_scans_in_python_wait_for_ever_from_some_time_on() -> None:
+    one, other = (list(mlbatch.scans(CAPTURE, rig=RIG, max_wait=s)) for s in (1e300, math.inf))
+    assert [scan.points for scan in one] == [scan.points for scan in other]
 
 
 def test_a_conversion_may_be_left_half_way() -> None:
