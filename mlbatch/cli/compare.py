@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mlbatch.errors import UsageError
+from mlbatch.errors import UsageError, one_line
 from mlbatch.units import NS_PER_S
 
 
@@ -52,7 +52,7 @@ def compare(
     job = Job(tuple(recordings), wishes, rate=None if rate is None else values.rate(rate))
     found = compare(job, settings)
     for note in found.notes:
-        typer.echo(f"mlbatch: warning: {note.code}: {note.message}", err=True)
+        typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
     if as_json:
         typer.echo(json.dumps(found.as_json(), indent=1))
         return

@@ -185,9 +185,12 @@ def _opener(name: str, target: Path, options: WriterOptions) -> OpenWriter:
 def _tell(conversion: Conversion) -> None:
     for sensor in conversion.setup.sensors:
         lidar = sensor.found.lidar
+        # Topics name calibrations and frames, and may be named anything.
         typer.echo(
-            f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-            f"extrinsics from {sensor.origin}"
+            one_line(
+                f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
+                f"extrinsics from {sensor.origin}"
+            )
         )
     typer.echo(f"decoded by {conversion.engine}")
 

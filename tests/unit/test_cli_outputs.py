@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.builders.sessions_of_bags import unit_messages, write_mcap
 from tests.unit.sessions import (
     EPOCH_NS,
     FIXTURE,
@@ -237,3 +238,11 @@ def test_host_clock_makes_uptime_clocks_comparable(
     assert report["timescale"] == "utc"
     assert [sensor["clock"]["source"] for sensor in report["sensors"]] == ["host", "host"]
     assert report["scans"]["written"] == 2
+
+
+def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
+    write_mcap(tmp_path / "drive.mcap", unit_messages(Unit(turns=3), "a\x1b[31m\x07\n"))
+    outcome = shell("convert drive.mcap -o out -v")
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.startswith("ouster_111: ")
+    assert r"calibration /a\x1b[31m\x07\n/ouster/metadata" in outcome.out
