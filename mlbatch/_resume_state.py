@@ -71,7 +71,8 @@ class StateFile:
     def __init__(self, path: Path, state: State, *, is_new: bool) -> None:
         self._path = path
         with export_errors(path):
-            self._file = io.FileIO(path, "w" if is_new else "r+")
+            # Not emptied before it is ours.
+            self._file = io.FileIO(path, "a" if is_new else "r+")
             _lock(self._file, path)
             self._file.truncate(state.length)
             self._file.seek(state.length)

@@ -61,8 +61,8 @@ def convert(
     finally:
         if output.writer is not None:
             output.writer.abandon()
-            if course is not None:
-                course.settle()
+        if course is not None:
+            course.settle()
     return run, inputs
 
 
@@ -123,9 +123,10 @@ class _Output:
         """Open the output, now that it is known what its scans say of themselves."""
         self._idle.extend(self._run.benches)
         if self._open_writer is not None and self._run.info is not None:
-            self.writer = self._open_writer(self._run.info)
             if self._course is not None:
+                # Before anything of the output is touched: another run may have begun it meanwhile.
                 self._course.begin()
+            self.writer = self._open_writer(self._run.info)
 
     def _steps(self, piece: _Piece) -> Steps:
         """What a thread does for a scan; see `Workers`."""

@@ -117,7 +117,7 @@ class Course:
         run.finished = iter(self._state.rows)
 
     def begin(self) -> None:
-        """Open the state file, once the output is open."""
+        """Open the state file, before the output: from now on no other run writes it."""
         is_new = self._state is None
         state = self._state or State(self._identity, self._part)
         self._file = StateFile(state_path(self._target), state, is_new=is_new)
@@ -155,10 +155,16 @@ class Course:
 
     def settle(self) -> None:
         """The run ends early: force to the disk what it has done."""
-        if self._file is not None:
+        if self._file is None:
+            return
+        if partial_path(self._target).exists():
             self._file.settle()
+        else:
+            # The output could not be opened.
+            self._file.remove()
 
     def remove(self) -> None:
         """The output has its final name."""
         if self._file is not None:
             self._file.remove()
+            self._file = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch import _resume_state, resume
+from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.readers import _source
 from mlbatch.types import Scan
@@ -224,6 +226,39 @@ def test_a_run_that_lives_is_not_disturbed(shell: Shell, option: str) -> None:
         "end or choose another output\n"
     )
     assert STATE.is_file()
+
+
+@pytest.mark.parametrize("output", ["out", "out.mcap"])
+def test_a_run_that_began_after_the_look_is_not_disturbed(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    """Two runs may both find nothing before one of them writes."""
+    state, scan = Path(f"{output}.partial.state"), Path(f"{output}.partial")
+    with contextlib.ExitStack() as files:
+
+        def other_run(*_: object) -> None:
+            file = files.enter_context(state.open("wb", buffering=0))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(b"what it did")
+            scan.write_bytes(b"what it wrote")
+
+        monkeypatch.setattr(run, "check_target", other_run)
+        outcome = shell(f"convert {CAPTURE} -o {output}")
+    assert (outcome.code, "got another run that does" in outcome.err) == (1, True)
+    assert state.read_bytes() == b"what it did"
+    assert scan.read_bytes() == b"what it wrote"
+
+
+def test_an_output_that_cannot_be_opened_leaves_no_state(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        Path("out").mkdir()
+
+    monkeypatch.setattr(run, "check_target", refuse)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert (outcome.code, "got an existing one" in outcome.err) == (1, True)
+    assert [path.name for path in Path().iterdir()] == ["out"]
 
 
 @pytest.mark.parametrize(
