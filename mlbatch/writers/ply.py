@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import mlbatch
-from mlbatch.errors import UsageError
+from mlbatch.errors import UsageError, one_line
 from mlbatch.types import RunInfo, Scan
 from mlbatch.writers._folder import FolderWriter
 from mlbatch.writers._gathered import write_all
@@ -69,7 +69,8 @@ def header(scan: Scan, count: int) -> str:
         f"comment complete {str(scan.complete).lower()}",
         f"comment timescale {info.timescale}",
         f"comment rate_hz {info.rate_hz}",
-        f"comment frame_id {info.frame_id}",
+        # A recording may call a frame anything, also what ends a line.
+        f"comment frame_id {one_line(info.frame_id)}",
         "comment units: x y z m; time s after start_ns; intensity as sent by the sensor",
         f"comment lidar_id from 0: {names}",
         f"element vertex {count}",

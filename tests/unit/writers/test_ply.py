@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,14 @@ def test_one_vertex_by_hand(tmp_path: Path) -> None:
         "property uchar return_type",
         "property uchar lidar_id",
     ]
+
+
+def test_a_frame_of_any_name_stays_in_its_line(tmp_path: Path) -> None:
+    scan = point_scan()
+    scan = replace(scan, info=replace(scan.info, frame_id="map\nend_header\n\x1b"))
+    head, body = written(tmp_path / "out", scan).split(b"end_header\n")
+    assert rb"comment frame_id map\nend_header\n\x1b" in head.splitlines()
+    assert len(body) == 30
 
 
 def test_trimesh_reads_all_points(tmp_path: Path) -> None:
