@@ -112,7 +112,7 @@ class ReportPaths:
 def report_paths(target: Path, name: str) -> ReportPaths:
     """Inside an output folder, beside an output file.
 
-    A writer's `finish` writes scans.csv; the report follows by `write_text` once it has timings.
+    A writer's `finish` has the report written and writes scans.csv, before the output is named.
     """
     if plugin(name).SUFFIX is None:
         return ReportPaths(target / REPORT_JSON, target / SCANS_CSV)

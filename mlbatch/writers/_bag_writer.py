@@ -168,12 +168,12 @@ class BagWriter:
         with export_errors(output.partial):
             self._begin(summary.t_init_ns)
             self._sink.finish(summary, self._grid(summary))
-        if output.partial.is_dir():
-            write_text(output.partial / SCANS_CSV, summary.scans_csv)
-        else:
-            write_text(side_path(output.target, SCANS_CSV), summary.scans_csv)
         if last is not None:
             last(output.partial)
+        # What may fail is done: beside an older output its own table stands up to now.
+        inside = output.partial.is_dir()
+        table = output.partial / SCANS_CSV if inside else side_path(output.target, SCANS_CSV)
+        write_text(table, summary.scans_csv)
         output.publish()
 
     def abandon(self) -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,28 @@ def test_overwriting_happens_at_the_end(name: str, file: str, tmp_path: Path) ->
     if target.is_dir():
         files = ["metadata.yaml", "out_0.mcap"] if name == "rosbag2" else [f"000007.{name}"]
         assert sorted(path.name for path in target.iterdir()) == [*files, "scans.csv"]
+
+
+@pytest.mark.parametrize(("name", "file"), OUTPUTS)
+def test_an_older_output_and_its_table_stay_if_the_report_fails(
+    name: str, file: str, tmp_path: Path
+) -> None:
+    def files() -> dict[Path, bytes]:
+        paths = (path for path in tmp_path.rglob("*") if path.is_file())
+        return {path: path.read_bytes() for path in paths if ".partial" not in str(path)}
+
+    def refuse(partial: Path) -> None:
+        raise ExportError("no room for the report")
+
+    writer = open_writer(name, tmp_path / file, run_info(), WriterOptions())
+    in_one_go(writer.write(dense_scan(0)))
+    writer.finish(SUMMARY)
+    before = files()
+    writer = open_writer(name, tmp_path / file, run_info(), WriterOptions(overwrite=True))
+    in_one_go(writer.write(dense_scan(1)))
+    with pytest.raises(ExportError, match="no room"):
+        writer.finish(replace(SUMMARY, scans_csv="another table\n"), refuse)
+    assert files() == before
 
 
 @pytest.mark.parametrize("stranger", ["notes.txt", "left/photo.jpg", ".git/config"])
