@@ -14,7 +14,7 @@ from mlbatch.verify.claims import Claims
 from mlbatch.verify.folders import ScanFile, check_name
 from mlbatch.verify.scan import HeldScan
 from mlbatch.verify.verdict import DamageError, Judge
-from mlbatch.verify.zips import array, members
+from mlbatch.verify.zips import Array, array, members
 
 SUFFIX = ".npz"
 SCHEMA = "mlbatch.scan/1"
@@ -65,24 +65,35 @@ class NpzReader:
         """What the first scan says of the run."""
         data = _members(file)
         self._first = file.where
-        self._constant = {key: bytes(data[key]) for key in _CONSTANT if key in data}
-        values = {key: array(key, memoryview(raw)).values for key, raw in self._constant.items()}
+        arrays = {key: array(key, data[key]) for key in _CONSTANT if key in data}
+        values = {key: one.values for key, one in arrays.items() if self._fits(file, key, one)}
+        self._constant = {key: bytes(data[key]) for key in values}
         xyz = data.get("xyz")
         self.organized = xyz is not None and array("xyz", xyz).values.ndim == 3
         texts = {key: str(values[key]) for key in _TEXTS if key in values and key != "sensors"}
         self.judge.equal("layout", f"{file.where} schema", SCHEMA, texts.get("schema"))
         names = values.get("sensors")
-        if names is not None and names.ndim == 1:
+        if names is not None:
             self.sensors = tuple(map(str, names.tolist()))
         slices = values.get("slices")
         return Claims(
             texts.get("rate_hz"),
-            None if slices is None or slices.ndim else int(cast(I64Array, slices)),
+            None if slices is None else int(cast(I64Array, slices)),
             None,
             self.sensors or None,
             texts.get("timescale"),
             texts.get("frame_id"),
         )
+
+    def _fits(self, file: ScanFile, key: str, found: Array) -> bool:
+        """Whether a constant is what it should be; a number that is none is blamed in each scan."""
+        axes = found.values.ndim
+        if key not in _TEXTS:
+            return (found.kind, axes) == (_NUMBERS[key], 0)
+        wanted = "texts" if key == "sensors" else "a text"
+        got = f"{found.kind} of {axes} axes"
+        fits = found.kind.startswith("<U") and axes == (key == "sensors")
+        return self.judge.equal("layout", f"{file.where} {key}", wanted, wanted if fits else got)
 
     def scans(self, files: list[ScanFile]) -> Iterator[HeldScan]:
         """Every scan that can be read; what cannot is blamed."""

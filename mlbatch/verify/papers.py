@@ -13,6 +13,7 @@ from mlbatch.verify.table import Table, read_table
 from mlbatch.verify.verdict import Judge, VerifyError
 
 REPORT, TABLE = "report.json", "scans.csv"
+_MOST_DIGITS = 19
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +113,8 @@ def claims_of_grid(judge: Judge, where: str, grid: dict[str, str]) -> Claims:
     numbers: dict[str, int | None] = {}
     for key in ("slices", "t_init_ns"):
         text = grid.get(key, "")
-        numbers[key] = int(text) if text.isdecimal() else None
+        # Python refuses to read very long ones.
+        numbers[key] = int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
         judge.passed("metadata")
         if numbers[key] is None:
             judge.blame("metadata", f"{where} mlbatch.grid {key}", "a number", text or "nothing")

@@ -33,7 +33,9 @@ _PLACE = np.dtype(
 _HEAD = "ply\nformat binary_little_endian 1.0\ncomment mlbatch "
 _END = b"end_header\n"
 _LONGEST_HEAD = 1 << 20
-_INDEX = re.compile(r"(-?\d+) slice (\d+) of (\d+)")
+# Numbers of up to 19 digits: Python refuses to read very long ones.
+_INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)
+_VERTICES = re.compile(r"element vertex (\d{1,19})", re.ASCII)
 _NS = 1e9
 
 LIMITS = {
@@ -172,8 +174,8 @@ def _head(data: bytes) -> _Head:
         words = line.split(" ", 2)
         if words[0] == "comment" and len(words) == 3:
             notes[words[1].rstrip(":")] = words[2]
-        elif words[:2] == ["element", "vertex"] and words[-1].isdecimal():
-            vertices = int(words[-1])
+        elif (count := _VERTICES.fullmatch(line)) is not None:
+            vertices = int(count[1])
         elif words[0] == "property" and len(words) == 3:
             properties[words[2]] = words[1]
         else:

@@ -89,8 +89,8 @@ def array(name: str, member: memoryview) -> Array:
     if head is None or head[2] == b"True":
         raise DamageError(f"{name} as an npy of version 1.0 in C order", "other bytes")
     kind = head[1].decode()
-    shape = tuple(int(part) for part in head[3].split(b",") if part.strip())
     try:
+        shape = tuple(int(part) for part in head[3].split(b",") if part.strip())
         dtype = np.dtype(kind)
         count = 1
         for length in shape:

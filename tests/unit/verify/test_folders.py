@@ -86,6 +86,8 @@ def as_type(kind: str) -> Edit:
     return npz(ONE, "intensity", lambda values: values.astype(kind))
 
 
+# The first by name: it tells the constants that others are held against.
+HEAD = "head.npz"
 NPZ: dict[str, tuple[Edit, str, str]] = {
     "start off the grid": (npz(ONE, "start_ns", plus((), -5)), "grid", "000001.npz start_ns"),
     "end off the grid": (npz(ONE, "end_ns", plus((), 1)), "grid", "000001.npz end_ns"),
@@ -144,6 +146,27 @@ NPZ: dict[str, tuple[Edit, str, str]] = {
     "key left out": (without("ring"), "container", "000001.npz"),
     "key of others left out": (without("reflectivity"), "layout", "000001.npz"),
     "another type": (as_type("<f8"), "layout", "000001.npz intensity"),
+    "truth for slices": (
+        npz(HEAD, "slices", lambda v: np.array(True)),
+        "layout",
+        "head.npz slices",
+    ),
+    "no number of slices": (
+        npz(HEAD, "slices", lambda v: np.array(np.nan)),
+        "layout",
+        "head.npz slices",
+    ),
+    "slices in words": (
+        npz(HEAD, "slices", lambda v: np.array("one")),
+        "layout",
+        "head.npz slices",
+    ),
+    "number for a rate": (
+        npz(HEAD, "rate_hz", lambda v: np.array(10.0)),
+        "layout",
+        "head.npz rate",
+    ),
+    "text for sensors": (npz(HEAD, "sensors", lambda v: v[0]), "layout", "head.npz sensors"),
     "fewer values": (npz(ONE, "ring", lambda v: v[1:]), "layout", "000001.npz ring"),
     "two axes": (npz(ONE, "ring", lambda v: v[None]), "layout", "000001.npz ring"),
     "a byte of an array": (raw(ONE, flipped(4000)), "container", "000001.npz"),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mlbatch.verify import verify
-from mlbatch.verify.verdict import VerifyError
+from mlbatch.verify.papers import claims_of_grid
+from mlbatch.verify.verdict import Judge, VerifyError
 from tests.unit.verify.made import Edit, copied, forget, found, report, row, spoiled_places, text
 from tests.unit.verify.remade import (
     Change,
@@ -189,3 +190,10 @@ def test_slices_that_no_run_has_are_damage(slices: int, tmp_path: Path) -> None:
     report("grid", "slices", to=slices)(path)
     with pytest.raises(VerifyError, match="wanted 1 to 1000000 slices a window, got"):
         verify(path)
+
+
+def test_numbers_that_python_refuses_to_read_are_none() -> None:
+    judge = Judge()
+    claims = claims_of_grid(judge, "out.mcap", {"slices": "9" * 5000, "t_init_ns": "9" * 19})
+    assert (claims.slices, claims.t_init_ns) == (None, 10**19 - 1)
+    assert "out.mcap mlbatch.grid slices" in [one.where for one in judge.violations]

@@ -63,6 +63,12 @@ PLY: dict[str, tuple[Edit, str, str]] = {
     "frame": (text(ONE, "frame_id base_link", "frame_id map"), "metadata", "frame_id"),
     "sensors": (text(ONE, "from 0: left right", "from 0: a b"), "metadata", "sensors"),
     "vertices": (text(ONE, "element vertex ", "element vertex 1"), "container", ONE),
+    "more vertices than Python counts": (
+        text(ONE, "element vertex ", "element vertex " + "1" * 5000),
+        "container",
+        ONE,
+    ),
+    "index beyond all counting": (text(ONE, "index 1", "index " + "1" * 5000), "container", ONE),
     "property": (text(ONE, "property int ring", "property uint ring"), "container", ONE),
     "big endian": (text(ONE, "binary_little", "binary_big"), "container", ONE),
     "cut off": (raw(ONE, lambda data: data[:-7]), "container", ONE),
