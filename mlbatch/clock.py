@@ -5,12 +5,11 @@ facts/ouster.md section 7: the mode a sensor was set to does not prove what it d
 
 from __future__ import annotations
 
+from mlbatch.leap_seconds import tai_utc_s
 from mlbatch.units import NS_PER_S
 
 # Stamps below 1e9 s (2001) cannot be today's time: the sensor counts from power-on.
 EPOCH_NS = 10**9 * NS_PER_S
-# TAI - UTC since 2017-01-01 (IERS Bulletin C 52).
-TAI_UTC_NS = 37 * NS_PER_S
 NEAR_NS = 2 * NS_PER_S
 
 
@@ -18,7 +17,7 @@ def timescale(stamp_ns: int, host_ns: int) -> str:
     """`utc`, `tai`, `uptime` or `unknown`, for a stamp and the arrival of its packet (UTC)."""
     if stamp_ns < EPOCH_NS:
         return "uptime"
-    for name, offset_ns in (("utc", 0), ("tai", TAI_UTC_NS)):
+    for name, offset_ns in (("utc", 0), ("tai", tai_utc_s(host_ns) * NS_PER_S)):
         if abs(stamp_ns - host_ns - offset_ns) < NEAR_NS:
             return name
     return "unknown"

@@ -32,6 +32,14 @@ def test_a_date_is_judged_by_the_recorder(ahead_s: float, name: str) -> None:
     assert timescale(NOON_NS + round(ahead_s * NS_PER_S), NOON_NS) == name
 
 
+@pytest.mark.parametrize(("date_s", "ahead_s"), [(1_388_534_400, 35), (1_230_768_000, 34)])
+def test_older_recordings_have_their_own_leap_seconds(date_s: int, ahead_s: int) -> None:
+    """New Year of 2014 and of 2009 (IERS)."""
+    host_ns = date_s * NS_PER_S
+    assert timescale(host_ns + ahead_s * NS_PER_S, host_ns) == "tai"
+    assert timescale(host_ns + 37 * NS_PER_S, host_ns) == "unknown"
+
+
 @pytest.mark.parametrize("seconds", [0, 866, 16011, 999_999_999])
 def test_small_stamps_count_from_power_on(seconds: int) -> None:
     """Also where PTP was asked for and never locked: 866 s and 1089 s were seen."""
