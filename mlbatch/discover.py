@@ -73,7 +73,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     recordings = with_clouds(recordings, table, {stream.topic for stream in streams} - {""})
     sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
-    calibrations, files = calibrations_for(paths, wishes.metadata)
+    calibrations, files = calibrations_for(paths, wishes.metadata, wishes.rig)
     recorded = learner.calibrations()
     calibrations += recorded
     looked = [path.name for path in files] + [str(one.path) for one in recorded]
@@ -131,14 +131,11 @@ def _find_rigged(
     for sensor in rig.sensors:
         _refuse_undecodable(sampler, sensor, origin)
         _refuse_unknown_model(sensor, origin)
-    every = [*calibrations, *sensors.built_in()]
     wanted = [
         Wanted(
             sensor.name,
             sensor.stream or StreamSelector(),
-            _of_model(
-                every if sensor.metadata is None else [read_given(sensor.metadata)], sensor.model
-            ),
+            _of_model(_possible(sensor, calibrations), sensor.model),
             wishes.decode | sensor.decode,
             sensor.model,
         )
@@ -152,6 +149,13 @@ def _find_rigged(
         if sensor.model is not None:
             _check_model(sensor.name, sensor.model, one.lidar.model, origin)
     return matched
+
+
+def _possible(sensor: RigSensor, calibrations: Sequence[Calibration]) -> list[Calibration]:
+    """The calibration that the rig names; else those found, and all that are built in."""
+    if sensor.metadata is not None:
+        return [read_given(sensor.metadata)]
+    return [*calibrations, *sensors.built_in()]
 
 
 def _of_model(calibrations: Sequence[Calibration], model: str | None) -> list[Calibration]:
@@ -180,8 +184,10 @@ def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> No
 
 
 def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
+    if sensor.model is None:
+        return
     known = [model.name for model in sensors.models()]
-    if sensor.model is not None and sensor.model not in known:
+    if sensor.model not in known:
         # A slip of case says more than a likeness of letters.
         near = [name for name in known if name.lower() == sensor.model.lower()]
         near = near or difflib.get_close_matches(sensor.model, known, 1)

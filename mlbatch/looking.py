@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.clouds import CloudRecording, Layout, cloud_topics
 from mlbatch.errors import RigError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
@@ -37,6 +36,11 @@ def with_clouds(
     Where nothing is named and the session holds no raw packets, all its clouds are taken.
     """
     topics = [topic for recording in recordings for topic in recording.topics]
+    if not topics:
+        return list(recordings)
+    # Not loaded for captures.
+    from mlbatch.clouds import CloudRecording, Layout, cloud_topics
+
     clouds = {topic.name: topic for topic in cloud_topics(topics)}
     # A capture has no topics, and nothing but packets.
     raw = any(not recording.topics for recording in recordings) or any(map(holds_packets, topics))
@@ -95,15 +99,20 @@ def _lidars_begin_ns(batch: PacketBatch) -> int | None:
 
 
 def calibrations_for(
-    recordings: Sequence[Path], given: Sequence[Path]
+    recordings: Sequence[Path], given: Sequence[Path], rig: Path | None = None
 ) -> tuple[list[Calibration], list[Path]]:
-    """Calibrations that were given, else those beside the recordings; and the files looked at."""
+    """Calibrations that were given, else those beside the recordings; and the files looked at.
+
+    rig: the rig file, which may lie among them.
+    """
     if given:
         return [read_given(path) for path in given], list(given)
     looked: list[Path] = []
     found = []
     for folder in dict.fromkeys(map(_folder_of, recordings)):
         for path in sorted(path for path in folder.iterdir() if _may_be_calibration(path)):
+            if rig is not None and path.samefile(rig):
+                continue
             # A file beside the recording was never named by the user: a foreign one is no error.
             try:
                 calibration = sensors.read_calibration(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, cast
@@ -52,15 +53,21 @@ class Plugin(Protocol):
         ...
 
 
-@lru_cache(maxsize=1)
 def plugins() -> tuple[Plugin, ...]:
     """The makers' modules, in the order of their names."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    return tuple(
-        cast(Plugin, importlib.import_module(f"{__name__}.{name}"))
-        for name in names
-        if not name.startswith("_")
-    )
+    return tuple(_one_by_one())
+
+
+def _one_by_one() -> Iterator[Plugin]:
+    """The same; a maker's tables are loaded when it is asked, and those before could not answer."""
+    for name in _names():
+        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}"))
+
+
+@lru_cache(maxsize=1)
+def _names() -> tuple[str, ...]:
+    names = (module.name for module in pkgutil.iter_modules(__path__))
+    return tuple(sorted(name for name in names if not name.startswith("_")))
 
 
 def models() -> tuple[SensorModel, ...]:
@@ -90,11 +97,11 @@ def read_calibration(path: Path) -> Calibration | None:
 
 def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
     """The calibration in a text from a file or a topic (`origin`), or None if it is none."""
-    found = (plugin.read_calibration(origin, content) for plugin in plugins())
+    found = (plugin.read_calibration(origin, content) for plugin in _one_by_one())
     return next((calibration for calibration in found if calibration is not None), None)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
     """What payloads (k, size) of an unknown stream are, or None if no maker knows them."""
-    found = (plugin.describe(size, sample) for plugin in plugins())
+    found = (plugin.describe(size, sample) for plugin in _one_by_one())
     return next((text for text in found if text is not None), None)
