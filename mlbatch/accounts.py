@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import resource
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import discover, sensors
-from mlbatch.clouds import CloudRecording
 from mlbatch.discover import Note
 from mlbatch.ledger import PointCounts, ordered
 from mlbatch.passing import PASS_REASONS
@@ -57,7 +57,9 @@ def report_inputs(run: Conversion) -> ReportInputs:
             Passed(topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS))
             for topic, counts in sorted(run.passed.counts.items())
         ),
-        faults=tuple(FaultReport(one.fault, one.packets) for one in run.replay.counts),
+        faults=()
+        if run.replay is None
+        else tuple(FaultReport(one.fault, one.packets) for one in run.replay.counts),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
@@ -69,6 +71,19 @@ CLOUDS = "clouds"
 MANY = 0.01
 
 
+def _cloud_notes(run: Conversion) -> Iterator[Note]:
+    """What the times of clouds were taken for."""
+    if not any(recording.topics for recording in run.recordings):
+        return
+    # Captures have no topics, and so no clouds: they need not wait for what reads these.
+    from mlbatch.clouds import CloudRecording
+
+    for recording in run.recordings:
+        if isinstance(recording, CloudRecording):
+            for text in recording.verdicts:
+                yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
+
+
 def late_notes(run: Conversion) -> list[Note]:
     """Warnings that only the end of a run knows: damaged recordings, lidars that came late."""
     notes = [
@@ -76,12 +91,7 @@ def late_notes(run: Conversion) -> list[Note]:
         for recording in run.recordings
         for text in recording.notes
     ]
-    notes += [
-        Note(CLOUDS, "", f"{recording.path.name}: {text}")
-        for recording in run.recordings
-        if isinstance(recording, CloudRecording)
-        for text in recording.verdicts
-    ]
+    notes += _cloud_notes(run)
     for sensor, feed in zip(run.setup.sensors, run.feeds, strict=True):
         packets = feed.ledger.packets
         # What was captured twice is no loss.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from mlbatch.batching.grid import Grid
@@ -14,6 +16,9 @@ from mlbatch.mounting import Mounted
 from mlbatch.rate import rate_text
 from mlbatch.ring import RawRing
 from mlbatch.types import F64Array, RunInfo, SensorInfo
+
+if TYPE_CHECKING:
+    from mlbatch.faults import FaultReplay
 
 
 def feed_of(sensor: Mounted) -> Feed:
@@ -48,6 +53,19 @@ def source_of(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
         min(high),
         job.keep_repeated,
     )
+
+
+def replay_of(setup: Setup, job: Job, begin_ns: int | None) -> FaultReplay | None:
+    """The replay of the faults wanted; begin_ns: arrival of the first packet, where it is known."""
+    if not job.faults:
+        return None
+    # Not loaded for runs without faults.
+    from mlbatch.faults import FaultReplay
+
+    replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in setup.sensors])
+    # Not the first packet that is read: bags hold many in a message, of each sensor in turn.
+    replay.begin_ns = begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
+    return replay
 
 
 def boxes_of(setup: Setup, job: Job) -> F64Array:

@@ -6,14 +6,17 @@ import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mlbatch.batching.windows import Limit
 from mlbatch.clipping import Part
 from mlbatch.discover import Wishes
 from mlbatch.errors import UsageError
-from mlbatch.faults import Fault
 from mlbatch.types import EXTRAS
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.faults import Fault
 
 DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S

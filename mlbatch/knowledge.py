@@ -29,7 +29,6 @@ from mlbatch.rig import DEFAULT_BODY_FRAME
 from mlbatch.transforms import compose, inverse
 from mlbatch.types import F64Array
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
-from mlbatch.urdf import joints
 
 # Parent, child, translation x, y, z in metres, quaternion x, y, z, w.
 Stated: TypeAlias = tuple[str, str, Sequence[float], Sequence[float]]
@@ -136,6 +135,9 @@ class Knowledge:
 
     def add_urdf(self, text: str) -> None:
         """Add the fixed joints of a robot description; one that cannot be read is a finding."""
+        # Few recordings have one.
+        from mlbatch.urdf import joints
+
         try:
             for joint in joints(text):
                 parent, child = clean(joint.parent), clean(joint.child)

@@ -8,18 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from mlbatch import sensors
+from mlbatch import readers, sensors
 from mlbatch.errors import MlbatchError
 from mlbatch.frames import nearest_topic
 from mlbatch.knowledge import Knowledge
 from mlbatch.lidar import Calibration, Evidence, Lidar
-from mlbatch.readers import (
-    CORRECTION_TYPE,
-    decode_bytes,
-    decode_string,
-    decode_transforms,
-    holds_corrections,
-)
 from mlbatch.types import Message, PacketBatch, Recording, Topic
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
@@ -38,7 +31,7 @@ def teaches(topic: Topic) -> bool:
         return _tail(topic) in (METADATA, DESCRIPTION)
     if topic.type == BYTES_TYPE:
         return _tail(topic) == CORRECTIONS
-    return topic.type in TRANSFORM_TYPES or holds_corrections(topic)
+    return topic.type in TRANSFORM_TYPES or readers.holds_corrections(topic)
 
 
 def listen(recordings: Iterable[Recording]) -> None:
@@ -70,17 +63,17 @@ class Learner:
     def _learn(self, message: Message) -> None:
         topic = message.topic
         if topic.type in TRANSFORM_TYPES:
-            stated = decode_transforms(topic, message.data)
+            stated = readers.decode_transforms(topic, message.data)
             self.knowledge.add_transforms("tf_static" if _tail(topic) == STATIC else "tf", stated)
         elif topic.type == TEXT_TYPE and _tail(topic) == METADATA:
             # Of several, the first: it is the one under which the recording began.
-            self._texts.setdefault(topic.name, decode_string(topic, message.data).encode())
+            self._texts.setdefault(topic.name, readers.decode_string(topic, message.data).encode())
         elif topic.type == BYTES_TYPE and _tail(topic) == CORRECTIONS:
-            self._texts.setdefault(topic.name, decode_bytes(topic, message.data))
-        elif topic.type == CORRECTION_TYPE:
+            self._texts.setdefault(topic.name, readers.decode_bytes(topic, message.data))
+        elif topic.type == readers.CORRECTION_TYPE:
             self._texts.setdefault(topic.name, message.data)
         elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
-            self.knowledge.add_urdf(decode_string(topic, message.data))
+            self.knowledge.add_urdf(readers.decode_string(topic, message.data))
 
     @property
     def metadata_topics(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch import accounts
-from mlbatch.assembly import boxes_of, feed_of, intake_of, run_info, source_of
+from mlbatch.assembly import boxes_of, feed_of, intake_of, replay_of, run_info, source_of
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
@@ -20,7 +20,6 @@ from mlbatch.decode import Decoder, Source
 from mlbatch.decoding import Bench, Benches, Task, with_own_lidars
 from mlbatch.discover import Note, Setup, absent, discover, untimed
 from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
-from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
@@ -99,10 +98,7 @@ class Conversion:
         intakes = [intake_of(sensor, host_clock=by_host) for sensor, by_host in pairs]
         policy = Policy(job.max_wait_ns, job.keep_partial, job.start, job.end)
         self._refuse_untimed()
-        self.replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in sensors])
-        # Not the first packet that is read: bags hold many in a message, of each sensor in turn.
-        begin_ns = self.begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
-        self.replay.begin_ns = begin_ns
+        self.replay = replay_of(self.setup, self.job, self.begin_ns)
         streams = self.setup.sampler.table
         self.clocks = Timekeeper(sensors, host_clocks, self.replay, streams.untimed)
         if job.align_clocks_to:
@@ -150,7 +146,7 @@ class Conversion:
         # Also after an error files are closed here, by the thread that opened them.
         with contextlib.closing(merge(self.recordings)) as merged:
             batches: Iterator[PacketBatch] = merged
-            if self.job.faults:
+            if self.replay is not None:
                 batches = self.replay.batches(batches, self.feeder.owners)
             while (batch := self._read(batches)) is not None:
                 yield from self._due(self._push(batch))

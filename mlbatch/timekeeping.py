@@ -16,7 +16,6 @@ from mlbatch.batching.jumps import JumpGuard
 from mlbatch.clock_compare import Comparison, compare
 from mlbatch.discover import Note, Setup
 from mlbatch.doctor import ClockFinding, ClockWatch
-from mlbatch.faults import FaultReplay
 from mlbatch.feeding import Feeder
 from mlbatch.lidar import Lidar
 from mlbatch.mounting import Mounted
@@ -25,6 +24,7 @@ from mlbatch.types import I64Array, PacketBatch
 
 if TYPE_CHECKING:
     from mlbatch.clock_fit import ClockMap
+    from mlbatch.faults import FaultReplay
 
 SYNCHRONISED = "synchronised"
 # Codes of warnings by kind of jump.
@@ -35,13 +35,14 @@ _WARNINGS = {"host": "host_step"}
 class Timekeeper:
     """What is known and done of the clocks of a session's sensors, by their numbers.
 
-    host_clocks: sensors whose stamps are arrivals, which nothing here changes; untimed: numbers of
-    streams as in StreamTable; maps: of `--align-clocks`, once they are measured.
+    host_clocks: sensors whose stamps are arrivals, which nothing here changes; replay: None without
+    faults; untimed: numbers of streams as in StreamTable; maps: of `--align-clocks`, once they are
+    measured.
     """
 
     sensors: Sequence[Mounted]
     host_clocks: Sequence[bool]
-    replay: FaultReplay
+    replay: FaultReplay | None
     untimed: Collection[int]
     maps: tuple[ClockMap | None, ...] = ()
     guards: list[JumpGuard] = field(default_factory=list)
@@ -57,7 +58,7 @@ class Timekeeper:
 
     def retime(self, number: int, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
         """Stamps (P, C) of packets of a sensor as they are to be batched; host_ns: (P,)."""
-        if self.replay.faults:
+        if self.replay is not None:
             stamp_ns = stamp_ns + self.replay.shift_ns(number, host_ns)[:, None]
         found = self.maps[number] if self.maps else None
         return stamp_ns if found is None else found.apply(stamp_ns, host_ns[:, None])
@@ -70,8 +71,9 @@ class Timekeeper:
         feeds = [feed_of(sensor) for sensor in self.sensors]
         # Arrivals of sensors on the recorder's clock are needed as their own stamps, too.
         feeder = Feeder(setup, feeds, self.host_clocks, self.retime)
-        source = self.replay.batches(batches, feeder.owners) if self.replay.faults else batches
-        for batch in source:
+        if self.replay is not None:
+            batches = self.replay.batches(batches, feeder.owners)
+        for batch in batches:
             for arrival, watch in zip(
                 feeder.feed(batch, [None] * len(feeds)).arrivals, watches, strict=True
             ):

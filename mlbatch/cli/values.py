@@ -9,14 +9,17 @@ from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
-from mlbatch.faults import Fault, parse_fault
 from mlbatch.job import MOST_S, check_ranges_m, wait_ns
 from mlbatch.rate import parse_rate
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.faults import Fault
 
 MAX_SLICES = 10_000
 # Every job holds a few scans in memory.
@@ -144,6 +147,11 @@ def percent(option: str, value: float) -> float:
 
 def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
     """`--fault KIND:SENSOR:VALUE`, repeatable."""
+    if not texts:
+        return ()
+    # Not loaded for runs without faults.
+    from mlbatch.faults import parse_fault
+
     return tuple(parse_fault(text) for text in texts)
 
 

@@ -10,17 +10,19 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._definitions import type_key
-from mlbatch.readers._envelopes import CORRECTION_TYPE
-from mlbatch.readers._folder import bag_folder
-from mlbatch.readers._knowledge import decode_bytes, decode_string, decode_transforms
 from mlbatch.readers._merge import merge
-from mlbatch.readers._packet_types import PACKET_TYPES
 from mlbatch.readers._source import read_head
 from mlbatch.types import Recording, StreamTable, Topic
+
+if TYPE_CHECKING:
+    from mlbatch.readers._envelopes import CORRECTION_TYPE as CORRECTION_TYPE
+    from mlbatch.readers._knowledge import decode_bytes as decode_bytes
+    from mlbatch.readers._knowledge import decode_string as decode_string
+    from mlbatch.readers._knowledge import decode_transforms as decode_transforms
+    from mlbatch.readers._packet_types import Envelope
 
 __all__ = [
     "CORRECTION_TYPE",
@@ -37,6 +39,20 @@ __all__ = [
 ]
 
 _SHOWN_BYTES = 8
+# What only messages need.
+_PLACES = {
+    "CORRECTION_TYPE": "_envelopes",
+    "decode_bytes": "_knowledge",
+    "decode_string": "_knowledge",
+    "decode_transforms": "_knowledge",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load what is asked for: captures hold no messages, and are not to wait for their types."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_PLACES[name]}"), name)
 
 
 class Reader(Protocol):
@@ -66,12 +82,21 @@ class FolderReader(Reader, Protocol):
 
 def holds_packets(topic: Topic) -> bool:
     """Whether the messages of a topic hold raw packets of lidars."""
-    return type_key(topic.type) in PACKET_TYPES
+    return _envelope(topic) is not None
 
 
 def holds_corrections(topic: Topic) -> bool:
     """Whether calibrations may stand among the packets of a topic, as CORRECTION_TYPE."""
-    return holds_packets(topic) and PACKET_TYPES[type_key(topic.type)].corrections
+    envelope = _envelope(topic)
+    return envelope is not None and envelope.corrections
+
+
+def _envelope(topic: Topic) -> Envelope | None:
+    # As above: asked of topics only.
+    from mlbatch.readers._definitions import type_key
+    from mlbatch.readers._packet_types import PACKET_TYPES
+
+    return PACKET_TYPES.get(type_key(topic.type))
 
 
 def readers() -> list[Reader]:
@@ -128,6 +153,8 @@ def _reader_of(path: Path) -> Reader:
 
 def _open_folder(path: Path, streams: StreamTable) -> Recording:
     """Open a bag that is a folder."""
+    from mlbatch.readers._folder import bag_folder
+
     folder = bag_folder(path)
     found = [_reader_of(file) for file in folder.files]
     kinds = sorted({reader.CONTAINER for reader in found})
