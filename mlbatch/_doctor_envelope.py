@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch._doctor_bins import FIRST, TOP, Track
+from mlbatch.median import median
 from mlbatch.types import BoolArray, F64Array, I64Array
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -123,7 +124,7 @@ def envelope(part: Part) -> Line:
     knots_x, knots_y = _knots(x, y, rate)
     fine = groups(host_ns, offset_ns, part, MOST_GROUPS)
     residual = y[fine] - _polyline(x[fine], knots_x, knots_y, rate)
-    scatter_ns = _MAD_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
+    scatter_ns = _MAD_SIGMA * median(np.abs(residual - median(residual)))
     return Line(
         int(host_ns[0]) + np.rint(knots_x).astype(np.int64),
         int(offset_ns[0]) + np.rint(knots_y).astype(np.int64),
@@ -144,7 +145,7 @@ def _lonely(offset_ns: I64Array) -> BoolArray:
     padded = np.concatenate([np.full(_REACH, low), offset_ns, np.full(_REACH, low)])
     windows = np.lib.stride_tricks.sliding_window_view(padded, _REACH).max(axis=1)
     before, after = windows[:count], windows[_REACH + 1 :]
-    usual_ns = float(np.median(np.abs(np.diff(offset_ns))))
+    usual_ns = median(np.abs(np.diff(offset_ns)))
     above_ns = max(_ALONE_NS, _ALONE_SCALES * usual_ns)
     inner = slice(2, count - 2)
     lonely[inner] = (offset_ns - np.maximum(before, after))[inner] > above_ns
@@ -162,11 +163,11 @@ def _rate(x: F64Array, y: F64Array) -> tuple[float, float]:
     one, two = np.triu_indices(count, 1)
     run = x[two] - x[one]
     far = run > 0
-    rate = float(np.median((y[two] - y[one])[far] / run[far])) if far.any() else np.inf
+    rate = median((y[two] - y[one])[far] / run[far]) if far.any() else np.inf
     if abs(rate) > STEEPEST:
         return 0.0, float("inf")
     residual = y - rate * x
-    sigma = _MAD_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
+    sigma = _MAD_SIGMA * median(np.abs(residual - median(residual)))
     spread = float(np.sqrt(((x - x.mean()) ** 2).sum()))
     # 1.25: a median is that much less sure than a mean; few points tell their scatter badly.
     return rate, 3 * 1.25 * (sigma + 1.0) / spread * (1 + RATE_GROUPS / count)

@@ -14,6 +14,7 @@ import numpy as np
 from mlbatch._doctor_bins import BACK, FALL, RISE, Track
 from mlbatch._doctor_envelope import MOST_GROUPS, Line, Part, envelope, groups
 from mlbatch._doctor_names import HOST, SENSOR
+from mlbatch.median import median
 from mlbatch.types import F64Array, I64Array
 from mlbatch.units import NS_PER_MS
 
@@ -89,7 +90,7 @@ def _split(track: Track) -> list[Part]:
     level = _level(host_ns[tops], offset_ns[tops] - offset_ns[0], host_ns[0], rate)
     if len(level) < 2 * _LEAST_RISE:
         return [whole]
-    usual_ns = float(np.median(np.abs(np.diff(level))))
+    usual_ns = median(np.abs(np.diff(level)))
     size = _gaps(level)
     tops_of_rows = track.rows[:, 0] - track.rows[:, 1] - offset_ns[0]
     levels = _level(track.rows[:, 1], tops_of_rows, host_ns[0], rate)
@@ -108,7 +109,7 @@ def _usual_rate(host_ns: I64Array, offset_ns: I64Array) -> float:
     """The usual rate from each point to the next; steps do not count."""
     run = np.diff(host_ns)
     rates = np.diff(offset_ns)[run > 0] / run[run > 0]
-    return float(np.median(rates)) if len(rates) else 0.0
+    return median(rates) if len(rates) else 0.0
 
 
 def _level(host_ns: I64Array, offset_ns: I64Array, begin_ns: int, rate: float) -> F64Array:

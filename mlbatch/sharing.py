@@ -11,6 +11,7 @@ import numpy as np
 
 from mlbatch.geometry import rotor_ticks
 from mlbatch.lidar import Lidar
+from mlbatch.median import median
 from mlbatch.streams import Found, Kind, Sampler, as_rows
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -33,7 +34,7 @@ def shared_by(sampler: Sampler, sensor: Found) -> str:
             heads = _heads(sampler, kind, sensor.lidar)
             step_ns = _foreign_step_ns(heads, sensor.lidar)
             if step_ns is not None:
-                span_ns = float(np.median(_spans_ns(heads)))
+                span_ns = median(_spans_ns(heads))
                 return (
                     f"sensor {sensor.name}: {sampler.table.streams[kind[0]]}: wanted packets of "
                     f"one {sensor.lidar.model}, got packets of {span_ns / NS_PER_MS:.3f} ms that "
@@ -76,7 +77,7 @@ def _foreign_step_ns(heads: Heads, lidar: Lidar) -> float | None:
         elsewhere = _off_course(heads, rows, step_ns[rows], lidar)
         if np.count_nonzero(elsewhere) < _MANY * count:
             return None
-    return float(np.median(step_ns[foreign]))
+    return median(step_ns[foreign])
 
 
 def _off_course(heads: Heads, rows: I64Array, step_ns: F64Array, lidar: Lidar) -> BoolArray:

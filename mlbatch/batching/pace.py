@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.geometry import rotor_ticks
+from mlbatch.median import median
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, U16Array
 from mlbatch.units import NS_PER_S
 
@@ -186,7 +187,7 @@ def _missing(packets: _Packets, packet_ns: float) -> int:
     if not len(gap):
         return 0
     speed = _speed(packets, step_ns, pace_ns)[gap]
-    if float(np.median(speed)) < 0:
+    if median(speed) < 0:
         packets, speed = packets.mirrored(), -speed
     step_ns, begin, end = step_ns[gap], packets.first[gap], packets.first[gap + 1]
     turned = end - begin + np.rint(speed * step_ns - (end - begin))
@@ -199,7 +200,7 @@ def _missing(packets: _Packets, packet_ns: float) -> int:
     due = step_ns / pace_ns
     columns = packets.places.shape[1]
     column_turns = np.maximum(speed * (pace_ns / columns), 0.0)
-    dark = _dark_sectors(packets, begin, turned, float(np.median(column_turns)))
+    dark = _dark_sectors(packets, begin, turned, median(column_turns))
     across = np.flatnonzero(dark.passes(begin, turned).any(axis=1) & (column_turns > 0))
     if len(across):
         together = _together(packets.places)
@@ -303,7 +304,7 @@ def _dark_sectors(
         span = (packets.last - packets.first) % 1.0
         # A rotor that jitters or rests may seem to step back.
         span[span > 1 - _BACK_TURNS] = 0.0
-        wide = np.flatnonzero(span > 1.5 * np.median(span))
+        wide = np.flatnonzero(span > 1.5 * median(span))
         is_dark |= holes.passes(packets.first[wide], span[wide]).any(axis=0)
     return holes.take(is_dark)
 

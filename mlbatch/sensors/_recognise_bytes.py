@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from mlbatch.median import median
 from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
 
 # What `discover` and `survey` look for in a description.
@@ -58,7 +59,7 @@ def in_pairs(azimuth: I64Array) -> bool:
     width = min(even.shape[1], odd.shape[1])
     if width < 2:
         return False
-    turning = np.median((even[:, 1:] - even[:, :-1]) % _TICKS_PER_TURN) > 0
+    turning = median((even[:, 1:] - even[:, :-1]) % _TICKS_PER_TURN) > 0
     return bool(turning) and float((even[:, :width] == odd[:, :width]).mean()) > 0.75
 
 
@@ -77,6 +78,6 @@ def block_time_us(stamp_us: I64Array, azimuth: I64Array, wrap_us: int) -> float 
     usable = (step_us > 0) & (step_us < US_PER_MINUTE) & (turned > 0) & (turned < _MOST_LOST_TURN)
     if not usable.any():
         return None
-    speed = float(np.median(turned[usable] / step_us[usable]))
+    speed = median(turned[usable] / step_us[usable])
     span: F64Array = ((azimuth[:, -1] - azimuth[:, 0]) % _TICKS_PER_TURN).astype(np.float64)
-    return float(np.median(span) / (azimuth.shape[1] - 1) / speed)
+    return float(median(span) / (azimuth.shape[1] - 1) / speed)

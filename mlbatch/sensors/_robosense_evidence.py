@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mlbatch.median import median
 from mlbatch.sensors._recognise_bytes import number, usual
 from mlbatch.sensors._recognise_robosense import identify, returns_of
 from mlbatch.sensors._robosense_difop import Difop
@@ -71,7 +72,7 @@ def is_counted(points: U8Array, row: Model) -> bool:
         return False
     count = number(points[:_COUNTED_PACKETS], row.counter_at, 4, ">")
     steps = np.diff(count) % COUNTER_MODULUS
-    return len(steps) > 0 and float(np.median(steps)) == 1.0
+    return len(steps) > 0 and median(steps) == 1.0
 
 
 def doubts(points: U8Array, row: Model, difop: Difop | None, *, is_named: bool) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mlbatch.geometry import rotor_words
 from mlbatch.lidar import FAULTS, Records
+from mlbatch.median import median
 from mlbatch.pixels import PixelTable, readings
 from mlbatch.sensors._recognise_bytes import number, starts
 from mlbatch.sensors._robosense_models import READING, Layout, Model
@@ -116,7 +117,7 @@ class PacketReader:
         if near.any():
             self._cdeg_per_s = float(turned[near].sum() / took_ns[near].sum() * NS_PER_S)
         else:
-            self._cdeg_per_s = float(np.median(self._steps(azimuth, good)[0]))
+            self._cdeg_per_s = median(self._steps(azimuth, good)[0])
 
     def faults(self, packets: U8Array) -> U8Array:
         """Index into FAULTS for each packet."""

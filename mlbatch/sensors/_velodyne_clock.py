@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mlbatch.lidar import Beside
+from mlbatch.median import median
 from mlbatch.sensors._recognise_bytes import usual
 from mlbatch.sensors._recognise_velodyne import (
     NMEA_AT,
@@ -61,11 +62,11 @@ def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside
     away_ns = top_of_hour_ns(packets) - host_ns
     # They lie around a circle of one hour.
     spread_ns = (away_ns - away_ns[0] + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
-    offset_ns = int(away_ns[0]) + round(float(np.median(spread_ns)))
+    offset_ns = int(away_ns[0]) + round(median(spread_ns))
     offset_ns = (offset_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     told_ns = [value for one in beside for value in _position_offsets_ns(one)]
     if told_ns:
-        aim_ns = round(float(np.median(told_ns)))
+        aim_ns = round(median(np.array(told_ns)))
         offset_ns += (aim_ns - offset_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
     if int(host_ns.min()) + offset_ns < 0:
         offset_ns += HOUR_NS
@@ -109,7 +110,7 @@ def rotor_speed(stamp_ns: I64Array, azimuth: I64Array, rough: float | None) -> f
     turned = (np.diff(azimuth) % TURN_CDEG).astype(np.float64)
     near = (step_ns > 0) & (step_ns < _NEAR_NS)
     if near.any():
-        rough = float(np.median(turned[near] / step_ns[near]))
+        rough = median(turned[near] / step_ns[near])
     if not rough or rough < 0:
         return None
     # Whole turns between packets follow from the rough speed; over all, roundings cancel.

@@ -16,6 +16,7 @@ import numpy as np
 from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar import Calibration, Evidence, SensorModel
+from mlbatch.median import median
 from mlbatch.sensors import _hesai_models as rows
 from mlbatch.sensors._hesai_at128 import at128_projection
 from mlbatch.sensors._hesai_corrections import At128File, HesaiAngles, read_angles, read_at128
@@ -298,4 +299,4 @@ def _sense(reader: PacketReader, evidence: Evidence | None) -> int:
     if evidence is None or len(evidence.sample) < 2:
         return 1
     step = np.diff(reader.azimuth_turns(evidence.sample[:_PACKETS_IN_A_ROW]))
-    return -1 if np.median(step - np.rint(step)) < 0 else 1
+    return -1 if median(step - np.rint(step)) < 0 else 1

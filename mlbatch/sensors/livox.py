@@ -16,6 +16,7 @@ import numpy as np
 from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
+from mlbatch.median import median
 from mlbatch.sensors._livox_packets import (
     IMU_SIZE,
     faults,
@@ -195,7 +196,7 @@ def _counts_on(packets: U8Array) -> bool:
     next_ns = steps_ns[(steps == 1) & (steps_ns > 0)]
     if not len(next_ns):
         return False
-    wanted = np.cumsum(steps_ns) / np.median(next_ns)
+    wanted = np.cumsum(steps_ns) / median(next_ns)
     away = np.abs(np.cumsum(steps) - wanted)
     return bool((away <= _COUNTER_SHARE * np.abs(wanted) + _COUNTER_SLACK).all())
 

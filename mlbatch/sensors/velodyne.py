@@ -13,6 +13,7 @@ import numpy as np
 
 from mlbatch.errors import RigError
 from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.median import median
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_velodyne import BLOCK_LASERS, Identity, identify, takes, velodyne
 from mlbatch.sensors._velodyne_calibration import VelodyneFile, read_velodyne
@@ -207,7 +208,7 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
             )
     within = None
     if where.sequences > 1 and len(packets):
-        within = float(np.median(mean_step(*steps(azimuth)))) / (sequence_ns * row.halves)
+        within = median(mean_step(*steps(azimuth))) / (sequence_ns * row.halves)
     speed = rotor_speed(stamp_ns, azimuth[:, 0], within) or 0.0
     offset_ns = clock_offset_ns(packets, host_ns, evidence.beside)
     return Measured(seen.mode, sequence_ns, offset_ns, speed, pulse(evidence.beside)), notes

@@ -48,7 +48,7 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ),
     ),
     (("lidar",), ("transforms",), ("verify",), ("bench",)),
-    (("geometry",), ("kernels",), ("pixels",)),
+    (("geometry",), ("kernels",), ("pixels",), ("median",)),
     (("types",), ("leap_seconds",)),
     (("rate",), ("units",)),
     (("errors",), ("workers",)),
