@@ -24,10 +24,10 @@ def main() -> None:
     """Run the command line; exit codes are those of CONTRACT.md section 2."""
     gc.set_threshold(_BETWEEN_COLLECTIONS)
     atexit.register(gc.freeze)
-    from mlbatch.cli.app import app
+    from mlbatch.cli.app import command_line
 
     try:
-        code = app(standalone_mode=False)
+        code = command_line(*sys.argv[1:2])(standalone_mode=False)
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
         sys.exit(code)

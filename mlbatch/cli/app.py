@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Annotated
 
 import typer
 
 import mlbatch
-from mlbatch.cli.bench import bench
-from mlbatch.cli.compare import compare
-from mlbatch.cli.convert import convert
-from mlbatch.cli.inspect import inspect
-from mlbatch.cli.sensors import sensors
-from mlbatch.cli.verify import verify
 
-app = typer.Typer(
-    name="mlbatch",
-    help="Time-consistent merged scans from raw packets of many lidars, offline.",
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
+# Modules of this package, and the functions in them, in the order of the first page.
+COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "bench")
+
+
+def command_line(first: str = "") -> typer.Typer:
+    """The parser of a command line; first: its first word.
+
+    Where that is a command, the others are left out: each takes its time to be described.
+    """
+    app = typer.Typer(
+        name="mlbatch",
+        help="Time-consistent merged scans from raw packets of many lidars, offline.",
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback(invoke_without_command=True)(root)
+    for name in (first,) if first in COMMANDS else COMMANDS:
+        module = importlib.import_module(f"mlbatch.cli.{name}")
+        app.command()(getattr(module, name))
+    return app
 
 
 def _version(wanted: bool) -> None:
@@ -29,7 +38,6 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(invoke_without_command=True)
 def root(
     context: typer.Context,
     version: Annotated[
@@ -40,11 +48,3 @@ def root(
     if context.invoked_subcommand is None:
         typer.echo(context.get_help(), err=True)
         raise typer.Exit(2)
-
-
-app.command()(convert)
-app.command()(inspect)
-app.command()(compare)
-app.command()(sensors)
-app.command()(verify)
-app.command()(bench)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 
 import pytest
+from typer.core import TyperCommand
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from mlbatch.cli.app import app
+from mlbatch.cli.app import COMMANDS, command_line
 from tests.contract.tree import run_python
 
 # The options of this version (CONTRACT.md, section 2), and what their help has to say.
@@ -86,20 +87,44 @@ HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
 
 def _help(*arguments: str) -> str:
+    app = command_line(*arguments[:1])
     result = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == 0
     return " ".join(result.stdout.split())
 
 
+def _commands(first: str = "") -> dict[str, TyperCommand]:
+    group = get_command(command_line(first))
+    found: dict[str, TyperCommand] = getattr(group, "commands")  # noqa: B009 - typer hides its type
+    return found
+
+
 def _described(command: str) -> dict[str, str]:
     """Help text by the long name of each option of a command."""
-    commands = getattr(get_command(app), "commands")  # noqa: B009 - typer hides its type
     return {
-        name: parameter.help or ""
-        for parameter in commands[command].params
+        name: getattr(parameter, "help", None) or ""
+        for parameter in _commands()[command].params
         for name in parameter.opts
         if name.startswith("--")
     }
+
+
+def test_every_command_has_its_options_here() -> None:
+    assert sorted(COMMANDS) == sorted(OPTIONS)
+    assert tuple(_commands()) == COMMANDS
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_a_command_is_the_same_without_the_others(command: str) -> None:
+    alone = _commands(command)
+    assert list(alone) == [command]
+    options = [one.opts for one in alone[command].params]
+    assert options == [one.opts for one in _commands()[command].params]
+
+
+@pytest.mark.parametrize("first", ["", "convrt", "--help"])
+def test_other_words_leave_all_commands(first: str) -> None:
+    assert tuple(_commands(first)) == COMMANDS
 
 
 def test_the_first_page_names_every_command() -> None:
@@ -125,7 +150,8 @@ def test_help_shows_every_option(command: str) -> None:
 
 def test_help_loads_nothing_heavy() -> None:
     loaded = run_python(
-        f"import sys, mlbatch.cli.app\nprint([name for name in {HEAVY!r} if name in sys.modules])"
+        "import sys\nfrom mlbatch.cli.app import command_line\ncommand_line()\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )
     assert loaded.strip() == "[]"
 
