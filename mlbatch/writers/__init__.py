@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
 from mlbatch.errors import UsageError
@@ -58,6 +59,7 @@ LATER_SUFFIXES = {
 }
 
 
+@lru_cache(maxsize=1)
 def formats() -> tuple[str, ...]:
     """Names of all formats, sorted; no plug-in is imported."""
     found = pkgutil.iter_modules(__path__)
@@ -77,9 +79,8 @@ def plugin(name: str) -> WriterModule:
 def choose_format(target: Path, asked: str | None) -> str:
     """Format of the output `target`; `asked` is the value of `--format`, None if not given."""
     suffix = target.suffix.lower()
-    by_suffix = {plugin(name).SUFFIX: name for name in formats() if plugin(name).SUFFIX}
     _refuse_file_name(target, suffix)
-    found = by_suffix.get(suffix)
+    found = _of_suffix(suffix)
     if asked is None:
         return found or DEFAULT_FORMAT
     if found is not None and plugin(asked).SUFFIX is None:
@@ -93,6 +94,16 @@ def choose_format(target: Path, asked: str | None) -> str:
             f"got that of a {found} file; change {suffix} or leave out the option"
         )
     return plugin(asked).FORMAT
+
+
+def _of_suffix(suffix: str) -> str | None:
+    """The format whose files bear a suffix."""
+    if not suffix:
+        return None
+    # Importing them all takes long: the one that is likely comes first.
+    likely = sorted(formats(), key=lambda name: name != suffix.removeprefix("."))
+    suffixes = ((plugin(name).SUFFIX, name) for name in likely)
+    return next((name for own, name in suffixes if own == suffix), None)
 
 
 def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
