@@ -127,7 +127,9 @@ def test_programs_run_in_turn_and_back(tmp_path: Path, monkeypatch: pytest.Monke
         *((Case("small", ("three-vlp16",), "", (), pair),), ("numpy",), 1.0, 3), keep=tmp_path
     )
     assert [row.program for row in runner.bench(settings).rows] == ["a", "b"]
-    assert order == ["a", "b", "b", "a", "a", "b"]
+    # After runs that are not measured, in which all is compiled.
+    assert order[2:] == ["a", "b", "b", "a", "a", "b"]
+    assert sorted(order[:2]) == ["a", "b"]
 
 
 def test_case_names_are_all_different() -> None:
