@@ -91,7 +91,7 @@ def _settings(
             raise UsageError(f"--case: wanted one of {', '.join(cases)}, got {name!r}")
     engines, notes = _engines(engine)
     return Settings(
-        *(tuple(cases[name] for name in case or cases), engines, seconds, repeat),
+        *(tuple(cases[name] for name in dict.fromkeys(case or cases)), engines, seconds, repeat),
         # Not resolved: the python of an environment is a link, and its place says which one.
         peer_pythons=tuple(str(path.absolute()) for path in peer_python),
         keep=keep,

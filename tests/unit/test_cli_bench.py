@@ -134,3 +134,10 @@ def test_programs_run_in_turn_and_back(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_case_names_are_all_different() -> None:
     assert len({case.name for case in CASES}) == len(CASES)
+
+
+def test_a_case_that_is_named_twice_is_measured_once() -> None:
+    """Else its rows would be compared with each other."""
+    names = ["pandar64", "mixed", "pandar64"]
+    settings = options._settings(1.0, 1, names, "numpy", [], None, None)
+    assert [case.name for case in settings.cases] == ["pandar64", "mixed"]
