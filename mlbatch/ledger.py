@@ -109,6 +109,11 @@ def check_capture(counts: CaptureCounts) -> list[str]:
     ]
 
 
+def check_messages(topic: str, read: int, written: int, dropped: dict[str, int]) -> list[str]:
+    """What does not balance among the recorded messages of a topic, a line each."""
+    return _balance(f"messages of {topic}", read, (written, *dropped.values()))
+
+
 def ordered(counts: dict[str, int], reasons: tuple[str, ...]) -> dict[str, int]:
     """The reasons that were counted, in the order of their closed list."""
     known = {reason: counts[reason] for reason in reasons if counts.get(reason)}

@@ -16,6 +16,7 @@ from mlbatch.ledger import (
     PACKET_REASONS,
     SensorLedger,
     check_capture,
+    check_messages,
     ordered,
 )
 from mlbatch.scan_table import ScanStatistics, ScanTable, Spread
@@ -194,6 +195,8 @@ def imbalances(run: ReportInputs) -> list[str]:
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
     for sensor in run.sensors:
         lines += [f"{sensor.name}: {line}" for line in sensor.ledger.check()]
+    for one in run.messages:
+        lines += check_messages(one.topic, one.read, one.written, one.dropped)
     return lines
 
 

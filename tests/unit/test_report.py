@@ -15,6 +15,7 @@ from mlbatch.ledger import SensorLedger, check_capture
 from mlbatch.report import (
     ClockReport,
     InputReport,
+    Passed,
     ReportInputs,
     ScanTable,
     SensorReport,
@@ -89,6 +90,8 @@ def test_balanced_ledgers_have_nothing_to_say() -> None:
         ("columns", "written"),
         *(("points", name) for name in ("slots", "no_return", "range", "box", "repeated")),
         ("points", "written"),
+        ("imu_samples", "decoded"),
+        ("imu_samples", "written"),
     ],
 )
 def test_every_counter_tips_its_ledger(part: str, name: str) -> None:
@@ -96,7 +99,15 @@ def test_every_counter_tips_its_ledger(part: str, name: str) -> None:
     counter = getattr(counts, part)
     setattr(counter, name, getattr(counter, name) + 1)
     [line] = counts.check()
-    assert line.startswith(part)
+    assert line.startswith(part.replace("imu_", "IMU "))
+
+
+def test_messages_that_nobody_accounts_for_are_found() -> None:
+    passed = Passed("/imu", 10, 6, {"no_place": 4})
+    assert imbalances(replace(run(), messages=(passed,))) == []
+    assert imbalances(replace(run(), messages=(passed, replace(passed, written=5)))) == [
+        "messages of /imu: wanted 10 accounted for, got 5 + 4"
+    ]
 
 
 def test_unknown_reasons_are_found() -> None:
