@@ -117,7 +117,7 @@ def _convert(job: Job, wanted: Wanted) -> None:
     check_compression(name, options)
     job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
-        checks.place(job, wanted.output)
+        checks.place(job, wanted.output, name)
         if wanted.resume and interrupted.is_complete(wanted.output, overwrite=wanted.overwrite):
             return
         course = interrupted.course(job, wanted.output, name, options, resume=wanted.resume)
@@ -127,7 +127,7 @@ def _convert(job: Job, wanted: Wanted) -> None:
             checks.disk(job, wanted.output)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
-    checks.report(job, report_path, wanted.output)
+    checks.report(job, report_path, wanted.output, name)
     with _progress(wanted.quiet) as progress:
         conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
     for note in conversion.notes:

@@ -85,8 +85,13 @@ class Output:
         shutil.rmtree(old)
 
 
-def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
-    """Check that `target` can be written, and make a new `.partial` unless one is to be kept."""
+def is_taken(name: str) -> bool:
+    """Whether a file of this name in an output folder may be one of the run's own."""
+    return bool(_OWN_FILE.fullmatch(name) or _OWN_BAG_FILE.fullmatch(name))
+
+
+def check_name(target: Path) -> None:
+    """Refuse what cannot be the name of an output, or stands in no folder."""
     if target.name in ("", ".", ".."):
         raise ExportError(f"{target}: wanted the name of a new output, got a folder; add a name")
     if not target.parent.is_dir():
@@ -94,6 +99,11 @@ def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> 
             f"{target}: wanted an output in an existing folder, got {target.parent}, "
             f"which is none; create it (mkdir -p) or choose another"
         )
+
+
+def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
+    """Check that `target` can be written, and make a new `.partial` unless one is to be kept."""
+    check_name(target)
     if os.path.lexists(target):
         _check_replaceable(target, overwrite, folder)
     partial = partial_path(target)

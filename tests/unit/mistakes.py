@@ -93,6 +93,29 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "none/out: wanted an output in an existing folder, got none, which is none; create it "
         "(mkdir -p) or choose another",
     ),
+    "no name of an output": (
+        f"{FIX} -o .",
+        1,
+        ".: wanted the name of a new output, got a folder; add a name",
+    ),
+    "output over a rig": (
+        "fix/two_lidars.pcap --rig fix/rig.yaml -o fix/rig.yaml --format mcap --overwrite",
+        1,
+        "fix/rig.yaml: wanted an output that leaves fix/rig.yaml as it is, got one that writes "
+        "there; choose another name",
+    ),
+    "report over the growing output": (
+        f"{FIX} -o out.mcap --report out.mcap.partial",
+        1,
+        "out.mcap.partial: wanted a report besides the files of the output, got the place of one; "
+        "choose another name for the report",
+    ),
+    "report over a scan": (
+        f"{FIX} -o out --report out/000000.npz",
+        1,
+        "out/000000.npz: wanted a report besides the files of the output, got the place of one; "
+        "choose another name for the report",
+    ),
     "report folder missing": (
         f"{FIX} --report none/r.json",
         1,

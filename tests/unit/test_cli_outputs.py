@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -246,3 +247,40 @@ def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
     assert outcome.code == 0, outcome.err
     assert outcome.out.startswith("ouster_111: ")
     assert r"calibration /a\x1b[31m\x07\n/ouster/metadata" in outcome.out
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["partial", "partial.state", "scans.csv", "scans.csv.partial", "report.json", "old.partial"],
+)
+def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, name: str) -> None:
+    """A run would have removed them, or written over them."""
+    recording = Path(f"drive.mcap.{name}")
+    shutil.copy(CAPTURE, recording)
+    outcome = shell(f"convert {recording} --identity-extrinsics -o drive.mcap")
+    assert outcome.code == 1
+    assert f"wanted an output that leaves {recording} as it is" in outcome.err
+    assert recording.read_bytes() == CAPTURE.read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == [recording.name]
+
+
+@pytest.mark.parametrize(
+    ("output", "report"),
+    [
+        *(("out.mcap", f"out.mcap{suffix}") for suffix in ("", ".partial", ".scans.csv")),
+        ("out.mcap", "out.mcap.partial.state"),
+        *(("out", f"out/{name}") for name in ("000003.npz", "scans.csv", "left/report.json")),
+        *(("out", name) for name in ("out", "out.partial", "out.old.partial")),
+    ],
+)
+def test_a_report_takes_the_place_of_no_output(shell: Shell, output: str, report: str) -> None:
+    outcome = shell(f"convert {FIX} -o {output} --report {report}")
+    assert outcome.code == 1
+    assert f"{report}: wanted a report besides the files of the output" in outcome.err
+    assert not Path(output).exists()
+
+
+def test_a_bag_is_not_read_where_it_is_replaced(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o bag --format rosbag2").code == 0
+    outcome = shell("convert bag/bag_0.mcap -o bag --format rosbag2 --overwrite")
+    assert (outcome.code, "leaves bag/bag_0.mcap as it is" in outcome.err) == (1, True)
