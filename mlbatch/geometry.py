@@ -61,11 +61,17 @@ class BeamTable:
     def _turned(self, vectors: F64Array) -> F32Array:
         angle_rad = np.zeros(1) if self.angle_rad is None else self.angle_rad
         cosine, sine = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
-        turned = np.empty((3, len(angle_rad), vectors.shape[1]), np.float32)
+        # Planes of one memory, position after position, which is how they are looked up.
+        rows = np.empty((len(angle_rad), 3, vectors.shape[1]), np.float32)
+        turned: F32Array = rows.transpose(1, 0, 2)
+        # Fresh pages for each of the terms would cost more than the sums.
+        total, term = np.empty((2, *turned.shape[1:]))
         for axis in range(3):
-            turned[axis] = (
-                cosine * vectors[0, :, axis] + sine * vectors[1, :, axis] + vectors[2, :, axis]
-            )
+            np.multiply(cosine, vectors[0, :, axis], out=total)
+            np.multiply(sine, vectors[1, :, axis], out=term)
+            np.add(total, term, out=total)
+            np.add(total, vectors[2, :, axis], out=total)
+            turned[axis] = total
         return turned
 
 
@@ -304,7 +310,7 @@ def _stacked(planes: Sequence[F32Array]) -> F32Array:
     """Tables (3, W, B) of several sensors, one after the other, as (sum of W, 3, B)."""
     widest = max(plane.shape[2] for plane in planes)
     same = [np.broadcast_to(plane, (*plane.shape[:2], widest)) for plane in planes]
-    return np.ascontiguousarray(np.concatenate(same, axis=1).transpose(1, 0, 2))
+    return np.concatenate([plane.transpose(1, 0, 2) for plane in same])
 
 
 def _rotated(vectors: F64Array, rotation: F64Array) -> F64Array:
