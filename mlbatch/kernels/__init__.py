@@ -16,6 +16,8 @@ ENGINES = ("auto", "numpy", "numba")
 # From here on `auto` takes the kernels: loading them costs 0.05 s of CPU, as much as they save on
 # a tenth of this; the run that compiles them first (once) is to lose no more than some seconds.
 AUTO_BYTES = 64 << 20
+# The least that numba can compile.
+_PROBE = "mlbatch.kernels._probe_source"
 
 
 def is_installed() -> bool:
@@ -55,7 +57,9 @@ def _trouble(wanted: str) -> str:
         # Each run would compile, which takes longer than most recordings.
         return "no folder to keep kernels in"
     try:
-        native.load("mlbatch.kernels._probe_source")
+        # One that is kept was compiled here, and tells as much without being loaded.
+        if not native.is_kept(_PROBE):
+            native.load(_PROBE)
     except ImportError as err:  # It may be too old for this numpy.
         return f"got {' '.join(str(err).split())}"
     return ""

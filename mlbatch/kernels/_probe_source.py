@@ -1,4 +1,4 @@
-"""The least kernel: whether it loads tells whether others will."""
+"""The least kernel: whether it compiles tells whether others will."""
 
 from __future__ import annotations
 

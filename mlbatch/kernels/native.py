@@ -151,9 +151,13 @@ def _version(package: str) -> bytes:
 def _text(source: str) -> bytes:
     """The source of a kernel, and of all that kernels are made of."""
     found = importlib.util.find_spec(source)
-    own = [] if found is None or found.origin is None else [Path(found.origin)]
-    shared = sorted(Path(__file__).parent.glob("*.py"))
-    return b"\0".join(path.read_bytes() for path in [*own, *shared])
+    own = [] if found is None or found.origin is None else [Path(found.origin).read_bytes()]
+    return b"\0".join([*own, *_shared_texts()])
+
+
+@lru_cache(maxsize=1)
+def _shared_texts() -> tuple[bytes, ...]:
+    return tuple(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
 def _name(source: str, constants: tuple[Constant, ...]) -> str:
