@@ -27,7 +27,8 @@ def copy_runs(source: U8Array, start: I64Array, size: I64Array, out: U8Array, at
     Runs of one size are copied together, as elements of that many bytes: ten times faster than a
     loop over slices. Targets must not overlap each other or any source.
     """
-    for length in np.unique(size).tolist():
+    # numpy's unique would load its masked arrays.
+    for length in sorted(set(size.tolist())):
         if length:
             rows = np.flatnonzero(size == length)
             _windows(out, length)[at[rows]] = _windows(source, length)[start[rows]]
