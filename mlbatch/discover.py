@@ -13,7 +13,14 @@ from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.leap_seconds import gps_utc_s, tai_utc_s
 from mlbatch.lidar import Calibration, ModelFile
-from mlbatch.looking import calibrations_for, fault_of, look, read_given, with_clouds
+from mlbatch.looking import (
+    calibrations_besides,
+    calibrations_for,
+    fault_of,
+    look,
+    read_given,
+    with_clouds,
+)
 from mlbatch.matching import Matched, match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.rig import Rig, RigSensor, StreamSelector, read_rig
@@ -73,7 +80,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     recordings = with_clouds(recordings, table, {stream.topic for stream in streams} - {""})
     sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
-    calibrations, files = calibrations_for(paths, wishes.metadata, wishes.rig)
+    calibrations, files = calibrations_besides(rig, paths, wishes.metadata)
     recorded = learner.calibrations()
     calibrations += recorded
     looked = [path.name for path in files] + [str(one.path) for one in recorded]
@@ -86,6 +93,8 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
     found = matched.sensors
     lidar_kinds = [kind for kind in matched.unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
+        files = files or calibrations_for(paths, wishes.metadata)[1]
+        looked = [*(path.name for path in files), *(str(one.path) for one in recorded)]
         reason = _nothing_found(sampler, recordings, lidar_kinds, looked, matched.failures)
         faults = [*learner.faults, *filter(None, map(fault_of, files))]
         raise RecordingError(f"{reason}{_hints(recordings, faults)}")

@@ -14,6 +14,7 @@ from mlbatch.errors import RigError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
 from mlbatch.readers import holds_packets, merge
+from mlbatch.rig import Rig
 from mlbatch.streams import Sampler, split_by_kind
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_S
@@ -99,20 +100,15 @@ def _lidars_begin_ns(batch: PacketBatch) -> int | None:
 
 
 def calibrations_for(
-    recordings: Sequence[Path], given: Sequence[Path], rig: Path | None = None
+    recordings: Sequence[Path], given: Sequence[Path]
 ) -> tuple[list[Calibration], list[Path]]:
-    """Calibrations that were given, else those beside the recordings; and the files looked at.
-
-    rig: the rig file, which may lie among them.
-    """
+    """Calibrations that were given, else those beside the recordings; and the files looked at."""
     if given:
         return [read_given(path) for path in given], list(given)
     looked: list[Path] = []
     found = []
     for folder in dict.fromkeys(map(_folder_of, recordings)):
         for path in sorted(path for path in folder.iterdir() if _may_be_calibration(path)):
-            if rig is not None and path.samefile(rig):
-                continue
             # A file beside the recording was never named by the user: a foreign one is no error.
             try:
                 calibration = sensors.read_calibration(path)
@@ -124,6 +120,16 @@ def calibrations_for(
             if calibration is not None or path.suffix.lower() == METADATA_SUFFIX:
                 looked.append(path)
     return found, looked
+
+
+def calibrations_besides(
+    rig: Rig | None, recordings: Sequence[Path], given: Sequence[Path]
+) -> tuple[list[Calibration], list[Path]]:
+    """The same; nothing where the rig names the file of every sensor."""
+    # All makers would be asked for all files beside the recordings.
+    if rig is not None and not given and all(one.metadata for one in rig.sensors):
+        return [], []
+    return calibrations_for(recordings, given)
 
 
 def fault_of(path: Path) -> str:

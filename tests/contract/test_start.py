@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from tests.contract.tree import run_python
+from pathlib import Path
+
+import pytest
+
+from tests.contract.tree import modules, run_python
+from tests.unit.sessions import SMALL, Unit, write_session
 
 
 def test_the_command_line_spares_the_collector() -> None:
@@ -28,3 +33,41 @@ def test_the_library_leaves_the_collector_alone() -> None:
         "print(before == (gc.get_threshold(), gc.get_freeze_count(), gc.isenabled()))\n"
     )
     assert printed.strip() == "True"
+
+
+# Makers that are asked after Ouster, containers and messages that are not there, outputs and
+# commands that were not wanted.
+NEEDLESS = (
+    *("mlbatch.sensors.points", "mlbatch.sensors.robosense", "mlbatch.sensors.velodyne"),
+    *("mlbatch.sensors._recognise_robosense", "mlbatch.sensors._recognise_velodyne"),
+    *("mlbatch.readers.mcap", "mlbatch.readers.pcapng", "mlbatch.readers.rosbag1"),
+    *("mlbatch.readers._bag", "mlbatch.readers._envelopes", "mlbatch.readers._folder"),
+    *("mlbatch.clouds", "mlbatch.faults", "mlbatch.urdf", "mlbatch.survey"),
+    *("mlbatch.compare", "mlbatch.verify", "mlbatch.bench", "mlbatch.api"),
+    *("mlbatch.writers.npz", "mlbatch.writers.ply", "mlbatch.writers.rosbag1"),
+    *("mlbatch.cli.bench", "mlbatch.cli.compare", "mlbatch.cli.inspect", "mlbatch.cli.verify"),
+    *("numpy.ma", "rosbags", "rich", "numba"),
+)
+
+
+@pytest.mark.parametrize("name", [name for name in NEEDLESS if name.startswith("mlbatch.")])
+def test_what_is_needless_is_there(name: str) -> None:
+    assert name.removeprefix("mlbatch.") in {module.name for module in modules()}
+
+
+def test_a_capture_loads_only_what_it_needs(tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit())
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"sensors: [{{name: front, metadata: {SMALL.serial}.json}}]\n")
+    output = tmp_path / "scans.mcap"
+    arguments = ["convert", str(capture), "--rig", str(rig), "-o", str(output), "--quiet"]
+    printed = run_python(
+        "import atexit, sys\n"
+        "from mlbatch.cli import main\n"
+        f"names = {NEEDLESS!r}\n"
+        "atexit.register(lambda: print([name for name in names if name in sys.modules]))\n"
+        f"sys.argv[1:] = {arguments!r}\n"
+        "main()\n"
+    )
+    assert printed.strip() == "[]"
+    assert output.is_file()
