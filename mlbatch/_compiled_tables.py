@@ -116,6 +116,7 @@ def _put_pixels(tables: Tables, projector: Projector, table: PixelTable) -> None
     tables.set_numbers(
         {
             at.SLOTS: projector.slots,
+            at.RECORD_BYTES: lidar.records.size,
             at.RUN_COUNT: len(runs[0]),
             at.SILENT: table.silent,
             at.DARK_COUNT: len(table.dark),

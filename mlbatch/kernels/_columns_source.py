@@ -19,6 +19,7 @@ from mlbatch.kernels._primitives import (
     Pointer,
     as_c16,
     f4_scratch,
+    fetch,
     i8_at,
     i8_scratch,
     moved,
@@ -30,6 +31,10 @@ from mlbatch.kernels._read_source import reader_of
 
 _TABLE_AT = 56
 _RING = 5
+_NO_RECORD = 0
+# Records are asked for so many columns before they are read: neighbours in a scan lie apart, so
+# that no CPU foresees where.
+_AHEAD, _LINE_BYTES = 2, 64
 
 
 def build(
@@ -42,7 +47,7 @@ def build(
     read, project = reader_of(word, step, pad), projecting(kind, pad, returns)
     mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting(lanes)
     elements, four, eight = returns * pad, 4 * returns * pad, 8 * pad
-    record_of = _record_of()
+    coming = _coming()
 
     def kernel(frame: Pointer) -> int:
         ranges, levels, keep = f4_scratch(elements), f4_scratch(elements), u1_scratch(elements)
@@ -55,11 +60,15 @@ def build(
         members, sensors = i8_at(frame[at.MEMBER]), i8_at(frame[at.SENSOR])
         stamps_ns, words = i8_at(frame[at.STAMP_NS]), i8_at(frame[at.ENCODER])
         row, number, last_table = 0, 0, frame[at.TABLES] - 1
+        records = i8_scratch(_AHEAD)
+        for column in range(_AHEAD):
+            records[column] = coming(frame, column)
         for column in range(frame[at.COLUMNS]):
-            member = members[sensors[column]]
-            if member < 0:
+            record = records[column % _AHEAD]
+            records[column % _AHEAD] = coming(frame, column + _AHEAD)
+            if record == _NO_RECORD:
                 continue
-            record = record_of(frame, column, member)
+            member = members[sensors[column]]
             for which in range(returns):
                 read(frame, record, which, ranges, levels, others)
             table = min(max(words[column] >> _TABLE_AT, 0), last_table)
@@ -80,15 +89,23 @@ def build(
 
 
 @cache
-def _record_of() -> Callable[[Pointer, int, int], int]:
+def _coming() -> Callable[[Pointer, int], int]:
     @piece
-    def record_of(frame: Pointer, column: int, member: int) -> int:
-        """Address of the first byte of a column's record."""
+    def coming(frame: Pointer, column: int) -> int:
+        """Address of a column's record, which is asked for; _NO_RECORD if it is of other kinds."""
+        if column >= frame[at.COLUMNS]:
+            return _NO_RECORD
+        member = i8_at(frame[at.MEMBER])[i8_at(frame[at.SENSOR])[column]]
+        if member < 0:
+            return _NO_RECORD
         ring = moved(i8_at(frame[at.RINGS]), member * _RING)
         place, part = i8_at(frame[at.PLACE])[column], 0
         if ring[2] != 1:
             part = place % ring[2]
             place = place // ring[2]
-        return int(ring[0] + place % ring[1] * ring[3] + part * ring[4])
+        record = int(ring[0] + place % ring[1] * ring[3] + part * ring[4])
+        for byte in range(0, frame[at.RECORD_BYTES] + _LINE_BYTES - 1, _LINE_BYTES):
+            fetch(record + byte)
+        return record
 
-    return record_of
+    return coming

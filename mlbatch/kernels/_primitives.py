@@ -111,10 +111,26 @@ def _in_32_bits(builder: Any, number: Any, width: int) -> Any:
     return (builder.trunc if width > _NARROW.width else builder.zext)(number, _NARROW)
 
 
+def _fetch(typing_context: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.inttoptr(args[0], ir.IntType(8).as_pointer())
+        # To be read, and then used again, as data.
+        numbers = [ir.Constant(_NARROW, number) for number in (0, 3, 1)]
+        kind = ir.FunctionType(ir.VoidType(), [place.type, *(one.type for one in numbers)])
+        name = "llvm.prefetch.p0"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        builder.call(function, [place, *numbers])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
 _NARROW = ir.IntType(32)
 # The pointer so many elements further on.
 moved = cast(Callable[[Pointer, int], Pointer], intrinsic(_moved))
 # `(word >> shift) & mask` in 32 bits: wider numbers would halve what a vector holds.
 bits = cast(Callable[[int, int, int], int], intrinsic(_bits))
+# Ask for the bytes around an address, which will be read soon; any address will do.
+fetch = cast(Callable[[int], None], intrinsic(_fetch))
 # The same place, as elements of sixteen bytes.
 as_c16 = cast(Callable[[Pointer], Pointer], intrinsic(_as_c16))

@@ -42,7 +42,9 @@ COUNTS = 36
 (POINT, LABEL, RANGE, REFLECTIVITY, COLUMN, POINTS, HAS_REFLECTIVITY) = range(37, 44)
 # Organized: slots of a row, 0 for dense scans; (E,) int64, slot of each element.
 (WIDTH, SLOT) = range(44, 46)
-SIZE = 46
+# Bytes of a column's record.
+RECORD_BYTES = 46
+SIZE = 47
 
 # Dense parts of several kinds to one scan: columns; the kind of each sensor, sensors, points of
 # every column (addresses of int64); (kinds, 4) int64, addresses of their planes (point, label,
