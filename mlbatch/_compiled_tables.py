@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,7 +12,7 @@ from mlbatch.kernels import frame as at
 from mlbatch.lidar import Lidar
 from mlbatch.pixels import Bits, PixelTable
 from mlbatch.projection import Projector
-from mlbatch.types import F32Array
+from mlbatch.types import F32Array, I64Array
 
 AnyArray = npt.NDArray[np.generic]
 
@@ -83,19 +85,40 @@ def padded(channels: int) -> int:
     return max(_LEAST_PAD, 1 << (channels - 1).bit_length())
 
 
-def described(projector: Projector, table: PixelTable, wide: int) -> Tables:
-    """All that stays the same from window to window; wide: see `compiled.CompiledKind`."""
-    tables, pad = Tables(at.SIZE), padded(projector.lidar.channels)
-    _put_pixels(tables, projector, table)
-    if isinstance(projector.projection, Tabled):
-        _put_tabled(tables, projector, projector.projection, pad)
-    elif isinstance(projector.projection, Turning):
-        _put_turning(tables, projector.lidar.channels, projector.projection, pad)
-    _put_slots(tables, projector, pad)
-    if projector.is_limited:
-        tables.set(at.LIMITS, projector.limits_m)
-    tables.set(at.BOXES, projector.boxes_m)
-    tables.set_numbers({at.BOX_COUNT: len(projector.boxes_m), at.WIDTH: wide})
+def likeness(projector: Projector) -> Hashable:
+    """Equal where the sensors of several projectors can be members of one frame.
+
+    Of those that turn, directions, labels and limits are of each member, the rest is of them all.
+    """
+    lidar, projection = projector.lidar, projector.projection
+    if not isinstance(projection, Turning):
+        return id(projector)
+    pixels = lidar.pixels, lidar.records, lidar.channels, lidar.returns, lidar.has_reflectivity
+    types = lidar.typed_by, lidar.sends_twice, projector.drops_repeated
+    turns = projection.has_reach, projection.fires_at_once, len(projection.firing_ns)
+    order = None if projector.order is None else projector.order.tobytes()
+    return pixels, types, turns, order, projector.number.tobytes()
+
+
+def described(projectors: Sequence[Projector], table: PixelTable, wide: int) -> Tables:
+    """All that stays the same from window to window; wide: see `compiled.CompiledKind`.
+
+    projectors: as many as are alike.
+    """
+    one = projectors[0]
+    tables, pad = Tables(at.SIZE), padded(one.lidar.channels)
+    _put_pixels(tables, one, table)
+    turning = [own.projection for own in projectors if isinstance(own.projection, Turning)]
+    if isinstance(one.projection, Tabled):
+        _put_tabled(tables, one, one.projection, pad)
+    elif turning:
+        _put_turning(tables, one.lidar.channels, turning, pad)
+    _put_slots(tables, one, pad)
+    _put_labels(tables, projectors, pad)
+    if any(own.is_limited for own in projectors):
+        tables.set(at.LIMITS, np.concatenate([own.limits_m for own in projectors]))
+    tables.set(at.BOXES, one.boxes_m)
+    tables.set_numbers({at.BOX_COUNT: len(one.boxes_m), at.WIDTH: wide})
     return tables
 
 
@@ -134,30 +157,31 @@ def _put_tabled(tables: Tables, projector: Projector, projection: Tabled, pad: i
     tables.set_numbers({at.ROWS: len(projection.direction), at.TABLES: 1})
 
 
-def _put_turning(tables: Tables, channels: int, projection: Turning, pad: int) -> None:
-    tables.set(at.DIRECTION, _wide(projection.direction, pad))
-    tables.set(at.ORIGIN, _wide(projection.origin, pad))
+def _put_turning(tables: Tables, channels: int, members: Sequence[Turning], pad: int) -> None:
+    one = members[0]
+    tables.set(at.DIRECTION, _wide(np.stack([own.direction for own in members]), pad))
+    tables.set(at.ORIGIN, _wide(np.stack([own.origin for own in members]), pad))
+    tables.set(at.VECTORS, np.array([_vectors(own) for own in members], np.int64))
+    tables.set_numbers({at.TABLES: len(one.firing_ns)})
+    if one.has_reach:
+        reaches_m = [np.broadcast_to(own.reach_m, (channels,)) for own in members]
+        tables.set(at.REACH, _wide(np.stack(reaches_m), pad))
+    if not one.fires_at_once:
+        tables.set(at.FIRING, _wide(np.concatenate([own.firing_ns for own in members]), pad))
+
+
+def _vectors(projection: Turning) -> int:
+    """Bits of the vectors that count."""
     flags = _axes(projection.direction[:2]) | _axes(projection.direction[2:]) << 3
     flags |= _axes(projection.origin[2:]) << 9
     if projection.origin_turns:
         flags |= _axes(projection.origin[:2]) << 6
-    tables.set_numbers({at.VECTORS: flags, at.TABLES: len(projection.firing_ns)})
-    if projection.has_reach:
-        tables.set(at.REACH, _wide(np.broadcast_to(projection.reach_m, (channels,)), pad))
-    if not projection.fires_at_once:
-        tables.set(at.FIRING, _wide(projection.firing_ns, pad))
+    return flags
 
 
 def _put_slots(tables: Tables, projector: Projector, pad: int) -> None:
     lidar, returns = projector.lidar, projector.lidar.returns
-    slot = np.arange(projector.slots)
-    element = slot % returns * pad + slot // returns
-    labels = np.zeros((len(projector.labels), returns * pad), np.int64)
-    typed = _TYPED[lidar.typed_by] if returns == 2 else 0
-    # Types that the kernel tells stand in no table.
-    words = projector.labels & ~_TYPE_BITS if typed else projector.labels
-    labels[:, element] = words.view(np.int64)
-    tables.set(at.LABELS, labels)
+    element = _elements(projector, pad)
     place = np.zeros(returns * pad, np.int64)
     place[element] = projector.number
     tables.set(at.SLOT, place)
@@ -169,11 +193,32 @@ def _put_slots(tables: Tables, projector: Projector, pad: int) -> None:
     tables.set_numbers(
         {
             at.ORDER_STEP: projector.slots if several else 0,
-            at.TYPED: typed,
+            at.TYPED: _typed(lidar),
             at.SENT_TWICE: lidar.sends_twice,
             at.DROPS_REPEATED: projector.drops_repeated,
         }
     )
+
+
+def _put_labels(tables: Tables, projectors: Sequence[Projector], pad: int) -> None:
+    one = projectors[0]
+    words = np.concatenate([own.labels for own in projectors])
+    if _typed(one.lidar):
+        # Types that the kernel tells stand in no table.
+        words &= ~_TYPE_BITS
+    labels = np.zeros((len(words), one.lidar.returns * pad), np.int64)
+    labels[:, _elements(one, pad)] = words.view(np.int64)
+    tables.set(at.LABELS, labels)
+
+
+def _elements(projector: Projector, pad: int) -> I64Array:
+    """The element of each slot."""
+    slot, returns = np.arange(projector.slots), projector.lidar.returns
+    return slot % returns * pad + slot // returns
+
+
+def _typed(lidar: Lidar) -> int:
+    return _TYPED[lidar.typed_by] if lidar.returns == 2 else 0
 
 
 def _field(field: Bits | None) -> tuple[int, int, int]:

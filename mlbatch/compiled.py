@@ -7,11 +7,11 @@ addresses in a frame (`kernels/frame.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
-from mlbatch._compiled_tables import AnyArray, Tables, described, is_compiled, padded
+from mlbatch._compiled_tables import AnyArray, Tables, described, is_compiled, likeness, padded
 from mlbatch.buffers import Buffer, Due
 from mlbatch.geometry import Tabled, Turning, rotor_angles
 from mlbatch.kernels import frame as at
@@ -28,27 +28,34 @@ _COLUMNS_SOURCE, _MERGE_SOURCE = "mlbatch.kernels._columns_source", "mlbatch.ker
 class CompiledKind:
     """Sensors of one kind, from raw columns to points in their final rows."""
 
-    def __init__(self, projector: Projector, seat: I64Array, extras: Extras, wide: int) -> None:
-        """seat: (sensors,) number of each among those of the kind, else -1.
+    def __init__(
+        self, projectors: Sequence[Projector], seat: I64Array, extras: Extras, wide: int
+    ) -> None:
+        """projectors: as many as are alike; seat: (sensors,) number of each among those of the
+        kind, else -1.
 
         extras: those that the scan has, of any sensor; wide: slots of a row of organized scans; 0:
         scans are dense.
         """
-        lidar, table = projector.lidar, projector.lidar.pixels
+        lidar, projection = projectors[0].lidar, projectors[0].projection
+        table = lidar.pixels
         if table is None:
             raise ValueError(f"no kernel for {lidar.model}")
-        self._projector = projector
+        self._rings = [source.ring for own in projectors for source in own.sources]
+        self._ledgers = [counts for own in projectors for counts in own.counts]
+        self._slots = projectors[0].slots
+        self._turns = isinstance(projection, Turning)
         self._extras = extras
         self._seat = seat
         word = table.echoes[0].distance.word
-        kind = "tabled" if isinstance(projector.projection, Tabled) else "turning"
+        kind = "tabled" if isinstance(projection, Tabled) else "turning"
         lanes = _LANES if has_features(*_PACKS) else 1
         self._kernel = load(
             *(_COLUMNS_SOURCE, word, table.step, padded(lidar.channels), lidar.returns, kind, lanes)
         )
-        self._tables = described(projector, table, wide)
+        self._tables = described(projectors, table, wide)
         self._tables.set(at.MEMBER, seat)
-        self._counts = np.zeros((len(projector.counts), 5), np.int64)
+        self._counts = np.zeros((len(self._ledgers), 5), np.int64)
         self._tables.set(at.COUNTS, self._counts)
 
     def decode(
@@ -69,8 +76,7 @@ class CompiledKind:
         ):
             tables.set(place, np.asarray(values, np.int64))
         self._aim(due)
-        rings = [source.ring.pieces for source in self._projector.sources]
-        tables.set(at.RINGS, _rings(rings))
+        tables.set(at.RINGS, _rings([ring.pieces for ring in self._rings]))
         self._aim_at(out, points)
         self._counts[:] = 0
         count = self._kernel(tables.frame)
@@ -78,7 +84,7 @@ class CompiledKind:
         return count
 
     def _aim(self, due: Due) -> None:
-        if not isinstance(self._projector.projection, Turning):
+        if not self._turns:
             return
         own = due.encoder
         if (self._seat < 0).any():
@@ -104,8 +110,8 @@ class CompiledKind:
             tables.set(at.POINTS, points)
 
     def _account(self) -> None:
-        slots = self._projector.slots
-        for counts, row in zip(self._projector.counts, self._counts.tolist(), strict=True):
+        slots = self._slots
+        for counts, row in zip(self._ledgers, self._counts.tolist(), strict=True):
             columns, found, single, in_range, outside = row
             counts.slots += columns * slots
             counts.no_return += columns * slots - found
@@ -174,17 +180,19 @@ class Kinds:
         if not any(is_compiled(projector) for projector in projectors):
             self._kinds = [Tiles(projectors, seat, columns, first_sensor, extras)]
             return
-        for number, projector in enumerate(projectors):
-            is_own = seat[:, 0] == number
-            if is_compiled(projector):
-                member = np.where(is_own, seat[:, 1], -1)
-                self._kinds.append(CompiledKind(projector, member, extras, wide))
+        kind, slots = np.empty(len(seat), np.int64), []
+        for number, group in enumerate(_alike(projectors)):
+            member = _members(projectors, group, seat)
+            alike = [projectors[which] for which in group]
+            kind[member >= 0] = number
+            slots.append(alike[0].slots)
+            if is_compiled(alike[0]):
+                self._kinds.append(CompiledKind(alike, member, extras, wide))
             else:
-                own = np.where(is_own[:, None], seat * (0, 1), -1)
-                self._kinds.append(Tiles([projector], own, columns, first_sensor, extras))
-        slots = [projector.slots for projector in projectors]
+                own = np.stack([np.minimum(member, 0), member], axis=1)
+                self._kinds.append(Tiles(alike, own, columns, first_sensor, extras))
         if len(slots) > 1 and not wide:
-            self._merger = Merger(seat[:, 0], extras)
+            self._merger = Merger(kind, extras)
             self._parts = [Buffer(columns * count, None) for count in slots]
             self._points = np.zeros(columns, np.int64)
 
@@ -200,6 +208,25 @@ class Kinds:
                 kind.decode(tile, start_ns, first + begin, part, points)
             row += self._merger.merge(tile.sensor, points, self._parts, out, row, first + begin)
         return row
+
+
+def _alike(projectors: Sequence[Projector]) -> list[list[int]]:
+    """Numbers of the projectors, grouped by kinds; without a kernel each is one of its own."""
+    groups: dict[Hashable, list[int]] = {}
+    for number, projector in enumerate(projectors):
+        key = likeness(projector) if is_compiled(projector) else number
+        groups.setdefault((is_compiled(projector), key), []).append(number)
+    return list(groups.values())
+
+
+def _members(projectors: Sequence[Projector], group: Sequence[int], seat: I64Array) -> I64Array:
+    """(sensors,) number of each among those of all projectors of a group, -1 for others."""
+    member, count = np.full(len(seat), -1), 0
+    for which in group:
+        own = seat[:, 0] == which
+        member[own] = seat[own, 1] + count
+        count += len(projectors[which].sources)
+    return member
 
 
 def _rings(pieces: Sequence[AnyArray]) -> I64Array:

@@ -72,11 +72,11 @@ def build(
             for which in range(returns):
                 read(frame, record, which, ranges, levels, others)
             table = min(max(words[column] >> _TABLE_AT, 0), last_table)
-            place = (member, words[column], table, number)
+            known = member * frame[at.TABLES] + table
+            place = (member, words[column], known, number)
             project(frame, place, ranges, levels, points, scratch)
             mark(frame, member, ranges, points, keep)
             offset_ns = stamps_ns[column] - frame[at.START_NS]
-            known = table if last_table else member
             if frame[at.ORDER] != 0 or frame[at.WIDTH] != 0:
                 label(frame, known, offset_ns, ranges, levels, labels)
             words_of = moved(i8_at(frame[at.LABELS]), known * elements)

@@ -2,8 +2,8 @@
 
 Source: the formulas of `mlbatch.geometry`, whose `Tabled` and `Turning` do the same in numpy, step
 by step in float32. Each piece is `(frame, place, ranges, levels, points, scratch)`: place is
-(member, encoder word, firing table, number among the columns of the kind); points are x, y, z and
-level; scratch is 8 * pad floats.
+(member, encoder word, firing table among those of all members, number among the columns of the
+kind); points are x, y, z and level; scratch is 8 * pad floats.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mlbatch.kernels._primitives import Pointer, f4_at, i8_at, moved, piece
 
 Place = tuple[int, int, int, int]
 Projecting = Callable[[Pointer, Place, Pointer, Pointer, Pointer, Pointer], None]
-_AXES = 3
+_VECTORS, _AXES = 3, 3
 # Bits of VECTORS.
 _FLAT, _LEVEL, _ORIGINS = 0, 3, 6
 # Of a rotor word.
@@ -77,7 +77,7 @@ def _turning(pad: int, returns: int) -> Projecting:
         points: Pointer,
         scratch: Pointer,
     ) -> None:
-        _, word, table, number = place
+        member, word, table, number = place
         cosine, sine = moved(scratch, 3 * pad), moved(scratch, 4 * pad)
         for beam in range(pad):
             cosine[beam] = f4_at(frame[at.COSINE])[number]
@@ -86,8 +86,10 @@ def _turning(pad: int, returns: int) -> Projecting:
         speed = np.float32(np.float64((field ^ _SPEED_SIGN) - _SPEED_SIGN) * _SPEED_STEP)
         if frame[at.FIRING] != 0 and speed != np.float32(0):
             turn_on(cosine, sine, speed, moved(f4_at(frame[at.FIRING]), table * pad))
-        directions, origins = f4_at(frame[at.DIRECTION]), f4_at(frame[at.ORIGIN])
-        vectors = frame[at.VECTORS]
+        first = member * _VECTORS * _AXES * pad
+        directions = moved(f4_at(frame[at.DIRECTION]), first)
+        origins = moved(f4_at(frame[at.ORIGIN]), first)
+        vectors = i8_at(frame[at.VECTORS])[member]
         begin = moved(scratch, 5 * pad)
         for axis in range(_AXES):
             here = axis * pad
@@ -97,7 +99,7 @@ def _turning(pad: int, returns: int) -> Projecting:
         for which in range(returns):
             metres, level = moved(ranges, which * pad), moved(levels, which * pad)
             if frame[at.REACH] != 0:
-                reach = f4_at(frame[at.REACH])
+                reach = moved(f4_at(frame[at.REACH]), member * pad)
                 for beam in range(pad):
                     cosine[beam] = metres[beam] + reach[beam]
                 lay(cosine, level, scratch, begin, moved(points, 4 * which * pad))

@@ -22,14 +22,14 @@ RINGS = 8
 # factor and divisor, float32; largest silent distance; dark channels, int64, and how many.
 (SLOTS, RUNS, RUN_COUNT, FIELDS, SCALE, SILENT, DARK, DARK_COUNT) = range(11, 19)
 # Tabled: (rows, 3, P) and (rows, 3) float32; int64 first row of each member; rows.
-# Turning: (3, 3, P) float32 vectors each, and bits, one an axis: vectors 1 and 2 count (from bit
-# 0), vector 3 counts (from bit 3); the same of origins (from bit 6).
+# Turning: (members, 3, 3, P) float32 vectors each; (members,) int64 bits, one an axis: vectors 1
+# and 2 count (from bit 0), vector 3 counts (from bit 3); the same of origins (from bit 6).
 (DIRECTION, ORIGIN, FIRST_ROW, ROWS, VECTORS) = range(19, 24)
-# (members, P) float32, added to ranges (0: nothing is); (tables, P) float32, firing times in ns (0:
-# all fire at once), and how many tables there are.
+# (members, P) float32, added to ranges (0: nothing is); (members * T, P) float32, firing times in
+# ns (0: all fire at once), and T, how many tables of them a member has.
 (REACH, FIRING, TABLES) = range(24, 27)
-# (members or tables, E) int64 words; (tables, slots) int64, elements in the order of firing (0: as
-# they lie), and the step from table to table, 0 if all share one; how types of two returns are
+# (members * T, E) int64 words; (T, slots) int64, elements in the order of firing (0: as they lie),
+# of all members, and the step from table to table, 0 if all share one; how types of two returns are
 # told: 0 not, 1 by range, 2 also by level; whether a lone return is sent twice; and dropped then.
 (LABELS, ORDER, ORDER_STEP, TYPED, SENT_TWICE, DROPS_REPEATED) = range(27, 33)
 # (members, 2) float32, lowest and highest range; (k, 6) float32 boxes, and k.

@@ -32,7 +32,12 @@ from tests.golden import test_every_model as models
 pytestmark = needs_numba
 
 START_NS, END_NS = 1_800_000_000_000_000_000, 1_800_000_000_100_000_000
-POSE = from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0))
+# Tilted, level, and where the vehicle is: sensors that are decoded together differ in these.
+POSES = (
+    from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0)),
+    from_rpy_deg((-1.0, 0.0, 1.8), (0.0, 0.0, 180.0)),
+    np.eye(4),
+)
 NAMES = tuple(name for name in PROFILES if name != "OFF")
 GUARD_ROWS, GUARD = 64, 0xA5
 # Of kinds that kernels decode, and of two that only numpy does.
@@ -148,12 +153,13 @@ def check(lidars: list[Lidar], case: Case) -> None:
     """Decode the same columns, twice, by both engines."""
     rng = np.random.default_rng(case.seed)
     rings = [filled(lidar, rng) for lidar in lidars]
-    low_m, high_m = (1.0, 60.0) if case.is_cut else (0.0, float("inf"))
     boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
     infos, sources, base = [], [], 0
-    for lidar, (ring, _) in zip(lidars, rings, strict=True):
-        sources.append(Source(lidar, ring, POSE, base, low_m, high_m, case.keeps_repeated))
-        infos.append(SensorInfo("one", lidar.model, lidar.channels, lidar.returns, base, POSE))
+    for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
+        pose = POSES[(case.seed + number) % len(POSES)]
+        low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
+        sources.append(Source(lidar, ring, pose, base, low_m, high_m, case.keeps_repeated))
+        infos.append(SensorInfo("one", lidar.model, lidar.channels, lidar.returns, base, pose))
         base += lidar.channels
     info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
     pair = Pair(
@@ -182,6 +188,13 @@ def test_any_pixels_of_any_rig(case: Case, chosen: list[int], others: list[Lidar
     # Two that are decoded together, as their pixels are alike.
     alike = [ouster("RNG15_RFL8_NIR8", 32, 1), ouster("RNG15_RFL8_NIR8", 32, 2)]
     check([[*others, *alike][number] for number in chosen], case)
+
+
+@pytest.mark.parametrize("chosen", [[0, 0, 0], [0, 2, 0], [5, 0, 5], [4, 1, 4]])
+def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: list[Lidar]) -> None:
+    for seed, layout in enumerate(("dense", "organized", "dense")):
+        case = Case(seed, 700, layout, EXTRAS, is_cut=seed == 0, keeps_repeated=False)
+        check([others[number] for number in chosen], case)
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
