@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-import numpy as np
-
 from mlbatch.kernels import frame as at
 from mlbatch.kernels._emit_source import emitting
 from mlbatch.kernels._keep_source import labelling, marking
@@ -18,6 +16,8 @@ from mlbatch.kernels._points_source import projecting
 from mlbatch.kernels._primitives import (
     Pointer,
     as_c16,
+    as_u1,
+    as_u4,
     f4_scratch,
     fetch,
     i8_at,
@@ -47,16 +47,21 @@ def build(
     read, project = reader_of(word, step, pad), projecting(kind, pad, returns)
     mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting(lanes)
     elements, four, eight = returns * pad, 4 * returns * pad, 8 * pad
+    whole = step * pad
     coming = _coming()
+    as_parts = as_u4 if word == "<u4" else as_u1
 
     def kernel(frame: Pointer) -> int:
         ranges, levels, keep = f4_scratch(elements), f4_scratch(elements), u1_scratch(elements)
         points, labels, scratch = f4_scratch(four), i8_scratch(elements), f4_scratch(eight)
         others = u2_scratch(elements)
         for element in range(elements):
-            ranges[element] = np.float32(0)
-            levels[element] = np.float32(0)
             others[element] = 0
+        # Beams that there are not hold no return.
+        pixels = u1_scratch(whole)
+        for byte in range(whole):
+            pixels[byte] = 0
+        planes = as_parts(pixels)
         members, sensors = i8_at(frame[at.MEMBER]), i8_at(frame[at.SENSOR])
         stamps_ns, words = i8_at(frame[at.STAMP_NS]), i8_at(frame[at.ENCODER])
         row, number, last_table = 0, 0, frame[at.TABLES] - 1
@@ -70,7 +75,7 @@ def build(
                 continue
             member = members[sensors[column]]
             for which in range(returns):
-                read(frame, record, which, ranges, levels, others)
+                read(frame, record, which, planes, ranges, levels, others)
             table = min(max(words[column] >> _TABLE_AT, 0), last_table)
             known = member * frame[at.TABLES] + table
             place = (member, words[column], known, number)
@@ -80,8 +85,8 @@ def build(
             if frame[at.ORDER] != 0 or frame[at.WIDTH] != 0:
                 label(frame, known, offset_ns, ranges, levels, labels)
             words_of = moved(i8_at(frame[at.LABELS]), known * elements)
-            planes = as_c16(points), labels, ranges, others, keep
-            row = emit(frame, column, table, row, planes, (words_of, offset_ns))
+            ready = as_c16(points), labels, ranges, others, keep
+            row = emit(frame, column, table, row, ready, (words_of, offset_ns))
             number += 1
         return row
 
