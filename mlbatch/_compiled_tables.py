@@ -33,6 +33,9 @@ class Tables:
 
     def set(self, place: int, values: AnyArray) -> None:
         """Put the address of an array there; it is kept until another one takes its place."""
+        # Arrays do not move, and the same ones are often used again.
+        if self._held.get(place) is values:
+            return
         held = np.ascontiguousarray(values)
         self._held[place] = held
         self.frame[place] = held.ctypes.data

@@ -11,7 +11,14 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 
-from mlbatch._compiled_tables import AnyArray, Tables, described, is_compiled, likeness, padded
+from mlbatch._compiled_tables import (
+    AnyArray,
+    Tables,
+    described,
+    is_compiled,
+    likeness,
+    padded,
+)
 from mlbatch.buffers import Buffer, Due
 from mlbatch.geometry import Tabled, Turning, rotor_angles
 from mlbatch.kernels import frame as at
@@ -22,7 +29,8 @@ from mlbatch.types import I64Array
 
 # Abilities of CPUs that pack eight lanes of a register by a mask.
 _LANES, _PACKS = 8, ("avx512f", "avx512bw", "avx512vl", "bmi2", "popcnt")
-_COLUMNS_SOURCE, _MERGE_SOURCE = "mlbatch.kernels._columns_source", "mlbatch.kernels._merge_source"
+_COLUMNS_SOURCE = "mlbatch.kernels._columns_source"
+_RELAY_SOURCE, _PARTS_SOURCE = "mlbatch.kernels._relay_source", "mlbatch.kernels._parts_source"
 
 
 class CompiledKind:
@@ -50,24 +58,30 @@ class CompiledKind:
         word = table.echoes[0].distance.word
         kind = "tabled" if isinstance(projection, Tabled) else "turning"
         lanes = _LANES if has_features(*_PACKS) else 1
-        self._kernel = load(
+        self.kernel = load(
             *(_COLUMNS_SOURCE, word, table.step, padded(lidar.channels), lidar.returns, kind, lanes)
         )
         self._tables = described(projectors, table, wide)
+        self.frame = self._tables.frame
         self._tables.set(at.MEMBER, seat)
         self._counts = np.zeros((len(self._ledgers), 5), np.int64)
         self._tables.set(at.COUNTS, self._counts)
 
-    def decode(
-        self, due: Due, start_ns: int, first: int, out: Buffer, points: I64Array | None = None
-    ) -> int:
+    def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
         """Decode those of the columns that are of this kind, from the buffer's first row on.
 
-        first: number of the first column; points: (n,), what each column gave is put there. Gives
-        the number of points.
+        first: number of the first column. Gives the number of points.
         """
+        self.prepare(due, start_ns, first, out)
+        count = self.kernel(self.frame)
+        self.account()
+        return count
+
+    def prepare(self, due: Due, start_ns: int, first: int, out: Buffer) -> None:
+        """What the kernel needs for `decode` goes into its frame."""
         tables = self._tables
-        tables.set_numbers({at.COLUMNS: len(due), at.START_NS: start_ns, at.FIRST_NUMBER: first})
+        tables.set_numbers({at.BEGIN: 0, at.END: len(due), at.ROW: 0, at.NUMBER: 0})
+        tables.set_numbers({at.START_NS: start_ns, at.FIRST_NUMBER: first})
         for place, values in (
             (at.STAMP_NS, due.stamp_ns),
             (at.SENSOR, due.sensor),
@@ -77,11 +91,8 @@ class CompiledKind:
             tables.set(place, np.asarray(values, np.int64))
         self._aim(due)
         tables.set(at.RINGS, _rings([ring.pieces for ring in self._rings]))
-        self._aim_at(out, points)
+        _put_outputs(tables, out, self._extras)
         self._counts[:] = 0
-        count = self._kernel(tables.frame)
-        self._account()
-        return count
 
     def _aim(self, due: Due) -> None:
         if not self._turns:
@@ -93,23 +104,8 @@ class CompiledKind:
         self._tables.set(at.COSINE, cosine)
         self._tables.set(at.SINE, sine)
 
-    def _aim_at(self, out: Buffer, points: I64Array | None) -> None:
-        extras, is_wide = self._extras, out.is_organized
-        tables = self._tables
-        tables.set(at.POINT, out.point)
-        tables.set(at.LABEL, out.label)
-        for place, name, values in (
-            (at.RANGE, "range_m", out.range_m),
-            (at.REFLECTIVITY, "reflectivity", out.reflectivity),
-        ):
-            if is_wide or name in extras:
-                tables.set(place, values)
-        if "column" in extras and points is None and not is_wide:
-            tables.set(at.COLUMN, out.column)
-        if points is not None:
-            tables.set(at.POINTS, points)
-
-    def _account(self) -> None:
+    def account(self) -> None:
+        """Add to the ledgers what the kernel counted since `prepare`."""
         slots = self._slots
         for counts, row in zip(self._ledgers, self._counts.tolist(), strict=True):
             columns, found, single, in_range, outside = row
@@ -121,45 +117,70 @@ class CompiledKind:
             counts.written += outside
 
 
-class Merger:
-    """Joins the dense points of several kinds in the order of the scan."""
+class CopiedKind:
+    """Sensors of one kind that numpy decodes, where others have kernels: as CompiledKind."""
 
-    def __init__(self, kind: I64Array, extras: frozenset[str]) -> None:
-        """kind: (sensors,) of each."""
+    def __init__(
+        self, tiles: Tiles, slots: int, columns: int, sensors: int, extras: Extras
+    ) -> None:
+        """slots: of a column; columns: the most that are decoded at once; sensors: of the rig."""
+        self.kernel = load(_PARTS_SOURCE)
+        self._tiles = tiles
         self._extras = extras
-        self._kernel = load(_MERGE_SOURCE)
-        self._tables = Tables(at.MERGE_SIZE)
-        self._tables.set(at.MERGE_KIND, kind)
-
-    def merge(
-        self,
-        sensor: I64Array,
-        points: I64Array,
-        parts: Sequence[Buffer],
-        out: Buffer,
-        row: int,
-        first: int,
-    ) -> int:
-        """Points of columns (n,), from the buffers of all kinds to `out` from `row` on.
-
-        points: (n,) of each column; first: number of the first column. Gives how many there are.
-        """
-        tables, planes = self._tables, [_planes(part) for part in parts]
-        tables.set_numbers({at.MERGED: len(sensor), at.MERGE_NUMBER: first})
-        tables.set(at.MERGE_SENSOR, sensor)
-        tables.set(at.MERGE_POINTS, points)
-        addresses = [[plane.ctypes.data for plane in planes_of] for planes_of in planes]
-        tables.set(at.MERGE_PARTS, np.array(addresses, np.int64))
-        tables.set(at.MERGE_POINT, out.point[row:])
-        tables.set(at.MERGE_LABEL, out.label[row:])
-        for place, name, values in (
-            (at.MERGE_RANGE, "range_m", out.range_m),
-            (at.MERGE_REFLECTIVITY, "reflectivity", out.reflectivity),
-            (at.MERGE_COLUMN, "column", out.column),
+        self._part = part = Buffer(columns * slots, None)
+        self._points = np.zeros(columns, np.int64)
+        self._tables = Tables(at.SIZE)
+        self.frame = self._tables.frame
+        # Nobody is to look for records.
+        self._tables.set(at.MEMBER, np.full(sensors, -1))
+        for place, values in (
+            (at.POINTS, self._points),
+            (at.PART_POINT, part.point),
+            (at.PART_LABEL, part.label),
+            (at.PART_RANGE, part.range_m),
+            (at.PART_REFLECTIVITY, part.reflectivity),
         ):
-            if name in self._extras:
-                tables.set(place, values[row:])
-        return self._kernel(tables.frame)
+            self._tables.set(place, values)
+
+    def prepare(self, due: Due, start_ns: int, first: int, out: Buffer) -> None:
+        """Decode the columns of the kind; what has to be copied goes into the kernel's frame."""
+        self._tiles.decode(due, start_ns, first, self._part, self._points[: len(due)])
+        self._tables.set_numbers({at.NUMBER: 0, at.FIRST_NUMBER: first})
+        self._tables.set(at.SENSOR, due.sensor)
+        _put_outputs(self._tables, out, self._extras)
+
+    def account(self) -> None:
+        """Nothing: numpy keeps ledgers of its own."""
+
+
+class Relay:
+    """Decodes dense scans of several kinds of sensors, whose kernels take turns."""
+
+    def __init__(
+        self, kinds: Sequence[CompiledKind | CopiedKind], kind: I64Array, most: int | None
+    ) -> None:
+        """kind: (sensors,) of each; most: columns that are decoded at once, None for all."""
+        self._kinds = kinds
+        self._most = most
+        self._kernel = load(_RELAY_SOURCE)
+        self._tables = Tables(at.RELAY_SIZE)
+        addresses = [(one.kernel.address, one.frame.ctypes.data) for one in kinds]
+        self._tables.set(at.RELAY_KIND, kind)
+        self._tables.set(at.RELAY_KERNELS, np.array(addresses, np.int64))
+
+    def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
+        """As `CompiledKind.decode`, of all sensors."""
+        tables, row, most = self._tables, 0, self._most or max(len(due), 1)
+        for begin in range(0, len(due), most):
+            some = due.part(slice(begin, begin + most))
+            for kind in self._kinds:
+                kind.prepare(some, start_ns, first + begin, out)
+            tables.set(at.RELAY_SENSOR, np.asarray(some.sensor, np.int64))
+            tables.set_numbers({at.RELAYED: len(some), at.RELAY_ROW: row})
+            row = self._kernel(tables.frame)
+            for kind in self._kinds:
+                kind.account()
+        return row
 
 
 class Kinds:
@@ -176,7 +197,7 @@ class Kinds:
     ) -> None:
         """wide: see CompiledKind; all else as of Tiles."""
         self._kinds: list[CompiledKind | Tiles] = []
-        self._columns = columns
+        self._relay: Relay | None = None
         if not any(is_compiled(projector) for projector in projectors):
             self._kinds = [Tiles(projectors, seat, columns, first_sensor, extras)]
             return
@@ -191,23 +212,21 @@ class Kinds:
             else:
                 own = np.stack([np.minimum(member, 0), member], axis=1)
                 self._kinds.append(Tiles(alike, own, columns, first_sensor, extras))
-        if len(slots) > 1 and not wide:
-            self._merger = Merger(kind, extras)
-            self._parts = [Buffer(columns * count, None) for count in slots]
-            self._points = np.zeros(columns, np.int64)
+        if len(self._kinds) > 1 and not wide:
+            parts = [
+                CopiedKind(one, count, columns, len(seat), extras)
+                if isinstance(one, Tiles)
+                else one
+                for one, count in zip(self._kinds, slots, strict=True)
+            ]
+            has_copies = any(isinstance(part, CopiedKind) for part in parts)
+            self._relay = Relay(parts, kind, columns if has_copies else None)
 
     def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
         """As `CompiledKind.decode`, of all sensors."""
-        if out.is_organized or len(self._kinds) == 1:
-            return sum(kind.decode(due, start_ns, first, out) for kind in self._kinds)
-        row = 0
-        for begin in range(0, len(due), self._columns):
-            tile = due.part(slice(begin, begin + self._columns))
-            points = self._points[: len(tile)]
-            for kind, part in zip(self._kinds, self._parts, strict=True):
-                kind.decode(tile, start_ns, first + begin, part, points)
-            row += self._merger.merge(tile.sensor, points, self._parts, out, row, first + begin)
-        return row
+        if self._relay is not None:
+            return self._relay.decode(due, start_ns, first, out)
+        return sum(kind.decode(due, start_ns, first, out) for kind in self._kinds)
 
 
 def _alike(projectors: Sequence[Projector]) -> list[list[int]]:
@@ -239,5 +258,15 @@ def _rings(pieces: Sequence[AnyArray]) -> I64Array:
     )
 
 
-def _planes(part: Buffer) -> tuple[AnyArray, ...]:
-    return part.point, part.label, part.range_m, part.reflectivity
+def _put_outputs(tables: Tables, out: Buffer, extras: Extras) -> None:
+    """Where points go; rows of organized scans are always whole."""
+    tables.set(at.POINT, out.point)
+    tables.set(at.LABEL, out.label)
+    for place, name, values in (
+        (at.RANGE, "range_m", out.range_m),
+        (at.REFLECTIVITY, "reflectivity", out.reflectivity),
+    ):
+        if out.is_organized or name in extras:
+            tables.set(place, values)
+    if "column" in extras and not out.is_organized:
+        tables.set(at.COLUMN, out.column)

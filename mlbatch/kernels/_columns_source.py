@@ -1,13 +1,12 @@
 """The decoding kernel: columns of one kind, from raw records to points in their final rows.
 
 All that a column needs lies in scratch that fits into the first cache; each of its pixels is read
-once and written once. The frame is that of `frame.py`; the result is the number of points.
+once and written once. The frame is that of `frame.py`; the result is the row after the last point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 
 from mlbatch.kernels import frame as at
 from mlbatch.kernels._emit_source import emitting
@@ -19,22 +18,16 @@ from mlbatch.kernels._primitives import (
     as_u1,
     as_u4,
     f4_scratch,
-    fetch,
     i8_at,
     i8_scratch,
     moved,
-    piece,
     u1_scratch,
     u2_scratch,
 )
 from mlbatch.kernels._read_source import reader_of
+from mlbatch.kernels._records_source import AHEAD, NO_RECORD, asking
 
 _TABLE_AT = 56
-_RING = 5
-_NO_RECORD = 0
-# Records are asked for so many columns before they are read: neighbours in a scan lie apart, so
-# that no CPU foresees where.
-_AHEAD, _LINE_BYTES = 2, 64
 
 
 def build(
@@ -48,7 +41,7 @@ def build(
     mark, label, emit = marking(pad, returns), labelling(pad, returns), emitting(lanes)
     elements, four, eight = returns * pad, 4 * returns * pad, 8 * pad
     whole = step * pad
-    coming = _coming()
+    ask = asking()
     as_parts = as_u4 if word == "<u4" else as_u1
 
     def kernel(frame: Pointer) -> int:
@@ -64,14 +57,16 @@ def build(
         planes = as_parts(pixels)
         members, sensors = i8_at(frame[at.MEMBER]), i8_at(frame[at.SENSOR])
         stamps_ns, words = i8_at(frame[at.STAMP_NS]), i8_at(frame[at.ENCODER])
-        row, number, last_table = 0, 0, frame[at.TABLES] - 1
-        records = i8_scratch(_AHEAD)
-        for column in range(_AHEAD):
-            records[column] = coming(frame, column)
-        for column in range(frame[at.COLUMNS]):
-            record = records[column % _AHEAD]
-            records[column % _AHEAD] = coming(frame, column + _AHEAD)
-            if record == _NO_RECORD:
+        begin, end, row = frame[at.BEGIN], frame[at.END], frame[at.ROW]
+        number, last_table = frame[at.NUMBER], frame[at.TABLES] - 1
+        records = i8_scratch(AHEAD)
+        for column in range(begin, min(begin + AHEAD, end)):
+            records[column % AHEAD] = ask(frame, column)
+        for column in range(begin, end):
+            record = records[column % AHEAD]
+            if column + AHEAD < end:
+                records[column % AHEAD] = ask(frame, column + AHEAD)
+            if record == NO_RECORD:
                 continue
             member = members[sensors[column]]
             for which in range(returns):
@@ -88,29 +83,7 @@ def build(
             ready = as_c16(points), labels, ranges, others, keep
             row = emit(frame, column, table, row, ready, (words_of, offset_ns))
             number += 1
-        return row
+        frame[at.NUMBER] = number
+        return int(row)
 
     return kernel
-
-
-@cache
-def _coming() -> Callable[[Pointer, int], int]:
-    @piece
-    def coming(frame: Pointer, column: int) -> int:
-        """Address of a column's record, which is asked for; _NO_RECORD if it is of other kinds."""
-        if column >= frame[at.COLUMNS]:
-            return _NO_RECORD
-        member = i8_at(frame[at.MEMBER])[i8_at(frame[at.SENSOR])[column]]
-        if member < 0:
-            return _NO_RECORD
-        ring = moved(i8_at(frame[at.RINGS]), member * _RING)
-        place, part = i8_at(frame[at.PLACE])[column], 0
-        if ring[2] != 1:
-            part = place % ring[2]
-            place = place // ring[2]
-        record = int(ring[0] + place % ring[1] * ring[3] + part * ring[4])
-        for byte in range(0, frame[at.RECORD_BYTES] + _LINE_BYTES - 1, _LINE_BYTES):
-            fetch(record + byte)
-        return record
-
-    return coming

@@ -62,8 +62,6 @@ def emitting(lanes: int) -> Emitting:
             out, number = u4_at(frame[at.COLUMN]), frame[at.FIRST_NUMBER] + column
             for place in range(row, after):
                 out[place] = np.uint32(number)
-        if frame[at.POINTS] != 0:
-            i8_at(frame[at.POINTS])[column] = after - row
         return after
 
     return emit

@@ -149,6 +149,19 @@ def _fetch(typing_context: Any, address: Any) -> Any:
     return types.void(types.int64), generate
 
 
+def _call_kernel(typing_context: Any, address: Any, frame: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        # numba's calling convention: places of the result and of an exception, then the arguments.
+        result = cgutils.alloca_once(builder, ir.IntType(64))
+        raised = cgutils.alloca_once(builder, ir.IntType(8).as_pointer())
+        values = [result, raised, args[1]]
+        kind = ir.FunctionType(_NARROW, [value.type for value in values])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
+        return builder.load(result)
+
+    return types.int64(types.int64, frame), generate
+
+
 _NARROW = ir.IntType(32)
 # The pointer so many elements further on.
 moved = cast(Callable[[Pointer, int], Pointer], intrinsic(_moved))
@@ -161,6 +174,8 @@ TOGETHER = 16
 take_apart = cast(
     Callable[[Pointer, Pointer, int, int], None], intrinsic(prefer_literal=True)(_taken_apart)
 )
+# What another kernel, at an address, makes of its frame.
+call_kernel = cast(Callable[[int, Pointer], int], intrinsic(_call_kernel))
 # Ask for the bytes around an address, which will be read soon; any address will do.
 fetch = cast(Callable[[int], None], intrinsic(_fetch))
 # The same place, as elements of another type, or of sixteen bytes.

@@ -12,7 +12,6 @@ import hashlib
 import importlib.util
 import os
 import threading
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -38,10 +37,16 @@ _MOST_ENTRIES = 200
 
 
 class Kernel:
-    """A compiled function of one argument: a frame of addresses and numbers."""
+    """A compiled function of one argument: a frame of addresses and numbers.
 
-    def __init__(self, call: Callable[..., int], owner: llvm.ExecutionEngine) -> None:
-        self._call = call
+    address: where its code lies, for other kernels.
+    """
+
+    def __init__(self, address: int, owner: llvm.ExecutionEngine) -> None:
+        # numba's calling convention: places of the result and of an exception, then the arguments.
+        kind = ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * 3)
+        self._call = kind(address)
+        self.address = address
         # The code lives as long as what loaded it.
         self._owner = owner
 
@@ -189,9 +194,7 @@ def _linked(symbol: str, code: bytes) -> Kernel:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), own)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    # numba's calling convention: places of the result and of an exception, then the arguments.
-    kind = ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * 3)
-    return Kernel(kind(engine.get_function_address(symbol)), engine)
+    return Kernel(engine.get_function_address(symbol), engine)
 
 
 def _read(path: Path) -> tuple[str, bytes] | None:
