@@ -29,7 +29,7 @@ class Due:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def part(self, columns: slice) -> Due:
+    def part(self, columns: slice | I64Array) -> Due:
         """Some of them."""
         return Due(
             self.stamp_ns[columns], self.sensor[columns], self.place[columns], self.encoder[columns]

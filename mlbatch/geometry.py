@@ -176,33 +176,54 @@ class Tabled:
         counts = [0 if one.angle_rad is None else len(one.angle_rad) for one in tables]
         self.first_position = np.cumsum([0, *counts[:-1]]).astype(np.int64)
         self.reaches_m = _reaches(tables)
-        self._taken = np.empty((columns, 3, self.direction.shape[2]), np.float32)
+        beams = self.direction.shape[2]
+        self._taken = np.empty((columns, 3, beams), np.float32)
         self._moved = np.empty_like(self._taken)
-        self._reached_m = np.empty((columns, self.direction.shape[2]), np.float32)
-        self._towards: F32Array = self._taken
-        self._from: F32Array = self._taken
-        self._reach_m = self.reaches_m[0]
+        self._reached_m = np.empty((columns, beams), np.float32)
+        self._runs: list[_Run] = []
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
         """Look up directions and origins."""
         position = encoder + self.first_position[member]
-        first, count = int(position[0]), len(position)
-        alone = len(self.reaches_m) == 1
-        self._reach_m = self.reaches_m[0] if alone else self.reaches_m[member]
-        if bool((position[1:] - position[:-1] == 1).all()):
-            turn = slice(first, first + count)
-            self._towards, self._from = self.direction[turn], self.origin[turn]
+        is_next = position[1:] - position[:-1] == 1
+        is_next &= member[1:] == member[:-1]
+        starts = [0, *((~is_next).nonzero()[0] + 1).tolist()]
+        count = len(position)
+        if len(starts) * _COLUMNS_OF_A_RUN > count + _COLUMNS_OF_A_RUN * len(self.reaches_m):
+            towards = self.direction.take(position, axis=0, out=self._taken[:count], mode="clip")
+            origin = self.origin.take(position, axis=0, mode="clip")
+            reach_m = self.reaches_m[member]
+            self._runs = [_Run(slice(0, count), towards, origin, reach_m)]
             return
-        self._towards = self._taken[:count]
-        self.direction.take(position, axis=0, out=self._towards, mode="clip")
-        self._from = self.origin.take(position, axis=0, mode="clip")
+        self._runs = []
+        for begin, end in zip(starts, [*starts[1:], count], strict=True):
+            first = int(position[begin])
+            turn = slice(first, first + end - begin)
+            reach_m = self.reaches_m[member[begin]]
+            run = _Run(slice(begin, end), self.direction[turn], self.origin[turn], reach_m)
+            self._runs.append(run)
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
-        count = len(range_m)
-        reached_m = np.add(range_m, self._reach_m, out=self._reached_m[:count])
-        moved = np.multiply(reached_m[:, None, :], self._towards, out=self._moved[:count])
-        np.add(moved, self._from, out=out.transpose(0, 2, 1))
+        for run in self._runs:
+            count = len(run.towards)
+            reached_m = np.add(range_m[run.columns], run.reach_m, out=self._reached_m[:count])
+            moved = np.multiply(reached_m[:, None, :], run.towards, out=self._moved[:count])
+            np.add(moved, run.origin, out=out[run.columns].transpose(0, 2, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Columns of a sensor, and what `Tabled` looked up for them; (n, 3, B or 1), metres."""
+
+    columns: slice
+    towards: F32Array
+    origin: F32Array
+    reach_m: F32Array
+
+
+# Positions that follow each other need not be looked up one by one, if there are enough of them.
+_COLUMNS_OF_A_RUN = 32
 
 
 class Turning:

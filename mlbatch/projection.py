@@ -30,8 +30,11 @@ from mlbatch.types import (
 
 # Enough work for a call to be cheap, little enough for the planes to stay in the caches.
 TILE_SLOTS = 1 << 16
+_NONE = np.float32(0)
 _ONLY, _FIRST_STRONG, _BOTH = np.uint8(7), np.uint8(3), np.uint8(9)
+_MOST_OF_A_BYTE = 255
 Extras: TypeAlias = frozenset[str]
+Counts: TypeAlias = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
 @dataclass(slots=True)
@@ -97,8 +100,8 @@ class Part:
 class Projector:
     """Sensors whose pixels decode alike: from places in their rings to points in the body frame.
 
-    They are decoded together, in the order of the scan; `counts` has one ledger for each. Slots of
-    a column are beams, in the order of the wire, times returns; `firing_order` and `number` tell
+    They are decoded together, one after the other; `counts` has one ledger for each. Slots of a
+    column are beams, in the order of the wire, times returns; `firing_order` and `number` tell
     where they belong.
 
     labels: what the points of a column are, a row for each sensor or firing table; order: slots in
@@ -124,6 +127,12 @@ class Projector:
         labels = [_labels(source, number) for number, source in members]
         self.labels = np.concatenate(labels).view(np.uint64)
         self._tables = len(lidar.firing_ns)
+        # Those of sensors that fire alike differ by one number for all slots.
+        steps = self.labels - self.labels[0]
+        self._label_steps = steps[:, 0].copy()
+        self._repeated_labels: npt.NDArray[np.uint64] | None = None
+        if self._tables == 1 and bool((steps == steps[:, :1]).all()):
+            self._repeated_labels = self.labels[:1].repeat(columns, axis=0)
         self.order = _firing_order(lidar)
         self._elements = np.arange(columns * self.slots)
         if self.order is not None and self._tables == 1:
@@ -136,7 +145,7 @@ class Projector:
         self.is_limited = any(low > 0 or high < float("inf") for low, high in limits)
         self._needs_range = "range_m" in extras or self.is_limited
         self.drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
-        self._records = np.empty((2, columns, lidar.records.size), np.uint8)
+        self._records = np.empty((columns, lidar.records.size), np.uint8)
         self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
@@ -145,11 +154,12 @@ class Projector:
     ) -> None:
         """Decode the columns at `place` into `part`, and mark the wanted points.
 
-        member: (n,) which of the sensors each column is of; place, encoder: as in Columns;
+        member: (n,) which of the sensors each column is of, rising; place, encoder: as in Columns;
         offset_ns: (n,) stamp minus start of the scan.
         """
         lidar = self.lidar
-        records = self._gathered(member, place)
+        blocks = self._blocks(member)
+        records = self._gathered(blocks, place)
         self.projection.aim(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
@@ -162,15 +172,21 @@ class Projector:
                 part.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
             part.reflectivity[:] = 0
-        words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)[:, None]
-        if len(self.labels) == 1:
-            np.add(self.labels, offset, out=words)
-        else:
-            self.labels.take(self._row(member, encoder), axis=0, out=words, mode="clip")
-            words += offset
+        self._label(member, encoder, offset_ns, part)
         if lidar.returns == 2:
             self._type_returns(part)
-        self._keep(member, part)
+        self._keep(blocks, part)
+
+    def _label(self, member: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part) -> None:
+        """What the points are, their times included."""
+        words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)
+        if self._repeated_labels is None:
+            self.labels.take(self._row(member, encoder), axis=0, out=words, mode="clip")
+            words += offset[:, None]
+            return
+        # A sum of whole planes costs less than one that repeats a row.
+        np.copyto(words, (offset + self._label_steps[member])[:, None])
+        words += self._repeated_labels[: len(words)]
 
     def in_firing_order(
         self, keep: BoolArray, encoder: I64Array
@@ -195,21 +211,18 @@ class Projector:
     def _row(self, member: I64Array, encoder: I64Array) -> I64Array:
         return member if self._tables == 1 else read_rotor_words(encoder)[2]
 
-    def _gathered(self, member: I64Array, place: I64Array) -> U8Array:
-        """Records of all columns, in their order."""
-        count = len(place)
+    def _blocks(self, member: I64Array) -> list[slice]:
+        """The columns of each sensor."""
         if len(self.sources) == 1:
-            self.sources[0].ring.gather(place, self._records[0, :count])
-            return self._records[0, :count]
-        order, begin = np.empty(count, np.int64), 0
-        for number, source in enumerate(self.sources):
-            rows = (member == number).nonzero()[0]
-            end = begin + len(rows)
-            source.ring.gather(place[rows], self._records[1, begin:end])
-            order[rows] = np.arange(begin, end)
-            begin = end
-        self._records[1].take(order, axis=0, out=self._records[0, :count], mode="clip")
-        return self._records[0, :count]
+            return [slice(0, len(member))]
+        ends = np.bincount(member, minlength=len(self.sources)).cumsum().tolist()
+        return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
+
+    def _gathered(self, blocks: Sequence[slice], place: I64Array) -> U8Array:
+        """Records of all columns, in their order."""
+        for source, own in zip(self.sources, blocks, strict=True):
+            source.ring.gather(place[own], self._records[own])
+        return self._records[: len(place)]
 
     def _type_returns(self, part: Part) -> None:
         """Numbering of facts/outputs.md section 3, by which of two returns is nearer and stronger.
@@ -234,61 +247,53 @@ class Projector:
         np.bitwise_or(kind, only, out=types[:, 0::2])
         np.bitwise_or(np.subtract(_BOTH, kind, out=kind), only, out=types[:, 1::2])
 
-    def _keep(self, member: I64Array, part: Part) -> None:
+    def _keep(self, blocks: Sequence[slice], part: Part) -> None:
         """Mark the points that are wanted, and count the others under their reason."""
         keep = part.keep
-        columns = np.bincount(member, minlength=len(self.sources))
-        found, left = self._mark(member, part)
-        for counts, number, points, wanted in zip(
-            self.counts, columns.tolist(), found, left, strict=True
-        ):
-            counts.slots += number * self.slots
-            counts.no_return += number * self.slots - points
+        found, left = self._mark(blocks, part)
+        for counts, own, points, wanted in zip(self.counts, blocks, found, left, strict=True):
+            slots = (own.stop - own.start) * self.slots
+            counts.slots += slots
+            counts.no_return += slots - points
             counts.repeated += points - wanted
         if self.is_limited:
-            limits_m = self.limits_m[member]
-            keep &= part.range_m >= limits_m[:, :1]
-            keep &= part.range_m <= limits_m[:, 1:]
-            left = self._drop("range", member, keep, left)
+            for own, (low, high) in zip(blocks, self.limits_m, strict=True):
+                keep[own] &= part.range_m[own] >= low
+                keep[own] &= part.range_m[own] <= high
+            left = self._drop("range", blocks, keep, left)
         if len(self.boxes_m):
             self._cut_boxes(part.point[..., :3], keep)
-            left = self._drop("box", member, keep, left)
+            left = self._drop("box", blocks, keep, left)
         for counts, points in zip(self.counts, left, strict=True):
             counts.written += points
 
-    def _left(self, member: I64Array, keep: BoolArray) -> list[int]:
-        """Points that are still wanted, of each sensor."""
-        if len(self.sources) == 1:
-            return [int(np.count_nonzero(keep))]
-        # Sums of whole numbers far below 2**53 are exact in a float64.
-        left = np.bincount(member, weights=wanted_points(keep), minlength=len(self.sources))
-        return [int(count) for count in left]
-
-    def _drop(self, reason: str, member: I64Array, keep: BoolArray, before: list[int]) -> list[int]:
-        left = self._left(member, keep)
+    def _drop(
+        self, reason: str, blocks: Sequence[slice], keep: BoolArray, before: list[int]
+    ) -> list[int]:
+        left = _left(blocks, keep)
         for counts, had, has in zip(self.counts, before, left, strict=True):
             setattr(counts, reason, getattr(counts, reason) + had - has)
         return left
 
-    def _mark(self, member: I64Array, part: Part) -> tuple[list[int], list[int]]:
+    def _mark(self, blocks: Sequence[slice], part: Part) -> tuple[list[int], list[int]]:
         """Mark the slots with a return; how many there are, and how many equal no earlier one.
 
         Both for each sensor. A return that equals an earlier one of the same shot is not marked.
         """
         keep, returns = part.keep, self.lidar.returns
         if returns == 1:
-            np.greater(part.range_m, 0, out=keep)
-            found = self._left(member, keep)
+            np.greater(part.range_m, _NONE, out=keep)
+            found = _left(blocks, keep)
             return found, found
         ranges_m = self._range_m[:, : len(keep)]
         found, left = [0] * len(self.sources), [0] * len(self.sources)
         for which, range_m in enumerate(ranges_m):
-            own = range_m > 0
-            found = list(map(int.__add__, found, self._left(member, own)))
+            own = range_m > _NONE
+            found = list(map(int.__add__, found, _left(blocks, own)))
             if self.drops_repeated:
                 for earlier in ranges_m[:which]:
                     own &= range_m != earlier
-            left = list(map(int.__add__, left, self._left(member, own)))
+            left = list(map(int.__add__, left, _left(blocks, own)))
             keep[:, which::returns] = own
         return found, left
 
@@ -298,9 +303,16 @@ class Projector:
             keep &= ~inside.all(axis=2)
 
 
-def wanted_points(keep: BoolArray) -> npt.NDArray[np.uint16]:
+def _left(blocks: Sequence[slice], keep: BoolArray) -> list[int]:
+    """Points that are still wanted, of each sensor."""
+    return [int(np.count_nonzero(keep[own])) for own in blocks]
+
+
+def wanted_points(keep: BoolArray) -> Counts:
     """How many points of each column (n, slots) are wanted: (n,)."""
-    return np.asarray(np.add.reduce(keep, axis=1, dtype=np.uint16))
+    # Short rows are where sums along an axis cost most; einsum's cost least.
+    narrow = np.uint8 if keep.shape[1] <= _MOST_OF_A_BYTE else np.uint16
+    return np.asarray(np.einsum("ij->i", keep.view(np.uint8), dtype=narrow))
 
 
 def _projection(sources: Sequence[Source], columns: int) -> Projection:

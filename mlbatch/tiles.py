@@ -1,7 +1,7 @@
 """The engine `numpy`: a window tile by tile, few passes over planes that stay in the caches.
 
-Sensors of one kind are projected together (`projection.py`); the index by which the valid points
-leave the tile lays their columns between those of other kinds.
+The columns of a tile are decoded sensor by sensor, those of one kind in one go (`projection.py`);
+the index by which the valid points leave the tile puts them in the order of the scan.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from mlbatch.types import BoolArray, I64Array
 class _Laid:
     """Columns of a tile that are decoded together.
 
-    rows: in the tile's order; begin: first element in its planes; encoder: of each.
+    rows: in the scan's order; begin: first element in the tile's planes; encoder: of each.
     """
 
     projector: Projector
     part: Part
-    rows: I64Array | slice
+    rows: I64Array
     begin: int
     encoder: I64Array
 
@@ -47,14 +47,22 @@ class Tiles:
         the scan has, of any sensor.
         """
         self._projectors = projectors
-        self._seat = seat
         self._columns = columns
         self._first_sensor = first_sensor
         self._extras = extras
         self._slots = max(projector.slots for projector in projectors)
         self._tile = Tile(columns * self._slots)
         self._keep = np.zeros((columns, self._slots), np.bool_)
-        self._element = np.empty(columns * self._slots, np.int64)
+        self._element = np.arange(columns * self._slots)
+        self._is_ordered = any(projector.order is not None for projector in projectors)
+        self._member = np.concatenate([np.arange(len(one.sources)) for one in projectors])
+        self._ends = np.cumsum([len(one.sources) for one in projectors])
+        # Of each sensor: its place among those that are decoded here, beyond all of them if not.
+        self._is_partial = bool((seat < 0).any())
+        seats = len(self._member)
+        first = np.array([0, *self._ends])[seat[:, 0]]
+        self._seat = np.where(seat[:, 0] < 0, seats, first + seat[:, 1]).astype(np.uint8)
+        self._is_alone = seats == 1
 
     def decode(
         self, due: Due, start_ns: int, first: int, out: Buffer, points: I64Array | None = None
@@ -63,103 +71,103 @@ class Tiles:
         count = 0
         for begin in range(0, len(due), self._columns):
             tile = slice(begin, min(begin + self._columns, len(due)))
-            laid = self._project(due, tile, start_ns)
-            if not laid:
+            number = np.arange(first + begin, first + tile.stop)
+            columns = due.part(tile)
+            own: I64Array | None = None
+            if self._is_partial:
+                own = (self._seat[columns.sensor] < len(self._member)).nonzero()[0]
+                columns, number = columns.part(own), number[own]
+            if not len(columns):
                 continue
+            laid = self._project(columns, start_ns)
             if out.is_organized:
-                count += self._place(laid, due, tile, first, out)
-            else:
-                count += self._compress(laid, tile, first, out, count, points)
+                count += self._place(laid, columns, number, out)
+                continue
+            index, keep = self._index(laid, len(columns))
+            self._move(index, out, count)
+            if points is not None:
+                points[tile][slice(None) if own is None else own] = wanted_points(keep)
+            elif "column" in self._extras:
+                out.column[count : count + len(index)] = number.repeat(wanted_points(keep))
+            count += len(index)
         return count
 
-    def _project(self, due: Due, tile: slice, start_ns: int) -> list[_Laid]:
-        """Decode the columns of one tile, kind by kind."""
-        place, encoder = due.place[tile], due.encoder[tile]
-        offset_ns = due.stamp_ns[tile] - start_ns
-        which, member = self._seat[due.sensor[tile]].T
+    def _project(self, due: Due, start_ns: int) -> list[_Laid]:
+        """Decode the columns of one tile, sensor by sensor."""
+        seat = self._seat[due.sensor]
+        rows = self._element[: len(due)]
+        if not self._is_alone:
+            rows = seat.argsort(kind="stable")
+            due = due.part(rows)
+        member, offset_ns = self._member[seat[rows]], due.stamp_ns - start_ns
         laid: list[_Laid] = []
-        begin = 0
-        counts = np.bincount(which + 1, minlength=1)[1:].tolist()
-        for number, projector in enumerate(self._projectors[: len(counts)]):
-            count = counts[number]
-            if not count:
+        element = begin = 0
+        counts = np.bincount(seat, minlength=len(self._member)).cumsum()[self._ends - 1]
+        for projector, end in zip(self._projectors, counts.tolist(), strict=True):
+            if begin == end:
                 continue
-            part = self._tile.part(begin, count, projector.slots)
-            if count == len(place):
-                projector.project(member, place, encoder, offset_ns, part)
-                return [_Laid(projector, part, slice(0, count), begin, encoder)]
-            rows = (which == number).nonzero()[0]
-            words = encoder[rows]
-            projector.project(member[rows], place[rows], words, offset_ns[rows], part)
-            laid.append(_Laid(projector, part, rows, begin, words))
-            begin += count * projector.slots
+            own = slice(begin, end)
+            part = self._tile.part(element, end - begin, projector.slots)
+            encoder = due.encoder[own]
+            projector.project(member[own], due.place[own], encoder, offset_ns[own], part)
+            laid.append(_Laid(projector, part, rows[own], element, encoder))
+            element += (end - begin) * projector.slots
+            begin = end
         return laid
 
     def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, BoolArray]:
         """Elements of the tile's planes in the order of the scan; wanted slots (columns, slots)."""
-        if len(laid) == 1:
+        if self._is_alone:
             keep, element = laid[0].projector.in_firing_order(laid[0].part.keep, laid[0].encoder)
             index = keep.reshape(-1).nonzero()[0]
             return index if element is None else element.take(index), keep
         wide = self._keep[:columns]
         shift = np.empty(columns, np.int64)
-        is_ordered = False
+        elements = np.empty(columns * self._slots, np.int64) if self._is_ordered else None
         for one in laid:
             count, slots = one.part.keep.shape
             keep, element = one.projector.in_firing_order(one.part.keep, one.encoder)
-            own = slice(one.begin, one.begin + count * slots)
-            is_ordered |= element is not None
-            elements = np.arange(count * slots) if element is None else element
-            np.add(elements, one.begin, out=self._element[own])
+            if elements is not None:
+                own = slice(one.begin, one.begin + count * slots)
+                within = self._element[: count * slots] if element is None else element
+                np.add(within, one.begin, out=elements[own])
             wide[one.rows, :slots] = keep
             wide[one.rows, slots:] = False
-            shift[one.rows] = one.begin + np.arange(count) * slots
-        shift -= np.arange(columns) * self._slots
+            shift[one.rows] = self._element[one.begin : one.begin + count * slots : slots]
+        shift -= self._element[: columns * self._slots : self._slots]
         index = wide.reshape(-1).nonzero()[0]
         index += shift.repeat(wanted_points(wide))
-        return self._element.take(index) if is_ordered else index, wide
+        return index if elements is None else elements.take(index), wide
 
-    def _compress(
-        self,
-        laid: Sequence[_Laid],
-        columns: slice,
-        first: int,
-        buffer: Buffer,
-        at: int,
-        points: I64Array | None,
-    ) -> int:
-        """Move the wanted points of a tile to their final rows; gives their number."""
+    def _move(self, index: I64Array, buffer: Buffer, at: int) -> None:
+        """Copy the wanted points of a tile to their final rows, from row `at` on.
+
+        No index is out of bounds; of what `take` might do then, to wrap is the fastest.
+        """
         tile = self._tile
-        index, keep = self._index(laid, columns.stop - columns.start)
         rows = slice(at, at + len(index))
         whole = tile.point.view(np.complex128).reshape(-1)
-        whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="clip")
+        whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="wrap")
         words = tile.label.view(np.uint64)
-        words.take(index, out=buffer.label[rows].view(np.uint64), mode="clip")
+        words.take(index, out=buffer.label[rows].view(np.uint64), mode="wrap")
         if "range_m" in self._extras:
-            tile.range_m.take(index, out=buffer.range_m[rows], mode="clip")
+            tile.range_m.take(index, out=buffer.range_m[rows], mode="wrap")
         if "reflectivity" in self._extras:
-            tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="clip")
-        if points is not None:
-            own = laid[0].rows if len(laid) == 1 else slice(None)
-            points[columns][own] = wanted_points(keep)
-        elif "column" in self._extras:
-            number = np.arange(first + columns.start, first + columns.stop, dtype=np.uint32)
-            buffer.column[rows] = number.repeat(wanted_points(keep))
-        return len(index)
+            tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="wrap")
 
-    def _place(
-        self, laid: Sequence[_Laid], due: Due, columns: slice, first: int, buffer: Buffer
-    ) -> int:
-        """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points."""
+    def _place(self, laid: Sequence[_Laid], due: Due, number: I64Array, buffer: Buffer) -> int:
+        """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points.
+
+        number: (n,) of the columns in the scan.
+        """
         points = 0
         for one in laid:
             part, keep = one.part, one.part.keep
             points += int(np.count_nonzero(keep))
             row, slot = np.nonzero(keep)
-            order = np.arange(first + columns.start, first + columns.stop)[one.rows]
+            order = number[one.rows]
             buffer.clear(order)
-            sensor = due.sensor[columns][one.rows] + self._first_sensor
+            sensor = due.sensor[one.rows] + self._first_sensor
             buffer.label["lidar_id"][order] = sensor[:, None]
             at = (order[row], one.projector.number[slot])
             buffer.point[at] = part.point[keep]
