@@ -60,7 +60,7 @@ class Decoder:
         # Rotor positions of a turn, None for those that columns tell themselves.
         angles = [source.lidar.beams.angle_rad for source in sources]
         self._positions = [None if one is None else len(one) for one in angles]
-        groups = _alike(sources)
+        groups = _alike(sources, together=engine == "numpy")
         first = only or 0
         self._projectors = [
             Projector(
@@ -211,13 +211,25 @@ def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> _O
     return _Outline(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)
 
 
-def _alike(sources: Sequence[Source]) -> list[list[int]]:
+def _alike(sources: Sequence[Source], *, together: bool) -> list[list[int]]:
     """Numbers of the sensors, grouped by what their pixels look like.
 
-    Those that say their angle themselves stay alone: their directions are made, not looked up.
+    together: also those that say their angle themselves, if their beams fire at the same times;
+    compiled loops follow the rotor of one sensor only.
     """
-    groups: dict[tuple[str | int | bool, ...], list[int]] = {}
+    groups: dict[tuple[str | int | bool | bytes, ...], list[int]] = {}
     for number, source in enumerate(sources):
-        own = source.lidar.beams.angle_rad is None
-        groups.setdefault((number,) if own else source.lidar.pixel_layout, []).append(number)
+        kind: tuple[str | int | bool | bytes, ...] = source.lidar.pixel_layout
+        if source.lidar.beams.angle_rad is None:
+            kind = (*kind, *_firing(source)) if together else (number,)
+        if source.lidar.projection(source.body_from_sensor, 1) is not None:
+            kind = (number,)
+        groups.setdefault(kind, []).append(number)
     return list(groups.values())
+
+
+def _firing(source: Source) -> tuple[str | bool | bytes, ...]:
+    """What sensors have in common whose beams fire alike, and whose returns mean the same."""
+    lidar = source.lidar
+    tables = lidar.firing_ns.tobytes(), lidar.channel.tobytes()
+    return (*tables, lidar.typed_by, lidar.sends_twice, source.keep_repeated)

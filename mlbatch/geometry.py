@@ -154,7 +154,7 @@ class Projection(Protocol):
     """Ranges to points in the body frame, for columns of sensors that are decoded together."""
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
-        """Prepare for n columns; member: (n,) which of the sensors; encoder: as in Columns."""
+        """Prepare for n columns; member: (n,) which of the sensors, rising; encoder: of Columns."""
         ...
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
@@ -227,56 +227,67 @@ _COLUMNS_OF_A_RUN = 32
 
 
 class Turning:
-    """A sensor that says its angle itself, whose beams fire while the rotor goes on.
+    """Sensors that say their angle themselves, whose beams fire while the rotor goes on.
 
-    What is the same for all columns lies repeated in planes (columns, B): loops over whole planes
-    cost a fraction of loops over the few beams of a column.
-
-    direction, origin: (3 vectors, 3 axes, B) float32; reach_m: (B,) or (1,); firing_ns: (T, B).
+    direction, origin: (3 vectors, 3 axes, B) float32, and reach_m: (B,) or (1,), all of the first
+    sensor; firing_ns: (T, B), the same for all.
     """
 
-    def __init__(self, table: BeamTable, firing_ns: I64Array, columns: int) -> None:
-        """table: beams in the body frame; firing_ns: (T, B); columns: the most aimed at once."""
-        beams = table.direction.shape[1]
-        self._direction = _planes(table.direction, columns, beams)
-        self._origin = _planes(table.origin, columns, beams)
-        self.direction, self.origin = self._direction[:, :, 0], self._origin[:, :, 0]
+    def __init__(
+        self,
+        table: BeamTable,
+        firing_ns: I64Array,
+        columns: int,
+        others: Sequence[BeamTable] = (),
+    ) -> None:
+        """table: beams in the body frame; firing_ns: (T, B); columns: the most aimed at once.
+
+        others: beams of more sensors.
+        """
+        tables, beams = (table, *others), table.direction.shape[1]
+        self._directions = [_Vectors(one.direction, columns, beams) for one in tables]
+        self._origins = [_Vectors(one.origin, columns, beams) for one in tables]
+        self.direction, self.origin = self._directions[0].first, self._origins[0].first
         self.origin_turns = bool(table.origin[:2].any())
-        self.reach_m = table.reach_m.astype(np.float32)
-        self.has_reach = bool(table.reach_m.any())
+        self._reaches_m = [one.reach_m.astype(np.float32) for one in tables]
+        self.reach_m = self._reaches_m[0]
+        self.has_reach = any(bool(one.reach_m.any()) for one in tables)
         self.firing_ns = firing_ns.astype(np.float32)
         self.fires_at_once = not firing_ns.any()
         self._repeated_ns = np.broadcast_to(self.firing_ns[0], (columns, beams)).copy()
         self._cosine, self._sine, self._turned, self._half, self._scratch = np.empty(
             (5, columns, beams), np.float32
         )
-        self._towards = np.empty((3, columns, beams), np.float32)
-        self._from = np.empty_like(self._towards) if self.origin_turns else self._origin[2]
-        self._count = 0
+        self._towards, self._from = np.empty((2, 3, columns, beams), np.float32)
+        self._aimed: list[_Aimed] = []
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
         """Cosine and sine of every beam at the angle at which it fires; directions, origins."""
         angle, speed, table = read_rotor_words(encoder)
-        count = self._count = len(encoder)
+        count = len(encoder)
         cosine, sine = self._cosine[:count], self._sine[:count]
         cosine[:] = np.cos(angle).astype(np.float32)[:, None]
         sine[:] = np.sin(angle).astype(np.float32)[:, None]
         if not self.fires_at_once and speed.any():
             self._turn_on(cosine, sine, speed, table)
-        for axis in range(3):
-            self._combine(self._direction, axis, self._towards[axis, :count])
-            if self.origin_turns:
-                self._combine(self._origin, axis, self._from[axis, :count])
+        self._aimed = []
+        for number, own in enumerate(blocks(member, len(self._directions))):
+            if own.start < own.stop:
+                turn = (cosine[own], sine[own], self._scratch[own])
+                towards = self._directions[number].turned(*turn, self._towards[:, own])
+                origin = self._origins[number].turned(*turn, self._from[:, own])
+                self._aimed.append(_Aimed(own, towards, origin, self._reaches_m[number]))
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
-        count = self._count
-        moved = self._scratch[:count]
-        if self.has_reach:
-            range_m = np.add(range_m, self.reach_m, out=self._half[:count])
-        for axis in range(3):
-            np.multiply(range_m, self._towards[axis, :count], out=moved)
-            np.add(moved, self._from[axis, :count], out=out[:, :, axis])
+        for one in self._aimed:
+            own = one.columns
+            moved, reached_m = self._scratch[own], range_m[own]
+            if self.has_reach:
+                reached_m = np.add(reached_m, one.reach_m, out=self._half[own])
+            for axis, (towards, origin) in enumerate(zip(one.towards, one.origin, strict=True)):
+                np.multiply(reached_m, towards, out=moved)
+                np.add(moved, origin, out=out[own, :, axis])
 
     def _turn_on(self, cosine: F32Array, sine: F32Array, speed: F64Array, table: I64Array) -> None:
         """Add d = speed * firing to the angles of cosine and sine (n, B), without trigonometry.
@@ -300,20 +311,59 @@ class Turning:
         np.subtract(cosine, scratch, out=cosine)
         np.add(sine, half, out=sine)
 
-    def _combine(self, vectors: F32Array, axis: int, out: F32Array) -> None:
-        """cos * V1 + sin * V2 + V3 of one axis: (n, B); vectors that are zero are left out."""
-        count = len(out)
-        turning, level = vectors[:2, axis, :count], vectors[2, axis, :count]
-        # All columns are alike, so that the first one tells.
-        if not turning[:, :1].any():
-            out[:] = level
-            return
-        scratch = self._scratch[:count]
-        np.multiply(self._cosine[:count], turning[0], out=out)
-        np.multiply(self._sine[:count], turning[1], out=scratch)
-        np.add(out, scratch, out=out)
-        if level[:1].any():
-            np.add(out, level, out=out)
+
+@dataclass(frozen=True, slots=True)
+class _Aimed:
+    """Columns of a sensor, and what `Turning` made for them: planes (n, B) of each axis, metres."""
+
+    columns: slice
+    towards: list[F32Array]
+    origin: list[F32Array]
+    reach_m: F32Array
+
+
+class _Vectors:
+    """Three vectors of every beam, repeated in planes (columns, B).
+
+    Loops over whole planes cost a fraction of loops over the few beams of a column. first: (3
+    vectors, 3 axes, B) float32.
+    """
+
+    def __init__(self, vectors: F64Array, columns: int, beams: int) -> None:
+        """vectors: (3, B or 1, 3)."""
+        self._planes = _planes(vectors, columns, beams)
+        self.first = self._planes[:, :, 0]
+        self._turns = [bool(self.first[:2, axis].any()) for axis in range(3)]
+        self._rises = [bool(self.first[2, axis].any()) for axis in range(3)]
+
+    def turned(
+        self, cosine: F32Array, sine: F32Array, scratch: F32Array, out: F32Array
+    ) -> list[F32Array]:
+        """cos * V1 + sin * V2 + V3 of each axis: (n, B); vectors that are zero are left out.
+
+        out: (3, n, B), for the axes that turn.
+        """
+        planes, count = [], len(cosine)
+        for axis in range(3):
+            level = self._planes[2, axis, :count]
+            if not self._turns[axis]:
+                planes.append(level)
+                continue
+            turned = np.multiply(cosine, self._planes[0, axis, :count], out=out[axis])
+            np.multiply(sine, self._planes[1, axis, :count], out=scratch)
+            np.add(turned, scratch, out=turned)
+            if self._rises[axis]:
+                np.add(turned, level, out=turned)
+            planes.append(turned)
+        return planes
+
+
+def blocks(member: I64Array, members: int) -> list[slice]:
+    """The columns of each of several sensors that lie one after the other."""
+    if members == 1:
+        return [slice(0, len(member))]
+    ends = np.bincount(member, minlength=members).cumsum().tolist()
+    return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
 
 
 def _planes(vectors: F64Array, columns: int, beams: int) -> F32Array:

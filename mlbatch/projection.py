@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.buffers import LABEL, Labels
-from mlbatch.geometry import Projection, Tabled, Turning, read_rotor_words
+from mlbatch.geometry import Projection, Tabled, Turning, blocks, read_rotor_words
 from mlbatch.ledger import PointCounts
 from mlbatch.lidar import Lidar
 from mlbatch.ring import RawRing
@@ -158,8 +158,8 @@ class Projector:
         offset_ns: (n,) stamp minus start of the scan.
         """
         lidar = self.lidar
-        blocks = self._blocks(member)
-        records = self._gathered(blocks, place)
+        own = blocks(member, len(self.sources))
+        records = self._gathered(own, place)
         self.projection.aim(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
@@ -175,7 +175,7 @@ class Projector:
         self._label(member, encoder, offset_ns, part)
         if lidar.returns == 2:
             self._type_returns(part)
-        self._keep(blocks, part)
+        self._keep(own, part)
 
     def _label(self, member: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part) -> None:
         """What the points are, their times included."""
@@ -209,14 +209,9 @@ class Projector:
         return order + np.arange(len(table))[:, None] * self.slots
 
     def _row(self, member: I64Array, encoder: I64Array) -> I64Array:
-        return member if self._tables == 1 else read_rotor_words(encoder)[2]
-
-    def _blocks(self, member: I64Array) -> list[slice]:
-        """The columns of each sensor."""
-        if len(self.sources) == 1:
-            return [slice(0, len(member))]
-        ends = np.bincount(member, minlength=len(self.sources)).cumsum().tolist()
-        return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
+        if self._tables == 1:
+            return member
+        return member * self._tables + read_rotor_words(encoder)[2]
 
     def _gathered(self, blocks: Sequence[slice], place: I64Array) -> U8Array:
         """Records of all columns, in their order."""
@@ -321,9 +316,9 @@ def _projection(sources: Sequence[Source], columns: int) -> Projection:
     own = lidar.projection(pose, columns)
     if own is not None:
         return own
-    if lidar.beams.angle_rad is None:
-        return Turning(lidar.beams.moved(pose), np.maximum(lidar.firing_ns, 0), columns)
     tables = [source.lidar.beams.moved(source.body_from_sensor) for source in sources]
+    if lidar.beams.angle_rad is None:
+        return Turning(tables[0], np.maximum(lidar.firing_ns, 0), columns, tables[1:])
     return Tabled(tables, columns)
 
 

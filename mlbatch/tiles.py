@@ -117,10 +117,8 @@ class Tiles:
 
     def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, BoolArray]:
         """Elements of the tile's planes in the order of the scan; wanted slots (columns, slots)."""
-        if self._is_alone:
-            keep, element = laid[0].projector.in_firing_order(laid[0].part.keep, laid[0].encoder)
-            index = keep.reshape(-1).nonzero()[0]
-            return index if element is None else element.take(index), keep
+        if len(laid) == 1:
+            return self._index_one(laid[0])
         wide = self._keep[:columns]
         shift = np.empty(columns, np.int64)
         elements = np.empty(columns * self._slots, np.int64) if self._is_ordered else None
@@ -138,6 +136,22 @@ class Tiles:
         index = wide.reshape(-1).nonzero()[0]
         index += shift.repeat(wanted_points(wide))
         return index if elements is None else elements.take(index), wide
+
+    def _index_one(self, laid: _Laid) -> tuple[I64Array, BoolArray]:
+        """The same, where all columns were decoded together."""
+        keep, element = laid.projector.in_firing_order(laid.part.keep, laid.encoder)
+        if self._is_alone:
+            index = keep.reshape(-1).nonzero()[0]
+        else:
+            count, slots = keep.shape
+            place, number = np.empty(count, np.int64), self._element[:count]
+            place[laid.rows] = number
+            keep = keep.take(place, axis=0)
+            index = keep.reshape(-1).nonzero()[0]
+            place -= number
+            place *= slots
+            index += place.repeat(wanted_points(keep))
+        return index if element is None else element.take(index), keep
 
     def _move(self, index: I64Array, buffer: Buffer, at: int) -> None:
         """Copy the wanted points of a tile to their final rows, from row `at` on.
