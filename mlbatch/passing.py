@@ -6,6 +6,7 @@ all at their own stamps; other topics byte for byte at their log time.
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -54,7 +55,9 @@ class PassQueue:
         self.counts: dict[str, PassCounts] = {}
         self._patterns = list(patterns)
         self._encodings = encodings
-        self._waiting: list[tuple[int, Message]] = []
+        # A heap by stamp, then arrival: a recording of messages alone is read before all packets.
+        self._waiting: list[tuple[int, int, Message]] = []
+        self._arrived = 0
 
     @property
     def has_room(self) -> bool:
@@ -86,7 +89,8 @@ class PassQueue:
                     counts.drop("bad_stamp")
                     continue
                 stamp_ns = own_ns
-            self._waiting.append((stamp_ns, message))
+            heapq.heappush(self._waiting, (stamp_ns, self._arrived, message))
+            self._arrived += 1
 
     def take(
         self, until_ns: int | None, limits_ns: tuple[int | None, int | None], offset_ns: int | None
@@ -96,11 +100,9 @@ class PassQueue:
         offset_ns: scan clock minus arrival, None where scans are not on an epoch clock.
         """
         low, high = limits_ns
-        taken, later = [], []
-        for stamp_ns, message in self._waiting:
-            if until_ns is not None and stamp_ns >= until_ns:
-                later.append((stamp_ns, message))
-                continue
+        taken = []
+        while self._waiting and (until_ns is None or self._waiting[0][0] < until_ns):
+            stamp_ns, _, message = heapq.heappop(self._waiting)
             counts = self.counts[message.topic.name]
             if (low is not None and stamp_ns < low) or (high is not None and stamp_ns >= high):
                 counts.drop("outside_time")
@@ -109,7 +111,6 @@ class PassQueue:
             else:
                 counts.written += 1
                 taken.append(replace(message, host_ns=stamp_ns))
-        self._waiting = later
         return sorted(taken, key=lambda message: (message.host_ns, message.topic.name))
 
 
