@@ -27,6 +27,8 @@ from mlbatch.verify.verdict import Judge
 
 # Sensors that one byte can name, where an output does not tell how many there are.
 _MOST_SENSORS = 256
+# Stamps end at 2^31 s; times of points are added to them in 64 bits.
+_MOST_NS = 2**62
 
 
 class Examination:
@@ -52,6 +54,10 @@ class Examination:
     def scan(self, scan: HeldScan) -> None:
         """Hold one scan against the rules."""
         judge = self.judge
+        for name, at_ns in (("start_ns", scan.start_ns), ("end_ns", scan.end_ns)):
+            if at_ns is not None and abs(at_ns) >= _MOST_NS:
+                judge.blame("grid", f"{scan.where} {name}", "a time", at_ns)
+                return
         place = self._placing.place(scan)
         end_ns = self._end(scan)
         named = check_columns(judge, scan, end_ns, self._sensors)

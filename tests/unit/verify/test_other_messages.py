@@ -11,7 +11,18 @@ import pytest
 from mlbatch.verify import verify
 from mlbatch.verify.papers import claims_of_grid
 from mlbatch.verify.verdict import Judge, VerifyError
-from tests.unit.verify.made import Edit, copied, forget, found, report, row, spoiled_places, text
+from tests.unit.verify.made import (
+    Edit,
+    at,
+    copied,
+    forget,
+    found,
+    npz,
+    report,
+    row,
+    spoiled_places,
+    text,
+)
 from tests.unit.verify.remade import (
     Change,
     Records,
@@ -197,3 +208,12 @@ def test_numbers_that_python_refuses_to_read_are_none() -> None:
     claims = claims_of_grid(judge, "out.mcap", {"slices": "9" * 5000, "t_init_ns": "9" * 19})
     assert (claims.slices, claims.t_init_ns) == (None, 10**19 - 1)
     assert "out.mcap mlbatch.grid slices" in [one.where for one in judge.violations]
+
+
+@pytest.mark.parametrize("ns", [2**63 - 1, -(2**63)])
+def test_times_at_the_end_of_all_counting_are_told(ns: int, tmp_path: Path) -> None:
+    """In the first scan, without a report that says where it should begin."""
+    path = copied("npz", tmp_path)
+    (path / "report.json").unlink()
+    npz("head.npz", "start_ns", at((), ns))(path)
+    assert "head.npz start_ns" in [one.where for one in verify(path).violations]

@@ -68,6 +68,7 @@ PLY: dict[str, tuple[Edit, str, str]] = {
         "container",
         ONE,
     ),
+    "start beyond all counting": (text(ONE, "start_ns 1", f"start_ns {10**20}1"), "grid", ONE),
     "index beyond all counting": (text(ONE, "index 1", "index " + "1" * 5000), "container", ONE),
     "property": (text(ONE, "property int ring", "property uint ring"), "container", ONE),
     "big endian": (text(ONE, "binary_little", "binary_big"), "container", ONE),
