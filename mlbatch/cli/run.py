@@ -127,7 +127,7 @@ def _convert(job: Job, wanted: Wanted) -> None:
             checks.disk(job, wanted.output)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
-    checks.report(job, report_path, wanted.output, name)
+    checks.report(job, report_path, None if wanted.dry_run else wanted.output, name)
     with _progress(wanted.quiet) as progress:
         conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
     for note in conversion.notes:

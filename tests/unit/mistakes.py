@@ -116,6 +116,12 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "out/000000.npz: wanted a report besides the files of the output, got the place of one; "
         "choose another name for the report",
     ),
+    "report in a folder that a dry run does not make": (
+        f"{FIX} -o out --dry-run --report out/r.json",
+        1,
+        "out/r.json: wanted a report in an existing folder, got out, which is none; create it "
+        "(mkdir -p) or choose another",
+    ),
     "report folder missing": (
         f"{FIX} --report none/r.json",
         1,
