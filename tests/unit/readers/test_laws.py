@@ -6,9 +6,11 @@ import random
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from mlbatch.errors import RecordingError
+from mlbatch.readers._capture import CaptureRecording
 from tests.builders.captures import (
     Interface,
     Other,
@@ -18,7 +20,7 @@ from tests.builders.captures import (
     section_bytes,
     udp_frame,
 )
-from tests.unit.readers.reading import open_capture, read
+from tests.unit.readers.reading import Seen, assert_balanced, open_capture, read
 
 BUFFERS = st.sampled_from([64, 700, 4096, 20_000, 65_536])
 
@@ -75,6 +77,15 @@ def damaged(content: bytes, pick: random.Random) -> bytes:
     return bytes(data)
 
 
+def read_or_refusal(recording: CaptureRecording) -> list[Seen] | str:
+    """All packets; the error where damage leaves no frame of a known link."""
+    try:
+        return read(recording)
+    except RecordingError as err:
+        assert_balanced(recording)
+        return str(err)
+
+
 @settings(max_examples=80, deadline=None)
 @given(seed=st.integers(0, 2**32), buffer_bytes=BUFFERS)
 def test_any_buffer_gives_the_same_packets_and_counts(seed: int, buffer_bytes: int) -> None:
@@ -88,6 +99,7 @@ def test_any_buffer_gives_the_same_packets_and_counts(seed: int, buffer_bytes: i
 
 
 @settings(max_examples=200, deadline=None)
+@example(seed=128280, buffer_bytes=64)
 @given(seed=st.integers(0, 2**32), buffer_bytes=BUFFERS)
 def test_damaged_files_balance_whatever_the_buffer(seed: int, buffer_bytes: int) -> None:
     pick = random.Random(seed)
@@ -95,6 +107,6 @@ def test_damaged_files_balance_whatever_the_buffer(seed: int, buffer_bytes: int)
         path = Path(folder) / "a"
         path.write_bytes(damaged(mixed_file(pick), pick))
         whole, small = open_capture(path), open_capture(path, buffer_bytes=buffer_bytes)
-        assert read(small) == read(whole)
+        assert read_or_refusal(small) == read_or_refusal(whole)
         assert small.counts == whole.counts
         assert small.notes == whole.notes
