@@ -29,7 +29,7 @@ from mlbatch.types import (
 )
 
 # Enough work for a call to be cheap, little enough for the planes to stay in the caches.
-TILE_SLOTS = 1 << 16
+TILE_SLOTS = 3 << 15
 _NONE = np.float32(0)
 _ONLY, _FIRST_STRONG, _BOTH = np.uint8(7), np.uint8(3), np.uint8(9)
 _MOST_OF_A_BYTE = 255

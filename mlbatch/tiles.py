@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -69,8 +70,11 @@ class Tiles:
     ) -> int:
         """As `compiled.CompiledKind.decode`."""
         count = 0
-        for begin in range(0, len(due), self._columns):
-            tile = slice(begin, min(begin + self._columns, len(due)))
+        # Of equal size, since what a small one costs is mostly its calls.
+        tiles = -(-len(due) // self._columns)
+        bounds = [len(due) * number // tiles for number in range(tiles + 1)]
+        for begin, end in pairwise(bounds):
+            tile = slice(begin, end)
             number = np.arange(first + begin, first + tile.stop)
             columns = due.part(tile)
             own: I64Array | None = None
@@ -98,12 +102,12 @@ class Tiles:
         rows = self._element[: len(due)]
         if not self._is_alone:
             rows = seat.argsort(kind="stable")
-            due = due.part(rows)
-        member, offset_ns = self._member[seat[rows]], due.stamp_ns - start_ns
+            due, seat = due.part(rows), seat[rows]
+        member, offset_ns = self._member[seat], due.stamp_ns - start_ns
         laid: list[_Laid] = []
         element = begin = 0
-        counts = np.bincount(seat, minlength=len(self._member)).cumsum()[self._ends - 1]
-        for projector, end in zip(self._projectors, counts.tolist(), strict=True):
+        ends = np.searchsorted(seat, self._ends).tolist()
+        for projector, end in zip(self._projectors, ends, strict=True):
             if begin == end:
                 continue
             own = slice(begin, end)
