@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -323,54 +324,63 @@ class _Aimed:
 
 
 class _Vectors:
-    """Three vectors of every beam, repeated in planes (columns, B).
+    """Three vectors of every beam, repeated in planes (columns, B); see `_plane`.
 
-    Loops over whole planes cost a fraction of loops over the few beams of a column. first: (3
-    vectors, 3 axes, B) float32.
+    first: (3 vectors, 3 axes, B) float32.
     """
 
     def __init__(self, vectors: F64Array, columns: int, beams: int) -> None:
         """vectors: (3, B or 1, 3)."""
-        self._planes = _planes(vectors, columns, beams)
-        self.first = self._planes[:, :, 0]
-        self._turns = [bool(self.first[:2, axis].any()) for axis in range(3)]
-        self._rises = [bool(self.first[2, axis].any()) for axis in range(3)]
+        wide = np.broadcast_to(vectors, (3, beams, 3)).transpose(0, 2, 1)
+        self.first = wide.astype(np.float32, order="C")
+        self._turning = [
+            [_plane(one[axis], columns) for one in self.first[:2]]
+            if self.first[:2, axis].any()
+            else None
+            for axis in range(3)
+        ]
+        self._level = [_plane(one, columns) for one in self.first[2]]
+        self._rises = [bool(one.any()) for one in self.first[2]]
 
     def turned(
         self, cosine: F32Array, sine: F32Array, scratch: F32Array, out: F32Array
     ) -> list[F32Array]:
         """cos * V1 + sin * V2 + V3 of each axis: (n, B); vectors that are zero are left out.
 
-        out: (3, n, B), for the axes that turn.
+        out: (3, n, B), for the axes that turn; others may be (1, 1).
         """
         planes, count = [], len(cosine)
-        for axis in range(3):
-            level = self._planes[2, axis, :count]
-            if not self._turns[axis]:
-                planes.append(level)
+        for turning, level, rises, turned in zip(
+            self._turning, self._level, self._rises, out, strict=True
+        ):
+            if turning is None:
+                planes.append(level[:count])
                 continue
-            turned = np.multiply(cosine, self._planes[0, axis, :count], out=out[axis])
-            np.multiply(sine, self._planes[1, axis, :count], out=scratch)
+            np.multiply(cosine, turning[0][:count], out=turned)
+            np.multiply(sine, turning[1][:count], out=scratch)
             np.add(turned, scratch, out=turned)
-            if self._rises[axis]:
-                np.add(turned, level, out=turned)
+            if rises:
+                np.add(turned, level[:count], out=turned)
             planes.append(turned)
         return planes
 
 
+def _plane(values: F32Array, columns: int) -> F32Array:
+    """Values of the beams (B,), the same for all columns: (columns, B); (1, 1) if all are equal.
+
+    Loops over whole planes cost a fraction of loops over the few beams of a column.
+    """
+    # As bits, since a zero has a sign.
+    bits = values.view(np.uint32)
+    if bool((bits == bits[0]).all()):
+        return values[None, :1]
+    return values[None].repeat(columns, axis=0)
+
+
 def blocks(member: I64Array, members: int) -> list[slice]:
     """The columns of each of several sensors that lie one after the other."""
-    if members == 1:
-        return [slice(0, len(member))]
-    ends = np.bincount(member, minlength=members).cumsum().tolist()
-    return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
-
-
-def _planes(vectors: F64Array, columns: int, beams: int) -> F32Array:
-    """(3, B or 1, 3) vectors as (3 vectors, 3 axes, columns, B), the same for all columns."""
-    planes = np.empty((3, 3, columns, beams), np.float32)
-    planes[:] = vectors.transpose(0, 2, 1)[:, :, None, :]
-    return planes
+    bounds = np.searchsorted(member, np.arange(members + 1)).tolist()
+    return [slice(begin, end) for begin, end in pairwise(bounds)]
 
 
 def _reaches(tables: Sequence[BeamTable]) -> F32Array:
