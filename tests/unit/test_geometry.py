@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.geometry import BeamTable, Turning, read_rotor_words, rotor_words, spherical
+from mlbatch.geometry import (
+    BeamTable,
+    Projection,
+    Tabled,
+    Turning,
+    blocks,
+    read_rotor_words,
+    rotor_words,
+    spherical,
+)
 from mlbatch.transforms import from_rpy_deg
-from mlbatch.types import F64Array
+from mlbatch.types import F32Array, F64Array, I64Array
 
 AZIMUTH_DEG = (0.0, 1.5, -4.2, 30.0)
 ELEVATION_DEG = (-25.0, -1.0, 3.0, 15.0)
@@ -69,6 +79,61 @@ def test_a_beam_to_the_right_at_a_quarter_turn() -> None:
         out = np.empty((1, 1, 3), np.float32)
         turning.points(np.full((1, 1), 2.0, np.float32), out)
         np.testing.assert_allclose(out[0, 0], wanted, atol=1e-6)
+
+
+def _points(projection: Projection, member: I64Array, encoder: I64Array) -> F32Array:
+    """Points (n, 4, 3) at ranges of their own; 0 is one of them."""
+    range_m = np.linspace(0, 120, len(member) * 4).reshape(-1, 4).astype(np.float32)
+    points = np.empty((len(member), 4, 4), np.float32)
+    projection.aim(member, encoder)
+    projection.points(range_m, points[:, :, :3])
+    return points[:, :, :3]
+
+
+@pytest.mark.parametrize("lens_m", [0.0, 0.035])
+@pytest.mark.parametrize("members", [(0, 0, 0, 1, 1), (0, 0, 0, 0, 0), (1, 1, 1, 1, 1)])
+def test_rotors_aimed_together_are_those_aimed_alone(
+    lens_m: float, members: tuple[int, ...]
+) -> None:
+    # The second one stands as its frame does: its zeros have signs.
+    own = _beams("y", lens_m)
+    level = replace(own, direction=-own.direction, reach_m=np.zeros(4))
+    tables = _beams("x", lens_m).moved(POSE), level
+    member, turns = np.array(members), np.linspace(0, 1, 5, dtype=np.float64)
+    words = rotor_words(turns, np.full(5, 10.0), np.arange(5) % 2)
+    together = _points(Turning(tables[0], FIRING_NS, 5, tables[1:]), member, words)
+    for number, table in enumerate(tables):
+        alone = _points(Turning(table, FIRING_NS, 5), np.zeros(5, np.int64), words)
+        columns = member == number
+        assert together[columns].tobytes() == alone[columns].tobytes()
+
+
+@pytest.mark.parametrize(
+    "positions",
+    [range(60), [*range(40, 64), *range(36)], [*range(0, 60, 2), *range(1, 61, 2)], [7] * 60],
+    ids=["in a row", "past the end of a turn", "each second", "one"],
+)
+def test_positions_looked_up_in_a_row_are_those_looked_up_alone(positions: list[int]) -> None:
+    angle_rad = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    first = replace(_beams("x", 0.02), angle_rad=angle_rad)
+    tables = first.moved(POSE), replace(first, reach_m=first.reach_m + 0.5)
+    encoder = np.array(positions)
+    # Where the first sensor's last position comes before the other's first one, too.
+    for member in (np.zeros(60, np.int64), np.repeat([0, 1], [24, 36])):
+        together = _points(Tabled(tables, 60), member, encoder)
+        for column in range(60):
+            one = slice(column, column + 1)
+            projection = Tabled(tables, 1)
+            range_m = np.linspace(0, 120, 240).reshape(-1, 4).astype(np.float32)[one]
+            alone = np.empty((1, 4, 3), np.float32)
+            projection.aim(member[one], encoder[one])
+            projection.points(range_m, alone)
+            assert together[one].tobytes() == alone.tobytes()
+
+
+def test_blocks_are_the_columns_of_each_sensor() -> None:
+    assert blocks(np.array([0, 0, 2]), 4) == [slice(0, 2), slice(2, 2), slice(2, 3), slice(3, 3)]
+    assert blocks(np.zeros(3, np.int64), 1) == [slice(0, 3)]
 
 
 @given(
