@@ -25,11 +25,12 @@ from mlbatch.kernels import frame as at
 from mlbatch.kernels.native import has_features, load
 from mlbatch.projection import Extras, Projector
 from mlbatch.tiles import Tiles
-from mlbatch.types import I64Array
+from mlbatch.types import F32Array, I64Array
 
 # Abilities of CPUs that pack eight lanes of a register by a mask.
 _LANES, _PACKS = 8, ("avx512f", "avx512bw", "avx512vl", "bmi2", "popcnt")
 _COLUMNS_SOURCE = "mlbatch.kernels._columns_source"
+_ANGLES_SOURCE = "mlbatch.kernels._angles_source"
 _RELAY_SOURCE, _PARTS_SOURCE = "mlbatch.kernels._relay_source", "mlbatch.kernels._parts_source"
 
 
@@ -100,7 +101,7 @@ class CompiledKind:
         own = due.encoder
         if (self._seat < 0).any():
             own = own[self._seat[due.sensor] >= 0]
-        cosine, sine = rotor_angles(own)
+        cosine, sine = compiled_angles(own)
         self._tables.set(at.COSINE, cosine)
         self._tables.set(at.SINE, sine)
 
@@ -115,6 +116,24 @@ class CompiledKind:
             counts.range += single - in_range
             counts.box += in_range - outside
             counts.written += outside
+
+
+def compiled_angles(words: I64Array) -> tuple[F32Array, F32Array]:
+    """What `rotor_angles` gives for rotor words (n,), to the last bit."""
+    words = np.ascontiguousarray(words)
+    cosine, sine = np.empty((2, len(words)), np.float32)
+    tables = Tables(at.ANGLE_SIZE)
+    tables.set_numbers({at.ANGLES: len(words)})
+    for place, values in (
+        (at.ANGLE_WORDS, words),
+        (at.ANGLE_COSINE, cosine),
+        (at.ANGLE_SINE, sine),
+    ):
+        tables.set(place, values)
+    if load(_ANGLES_SOURCE)(tables.frame):
+        unsure = np.isnan(cosine)
+        cosine[unsure], sine[unsure] = rotor_angles(words[unsure])
+    return cosine, sine
 
 
 class CopiedKind:

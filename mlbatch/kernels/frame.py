@@ -57,3 +57,8 @@ SIZE = 54
 # int64, addresses of kernels and of their frames; row of the first point.
 (RELAYED, RELAY_KIND, RELAY_SENSOR, RELAY_KERNELS, RELAY_ROW) = range(5)
 RELAY_SIZE = 5
+
+# Rotor words: how many; the words (int64); their cosines and sines (float32), NaN and anything
+# where numpy has to tell.
+(ANGLES, ANGLE_WORDS, ANGLE_COSINE, ANGLE_SINE) = range(4)
+ANGLE_SIZE = 4
