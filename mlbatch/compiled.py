@@ -40,16 +40,16 @@ class CompiledKind:
     def __init__(
         self, projectors: Sequence[Projector], seat: I64Array, extras: Extras, wide: int
     ) -> None:
-        """projectors: as many as are alike; seat: (sensors,) number of each among those of the
-        kind, else -1.
+        """projectors: as many as are alike.
 
-        extras: those that the scan has, of any sensor; wide: slots of a row of organized scans; 0:
-        scans are dense.
+        seat: (sensors,) number of each among those of the kind, else -1; extras: those that the
+        scan has, of any sensor; wide: slots of a row of organized scans; 0: scans are dense.
         """
         lidar, projection = projectors[0].lidar, projectors[0].projection
         table = lidar.pixels
         if table is None:
             raise ValueError(f"no kernel for {lidar.model}")
+        self._pieces: list[AnyArray] = []
         self._rings = [source.ring for own in projectors for source in own.sources]
         self._ledgers = [counts for own in projectors for counts in own.counts]
         self._slots = projectors[0].slots
@@ -91,7 +91,9 @@ class CompiledKind:
         ):
             tables.set(place, np.asarray(values, np.int64))
         self._aim(due)
-        tables.set(at.RINGS, _rings([ring.pieces for ring in self._rings]))
+        # Held until the kernel is done: another thread may put larger ones in their place.
+        self._pieces = [ring.pieces for ring in self._rings]
+        tables.set(at.RINGS, _places(self._pieces))
         _put_outputs(tables, out, self._extras)
         self._counts[:] = 0
 
@@ -267,7 +269,7 @@ def _members(projectors: Sequence[Projector], group: Sequence[int], seat: I64Arr
     return member
 
 
-def _rings(pieces: Sequence[AnyArray]) -> I64Array:
+def _places(pieces: Sequence[AnyArray]) -> I64Array:
     return np.array(
         [
             (one.ctypes.data, one.shape[0], one.shape[1], one.strides[0], one.strides[1])

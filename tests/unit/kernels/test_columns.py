@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -18,6 +19,7 @@ from mlbatch import compiled, decode
 from mlbatch.buffers import LABEL, Buffer
 from mlbatch.decode import Decoder, Due, Label, Source
 from mlbatch.geometry import rotor_words
+from mlbatch.kernels import native
 from mlbatch.lidar import Lidar
 from mlbatch.pipeline import Conversion
 from mlbatch.ring import RawRing
@@ -216,6 +218,33 @@ def test_nothing_is_written_beyond_the_arrays(
         check(lidars, Case(seed, 130, layout, EXTRAS, is_cut=False, keeps_repeated=True))
     assert made
     assert all(buffer.is_intact for buffer in made)
+
+
+def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    lidar, rng = ouster("RNG15_RFL8_NIR8", 16), np.random.default_rng(0)
+    ring, places = filled(lidar, rng)
+    before = weakref.ref(ring.pieces)
+
+    def load_late(*key: str | int) -> Callable[[I64Array], int]:
+        kernel = native.load(str(key[0]), *key[1:])
+
+        def call(frame: I64Array) -> int:
+            start = np.arange(1000) * lidar.packet_size
+            ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
+            assert before() is not None
+            assert before() is not ring.pieces
+            return kernel(frame)
+
+        return call
+
+    monkeypatch.setattr(compiled, "load", load_late)
+    info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, POSES[0])
+    run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
+    sources = [Source(lidar, ring, POSES[0], 0)]
+    decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine="numba")
+    stamp_ns, nothing = np.full(len(places), START_NS), np.zeros(len(places), np.int64)
+    due = Due(stamp_ns, nothing, places, nothing)
+    assert decoder.scan(due, Label(0, 0, START_NS, END_NS, True, 0)).points > 0
 
 
 def test_cpus_without_wide_registers_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
