@@ -67,12 +67,15 @@ def block_time_us(stamp_us: I64Array, azimuth: I64Array, wrap_us: int) -> float 
     """Time from azimuth to azimuth of a packet, by the rotor's speed between packets.
 
     It tells models apart whatever the returns, and though packets are lost; stamp_us: (k,), wraps
-    at `wrap_us`; azimuth: (k, blocks), pairs taken as one. None where the rotor seems to rest.
+    at `wrap_us`; azimuth: (k, blocks), pairs taken as one. None where the rotor seems to rest, or a
+    packet has one azimuth.
     """
     if len(stamp_us) < 2:
         return None
     if in_pairs(azimuth):
         azimuth = azimuth[:, 0::2]
+    if azimuth.shape[1] < 2:
+        return None
     step_us = np.diff(stamp_us) % wrap_us
     turned = np.diff(azimuth[:, 0]) % _TICKS_PER_TURN
     usable = (step_us > 0) & (step_us < US_PER_MINUTE) & (turned > 0) & (turned < _MOST_LOST_TURN)
