@@ -60,7 +60,11 @@ def _words_reader(step: int, pad: int) -> Reader:
         scale = f4_at(frame[at.SCALE])
         factor, divisor, silent = scale[0], scale[1], np.int32(frame[at.SILENT])
         first, row = which * pad, which * _FIELDS
-        spread(u4_at(record + run[0]), run[2], planes)
+        if step == 1 and run[2] == pad:
+            # Already a plane, and whole.
+            planes = u4_at(record + run[0])
+        else:
+            spread(u4_at(record + run[0]), run[2], planes)
         words = moved(planes, fields[row] * pad)
         shift, mask = fields[row + 1], fields[row + 2]
         for beam in range(pad):
