@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch import accounts
-from mlbatch.decoding import Bench, Decoded, Task
-from mlbatch.errors import RecordingError
+from mlbatch.decoding import Bench, Decoded, LeftOut, Task
+from mlbatch.errors import NoScanError, RecordingError
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, imbalances, report_text
@@ -58,6 +58,9 @@ def convert(
         if course is not None:
             course.remove()
         output.writer = None
+    except NoScanError:
+        output.discard()
+        raise
     finally:
         if output.writer is not None:
             output.writer.abandon()
@@ -68,13 +71,13 @@ def convert(
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A scan on its way into the output.
+    """A scan on its way into the output; task None: what passes by where there is no scan.
 
     is_kept: a continued output holds it; before: what comes before it; decoded: None where that is
     still to be done.
     """
 
-    task: Task
+    task: Task | None
     is_kept: bool
     before: list[ImuSamples | Message]
     decoded: Decoded | None
@@ -92,6 +95,8 @@ class _Output:
         self._course = course
         self._jobs = run.job.jobs
         self._idle: list[Bench] = []
+        self._is_begun = False
+        self._scans = 0
 
     def make(self, progress: Progress | None) -> None:
         """Decode and write all scans."""
@@ -101,17 +106,13 @@ class _Output:
             contextlib.closing(run.tasks(progress)) as tasks,
             Workers(self._steps, self._jobs, ahead) as workers,
         ):
-            for number, task in enumerate(tasks):
-                before = run.take_passing(task.label.end_ns)
-                if not number:
-                    self._begin()
-                is_kept = self._course is not None and number < self._course.done
-                decoded = None
-                if alone:
-                    began_s = time.perf_counter()
-                    decoded = run.benches[0].decode(task)
-                    run.stages.decode_s += time.perf_counter() - began_s
-                piece = _Piece(task, is_kept, before, decoded)
+            for item in tasks:
+                task = None if isinstance(item, LeftOut) else item
+                before = run.take_passing(item.end_ns)
+                if task is None and not before:
+                    continue
+                self._begin()
+                piece = self._piece(task, before)
                 if alone and self._open_writer is None:
                     # There is nothing to write that another thread could do meanwhile.
                     in_one_go(self._steps(piece))
@@ -119,8 +120,31 @@ class _Output:
                     workers.put(piece)
             workers.finish()
 
+    def _piece(self, task: Task | None, before: list[ImuSamples | Message]) -> _Piece:
+        if task is None:
+            return _Piece(None, False, before, None)
+        is_kept = self._course is not None and self._scans < self._course.done
+        self._scans += 1
+        decoded = None
+        if self._jobs == 1:
+            began_s = time.perf_counter()
+            decoded = self._run.benches[0].decode(task)
+            self._run.stages.decode_s += time.perf_counter() - began_s
+        return _Piece(task, is_kept, before, decoded)
+
+    def discard(self) -> None:
+        """Remove the output: without a scan there is nothing to go on from."""
+        if self.writer is not None:
+            self.writer.abandon()
+            self.writer = None
+        if self._course is not None:
+            self._course.discard()
+
     def _begin(self) -> None:
-        """Open the output, now that it is known what its scans say of themselves."""
+        """Open the output, now that it is known what its scans say of themselves; once."""
+        if self._is_begun:
+            return
+        self._is_begun = True
         self._idle.extend(self._run.benches)
         if self._open_writer is not None and self._run.info is not None:
             if self._course is not None:
@@ -130,12 +154,31 @@ class _Output:
 
     def _steps(self, piece: _Piece) -> Steps:
         """What a thread does for a scan; see `Workers`."""
+        if piece.task is None:
+            return self._steps_between(piece)
+        return self._steps_of_scan(piece, piece.task)
+
+    def _steps_between(self, piece: _Piece) -> Steps:
+        """The same where there is no scan."""
+        watch, writing = _Watch(), iter(()) if self.writer is None else self.writer.flush()
+        watch.do(writing)
+        yield
+        for item in piece.before:
+            _hand_over(item, self.writer)
+        watch.do(writing)
+        yield
+        watch.do(writing)
+        yield
+        watch.do(writing)
+        self._run.stages.write_s += watch.spent_s
+
+    def _steps_of_scan(self, piece: _Piece, task: Task) -> Steps:
         bench, decoded, began_s = None, piece.decoded, time.perf_counter()
         if decoded is None:
             bench = self._idle.pop()
-            decoded = bench.decode(piece.task)
+            decoded = bench.decode(task)
         decode_s = time.perf_counter() - began_s
-        watch, writing = _Watch(), self._writing(piece, decoded.scan)
+        watch, writing = _Watch(), self._writing(task, decoded.scan, is_kept=piece.is_kept)
         watch.do(writing)
         yield
         self._run.account(decoded.scan)
@@ -153,11 +196,11 @@ class _Output:
             self._run.stages.decode_s += decode_s
             self._idle.append(bench)
 
-    def _writing(self, piece: _Piece, scan: Scan) -> Steps:
+    def _writing(self, task: Task, scan: Scan, *, is_kept: bool) -> Steps:
         if self.writer is None:
             return iter(())
-        write = self.writer.pass_over if piece.is_kept else self.writer.write
-        return write(scan, piece.task.only)
+        write = self.writer.pass_over if is_kept else self.writer.write
+        return write(scan, task.only)
 
 
 @dataclass(slots=True)

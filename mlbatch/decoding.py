@@ -31,6 +31,11 @@ class Task:
     fates: Fates | None
     is_decoded: bool = False
 
+    @property
+    def end_ns(self) -> int:
+        """End of the window."""
+        return self.label.end_ns
+
     def oldest_place(self, sensor: int) -> int | None:
         """First ring place of a sensor whose pixels are still needed."""
         if self.is_decoded:
@@ -40,6 +45,13 @@ class Task:
         else:
             place = self.due.place[: len(self.due) if self.only == sensor else 0]
         return int(place.min()) if len(place) else None
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A window that gives no scan, though it holds columns; what passes by goes on."""
+
+    end_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,11 @@ class ImuQueue:
         if len(samples.stamp_ns):
             self._waiting.append(samples)
 
+    def drop_before(self, low_ns: int) -> None:
+        """Drop what lies before the first limit, so that it need not wait for a scan."""
+        kept = [self._kept(one, one.stamp_ns >= low_ns, "outside_time") for one in self._waiting]
+        self._waiting = [samples for samples in kept if len(samples.stamp_ns)]
+
     def take(
         self, until_ns: int | None, limits_ns: tuple[int | None, int | None]
     ) -> list[ImuSamples]:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 
+from mlbatch.errors import UsageError
 from mlbatch.types import Message, Recording, Topic
 from mlbatch.units import NS_PER_S
 
@@ -60,6 +61,11 @@ class PassQueue:
         self._arrived = 0
 
     @property
+    def waiting(self) -> int:
+        """Messages whose time has not come."""
+        return len(self._waiting)
+
+    @property
     def has_room(self) -> bool:
         """Whether the output takes messages at all."""
         return bool(self._encodings)
@@ -69,10 +75,15 @@ class PassQueue:
         for recording in recordings:
             recording.keep = selected(recording.topics, self._patterns)
 
-    def missing(self, recordings: Sequence[Recording]) -> list[str]:
-        """Patterns that no topic of the recordings matches."""
+    def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
+        """Refuse a pattern that no topic of the recordings matches."""
         names = [topic.name for recording in recordings for topic in recording.topics]
-        return [p for p in self._patterns if not any(fnmatchcase(name, p) for name in names)]
+        for pattern in self._patterns:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                raise UsageError(
+                    f"--pass {pattern}: wanted a topic of the recording, got none that matches; "
+                    "see `mlbatch inspect`"
+                )
 
     def add(self, messages: Iterable[Message]) -> None:
         """Take in messages, in file order."""
@@ -92,6 +103,12 @@ class PassQueue:
             heapq.heappush(self._waiting, (stamp_ns, self._arrived, message))
             self._arrived += 1
 
+    def drop_before(self, low_ns: int) -> None:
+        """Drop what lies before the first limit, so that it need not wait for a scan."""
+        while self._waiting and self._waiting[0][0] < low_ns:
+            _, _, message = heapq.heappop(self._waiting)
+            self.counts[message.topic.name].drop("outside_time")
+
     def take(
         self, until_ns: int | None, limits_ns: tuple[int | None, int | None], offset_ns: int | None
     ) -> list[Message]:
@@ -100,11 +117,13 @@ class PassQueue:
         offset_ns: scan clock minus arrival, None where scans are not on an epoch clock.
         """
         low, high = limits_ns
+        if low is not None:
+            self.drop_before(low if until_ns is None else min(low, until_ns))
         taken = []
         while self._waiting and (until_ns is None or self._waiting[0][0] < until_ns):
             stamp_ns, _, message = heapq.heappop(self._waiting)
             counts = self.counts[message.topic.name]
-            if (low is not None and stamp_ns < low) or (high is not None and stamp_ns >= high):
+            if high is not None and stamp_ns >= high:
                 counts.drop("outside_time")
             elif message.topic.type == IMU_TYPE and not _is_near(stamp_ns, message, offset_ns):
                 counts.drop("other_clock")

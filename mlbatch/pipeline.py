@@ -17,7 +17,7 @@ from mlbatch.batching.windows import Policy, Window
 from mlbatch.clipping import ClippedRecording, Part
 from mlbatch.clock import common_timescale, timescale
 from mlbatch.decode import Decoder, Source
-from mlbatch.decoding import Bench, Benches, Task, with_own_lidars
+from mlbatch.decoding import Bench, Benches, LeftOut, Task, with_own_lidars
 from mlbatch.discover import Note, Setup, absent, discover, untimed
 from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
 from mlbatch.feeding import Feeder
@@ -115,12 +115,7 @@ class Conversion:
             wanted=IMU in job.extras,
         )
         self.passed = PassQueue(job.passed, MESSAGE_ENCODINGS & job.extras)
-        unknown = self.passed.missing(self.recordings)
-        if unknown:
-            raise UsageError(
-                f"--pass {unknown[0]}: wanted a topic of the recording, got none that matches; "
-                "see `mlbatch inspect`"
-            )
+        self.passed.refuse_unknown(self.recordings)
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
 
@@ -130,16 +125,18 @@ class Conversion:
         """Yield every scan and, with split, the sensor it is of; arrays live until the next."""
         with contextlib.closing(self.tasks(progress)) as tasks:
             for task in tasks:
+                if isinstance(task, LeftOut):
+                    continue
                 with self._timed("decode_s"):
                     scan = self.benches[0].decode(task).scan
                 self.account(scan)
                 yield scan, task.only
         self.close()
 
-    def tasks(self, progress: Progress | None = None) -> Generator[Task, None, None]:
+    def tasks(self, progress: Progress | None = None) -> Generator[Task | LeftOut, None, None]:
         """Yield what is to be decoded, scan by scan; `close` has to follow the last.
 
-        Each may be given to any of the benches, by any thread, while the next are made.
+        Each task may be given to any of the benches, by any thread, while the next are made.
         """
         size = sum(recording.size_bytes for recording in self.recordings)
         self.passed.keep(self.recordings)
@@ -176,11 +173,16 @@ class Conversion:
             for samples in fed.imu:
                 self._imu.add(samples)
             self.passed.add(batch.messages)
+            low_ns, _ = self.batcher.limits_ns
+            if low_ns is not None:
+                # Until the first scan all of it would wait.
+                self._imu.drop_before(low_ns)
+                self.passed.drop_before(low_ns)
             if self.job.strict:
                 self._refuse_rejected()
         return self.batcher.push(fed.arrivals, batch.host_ns)
 
-    def _due(self, windows: Iterator[Window]) -> Iterator[Task]:
+    def _due(self, windows: Iterator[Window]) -> Iterator[Task | LeftOut]:
         while True:
             with self._timed("merge_s"):
                 window = next(windows, None)
@@ -188,7 +190,9 @@ class Conversion:
                 return
             if self.info is None:
                 self._begin()
-            if not self._is_too_incomplete(window):
+            if self._is_too_incomplete(window):
+                yield LeftOut(window.end_ns)
+            else:
                 yield from self._work.open(window, self.job.split, self.finished)
 
     def _is_too_incomplete(self, window: Window) -> bool:

@@ -163,6 +163,13 @@ class Course:
             # The output could not be opened.
             self._file.remove()
 
+    def discard(self) -> None:
+        """The run ends without a scan: nothing of what it wrote stays."""
+        if self._file is not None:
+            self._file.remove()
+            self._file = None
+            discard(self._target)
+
     def remove(self) -> None:
         """The output has its final name."""
         if self._file is not None:

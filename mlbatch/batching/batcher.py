@@ -142,7 +142,7 @@ class Batcher:
 
     @property
     def limits_ns(self) -> tuple[int | None, int | None]:
-        """`--start` and `--end` on the common clock, once eq. (1) is known."""
+        """`--start` and `--end` on the common clock; None: none, or not known yet."""
         return self._schedule.limits_ns
 
     @property

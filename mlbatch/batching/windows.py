@@ -101,9 +101,13 @@ class Schedule:
 
     @property
     def limits_ns(self) -> tuple[int | None, int | None]:
-        """`--start` and `--end` on the common clock; None where there is none."""
-        low, high, begin = self._policy.start, self._policy.end, self.t_init_ns or 0
-        return None if low is None else low.at(begin), None if high is None else high.at(begin)
+        """`--start` and `--end` on the common clock; None: none, or not known yet."""
+        return self._limit_ns(self._policy.start), self._limit_ns(self._policy.end)
+
+    def _limit_ns(self, limit: Limit | None) -> int | None:
+        if limit is None or (limit.from_t_init and self.t_init_ns is None):
+            return None
+        return limit.at(self.t_init_ns or 0)
 
     @property
     def empty(self) -> int:

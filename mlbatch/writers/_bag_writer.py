@@ -140,6 +140,11 @@ class BagWriter:
         yield from self._send_scan(scan, sensor, message)
         self._idle.append(cloud)
 
+    def flush(self) -> Steps:
+        """Write the chunks that messages alone have completed."""
+        yield
+        yield from self._write_chunks()
+
     def safe(self) -> Safe:
         """The scans in written chunks."""
         chunks, kept_bytes = self._sink.safe()
@@ -184,12 +189,17 @@ class BagWriter:
         return CloudMessage(self._layout, self._info.frame_id, self._wire)
 
     def _send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> Steps:
-        """Lay a scan in its chunk; then seal and write the chunks that are complete with it."""
+        """Lay a scan in its chunk, and write the chunks that are complete with it."""
         with export_errors(self._output.partial):
             self._begin(scan.start_ns)
             self._open_scans.append(self._sink.ended)
             topic = self._topics[sensor]
             self._sink.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+        yield from self._write_chunks()
+
+    def _write_chunks(self) -> Steps:
+        """Take the chunks that are complete; then seal and write them."""
+        with export_errors(self._output.partial):
             chunks = self._sink.take()
         yield
         self._sink.seal(chunks)

@@ -80,6 +80,10 @@ class FolderWriter:
             )
         self._written += 1
 
+    def flush(self) -> Steps:
+        """Nothing but scans is written."""
+        return iter(())
+
     def safe(self) -> Safe:
         """All: files are closed one by one."""
         return Safe(self._written)

@@ -57,6 +57,10 @@ class ScanWriter(Protocol):
         """Go past a scan that the continued `.partial` holds; its point arrays mean nothing."""
         ...
 
+    def flush(self) -> Steps:
+        """Write what messages and IMU samples have completed, where no scan follows them."""
+        ...
+
     def safe(self) -> Safe:
         """Hand what was written to the system, and say what of it needs no second writing."""
         ...

@@ -103,6 +103,10 @@ class Memory:
         """Nothing: what is in memory is never continued."""
         yield
 
+    def flush(self) -> Steps:
+        """Nothing: all is kept at once."""
+        return iter(())
+
     def safe(self) -> Safe:
         """Nothing: see above."""
         return Safe(0)

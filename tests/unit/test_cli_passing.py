@@ -1,0 +1,112 @@
+"""Messages that pass through a conversion: what waits for a scan, and what does not."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from mlbatch.decoding import LeftOut
+from mlbatch.discover import Wishes
+from mlbatch.job import Job
+from mlbatch.pipeline import Conversion
+from mlbatch.types import MESSAGE_ENCODINGS
+from tests.builders.bags import Body, Recorded
+from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.unit.sessions import NS_PER_MS, Shell, Unit, twin
+
+# Longer than what rates are measured over.
+TURNS, TURN_NS, EVERY_NS = 24, 100 * NS_PER_MS, 20 * NS_PER_MS
+NOTES = TURNS * TURN_NS // EVERY_NS
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    """The command line, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return Shell(monkeypatch, capsys)
+
+
+def _lidar(name: str, unit: Unit, lost: Collection[int]) -> list[Recorded]:
+    """A lidar that lost a third of each of these turns, within one window."""
+    about, *packets = unit_messages(replace(unit, turns=TURNS), name)
+    lossy = [at // 32 in lost and 10 <= at % 32 < 20 for at in range(len(packets))]
+    return [about, *(one for one, is_lost in zip(packets, lossy, strict=True) if not is_lost)]
+
+
+def _messages(*lost: int, also: Collection[int] = ()) -> list[Recorded]:
+    """Two lidars that lost parts of turns, and notes beside them."""
+    messages = _lidar("top", Unit(), lost) + _lidar("low", twin(Unit(), 222), also)
+    messages += [
+        Recorded("/note", "std_msgs/String", messages[0].log_ns + number * EVERY_NS, _text(number))
+        for number in range(NOTES)
+    ]
+    return sorted(messages, key=lambda message: message.log_ns)
+
+
+def _never_whole() -> list[Recorded]:
+    return _messages(*range(0, TURNS, 2), also=range(1, TURNS, 2))
+
+
+def _text(number: int) -> bytes:
+    return Body("cdr").text(str(number)).done()
+
+
+def _notes(path: Path) -> list[tuple[int, bytes]]:
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(["/note"], log_time_order=False)
+        return [(message.log_time, message.data) for _, _, message in found]
+
+
+@pytest.mark.parametrize("jobs", ["1", "3"])
+def test_windows_that_are_left_out_hold_no_message_back(
+    shell: Shell, tmp_path: Path, jobs: str
+) -> None:
+    messages = _messages(1, 4, 5, 6, 9)
+    write_mcap(tmp_path / "drive.mcap", messages)
+    outcome = shell(
+        "convert drive.mcap -o out.mcap --pass /note --keep-partial --drop-incomplete 95 "
+        "--identity-extrinsics "
+        f"--jobs {jobs}"
+    )
+    assert outcome.code == 0, outcome.err
+    report = json.loads((tmp_path / "out.mcap.report.json").read_text())
+    assert report["scans"]["dropped_incomplete"] > 3
+    wanted = [(one.log_ns, one.data) for one in messages if one.topic == "/note"]
+    assert _notes(tmp_path / "out.mcap") == wanted
+    assert report["messages"] == [
+        {"topic": "/note", "read": NOTES, "written": NOTES, "dropped": {}}
+    ]
+
+
+def test_what_passes_by_can_be_taken_at_every_window(tmp_path: Path) -> None:
+    recording = write_mcap(tmp_path / "drive.mcap", _never_whole())
+    wishes = Wishes(identity_extrinsics=True)
+    job = Job((recording,), wishes, drop_incomplete=95, passed=("/note",), extras=MESSAGE_ENCODINGS)
+    run = Conversion(job)
+    waiting = []
+    for item in run.tasks():
+        assert isinstance(item, LeftOut)
+        run.take_passing(item.end_ns)
+        waiting.append(run.passed.waiting)
+    assert len(waiting) > TURNS - 3
+    assert all(a - b == TURN_NS // EVERY_NS for a, b in itertools.pairwise(waiting[1:]))
+
+
+@pytest.mark.parametrize("resumed", ["", " --resume"])
+def test_messages_alone_are_no_output(shell: Shell, tmp_path: Path, resumed: str) -> None:
+    write_mcap(tmp_path / "drive.mcap", _never_whole())
+    outcome = shell(
+        f"convert drive.mcap -o out.mcap --pass /note --drop-incomplete 95 --identity-extrinsics"
+        f"{resumed}"
+    )
+    assert outcome.code == 1
+    assert "no scan: wanted a whole window" in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
