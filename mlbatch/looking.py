@@ -52,6 +52,17 @@ def with_clouds(
     return [CloudRecording(recording, table, chosen, layouts) for recording in recordings]
 
 
+def is_without_packets(recording: Recording) -> bool:
+    """Whether a recording can only hold messages beside the packets of others."""
+    if not recording.topics or any(map(holds_packets, recording.topics)):
+        return False
+    # As above.
+    from mlbatch.clouds import CloudRecording
+
+    clouds = recording.topics_of_clouds if isinstance(recording, CloudRecording) else ()
+    return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
+
+
 def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:
     """Look at the first 10 s of a session: its packets, and the messages that tell of sensors."""
     sampler, learner = Sampler(table), Learner()

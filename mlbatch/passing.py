@@ -56,7 +56,7 @@ class PassQueue:
         self.counts: dict[str, PassCounts] = {}
         self._patterns = list(patterns)
         self._encodings = encodings
-        # A heap by stamp, then arrival: a recording of messages alone is read before all packets.
+        # A heap by stamp, then arrival: recordings hold messages in any order.
         self._waiting: list[tuple[int, int, Message]] = []
         self._arrived = 0
 

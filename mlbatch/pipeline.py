@@ -24,6 +24,7 @@ from mlbatch.feeding import Feeder
 from mlbatch.inertial import ImuQueue
 from mlbatch.job import DEFAULT_RATE, Job
 from mlbatch.kernels import choose_engine
+from mlbatch.looking import is_without_packets
 from mlbatch.mounting import Mounted
 from mlbatch.passing import PassQueue
 from mlbatch.readers import merge, open_recording, use_engine
@@ -141,7 +142,7 @@ class Conversion:
         size = sum(recording.size_bytes for recording in self.recordings)
         self.passed.keep(self.recordings)
         # Also after an error files are closed here, by the thread that opened them.
-        with contextlib.closing(merge(self.recordings)) as merged:
+        with contextlib.closing(merge(self.recordings, is_without_packets)) as merged:
             batches: Iterator[PacketBatch] = merged
             if self.replay is not None:
                 batches = self.replay.batches(batches, self.feeder.owners)

@@ -1,12 +1,14 @@
 """Several recordings as one session: packets in the order of their arrival at the recorder.
 
 The order depends on host times alone, then on the order of the recordings; where a recording's own
-times step back, its packets keep their order and count with the largest time so far.
+times step back, its packets keep their order and count with the largest time so far. A recording
+of messages alone is read first, so that all it teaches is known before a packet comes, or by its
+log times, so that memory holds little of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,15 +23,23 @@ def close(packets: Iterator[PacketBatch]) -> None:
         packets.close()
 
 
-def merge(recordings: Sequence[Recording]) -> Generator[PacketBatch, None, None]:
+def _never(recording: Recording) -> bool:
+    return False
+
+
+def merge(
+    recordings: Sequence[Recording], by_log_time: Callable[[Recording], bool] = _never
+) -> Generator[PacketBatch, None, None]:
     """Yield all packets of all recordings; a single recording passes through untouched.
 
     A recording is opened when its time has come: memory holds those that overlap, not all.
+    by_log_time: whether a recording runs by the log times of its messages; to be said of those
+    without a packet only, since packets have times of their own.
     """
     if len(recordings) == 1:
         yield from recordings[0].packets()
         return
-    feeds = [_Feed.peek(recording) for recording in recordings]
+    feeds = [_Feed.peek(recording, by_log_time(recording)) for recording in recordings]
     try:
         yield from _merged(feeds)
     finally:
@@ -68,6 +78,7 @@ class _Feed:
     """
 
     recording: Recording
+    by_log_time: bool
     known_until_ns: int = 0
     ended: bool = False
     batch: PacketBatch | None = None
@@ -75,17 +86,20 @@ class _Feed:
     _source: Iterator[PacketBatch] | None = None
 
     @classmethod
-    def peek(cls, recording: Recording) -> _Feed:
+    def peek(cls, recording: Recording, by_log_time: bool) -> _Feed:
         """A feed that knows its first packet's time, but holds no buffer yet."""
         packets = recording.packets(until_ns=0)
         first = next((batch for batch in packets if len(batch) or batch.messages), None)
         # Closing ends the look ahead, and gives its buffer back.
         close(packets)
         if first is None:
-            return cls(recording, ended=True)
-        # A recording that holds messages only is no clock for the others: it goes first.
-        known_until_ns = int(first.host_ns[0]) if len(first) else 0
-        return cls(recording, known_until_ns)
+            return cls(recording, by_log_time, ended=True)
+        if len(first):
+            known_until_ns = int(first.host_ns[0])
+        else:
+            # Messages are no clock for the packets of others, unless that is said.
+            known_until_ns = first.messages[0].host_ns if by_log_time else 0
+        return cls(recording, by_log_time, known_until_ns)
 
     def take(self, bound_ns: int, inclusive: bool) -> tuple[PacketBatch, I64Array]:
         """The packets up to `bound_ns`, with their keys; they are then given out."""
@@ -109,6 +123,9 @@ class _Feed:
         self.batch, self.key_ns = batch, np.maximum(largest, self.known_until_ns)
         if len(batch):
             self.known_until_ns = int(self.key_ns[-1])
+        elif self.by_log_time:
+            last_ns = max(message.host_ns for message in batch.messages)
+            self.known_until_ns = max(self.known_until_ns, last_ns)
 
     def close(self) -> None:
         """End the reading."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,6 +59,13 @@ def _text(number: int) -> bytes:
     return Body("cdr").text(str(number)).done()
 
 
+def _in_two(folder: Path, messages: Sequence[Recorded]) -> list[Path]:
+    """The notes in a recording of their own."""
+    notes = [one for one in messages if one.topic == "/note"]
+    others = [one for one in messages if one.topic != "/note"]
+    return [write_mcap(folder / "drive.mcap", others), write_mcap(folder / "notes.mcap", notes)]
+
+
 def _notes(path: Path) -> list[tuple[int, bytes]]:
     with path.open("rb") as file:
         found = make_reader(file).iter_messages(["/note"], log_time_order=False)
@@ -110,3 +117,39 @@ def test_messages_alone_are_no_output(shell: Shell, tmp_path: Path, resumed: str
     assert outcome.code == 1
     assert "no scan: wanted a whole window" in outcome.err
     assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
+
+
+def test_a_recording_of_messages_alone_is_read_along_with_the_packets(tmp_path: Path) -> None:
+    # More than is read at once.
+    messages = [
+        replace(one, data=Body("cdr").text("x" * 200_000).done()) if one.topic == "/note" else one
+        for one in _messages()
+    ]
+    paths = _in_two(tmp_path, messages)
+    wishes = Wishes(identity_extrinsics=True)
+    run = Conversion(Job(tuple(paths), wishes, passed=("/note",), extras=MESSAGE_ENCODINGS))
+    most = taken = 0
+    for item in run.tasks():
+        most = max(most, run.passed.waiting)
+        taken += len(run.take_passing(item.end_ns))
+    assert taken + len(run.take_passing(None)) == NOTES
+    assert most < NOTES * 2 // 3
+
+
+@pytest.mark.parametrize("more", ["", "--start +1 --end +1.5"])
+def test_messages_in_a_recording_of_their_own_are_those_of_one(
+    shell: Shell, tmp_path: Path, more: str
+) -> None:
+    messages = _messages()
+    write_mcap(tmp_path / "one.mcap", messages)
+    _in_two(tmp_path, messages)
+    found = []
+    for recordings in ("one.mcap", "drive.mcap notes.mcap", "notes.mcap drive.mcap"):
+        outcome = shell(
+            f"convert {recordings} -o out.mcap --pass /note --identity-extrinsics --overwrite "
+            f"--compression none {more}"
+        )
+        assert outcome.code == 0, outcome.err
+        found.append(_notes(tmp_path / "out.mcap"))
+    assert found[0] == found[1] == found[2]
+    assert len(found[0]) == (25 if more else NOTES)

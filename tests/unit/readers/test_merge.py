@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.readers import merge
-from mlbatch.types import CaptureCounts, PacketBatch, StreamTable, Topic
+from mlbatch.types import CaptureCounts, Message, PacketBatch, StreamTable, Topic
 from tests.builders.captures import udp_frame, write_pcap
 from tests.unit.readers.reading import Seen, open_capture, seen_of
 
@@ -83,6 +83,43 @@ def test_equal_times_follow_the_order_of_recordings() -> None:
 
 def test_a_step_back_keeps_its_recordings_order() -> None:
     assert merged([[10, 3, 11], [4, 10, 12]]) == [(1, 0), (0, 0), (0, 1), (1, 1), (0, 2), (1, 2)]
+
+
+class Notes(Batches):
+    """A recording of nothing but messages, three in a batch."""
+
+    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+        """Messages at the host times."""
+        none = np.zeros(0, np.int64)
+        topic = Topic("/note", "std_msgs/String", "cdr")
+        for at in range(0, len(self.host_ns), 3):
+            messages = [Message(topic, log_ns, b"") for log_ns in self.host_ns[at : at + 3]]
+            yield PacketBatch(np.zeros(0, np.uint8), none, none, none, none, tuple(messages))
+
+
+def _told(by_log_time: bool) -> list[tuple[int, int]]:
+    """Packets that had come, and messages, after each batch; of each all in the end."""
+    packets = Batches(0, list(range(100, 400)), random.Random(0))
+    notes = Notes(1, list(range(100, 400, 2)), random.Random(0))
+    arrivals: list[int] = []
+    told: list[int] = []
+    found = []
+    for batch in merge([packets, notes], lambda one: by_log_time and one is notes):
+        told += [message.host_ns for message in batch.messages]
+        arrivals += batch.host_ns.tolist()
+        found.append((len(arrivals), len(told)))
+    assert told == notes.host_ns
+    assert arrivals == packets.host_ns
+    return found
+
+
+def test_messages_alone_are_read_before_all_packets() -> None:
+    assert all(told == 150 for come, told in _told(by_log_time=False) if come)
+
+
+def test_messages_alone_are_read_by_their_log_times() -> None:
+    """Two packets come for each message, but for what is read at once."""
+    assert all(abs(come - 2 * told) <= 12 for come, told in _told(by_log_time=True))
 
 
 def test_no_recordings_and_empty_recordings() -> None:
