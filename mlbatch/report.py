@@ -179,12 +179,13 @@ def without_machine(report: Section, inputs: Sequence[InputReport]) -> Section:
     return kept
 
 
-def report_text(run: ReportInputs, machine: bool = True) -> str:
+def report_text(run: ReportInputs, machine: bool = True, in_a_line: bool = False) -> str:
     """report.json as text; `machine`: with timings and paths."""
     report = build_report(run)
     if not machine:
         report = without_machine(report, run.inputs)
-    text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    indent = None if in_a_line else 1
+    text = json.dumps(report, indent=indent, ensure_ascii=False, allow_nan=False)
     # Names of files need not be text: their odd bytes stand as escapes of JSON, which give the name
     # back, where UTF-8 has no place for them.
     return text.encode("utf-8", "backslashreplace").decode() + "\n"

@@ -111,7 +111,11 @@ def convert(
     ] = None,
     fault_seed: Annotated[int, typer.Option(help="Which packets random faults befall.")] = 0,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Do all but write; print the report.")
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Do all but write; print the report (with --on-jump split a line for each part).",
+        ),
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, each in a thread.")] = 1,

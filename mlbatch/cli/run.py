@@ -135,7 +135,8 @@ def _convert(job: Job, wanted: Wanted) -> None:
     if opener is None and report_path is not None:
         write_text(report_path, report_text(inputs))
     elif wanted.dry_run and report_path is None:
-        typer.echo(report_text(inputs), nl=False)
+        # Of several parts each is a line, since documents one after the other are none.
+        typer.echo(report_text(inputs, in_a_line=wanted.splits_jumps), nl=False)
         return
     if not wanted.quiet:
         if wanted.verbose:

@@ -44,7 +44,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--ignore": "repeatable",
         "--fault": "repeatable",
         "--fault-seed": "random",
-        "--dry-run": "report",
+        "--dry-run": "report.*split.*line.*part",
         "--report": "JSON",
         "--jobs": "same time",
         "--compression": "none, lz4, zstd.*LEVEL",

@@ -186,3 +186,18 @@ def test_decoded_clouds_are_cut_where_their_clock_jumps(shell: Shell, tmp_path: 
             "datagrams": clouds * columns,
             "skipped": {},
         }
+
+
+@pytest.mark.parametrize("steps_ns", [(), (FORWARD,), (FORWARD, BACK)])
+def test_a_dry_run_prints_a_line_of_json_for_each_part(
+    shell: Shell, tmp_path: Path, steps_ns: tuple[int, ...]
+) -> None:
+    write_session(tmp_path, *_pieces(Unit(), *steps_ns))
+    outcome = shell("convert drive.pcap --dry-run --on-jump split")
+    assert outcome.code == 0, outcome.err
+    reports = [json.loads(line) for line in outcome.out.splitlines()]
+    assert len(reports) == len(steps_ns) + 1
+    assert shell("convert drive.pcap -o out --on-jump split").code == 0
+    written = [json.loads(path.read_text()) for path in sorted(tmp_path.glob("out*/report.json"))]
+    assert [one["grid"] for one in reports] == [one["grid"] for one in written]
+    assert [one["sensors"] for one in reports] == [one["sensors"] for one in written]
