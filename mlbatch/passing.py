@@ -51,11 +51,17 @@ def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]
 class PassQueue:
     """Holds messages until the scan of their time is out; `counts` by topic."""
 
-    def __init__(self, patterns: Sequence[str], encodings: frozenset[str]) -> None:
-        """encodings: those that the output has a place for."""
+    def __init__(
+        self, patterns: Sequence[str], encodings: frozenset[str], begin_ns: int | None = None
+    ) -> None:
+        """encodings: those that the output has a place for; begin_ns: arrival where a part begins.
+
+        Of what came before the part only latched messages are taken, as by a late subscriber.
+        """
         self.counts: dict[str, PassCounts] = {}
         self._patterns = list(patterns)
         self._encodings = encodings
+        self._begin_ns = begin_ns
         # A heap by stamp, then arrival: recordings hold messages in any order.
         self._waiting: list[tuple[int, int, Message]] = []
         self._arrived = 0
@@ -88,6 +94,8 @@ class PassQueue:
     def add(self, messages: Iterable[Message]) -> None:
         """Take in messages, in file order."""
         for message in messages:
+            if self._is_of_earlier_part(message):
+                continue
             counts = self.counts.setdefault(message.topic.name, PassCounts())
             counts.read += 1
             if message.topic.encoding not in self._encodings:
@@ -102,6 +110,11 @@ class PassQueue:
                 stamp_ns = own_ns
             heapq.heappush(self._waiting, (stamp_ns, self._arrived, message))
             self._arrived += 1
+
+    def _is_of_earlier_part(self, message: Message) -> bool:
+        """Whether a message that came to teach belongs to the output of an earlier part."""
+        begin_ns = self._begin_ns
+        return begin_ns is not None and message.host_ns < begin_ns and not message.topic.latched
 
     def drop_before(self, low_ns: int) -> None:
         """Drop what lies before the first limit, so that it need not wait for a scan."""

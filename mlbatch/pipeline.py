@@ -115,7 +115,7 @@ class Conversion:
             [self._offset_ns(sensor) for sensor in self.setup.sensors],
             wanted=IMU in job.extras,
         )
-        self.passed = PassQueue(job.passed, MESSAGE_ENCODINGS & job.extras)
+        self.passed = PassQueue(job.passed, MESSAGE_ENCODINGS & job.extras, job.part.begin_ns)
         self.passed.refuse_unknown(self.recordings)
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.builders.bags import Body, Recorded
+from tests.builders.bags import Body, Recorded, transforms_message
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 from tests.unit.sessions import (
@@ -201,3 +201,31 @@ def test_a_dry_run_prints_a_line_of_json_for_each_part(
     written = [json.loads(path.read_text()) for path in sorted(tmp_path.glob("out*/report.json"))]
     assert [one["grid"] for one in reports] == [one["grid"] for one in written]
     assert [one["sensors"] for one in reports] == [one["sensors"] for one in written]
+
+
+def test_what_teaches_passes_to_later_parts_only_if_it_is_latched(
+    shell: Shell, tmp_path: Path
+) -> None:
+    """A part is a recording of its own: what late subscribers get belongs in it, `/tf` does not."""
+    one, two = _pieces(Unit(), FORWARD)
+    messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
+    first_ns = messages[0].log_ns
+    still = transforms_message("cdr", [("base_link", "camera", (1, 0, 0), (0, 0, 0, 1))])
+    for topic in ("/tf", "/camera/tf_static"):
+        latched = topic != "/tf"
+        messages += [
+            Recorded(topic, "tf2_msgs/TFMessage", first_ns + at * TURN_NS, still, latched)
+            for at in (range(0, 12) if topic == "/tf" else range(2))
+        ]
+    write_mcap(tmp_path / "drive.mcap", sorted(messages, key=lambda message: message.log_ns))
+    outcome = shell(
+        "convert drive.mcap -o out.mcap --on-jump split --keep-partial --pass /tf "
+        "--pass /camera/tf_static --pass /top/ouster/metadata"
+    )
+    assert outcome.code == 0, outcome.err
+    parts = []
+    for n in (1, 2):
+        report = json.loads((tmp_path / f"out.seg{n}.mcap.report.json").read_text())
+        parts.append({one["topic"]: (one["read"], one["written"]) for one in report["messages"]})
+    latched_ones = {"/camera/tf_static": (2, 2), "/top/ouster/metadata": (1, 1)}
+    assert parts == [{"/tf": (6, 6), **latched_ones}, {"/tf": (6, 6), **latched_ones}]
