@@ -11,11 +11,11 @@ import typer
 from mlbatch._resume_state import state_path
 from mlbatch.errors import ExportError
 from mlbatch.job import Job
-from mlbatch.report import SCHEMA
 from mlbatch.rig import read_rig
 from mlbatch.writers import (
     check_free_space,
     check_name,
+    is_report,
     is_taken,
     old_path,
     partial_path,
@@ -26,8 +26,6 @@ from mlbatch.writers import (
 # low-rate ones to npz): nothing that would fit is refused.
 LEAST_OUTPUT = 4
 _BYTES_PER_MB = 1_000_000
-# A report names its schema first.
-_HEAD_BYTES = 64
 
 
 def place(job: Job, output: Path, name: str) -> None:
@@ -150,8 +148,6 @@ def _is_replaceable(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+        return not path.stat().st_size or is_report(path)
     except OSError:
         return False
-    return not head or SCHEMA.encode() in head

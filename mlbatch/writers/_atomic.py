@@ -26,6 +26,10 @@ REPORT_JSON = "report.json"
 _OWN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(npz|ply)|scans\.csv|report\.json")
 # The same of a ROS 2 bag. Recorders write such files, too: only a table of scans makes them ours.
 _OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
+# A report may have any name (`--report`): what it begins with tells it, of any version, from
+# somebody's only copy.
+_REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
+_HEAD_BYTES = 64
 _ADVICE = {
     errno.ENOSPC: "free space on this disk or choose another output",
     errno.EDQUOT: "free space in your quota or choose another output",
@@ -88,6 +92,14 @@ class Output:
 def is_taken(name: str) -> bool:
     """Whether a file of this name in an output folder may be one of the run's own."""
     return bool(_OWN_FILE.fullmatch(name) or _OWN_BAG_FILE.fullmatch(name))
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file holds the report of a run."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _REPORT.match(file.read(_HEAD_BYTES)) is not None
 
 
 def check_name(target: Path) -> None:
@@ -191,7 +203,7 @@ def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
             continue
         if deep and entry.is_dir() and not entry.is_symlink():
             yield from _strangers(entry, deep=False)
-        elif not _OWN_FILE.fullmatch(entry.name):
+        elif not (_OWN_FILE.fullmatch(entry.name) or is_report(entry)):
             yield entry
 
 

@@ -204,6 +204,17 @@ def test_overwrite_replaces_the_scans_of_a_run_before(shell: Shell) -> None:
 def test_a_report_may_lie_in_the_output_folder(shell: Shell) -> None:
     assert shell(f"convert {FIX} -o out --report out/other.json").code == 0
     assert names("out", ".json") == ["other.json"]
+    assert shell(f"convert {FIX} -o out --report out/third.json --overwrite").code == 0
+    assert names("out", ".json") == ["third.json"]
+
+
+def test_another_file_of_json_keeps_its_folder(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o out").code == 0
+    for text in ('{"schema": "mlbatch.rig/1"}', "[]", "", '{"title": "mlbatch.report/1"}'):
+        Path("out/notes.json").write_text(text)
+        outcome = shell(f"convert {FIX} -o out --overwrite")
+        assert outcome.code == 1
+        assert "got notes.json in it as well" in outcome.err
 
 
 def test_strict_is_silent_on_a_clean_recording(shell: Shell) -> None:
