@@ -60,6 +60,7 @@ def report_inputs(run: Conversion) -> ReportInputs:
         faults=()
         if run.replay is None
         else tuple(FaultReport(one.fault, one.packets) for one in run.replay.counts),
+        repeated=_repeated(run),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
@@ -169,6 +170,14 @@ def _capture(run: Conversion) -> CaptureCounts:
         total.frames -= ahead
         total.datagrams -= ahead
     return total
+
+
+def _repeated(run: Conversion) -> int:
+    """Datagrams that faults repeated less those they removed."""
+    if run.replay is None or run.batcher.past_end:
+        # Up to an end only those are counted that the faults gave.
+        return 0
+    return sum(one.repeated - one.removed for one in run.replay.ledgers)
 
 
 def _sensor(run: Conversion, number: int) -> SensorReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -107,6 +108,12 @@ def check_capture(counts: CaptureCounts) -> list[str]:
         *_balance("frames", counts.frames, fates),
         *_unknown("frames", counts.skipped, CAPTURE_REASONS),
     ]
+
+
+def check_datagrams(datagrams: int, sensors: Sequence[SensorLedger], unassigned: int) -> list[str]:
+    """What does not balance between the recordings and the sensors, a line."""
+    fates = [(one.packets.read, one.imu_packets) for one in sensors]
+    return _balance("datagrams", datagrams, (*itertools.chain(*fates), unassigned))
 
 
 def check_messages(topic: str, read: int, written: int, dropped: dict[str, int]) -> list[str]:

@@ -16,6 +16,7 @@ from mlbatch.ledger import (
     PACKET_REASONS,
     SensorLedger,
     check_capture,
+    check_datagrams,
     check_messages,
     ordered,
 )
@@ -126,7 +127,10 @@ class Warned:
 
 @dataclass(frozen=True, slots=True)
 class ReportInputs:
-    """All that a report is made of; `t_init_ns` is None when the run never started."""
+    """All that a report is made of; `t_init_ns` is None when the run never started.
+
+    repeated: datagrams that faults had come twice, less those they removed.
+    """
 
     inputs: tuple[InputReport, ...]
     timescale: str
@@ -141,6 +145,7 @@ class ReportInputs:
     warnings: tuple[Warned, ...] = ()
     messages: tuple[Passed, ...] = ()
     faults: tuple[FaultReport, ...] = ()
+    repeated: int = 0
 
 
 def build_report(run: ReportInputs) -> Section:
@@ -194,6 +199,9 @@ def report_text(run: ReportInputs, machine: bool = True, in_a_line: bool = False
 def imbalances(run: ReportInputs) -> list[str]:
     """Ledgers of a run that do not balance, a line each."""
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
+    ledgers = [sensor.ledger for sensor in run.sensors]
+    unassigned = sum(stream.packets for stream in run.unassigned)
+    lines += check_datagrams(run.capture.datagrams + run.repeated, ledgers, unassigned)
     for sensor in run.sensors:
         lines += [f"{sensor.name}: {line}" for line in sensor.ledger.check()]
     for one in run.messages:

@@ -54,7 +54,7 @@ def run() -> ReportInputs:
     table = ScanTable(run_info())
     table.add(dense_scan(0))
     table.add(dense_scan(1))
-    capture = CaptureCounts(130, 120)
+    capture = CaptureCounts(131, 121)
     capture.skip("fragment_lost", 3)
     capture.skip("not_ip", 7)
     clock = ClockReport("sensor", "ptp", 12.5, None, ("notes",))
@@ -107,6 +107,16 @@ def test_messages_that_nobody_accounts_for_are_found() -> None:
     assert imbalances(replace(run(), messages=(passed,))) == []
     assert imbalances(replace(run(), messages=(passed, replace(passed, written=5)))) == [
         "messages of /imu: wanted 10 accounted for, got 5 + 4"
+    ]
+
+
+@pytest.mark.parametrize("repeated", [0, 4, -3])
+def test_datagrams_that_reach_no_sensor_are_found(repeated: int) -> None:
+    """110 lidar packets, 9 of an IMU and 2 of nobody."""
+    counted = replace(run(), capture=CaptureCounts(121 - repeated, 121 - repeated))
+    assert imbalances(replace(counted, repeated=repeated)) == []
+    assert imbalances(replace(counted, repeated=repeated + 1)) == [
+        "datagrams: wanted 122 accounted for, got 110 + 9 + 2"
     ]
 
 
