@@ -13,7 +13,7 @@ import numpy as np
 
 from mlbatch.discover import Wishes
 from mlbatch.errors import UsageError
-from mlbatch.job import Job, check_ranges_m, wait_ns
+from mlbatch.job import Job, check_ranges_m, check_slices, wait_ns
 from mlbatch.kernels import ENGINES
 from mlbatch.pipeline import Conversion
 from mlbatch.rate import parse_rate
@@ -68,7 +68,7 @@ def scans(
         ),
         # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
-        slices=slices,
+        slices=check_slices("slices", slices),
         layout=layout,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction
+from operator import index
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, SupportsIndex
 
 from mlbatch.batching.windows import Limit
 from mlbatch.clipping import Part
@@ -22,6 +23,7 @@ DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S
 # Nothing lasts longer, and ns of it still fit into int64.
 MOST_S = 2**33
+MAX_SLICES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,18 @@ def wait_ns(option: str, seconds: float, given: object) -> int | None:
     """`max_wait_ns` of a job from seconds; given: what the user wrote."""
     if math.isnan(seconds) or seconds <= 0:
         raise UsageError(f"{option}: wanted seconds above 0, or inf, got {given!r}; write 1.0")
-    return None if seconds > MOST_S else round(seconds * NS_PER_S)
+    # Less than a nanosecond is above 0 as well.
+    return None if seconds > MOST_S else max(1, round(seconds * NS_PER_S))
+
+
+def check_slices(option: str, count: object) -> int:
+    """`slices` of a job, a whole number."""
+    if not (isinstance(count, SupportsIndex) and 1 <= index(count) <= MAX_SLICES):
+        raise UsageError(
+            f"{option}: wanted a whole number from 1 to {MAX_SLICES}, got {count!r}; leave it out "
+            "for 1"
+        )
+    return index(count)
 
 
 def check_ranges_m(low_option: str, low: float, high_option: str, high: float) -> None:

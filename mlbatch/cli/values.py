@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
-from mlbatch.job import MOST_S, check_ranges_m, wait_ns
+from mlbatch.job import MOST_S, check_ranges_m, check_slices, wait_ns
 from mlbatch.rate import parse_rate
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S
@@ -21,7 +21,6 @@ from mlbatch.units import NS_PER_S
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
 
-MAX_SLICES = 10_000
 # Every job holds a few scans in memory.
 MAX_JOBS = 64
 
@@ -36,8 +35,7 @@ def rate(text: str) -> Fraction:
 
 def slices(count: int) -> None:
     """`--slices`."""
-    if not 1 <= count <= MAX_SLICES:
-        raise UsageError(f"--slices: wanted 1 to {MAX_SLICES}, got {count}; leave it out for 1")
+    check_slices("--slices", count)
 
 
 def ranges_m(low: float, high: float) -> None:

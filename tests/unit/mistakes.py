@@ -165,7 +165,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "no slices": (
         f"{FIX} --slices 0",
         2,
-        "--slices: wanted 1 to 10000, got 0; leave it out for 1",
+        "--slices: wanted a whole number from 1 to 10000, got 0; leave it out for 1",
     ),
     "wait": (
         f"{FIX} --max-wait soon",

@@ -13,7 +13,7 @@ import mlbatch
 from mlbatch.converting import convert
 from mlbatch.discover import Wishes
 from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
-from mlbatch.job import Job
+from mlbatch.job import Job, wait_ns
 from mlbatch.pipeline import Conversion
 from mlbatch.report import ReportInputs
 from mlbatch.types import RunInfo, Scan
@@ -206,6 +206,22 @@ def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
     for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan)):
         with pytest.raises(UsageError, match=r"m(in|ax)_range: wanted "):
             next(iter(mlbatch.scans(CAPTURE, min_range=low_m, max_range=high_m)))
+
+
+@pytest.mark.parametrize("slices", [0, 2.5, 2.0, 10_001, "2", None])
+def test_scans_in_python_have_whole_numbers_of_slices(slices: object) -> None:
+    with pytest.raises(UsageError, match=r"slices: wanted a whole number from 1 to 10000, got "):
+        next(iter(mlbatch.scans(CAPTURE, slices=slices)))  # type: ignore[arg-type]
+
+
+def test_scans_in_python_take_numbers_of_numpy() -> None:
+    scan = next(iter(mlbatch.scans(CAPTURE, rig=RIG, slices=np.int64(2))))
+    assert scan.slices == 2
+
+
+def test_the_shortest_wait_is_a_nanosecond() -> None:
+    assert wait_ns("max_wait", 1e-12, 1e-12) == 1
+    assert wait_ns("max_wait", 2e-9, 2e-9) == 2
 
 
 def test_scans_in_python_wait_for_ever_from_some_time_on() -> None:
