@@ -50,6 +50,10 @@ class ExportError(MlbatchError):
     """An output that cannot be written."""
 
 
+class Interrupted(MlbatchError):
+    """A run that was interrupted, and left what another can go on with (exit code 130)."""
+
+
 def one_line(text: str) -> str:
     """Text that may quote untrusted words, fit for a terminal: on one line and not too long.
 

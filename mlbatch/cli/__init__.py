@@ -8,7 +8,7 @@ import os
 import sys
 from typing import NoReturn
 
-from mlbatch.errors import MlbatchError, UsageError
+from mlbatch.errors import Interrupted, MlbatchError, UsageError
 
 # numpy's linear algebra, which nothing here uses, would start a thread on every core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -33,13 +33,12 @@ def main() -> None:
         sys.exit(code)
     except UsageError as err:
         _fail(str(err), EXIT_USAGE)
+    except Interrupted as err:
+        _fail(str(err), EXIT_INTERRUPTED)
     except MlbatchError as err:
         _fail(str(err), EXIT_ERROR)
     except KeyboardInterrupt:
-        _fail(
-            "interrupted; what was written stays under .partial, where --resume goes on",
-            EXIT_INTERRUPTED,
-        )
+        _fail("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # Whoever read our output closed it: nothing to say, and nowhere to say it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

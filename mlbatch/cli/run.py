@@ -13,7 +13,7 @@ import typer
 from mlbatch.cli import checks, interrupted
 from mlbatch.clipping import Part
 from mlbatch.converting import Last, OpenWriter, convert
-from mlbatch.errors import ClockJump, MlbatchError, NoScanError, one_line
+from mlbatch.errors import ClockJump, Interrupted, MlbatchError, NoScanError, one_line
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, report_text, summary_lines
@@ -162,6 +162,13 @@ def _converted(
         if told is err:
             raise
         raise told from err
+    except KeyboardInterrupt as err:
+        # Of a run that writes nothing, or nothing so far, there is no more to say.
+        if course is None or not course.recorded:
+            raise
+        raise Interrupted(
+            "interrupted; what was written stays under .partial, where --resume goes on"
+        ) from err
 
 
 def _last(wanted: Wanted, report_path: Path | None) -> Last:

@@ -161,13 +161,15 @@ def test_progress_is_shown_on_a_terminal_only(shell: Shell, tmp_path: Path) -> N
 
 SLOW = """\
 import time
-from mlbatch import cli, pipeline
-scans = pipeline.Conversion.scans
+from mlbatch import cli, pipeline, resume
+tasks = pipeline.Conversion.tasks
 def slowly(self, progress=None):
-    for scan in scans(self, progress):
-        yield scan
+    for task in tasks(self, progress):
+        yield task
+        print("a scan", flush=True)
         time.sleep(0.5)
-pipeline.Conversion.scans = slowly
+pipeline.Conversion.tasks = slowly
+resume.INTERVAL_S = 0.0
 cli.main()
 """
 
@@ -187,13 +189,26 @@ def test_an_interrupted_run_leaves_nothing_under_the_final_name(tmp_path: Path) 
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert out == ""
+    assert out.splitlines()[0] == "a scan"
     assert err == (
         "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
         "on\n"
     )
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["out.partial", "out.partial.state"]
+
+
+@pytest.mark.parametrize("words", [("convert", "--dry-run"), ("compare",)])
+def test_an_interrupt_of_what_writes_nothing_speaks_of_no_output(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mlbatch.pipeline.Batcher.push", interrupt)
+    outcome = shell(*words, CAPTURE, "--rig", RIG)
+    assert (outcome.code, outcome.out) == (130, "")
+    assert outcome.err == "mlbatch: error: interrupted\n"
 
 
 def test_a_reader_that_goes_away_is_no_error_worth_a_traceback() -> None:
