@@ -7,16 +7,21 @@ makes one of them in a process of its own, so that the measuring process stays s
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 from mlbatch.units import NS_PER_MS
 
 CAPTURE, RIG = "capture.pcap", "rig.yaml"
+# Beside a capture: of what makes it, so that one that another version made is made anew.
+DIGEST: Final = "made-by.sha256"
+_MAKERS: Final = ("recordings.py", "captures.py", "lidars.py")
 LOW, FULL = "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"
 VLP16, PANDAR64 = "VLP-16", "Pandar64"
 INIT_ID: Final = 7_109_750
@@ -115,6 +120,20 @@ RECORDINGS: Final[Mapping[str, Recording]] = {
 }
 
 
+@lru_cache(maxsize=1)
+def digest() -> str:
+    """Of the sources that make recordings."""
+    folder = Path(__file__).parent
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in _MAKERS)).hexdigest()
+
+
+def is_made(folder: Path) -> bool:
+    """Whether a recording stands in a folder as it would be made now."""
+    made = folder / DIGEST
+    is_whole = (folder / CAPTURE).is_file() and made.is_file()
+    return is_whole and made.read_text(encoding="utf-8") == digest()
+
+
 def make(recording: Recording, seconds: float, folder: Path) -> None:
     """Write capture, rig and what the sensors need into an existing folder."""
     from mlbatch.bench.captures import ETHERNET_MTU, JUMBO_MTU, Source, write_capture
@@ -135,6 +154,7 @@ def make(recording: Recording, seconds: float, folder: Path) -> None:
     partial = folder / f"{CAPTURE}.partial"
     write_capture(partial, sources, seconds, mtu)
     partial.replace(folder / CAPTURE)
+    (folder / DIGEST).write_text(digest(), encoding="utf-8")
 
 
 def _rig(sensors: Sequence[Mounted]) -> str:

@@ -19,7 +19,7 @@ from mlbatch.bench.cases import Case, Conversion, disk_bytes
 from mlbatch.bench.machine import machine
 from mlbatch.bench.measure import BenchError, measure
 from mlbatch.bench.ratios import COPY, LIBRARY, START, WRITE, changes, ratios
-from mlbatch.bench.recordings import CAPTURE, RIG
+from mlbatch.bench.recordings import CAPTURE, RIG, is_made
 from mlbatch.bench.results import FLOOR, OURS, PEER, Counted, Result, Row, Run, read_document
 
 # A scan takes this much of a point in memory: x, y, z, intensity and label.
@@ -174,9 +174,9 @@ class Session:
         return found
 
     def _recording(self, name: str) -> Path:
-        """The folder of a recording, which is made if it is not there."""
+        """The folder of a recording, made if it is not there, or was made otherwise."""
         folder = self.folder / f"{name}-{self.settings.seconds:g}s"
-        if not (folder / CAPTURE).exists():
+        if not is_made(folder):
             folder.mkdir(exist_ok=True)
             self.settings.tell(f"making {name}")
             module = [sys.executable, "-m", "mlbatch.bench.recordings"]

@@ -14,7 +14,7 @@ from pathlib import Path
 import dpkt
 import pytest
 
-from mlbatch.bench import captures
+from mlbatch.bench import captures, recordings
 from mlbatch.bench.cases import CASES, disk_bytes
 from mlbatch.bench.recordings import CAPTURE, KINDS, RECORDINGS, RIG, make
 from tests.builders.run import command
@@ -196,3 +196,18 @@ def test_the_disk_that_cases_need() -> None:
     # The recording once, and all its slots at 48 bytes.
     assert disk_bytes([by_name["dual-4-mcap"]], 1.0) == low + 2 * 10_240 * 128 * 48
     assert set(KINDS) == {sensor.kind for one in RECORDINGS.values() for sensor in one.sensors}
+
+
+def test_a_kept_recording_is_used_as_long_as_it_would_be_made_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = RECORDINGS["three-vlp16"]
+    assert not recordings.is_made(tmp_path)
+    make(recording, 0.2, tmp_path)
+    assert recordings.is_made(tmp_path)
+    monkeypatch.setattr(recordings, "digest", lambda: "of other makers")
+    assert not recordings.is_made(tmp_path)
+    make(recording, 0.2, tmp_path)
+    assert recordings.is_made(tmp_path)
+    (tmp_path / CAPTURE).unlink()
+    assert not recordings.is_made(tmp_path)
