@@ -101,7 +101,6 @@ class Comparison:
     findings: tuple[Named, ...]
     pairs: tuple[Pair, ...]
     corrections: tuple[Correction, ...]
-    host_steps: tuple[Jump, ...]
 
     def apart(self, limit_ns: int) -> tuple[Pair, ...]:
         """Pairs that were farther apart than `limit_ns`, whatever the verdict."""
@@ -159,8 +158,7 @@ def compare(findings: Sequence[Named], bound_ns: int = BOUND_NS) -> Comparison:
         ]
         # Two sensors that are each near the reference are twice as far from each other.
         bound = sum(sorted(left)[-2:])
-    steps = tuple(jump for jump in named[0][1].jumps if jump.kind == HOST) if named else ()
-    return Comparison(verdict, bound, reference, named, pairs, corrections, steps)
+    return Comparison(verdict, bound, reference, named, pairs, corrections)
 
 
 def _reference(named: Sequence[Named]) -> str:

@@ -67,11 +67,6 @@ class TurnCutter:
         self._is_whole = False
         self._open: Turn | None = None
 
-    @property
-    def open_columns(self) -> int:
-        """Columns since the last cut, whose turn has not ended."""
-        return 0 if self._open is None else self._open.columns
-
     def take(self, stamp_ns: I64Array, encoder: I64Array) -> list[Turn]:
         """The turns that end within these columns (n,)."""
         if not len(stamp_ns):

@@ -44,7 +44,9 @@ def test_measurement_ids_that_fall_back_begin_a_turn() -> None:
     turns = cutter.take(STAMPS, np.array([256, 512, 768, 0] * 3))
     assert _ms(turns) == WHOLE
     assert [(turn.sensor, turn.columns) for turn in turns] == [(3, 4), (3, 4)]
-    assert cutter.open_columns == 1
+    # The last column is the first of the next turn.
+    (turn,) = cutter.take(_stamps(1300, 25, 4), np.array([256, 512, 768, 0]))
+    assert (_ms([turn]), turn.columns) == ([(1275, 1350, 1375)], 4)
 
 
 @pytest.mark.parametrize("sense", [1, -1])
