@@ -6,6 +6,7 @@ was set to does not prove what its clock does; the values do.
 
 from __future__ import annotations
 
+from mlbatch.clock import EPOCH_NS, NEAR_NS
 from mlbatch.leap_seconds import GPS_EPOCH_S, TAI_GPS_S, gps_utc_s, tai_utc_s
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -26,12 +27,8 @@ IN_WORDS = {
 }
 HOUR_NS = 3600 * NS_PER_S
 DAY_NS = 24 * HOUR_NS
-# Stamps below (2001) are no time of today.
-EPOCH_NS = 10**9 * NS_PER_S
 # No sensor runs for three years on end; 1973 to 2001 is a calendar that was never set.
 LONGEST_UPTIME_NS = 10**8 * NS_PER_S
-# How far the recorder's clock may be off for a domain to be told.
-NEAR_NS = 2 * NS_PER_S
 _HALF_A_YEAR_NS = 182 * DAY_NS
 # Sensors send within seconds of power-on, their clocks begin there.
 _STARTED_NS = 600 * NS_PER_S

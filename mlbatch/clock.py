@@ -10,6 +10,7 @@ from mlbatch.units import NS_PER_S
 
 # Stamps below 1e9 s (2001) cannot be today's time: the sensor counts from power-on.
 EPOCH_NS = 10**9 * NS_PER_S
+# How far the recorder's clock may be off for a timescale to be told.
 NEAR_NS = 2 * NS_PER_S
 
 

@@ -11,6 +11,7 @@ from mlbatch import sensors
 from mlbatch._rigged import Wanted, is_model, match_rig
 from mlbatch.batching.clocks import refuse_incomparable
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.frames import some
 from mlbatch.leap_seconds import gps_utc_s, tai_utc_s
 from mlbatch.lidar import Calibration, ModelFile
 from mlbatch.looking import (
@@ -29,6 +30,8 @@ from mlbatch.streams import Found, Kind, Router, Sampler
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
+# Of a list that may be long, in an error.
+_SHOWN = 4
 _NO_SUPPORTED = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
 
 
@@ -284,7 +287,7 @@ def _nothing_found(
     where = ", ".join(str(recording.path) for recording in recordings)
     table, types = sampler.table, packet_types(recordings)
     for kind, why in failures.items():
-        unfit = f" (does not fit: {_some(looked)})" if looked else ""
+        unfit = f" (does not fit: {some(looked, _SHOWN)})" if looked else ""
         return RecordingError(f"{where}: {table.streams[kind[0]]}: {why}{unfit}")
     carried = [(table.streams[kind[0]], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
@@ -307,24 +310,19 @@ def _nothing_found(
     )
     return RecordingError(
         f"{where}: no lidar packets; wanted raw UDP packets of a supported lidar "
-        f"(see `mlbatch sensors`), got {_some(seen) or 'no UDP packet at all'}; {remedy}"
+        f"(see `mlbatch sensors`), got {some(seen, _SHOWN) or 'no UDP packet at all'}; {remedy}"
     )
 
 
 def _hints(recordings: Sequence[Recording], faults: Sequence[str]) -> str:
     """What is wrong with the recordings themselves, which may be why there is nothing."""
     notes = [f"{one.path.name}: {note}" for one in recordings for note in one.notes]
-    hints = _some([*notes, *faults])
+    hints = some([*notes, *faults], _SHOWN)
     return f" ({hints})" if hints else ""
 
 
 def _known(words: Sequence[str]) -> str:
-    return f"only {_some(words)}" if words else "none beside the recording"
-
-
-def _some(words: Sequence[str], most: int = 4) -> str:
-    text = ", ".join(words[:most])
-    return text if len(words) <= most else f"{text} and {len(words) - most} more"
+    return f"only {some(words, _SHOWN)}" if words else "none beside the recording"
 
 
 def _compare_clocks(

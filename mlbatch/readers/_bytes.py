@@ -21,6 +21,11 @@ def records(data: U8Array, layout: np.dtype[np.void], at: I64Array) -> Records:
     return _windows(data, layout.itemsize)[at].view(layout)
 
 
+def single(value: int) -> I64Array:
+    """A number as (1,) int64."""
+    return np.array([value], np.int64)
+
+
 def copy_runs(source: U8Array, start: I64Array, size: I64Array, out: U8Array, at: I64Array) -> None:
     """Copy `source[start[i] : start[i] + size[i]]` to `out[at[i] : ...]` for all i.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.readers._bytes import records
+from mlbatch.readers._bytes import records, single
 from mlbatch.readers._cdr import Cursor, MessageError
 from mlbatch.readers._definitions import PRIMITIVES, SEQUENCE, Definitions, Field
 from mlbatch.readers._packet_types import Envelope
@@ -129,19 +129,15 @@ class Tracer:
         for one in cursor.fields(kind):
             if one.name == envelope.payload:
                 room = cursor.count(one)
-                places.start.append(_one(cursor.place(room, 1)))
-                places.room.append(_one(room))
+                places.start.append(single(cursor.place(room, 1)))
+                places.room.append(single(room))
             elif one.name == envelope.size:
-                places.size_at.append(_one(cursor.place(*_SIZE)))
+                places.size_at.append(single(cursor.place(*_SIZE)))
             elif one.name == envelope.stamp and self.stamped:
-                places.stamp_at.append(_one(cursor.place(*_STAMP)))
+                places.stamp_at.append(single(cursor.place(*_STAMP)))
             else:
                 cursor.skip(one)
         cursor.leave()
-
-
-def _one(value: int) -> I64Array:
-    return np.array([value], np.int64)
 
 
 def _holder(types: Definitions, root: str, envelope: Envelope) -> Field | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import BagRecording, Portion
+from mlbatch.readers._bytes import single
 from mlbatch.readers._mcap_bytes import SkippingSource, Unzipper, Window, in_pieces
 from mlbatch.readers._rosbag1_records import (
     LEAST_HEAD_BYTES,
@@ -32,7 +33,7 @@ from mlbatch.readers._rosbag1_records import (
     walk,
 )
 from mlbatch.readers._source import read_head
-from mlbatch.types import I64Array, Recording, StreamTable, Topic, U8Array
+from mlbatch.types import Recording, StreamTable, Topic, U8Array
 
 CONTAINER = "ROS 1 bag"
 
@@ -267,7 +268,9 @@ class _Pass:
         # What is there of a chunk is read like a whole one; that it was cut off is counted.
         self._cut = True
         data = body + _WORD_BYTES
-        record = Walked(_one(head), _one(body - head), _one(data), _one(window.end - data), 0)
+        record = Walked(
+            single(head), single(body - head), single(data), single(window.end - data), 0
+        )
         with contextlib.suppress(HeadError):
             if window.end > data:
                 yield from self._records(window.data, record)
@@ -278,10 +281,6 @@ def _parts(data: U8Array, begin: int, end: int) -> Iterator[Walked]:
     yield (walked := walk(data, begin, end))
     while len(walked.head) == MOST_RECORDS:
         yield (walked := walk(data, walked.next, end))
-
-
-def _one(value: int) -> I64Array:
-    return np.array([value], np.int64)
 
 
 def _compression(fields: dict[str, bytes]) -> str:
