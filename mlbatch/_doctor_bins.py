@@ -59,19 +59,19 @@ class Bins:
             return
         if self._last is None:
             self._last = int(stamp_ns[0]), int(host_ns[0])
-        before = np.empty((count, 2), np.int64)
-        before[0] = self._last
-        before[1:, 0], before[1:, 1] = stamp_ns[:-1], host_ns[:-1]
-        here = np.stack([stamp_ns, host_ns], axis=1)
-        if self.quantum_ns != 1:
-            steps = np.gcd.reduce(stamp_ns - before[:, 0])
-            self.quantum_ns = int(np.gcd(steps, np.int64(self.quantum_ns)))
+        steps = _Steps(
+            np.concatenate([[self._last[0]], stamp_ns[:-1]]),
+            np.concatenate([[self._last[1]], host_ns[:-1]]),
+            stamp_ns,
+            host_ns,
+        )
+        self.quantum_ns = _quantum_ns(self.quantum_ns, steps.stamp_ns - steps.before_ns)
         while -(-(self.packets + count) // self._per_bin) > MOST_BINS:
             self._per_bin *= 2
             self._rows = _merged(self._rows, np.arange(0, len(self._rows), 2))
         number = (self.packets + np.arange(count)) // self._per_bin
         starts = np.flatnonzero(np.diff(number, prepend=-1))
-        rows = _merged(np.hstack([here, here, *(before, here) * 3]), starts)
+        rows = steps.rows(starts)
         if self.packets % self._per_bin:
             # The last bin was not full.
             both = np.concatenate([self._rows[-1:], rows[:1]])
@@ -86,6 +86,40 @@ class Bins:
         if self._last is None:
             return None
         return Track(self._rows.copy(), self._per_bin, self.packets, self._last)
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """Packets, each with the one before it; all (P,), stamps and arrivals in ns."""
+
+    before_ns: I64Array
+    before_host_ns: I64Array
+    stamp_ns: I64Array
+    host_ns: I64Array
+
+    def rows(self, starts: I64Array) -> I64Array:
+        """A bin for each run of packets that begins at `starts`."""
+        ahead = self.stamp_ns - self.host_ns
+        rise = ahead - (self.before_ns - self.before_host_ns)
+        back = self.before_ns - self.stamp_ns
+        packet = self.stamp_ns, self.host_ns
+        step = self.before_ns, self.before_host_ns, *packet
+        kept = (
+            (_largest(ahead, starts), packet),
+            (starts, packet),
+            (_largest(rise, starts), step),
+            (_largest(-rise, starts), step),
+            (_largest(back, starts), step),
+        )
+        return np.stack([column[index] for index, columns in kept for column in columns], axis=1)
+
+
+def _quantum_ns(quantum_ns: int, step_ns: I64Array) -> int:
+    """Greatest common divisor of steps (P,) and a number."""
+    if quantum_ns and not (step_ns % quantum_ns).any():
+        # As nearly always; to look for a smaller one takes ten times as long.
+        return quantum_ns
+    return int(np.gcd(np.gcd.reduce(step_ns), np.int64(quantum_ns)))
 
 
 def _merged(rows: I64Array, starts: I64Array) -> I64Array:
