@@ -45,10 +45,8 @@ def _pointer_to(element: Any) -> Callable[[int], Pointer]:
 u1_at = _pointer_to(types.uint8)
 u2_at = _pointer_to(types.uint16)
 u4_at = _pointer_to(types.uint32)
-i4_at = _pointer_to(types.int32)
 i8_at = _pointer_to(types.int64)
 f4_at = _pointer_to(types.float32)
-f8_at = _pointer_to(types.float64)
 # Sixteen bytes that move as one.
 c16_at = _pointer_to(types.complex128)
 
@@ -72,7 +70,6 @@ def _scratch_of(element: Any) -> Callable[[int], Pointer]:
 
 
 u1_scratch = _scratch_of(types.uint8)
-i4_scratch = _scratch_of(types.int32)
 i8_scratch = _scratch_of(types.int64)
 f4_scratch = _scratch_of(types.float32)
 u2_scratch = _scratch_of(types.uint16)
