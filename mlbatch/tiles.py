@@ -71,12 +71,11 @@ class Tiles:
         """As `compiled.CompiledKind.decode`."""
         count = 0
         # Of equal size, since what a small one costs is mostly its calls.
-        tiles = -(-len(due) // self._columns)
-        bounds = [len(due) * number // tiles for number in range(tiles + 1)]
+        tiles = max(1, -(-len(due) // self._columns))
+        bounds = [len(due) * part // tiles for part in range(tiles + 1)]
         for begin, end in pairwise(bounds):
-            tile = slice(begin, end)
-            number = np.arange(first + begin, first + tile.stop)
-            columns = due.part(tile)
+            number: I64Array = np.arange(first + begin, first + end)
+            columns = due.part(slice(begin, end))
             own: I64Array | None = None
             if self._is_partial:
                 own = (self._seat[columns.sensor] < len(self._member)).nonzero()[0]
@@ -90,7 +89,7 @@ class Tiles:
             index, keep = self._index(laid, len(columns))
             self._move(index, out, count)
             if points is not None:
-                points[tile][slice(None) if own is None else own] = wanted_points(keep)
+                points[begin:end][slice(None) if own is None else own] = wanted_points(keep)
             elif "column" in self._extras:
                 out.column[count : count + len(index)] = number.repeat(wanted_points(keep))
             count += len(index)

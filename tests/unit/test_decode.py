@@ -215,6 +215,13 @@ def test_an_empty_window_gives_an_empty_scan(tmp_path: Path) -> None:
     assert (scan.points, scan.xyz.shape, len(scan.column_stamp_ns)) == (0, (0, 3), 2)
 
 
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+def test_a_window_without_a_column_gives_an_empty_scan(tmp_path: Path, layout: str) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges()})
+    scan = _scan(_decoder(bench, layout=layout), [bench], [])
+    assert (scan.points, len(scan.xyz), len(scan.column_stamp_ns)) == (0, 0, 0)
+
+
 # -- organized ------------------------------------------------------------------------------------
 
 
