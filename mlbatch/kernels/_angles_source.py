@@ -50,7 +50,7 @@ def build() -> Callable[[Pointer], int]:
             is_sure &= np.float32(sine - _OFF) == np.float32(sine + _OFF)
             cosines[number] = np.float32(cosine) if is_sure else _NAN
             sines[number] = np.float32(sine)
-            left += 1 - np.int64(is_sure)
+            left += 0 if is_sure else 1
         return left
 
     return kernel

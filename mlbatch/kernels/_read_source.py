@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -109,8 +110,8 @@ def _bytes_reader(word: str, step: int, pad: int) -> Reader:
             run = moved(runs, number * _RUN)
             spread(u1_at(record + run[0]), run[2], moved(planes, run[1]))
         for beam in range(pad):
-            number = np.int32(planes[low + beam]) | np.int32(planes[high + beam]) << 8
-            distance = bits(number, 0, mask)
+            pixel: Any = np.int32(planes[low + beam]) | np.int32(planes[high + beam]) << 8
+            distance = bits(pixel, 0, mask)
             metres = np.float32(distance) * factor / divisor
             ranges[first + beam] = metres if distance > silent else np.float32(0)
             levels[first + beam] = np.float32(planes[level + beam])

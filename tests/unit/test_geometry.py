@@ -114,7 +114,7 @@ def test_rotors_aimed_together_are_those_aimed_alone(
     ids=["in a row", "past the end of a turn", "each second", "one"],
 )
 def test_positions_looked_up_in_a_row_are_those_looked_up_alone(positions: list[int]) -> None:
-    angle_rad = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    angle_rad = np.linspace(0, 2 * np.pi, 64, endpoint=False).astype(np.float64)
     first = replace(_beams("x", 0.02), angle_rad=angle_rad)
     tables = first.moved(POSE), replace(first, reach_m=first.reach_m + 0.5)
     encoder = np.array(positions)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -215,7 +216,7 @@ def test_scans_in_python_have_whole_numbers_of_slices(slices: object) -> None:
 
 
 def test_scans_in_python_take_numbers_of_numpy() -> None:
-    scan = next(iter(mlbatch.scans(CAPTURE, rig=RIG, slices=np.int64(2))))
+    scan = next(iter(mlbatch.scans(CAPTURE, rig=RIG, slices=cast(int, np.int64(2)))))
     assert scan.slices == 2
 
 
