@@ -14,11 +14,11 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.buffers import Buffer, Due
-from mlbatch.geometry import SECTORS, sectors
 from mlbatch.ledger import PointCounts
+from mlbatch.outline import NO_COLUMNS, Outline, Outliner
 from mlbatch.projection import Extras, Projector, Source, tile_columns
 from mlbatch.tiles import Tiles
-from mlbatch.types import EXTRAS, F64Array, I64Array, RunInfo, Scan, U8Array
+from mlbatch.types import EXTRAS, F64Array, RunInfo, Scan, U8Array
 
 __all__ = ["Decoder", "Due", "Label", "Source"]
 
@@ -59,7 +59,7 @@ class Decoder:
         columns = tile_columns(self._slots)
         # Rotor positions of a turn, None for those that columns tell themselves.
         angles = [source.lidar.beams.angle_rad for source in sources]
-        self._positions = [None if one is None else len(one) for one in angles]
+        positions = [None if one is None else len(one) for one in angles]
         groups = _alike(sources, together=engine == "numpy")
         first = only or 0
         self._projectors = [
@@ -84,11 +84,14 @@ class Decoder:
         if engine == "numba":
             # Loaded only here, as what it needs may not be there.
             from mlbatch.compiled import Kinds
+            from mlbatch.compiled_outline import CompiledOutliner
 
+            self._outliner: Outliner = CompiledOutliner(positions)
             self._kinds: Tiles | Kinds = Kinds(
                 self._projectors, self._seat, columns, first, shown, wide
             )
         else:
+            self._outliner = Outliner(positions)
             self._kinds = Tiles(self._projectors, self._seat, columns, first, shown)
         self._buffer = self._new_buffer(0)
         self._others = deque(self._new_buffer(0) for _ in range(buffers - 1))
@@ -168,47 +171,13 @@ class Decoder:
             overlap=tuple(one.overlap for one in own),
         )
 
-    def _outlines(self, due: Due) -> list[_Outline]:
+    def _outlines(self, due: Due) -> list[Outline]:
         """What the columns of each sensor are."""
-        if len(self._positions) == 1:
-            outline = _outline(due.stamp_ns, due.encoder, self._positions[0])
-            nothing = [_NO_COLUMNS] * (len(self._info.sensors) - 1)
-            return [*nothing[: self._only or 0], outline, *nothing[self._only or 0 :]]
-        # Sorted once, and as bytes: masks of each sensor cost more.
-        order = due.sensor.astype(np.uint8).argsort(kind="stable")
-        stamp_ns, encoder = due.stamp_ns[order], due.encoder[order]
-        ends = np.bincount(due.sensor, minlength=len(self._positions)).cumsum().tolist()
-        return [
-            _outline(stamp_ns[begin:end], encoder[begin:end], positions)
-            for begin, end, positions in zip([0, *ends], ends, self._positions, strict=False)
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class _Outline:
-    """The columns of a sensor in a scan, but for its points; shares are those of Scan."""
-
-    columns: int
-    max_gap_ns: int
-    coverage: float
-    overlap: float
-
-
-_NO_COLUMNS = _Outline(0, 0, 0.0, 0.0)
-
-
-def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> _Outline:
-    """Of the columns of one sensor, (n,) each; positions: see `sectors`."""
-    if not len(stamp_ns):
-        return _NO_COLUMNS
-    gap_ns = int((stamp_ns[1:] - stamp_ns[:-1]).max(initial=0))
-    # How often the rotor entered each sector.
-    sector = sectors(encoder, positions)
-    entered = sector[1:][sector[1:] != sector[:-1]]
-    passes = np.bincount(entered, minlength=SECTORS)
-    passes[sector[0]] += 1
-    once, again = np.count_nonzero(passes), np.count_nonzero(passes > 1)
-    return _Outline(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)
+        outlines = self._outliner.outlines(due)
+        if self._only is None:
+            return outlines
+        nothing = [NO_COLUMNS] * (len(self._info.sensors) - 1)
+        return [*nothing[: self._only], *outlines, *nothing[self._only :]]
 
 
 def _alike(sources: Sequence[Source], *, together: bool) -> list[list[int]]:

@@ -62,3 +62,11 @@ RELAY_SIZE = 5
 # where numpy has to tell.
 (ANGLES, ANGLE_WORDS, ANGLE_COSINE, ANGLE_SINE) = range(4)
 ANGLE_SIZE = 4
+
+# Outlines: columns; stamps, sensors and encoder words (addresses of int64); sensors of the rig;
+# int64 of each: positions of a turn, 0 for rotor words; (sensors, sectors) scratch; (sensors,
+# OUTLINE_FIGURES) what is found.
+(OUTLINED, OUTLINE_STAMP_NS, OUTLINE_SENSOR, OUTLINE_ENCODER, OUTLINE_SENSORS) = range(5)
+(OUTLINE_POSITIONS, OUTLINE_PASSES, OUTLINE_FOUND) = range(5, 8)
+OUTLINE_SIZE = 8
+OUTLINE_FIGURES = 6

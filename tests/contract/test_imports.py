@@ -23,7 +23,10 @@ LAYERS: tuple[tuple[tuple[str, ...], ...], ...] = (
         ("readers",),
         ("sensors",),
         ("batching",),
-        ("decode", "compiled", "_compiled_tables", "tiles", "projection", "buffers"),
+        (
+            *("decode", "compiled", "compiled_outline", "_compiled_tables"),
+            *("outline", "tiles", "projection", "buffers"),
+        ),
         ("writers",),
         ("report",),
         ("streams",),
