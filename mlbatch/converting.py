@@ -19,7 +19,7 @@ from mlbatch.job import Job
 from mlbatch.pipeline import Conversion, Progress
 from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.resume import Course
-from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.workers import Steps, Workers, in_one_go
 from mlbatch.writers import ScanWriter
 
@@ -153,35 +153,17 @@ class _Output:
             self.writer = self._open_writer(self._run.info)
 
     def _steps(self, piece: _Piece) -> Steps:
-        """What a thread does for a scan; see `Workers`."""
-        if piece.task is None:
-            return self._steps_between(piece)
-        return self._steps_of_scan(piece, piece.task)
-
-    def _steps_between(self, piece: _Piece) -> Steps:
-        """The same where there is no scan."""
-        watch, writing = _Watch(), iter(()) if self.writer is None else self.writer.flush()
-        watch.do(writing)
-        yield
-        for item in piece.before:
-            _hand_over(item, self.writer)
-        watch.do(writing)
-        yield
-        watch.do(writing)
-        yield
-        watch.do(writing)
-        self._run.stages.write_s += watch.spent_s
-
-    def _steps_of_scan(self, piece: _Piece, task: Task) -> Steps:
+        """What a thread does for a scan, or for what passes by without one; see `Workers`."""
         bench, decoded, began_s = None, piece.decoded, time.perf_counter()
-        if decoded is None:
+        if piece.task is not None and decoded is None:
             bench = self._idle.pop()
-            decoded = bench.decode(task)
+            decoded = bench.decode(piece.task)
         decode_s = time.perf_counter() - began_s
-        watch, writing = _Watch(), self._writing(task, decoded.scan, is_kept=piece.is_kept)
+        watch, writing = _Watch(), self._writing(piece, decoded)
         watch.do(writing)
         yield
-        self._run.account(decoded.scan)
+        if decoded is not None:
+            self._run.account(decoded.scan)
         for item in piece.before:
             _hand_over(item, self.writer)
         watch.do(writing)
@@ -189,18 +171,20 @@ class _Output:
         watch.do(writing)
         yield
         watch.do(writing)
-        if self._course is not None and self.writer is not None:
+        if decoded is not None and self._course is not None and self.writer is not None:
             self._course.note(decoded.fates, self.writer)
         self._run.stages.write_s += watch.spent_s
         if bench is not None:
             self._run.stages.decode_s += decode_s
             self._idle.append(bench)
 
-    def _writing(self, task: Task, scan: Scan, *, is_kept: bool) -> Steps:
+    def _writing(self, piece: _Piece, decoded: Decoded | None) -> Steps:
         if self.writer is None:
             return iter(())
-        write = self.writer.pass_over if is_kept else self.writer.write
-        return write(scan, task.only)
+        if piece.task is None or decoded is None:
+            return self.writer.flush()
+        write = self.writer.pass_over if piece.is_kept else self.writer.write
+        return write(decoded.scan, piece.task.only)
 
 
 @dataclass(slots=True)
