@@ -25,14 +25,6 @@ FIX = f"{CAPTURE} --rig {RIG}"
 POINTS = 27998
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def without_timing(report: Report) -> Report:
     """What does not depend on the machine."""
     return {key: value for key, value in report.items() if key != "timing"}

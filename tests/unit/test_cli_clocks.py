@@ -18,15 +18,6 @@ Report = dict[str, Any]
 RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _dry(shell: Shell, arguments: str) -> Report:
     outcome = shell(f"convert {arguments} --dry-run")
     assert outcome.code == 0, outcome.err

@@ -14,14 +14,6 @@ CAPTURE = FIXTURE / "two_lidars.pcap"
 MAKERS = REPOSITORY / "fixtures" / "four_makers"
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def test_the_table_of_the_fixture(shell: Shell) -> None:
     outcome = shell(f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'}")
     assert (outcome.code, outcome.err) == (0, "")

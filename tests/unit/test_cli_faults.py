@@ -16,15 +16,6 @@ RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 LEFT, RIGHT, IMU = 271, 271, 85
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _report(shell: Shell, *faults: str, more: str = "") -> Report:
     options = " ".join(f"--fault {fault}" for fault in faults)
     outcome = shell(f"convert {RECORDING} --dry-run {options} {more}")

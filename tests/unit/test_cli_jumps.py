@@ -25,15 +25,6 @@ from tests.unit.sessions import (
 TURN_NS = 100 * NS_PER_MS
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
     """The same lidar, whose clock steps after every piece while the recorder's runs on."""
     pieces, begin_ns, ahead_ns = [], unit.begin_ns, unit.host_ns

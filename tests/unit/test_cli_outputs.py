@@ -36,14 +36,6 @@ HEAD_POINTS = 22440
 
 
 @pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
-@pytest.fixture
 def dry(shell: Shell) -> Callable[[str], Report]:
     """The report of a dry run, from stdout."""
 

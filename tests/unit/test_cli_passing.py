@@ -25,15 +25,6 @@ TURNS, TURN_NS, EVERY_NS = 24, 100 * NS_PER_MS, 20 * NS_PER_MS
 NOTES = TURNS * TURN_NS // EVERY_NS
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _lidar(name: str, unit: Unit, lost: Collection[int]) -> list[Recorded]:
     """A lidar that lost a third of each of these turns, within one window."""
     about, *packets = unit_messages(replace(unit, turns=TURNS), name)

@@ -31,14 +31,6 @@ needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDI
 LEFT, RIGHT = "ouster_122647000123", "ouster_122648000456"
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
     outcome = shell(f"inspect {arguments} --json")
     assert (outcome.code, outcome.err) == (0, "")

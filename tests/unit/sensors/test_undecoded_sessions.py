@@ -16,14 +16,6 @@ WHERE = "10.0.0.8 > port 6699"
 ADVICE = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _m1() -> Records:
     return [
         (EPOCH_NS + 1_327_000 * n, frame)
