@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 
-from mlbatch.lidar import SensorModel
+from mlbatch.lidar.interface import SensorModel
 from mlbatch.sensors import models
 
 README = Path(__file__).resolve().parents[1] / "README.md"

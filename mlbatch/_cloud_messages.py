@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from mlbatch._cloud_packets import CloudError, Points
 from mlbatch._cloud_times import Zero, stamps
-from mlbatch.types import F32Array, Message
+from mlbatch.arrays import F32Array
+from mlbatch.types import Message
 from mlbatch.units import NS_PER_S
 
 # A structured array; numpy has no type for the fields of a dtype.

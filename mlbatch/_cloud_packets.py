@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array
 from mlbatch.errors import RecordingError
-from mlbatch.types import BoolArray, F32Array, I64Array, U8Array, U16Array
 
 # Source of the points, by its number in packets.
 KINDS = ("PointCloud2", "CustomMsg")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch._cloud_packets import CloudError
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from mlbatch.units import NS_PER_S
 
 # Numbers of the type that a cloud's time field has.

@@ -11,13 +11,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.discover import Wishes
+from mlbatch.decode.kernels import ENGINES
+from mlbatch.discovery.discover import Wishes
 from mlbatch.errors import UsageError
-from mlbatch.job import Job, check_ranges_m, check_slices, wait_ns
-from mlbatch.kernels import ENGINES
-from mlbatch.pipeline import Conversion
-from mlbatch.rate import parse_rate
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
 from mlbatch.types import Scan
+from mlbatch.units import parse_rate
 
 PathLike: TypeAlias = str | Path
 

@@ -29,16 +29,8 @@ from mlbatch._cloud_packets import (
     layout_of,
     pack,
 )
-from mlbatch.types import (
-    CaptureCounts,
-    Message,
-    PacketBatch,
-    Recording,
-    Stream,
-    StreamTable,
-    Topic,
-    U8Array,
-)
+from mlbatch.arrays import U8Array
+from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Stream, StreamTable, Topic
 
 __all__ = [
     "CLOUD_TYPES",

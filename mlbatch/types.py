@@ -5,19 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-U8Array: TypeAlias = npt.NDArray[np.uint8]
-U16Array: TypeAlias = npt.NDArray[np.uint16]
-U32Array: TypeAlias = npt.NDArray[np.uint32]
-I32Array: TypeAlias = npt.NDArray[np.int32]
-I64Array: TypeAlias = npt.NDArray[np.int64]
-F32Array: TypeAlias = npt.NDArray[np.float32]
-F64Array: TypeAlias = npt.NDArray[np.float64]
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
 
 @dataclass(frozen=True, slots=True)

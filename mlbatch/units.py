@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
+from fractions import Fraction
+
+from mlbatch.errors import UsageError
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
@@ -12,3 +16,46 @@ MM_PER_M = 1000
 RAD_PER_DEG = math.pi / 180.0
 # Standard gravity, CGPM 1901; Ouster's legacy IMU packets count in it.
 STANDARD_GRAVITY = 9.80665
+
+
+# Scan rates as exact rationals: what a user wrote is the number (CONTRACT.md section 1).
+
+MIN_RATE_HZ = Fraction(1, 4)
+MAX_RATE_HZ = Fraction(1_000_000)
+# `Fraction` alone would also take "1e999999999" and then compute for hours.
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,2})?|\d+/\d+", re.ASCII)
+_MAX_CHARACTERS = 100
+_MAX_DECIMALS = 9
+
+
+def parse_rate(text: str) -> Fraction:
+    """Rate in Hz from text as `10`, `29.97`, `10/3` or `1e1`; UsageError if it is none."""
+    cleaned = text.strip()
+    shown = cleaned if len(cleaned) <= 40 else cleaned[:40] + "..."
+    if len(cleaned) > _MAX_CHARACTERS or _NUMBER.fullmatch(cleaned) is None:
+        raise UsageError(
+            f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got {shown!r}; "
+            "write a decimal number or a fraction"
+        )
+    try:
+        rate = Fraction(cleaned)
+    except ZeroDivisionError:
+        raise UsageError(
+            f"rate: wanted a fraction with a denominator above 0, got {shown!r}; write it as 10/3"
+        ) from None
+    if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:
+        raise UsageError(
+            f"rate: wanted {rate_text(MIN_RATE_HZ)} to {rate_text(MAX_RATE_HZ)} Hz, "
+            f"got {shown!r}; lidars turn at 5 to 20 Hz"
+        )
+    return rate
+
+
+def rate_text(rate: Fraction) -> str:
+    """The exact number as text: `10`, `29.97`, or a fraction where a short decimal is not exact."""
+    for decimals in range(_MAX_DECIMALS + 1):
+        scaled = rate * 10**decimals
+        if scaled.denominator == 1:
+            digits = str(scaled.numerator).rjust(decimals + 1, "0")
+            return digits if decimals == 0 else f"{digits[:-decimals]}.{digits[-decimals:]}"
+    return f"{rate.numerator}/{rate.denominator}"

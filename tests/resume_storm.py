@@ -27,13 +27,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from mlbatch import resume
 from mlbatch.cli import main as mlbatch
+from mlbatch.pipeline import resume
 from tests.builders.bags import Body, Recorded, imu_message, packet_message
 from tests.builders.captures import write_pcap
 from tests.builders.ouster import OusterSpec
+from tests.builders.sessions import NS_PER_MS, NS_PER_S, Unit, twin, write_metadata
 from tests.builders.sessions_of_bags import write_mcap
-from tests.unit.sessions import NS_PER_MS, NS_PER_S, Unit, twin, write_metadata
 
 TURN_NS = 100 * NS_PER_MS
 SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)

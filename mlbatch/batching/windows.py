@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mlbatch.arrays import I64Array
 from mlbatch.batching.grid import Grid
-from mlbatch.types import I64Array
 from mlbatch.units import NS_PER_S
 
 

@@ -15,8 +15,9 @@ from typing import Final
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.bench.lidars import EPOCH_NS, Lidar
-from mlbatch.types import I64Array, Stream, U8Array
+from mlbatch.types import Stream
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 ETHERNET_MTU, JUMBO_MTU = 1500, 65535

@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.bench.recordings import FULL, INIT_ID, LOW, PANDAR64, VLP16
-from mlbatch.types import I64Array, U8Array
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 EPOCH_NS: Final = 1_700_000_000 * NS_PER_S

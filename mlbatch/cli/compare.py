@@ -37,19 +37,19 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
     """Measure joined turns of several lidars against windows: time spans, columns, stale data."""
-    from mlbatch.cli import values
-    from mlbatch.cli.tables import columns
-    from mlbatch.compare import Settings, compare
-    from mlbatch.discover import Wishes
-    from mlbatch.job import Job
+    from mlbatch.cli import options
+    from mlbatch.cli.options import columns
+    from mlbatch.compare.compare import Settings, compare
+    from mlbatch.discovery.discover import Wishes
+    from mlbatch.pipeline.job import Job
 
-    values.choice("--clock", clock, ("sensor", "host"))
+    options.choice("--clock", clock, ("sensor", "host"))
     settings = Settings(
         _duration_ns("--tolerance", tolerance),
         _duration_ns("--timeout", timeout),
     )
     wishes = Wishes(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(tuple(recordings), wishes, rate=None if rate is None else values.rate(rate))
+    job = Job(tuple(recordings), wishes, rate=None if rate is None else options.rate(rate))
     found = compare(job, settings)
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)

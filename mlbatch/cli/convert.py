@@ -138,23 +138,23 @@ def convert(
     ] = False,
 ) -> None:
     """Turn raw lidar packets into merged scans at an exact rate."""
-    from mlbatch.cli import values
+    from mlbatch.cli import options
     from mlbatch.cli.run import Wanted, run
-    from mlbatch.discover import Wishes
-    from mlbatch.job import Job
-    from mlbatch.kernels import ENGINES
+    from mlbatch.decode.kernels import ENGINES
+    from mlbatch.discovery.discover import Wishes
+    from mlbatch.pipeline.job import Job
 
-    values.choices(
+    options.choices(
         layout=(layout, ("dense", "organized")),
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
         engine=(engine, ENGINES),
     )
-    values.output(output, dry_run=dry_run)
-    values.slices(slices)
-    values.ranges_m(min_range, max_range)
-    first, last, are_dates = values.time_limits(start, end)
+    options.output(output, dry_run=dry_run)
+    options.slices(slices)
+    options.ranges_m(min_range, max_range)
+    first, last, are_dates = options.time_limits(start, end)
     job = Job(
         recordings=tuple(recordings),
         wishes=Wishes(
@@ -165,28 +165,28 @@ def convert(
             identity_extrinsics=identity_extrinsics,
             host_clock=clock == "host",
             aligned=align_clocks,
-            decode=values.decode_options(decode or ()),
+            decode=options.decode_options(decode or ()),
         ),
-        rate=None if rate is None else values.rate(rate),
+        rate=None if rate is None else options.rate(rate),
         slices=slices,
         layout=layout,
         split=split,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
-        drop_incomplete=values.percent("--drop-incomplete", drop_incomplete),
-        max_wait_ns=values.max_wait_ns(max_wait),
+        drop_incomplete=options.percent("--drop-incomplete", drop_incomplete),
+        max_wait_ns=options.max_wait_ns(max_wait),
         start=first,
         end=last,
         limits_are_dates=are_dates,
         min_range_m=min_range,
         max_range_m=max_range,
-        boxes_m=tuple(values.box_m(text) for text in exclude_box or ()),
+        boxes_m=tuple(options.box_m(text) for text in exclude_box or ()),
         strict=strict,
-        faults=values.faults(fault or ()),
-        fault_seed=values.seed(fault_seed),
+        faults=options.faults(fault or ()),
+        fault_seed=options.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
-        jobs=values.jobs(jobs),
+        jobs=options.jobs(jobs),
         engine=engine,
     )
     splits = on_jump == "split"
@@ -194,6 +194,6 @@ def convert(
         job,
         Wanted(
             *(output, format_, point_layout, compression, dry_run, report, splits),
-            *(overwrite, values.resume(resume, dry_run=dry_run), quiet, verbose),
+            *(overwrite, options.resume(resume, dry_run=dry_run), quiet, verbose),
         ),
     )

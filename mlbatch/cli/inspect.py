@@ -28,8 +28,8 @@ def inspect(
     ] = None,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
-    from mlbatch.cli.tables import columns
-    from mlbatch.survey import survey
+    from mlbatch.cli.options import columns
+    from mlbatch.discovery.inspect import survey
 
     found = survey(tuple(recordings), tuple(metadata or ()), whole=whole)
     if write_rig is not None:

@@ -11,10 +11,10 @@ from types import FrameType
 
 import typer
 
-from mlbatch import resume as resuming
 from mlbatch.errors import ExportError, MlbatchError, RecordingError
-from mlbatch.job import Job
-from mlbatch.resume import Course
+from mlbatch.pipeline import resume as resuming
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.resume import Course
 from mlbatch.writers import WriterOptions
 
 

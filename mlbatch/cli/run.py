@@ -10,14 +10,15 @@ from pathlib import Path
 
 import typer
 
-from mlbatch.cli import checks, interrupted
-from mlbatch.clipping import Part
-from mlbatch.converting import Last, OpenWriter, convert
+from mlbatch.cli import interrupted
 from mlbatch.errors import ClockJump, Interrupted, MlbatchError, NoScanError, one_line
-from mlbatch.job import Job
-from mlbatch.pipeline import Conversion, Progress
-from mlbatch.report import ReportInputs, report_text, summary_lines
-from mlbatch.resume import Course
+from mlbatch.pipeline import preflight
+from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.resume import Course
+from mlbatch.pipeline.run import Last, OpenWriter, convert
+from mlbatch.pipeline.segments import Part
+from mlbatch.report.report import ReportInputs, report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -117,17 +118,17 @@ def _convert(job: Job, wanted: Wanted) -> None:
     check_compression(name, options)
     job = replace(job, extras=extras(name, options))
     if wanted.output is not None and not wanted.dry_run:
-        checks.place(job, wanted.output, name)
+        preflight.place(job, wanted.output, name)
         if wanted.resume and interrupted.is_complete(wanted.output, overwrite=wanted.overwrite):
             return
         course = interrupted.course(job, wanted.output, name, options, resume=wanted.resume)
         options = replace(options, kept_bytes=course.kept_bytes)
         if options.kept_bytes is None:
             check_target(name, wanted.output, options, job.layout)
-            checks.disk(job, wanted.output)
+            preflight.disk(job, wanted.output)
         opener = _opener(name, wanted.output, options)
         report_path = report_path or report_paths(wanted.output, name).report
-    checks.report(job, report_path, None if wanted.dry_run else wanted.output, name)
+    preflight.report(job, report_path, None if wanted.dry_run else wanted.output, name)
     with _progress(wanted.quiet) as progress:
         conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
     for note in conversion.notes:

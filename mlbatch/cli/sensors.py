@@ -31,7 +31,7 @@ def sensors(
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
         return
-    from mlbatch.cli.tables import columns
+    from mlbatch.cli.options import columns
 
     cells = [[_cell(row[key]) for key in HEAD] for row in rows]
     for line in columns([list(HEAD), *cells]):

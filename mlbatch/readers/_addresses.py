@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import I64Array, Stream, StreamTable
+from mlbatch.arrays import I64Array
+from mlbatch.types import Stream, StreamTable
 
 _PORT_BITS = 16
 

@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers._definitions import type_key
 from mlbatch.readers._envelopes import (
     CORRECTION_TYPE,
@@ -23,16 +24,7 @@ from mlbatch.readers._envelopes import (
     MessageError,
     Unpacker,
 )
-from mlbatch.types import (
-    CaptureCounts,
-    I64Array,
-    Message,
-    PacketBatch,
-    Stream,
-    StreamTable,
-    Topic,
-    U8Array,
-)
+from mlbatch.types import CaptureCounts, Message, PacketBatch, Stream, StreamTable, Topic
 
 # A file of nothing but damage would fill memory and screen with what is wrong with it.
 MOST_NOTES = 100

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import I64Array, U8Array
+from mlbatch.arrays import I64Array, U8Array
 
 # A structured array; numpy has no type for the fields of a dtype.
 Records: TypeAlias = npt.NDArray[Any]

@@ -15,8 +15,9 @@ from typing import Protocol
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
-from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers import _links
 from mlbatch.readers._addresses import Addresses, StreamNumbers
 from mlbatch.readers._bytes import SLACK
@@ -24,7 +25,7 @@ from mlbatch.readers._fragments import MAX_DATAGRAM_BYTES
 from mlbatch.readers._frames import Frames, dissect, in_order
 from mlbatch.readers._reassembly import Reassembler
 from mlbatch.readers._source import Source
-from mlbatch.types import CaptureCounts, I64Array, PacketBatch, StreamTable, Topic, U8Array
+from mlbatch.types import CaptureCounts, PacketBatch, StreamTable, Topic
 
 BUFFER_BYTES = 4 << 20
 # Room for fragments of earlier buffers beside those of this one.

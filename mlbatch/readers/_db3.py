@@ -19,13 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import Portion, is_latched
 from mlbatch.readers._definitions import definition_text, type_key
 from mlbatch.readers._shapes import u32
 from mlbatch.readers._source import Source
 from mlbatch.readers._sqlite_table import WINDOW_BYTES, HandOver, Rows, Table
-from mlbatch.types import I64Array, Topic, U8Array
+from mlbatch.types import Topic
 
 MAGIC = b"SQLite format 3\0"
 BUFFER_BYTES = WINDOW_BYTES

@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers._cdr import ENCODINGS, EncapsulationError, MessageError
 from mlbatch.readers._definitions import definitions_of, type_key
 from mlbatch.readers._knowledge import decode_bytes, decode_string, decode_transforms
 from mlbatch.readers._packet_types import PACKET_TYPES, Envelope
 from mlbatch.readers._shapes import Shape, Tracer, u32
-from mlbatch.types import I64Array, Topic, U8Array
+from mlbatch.types import Topic
 from mlbatch.units import NS_PER_S
 
 __all__ = [

@@ -78,7 +78,7 @@ def _packed(name: str, names: set[str]) -> bool:
 
 def _listed(metadata: Path) -> list[str] | None:
     """Names of files in metadata.yaml, None where it is no such file."""
-    from mlbatch._yaml_tree import read_yaml
+    from mlbatch.rig.yaml_tree import read_yaml
 
     # Only names are compared: no file outside the folder is ever opened.
     try:

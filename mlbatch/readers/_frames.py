@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.kernels.reading import CaptureKernel
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.readers import _ipv6, _links
 from mlbatch.readers._addresses import Addresses
 from mlbatch.readers._bytes import Records, records
-from mlbatch.types import BoolArray, I64Array, U8Array
 
 IPV4 = np.dtype(
     [

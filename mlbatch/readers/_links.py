@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers._bytes import records
-from mlbatch.types import I64Array, U8Array
 
 CUT, NOT_IP, IPV4, IPV6, _TAG = 0, 1, 4, 6, 7
 # A frame with more tags than this is not a network's; the bound keeps the loop short.

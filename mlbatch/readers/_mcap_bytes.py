@@ -12,9 +12,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mlbatch.arrays import U8Array
 from mlbatch.readers._bytes import SLACK
 from mlbatch.readers._source import Source
-from mlbatch.types import U8Array
 
 BUFFER_BYTES = 4 << 20
 # No recorder makes larger chunks or messages: rosbag2 has 0.75 to 4 MB, others less than 100 MB.

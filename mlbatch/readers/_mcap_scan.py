@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.readers._bytes import records
 from mlbatch.readers._mcap_bytes import MAX_RECORD_BYTES
 from mlbatch.readers._mcap_records import HEAD, MESSAGE_HEAD_BYTES, Channels, Op
-from mlbatch.types import BoolArray, I64Array, Topic, U8Array
+from mlbatch.types import Topic
 
 _CHANNEL = struct.Struct("<H")
 _MESSAGE = np.dtype(

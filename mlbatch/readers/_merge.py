@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers._bytes import SLACK, copy_runs
-from mlbatch.types import I64Array, PacketBatch, Recording, U8Array
+from mlbatch.types import PacketBatch, Recording
 
 
 def close(packets: Iterator[PacketBatch]) -> None:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.kernels.reading import CaptureKernel
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.readers._bytes import copy_runs, records
 from mlbatch.readers._fragments import MAX_AGE_NS, MAX_DATAGRAM_BYTES, MAX_SETS, SetTable
 from mlbatch.readers._frames import UDP, Datagrams, Fragments, in_order
-from mlbatch.types import BoolArray, CaptureCounts, I64Array, U8Array
+from mlbatch.types import CaptureCounts
 
 
 @dataclass(slots=True)

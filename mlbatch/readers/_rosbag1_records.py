@@ -13,9 +13,10 @@ from enum import IntEnum
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.readers._bytes import records
 from mlbatch.readers._definitions import type_key
-from mlbatch.types import BoolArray, I64Array, Topic, U8Array
+from mlbatch.types import Topic
 from mlbatch.units import NS_PER_S
 
 _U32 = struct.Struct("<I")

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.readers._bytes import records, single
 from mlbatch.readers._cdr import Cursor, MessageError
 from mlbatch.readers._definitions import PRIMITIVES, SEQUENCE, Definitions, Field
 from mlbatch.readers._packet_types import Envelope
-from mlbatch.types import BoolArray, I64Array, U8Array
 
 _U32 = np.dtype([("value", "<u4")])
 _NONE = np.zeros(0, np.int64)

@@ -14,8 +14,8 @@ from io import FileIO
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.readers._bytes import SLACK, copy_runs, records
-from mlbatch.types import BoolArray, I64Array, U8Array
 
 WINDOW_BYTES = 4 << 20
 _INTERIOR, _LEAF = 5, 13

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from mlbatch.units import NS_PER_S
 
 U64Array: TypeAlias = npt.NDArray[np.uint64]

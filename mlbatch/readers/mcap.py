@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import I64Array
 from mlbatch.readers._bag import BagRecording, Portion
 from mlbatch.readers._mcap_bytes import BUFFER_BYTES, MAX_RECORD_BYTES, SkippingSource
 from mlbatch.readers._mcap_records import (
@@ -29,7 +30,7 @@ from mlbatch.readers._mcap_records import (
 )
 from mlbatch.readers._mcap_scan import Messages
 from mlbatch.readers._mcap_walk import Walk
-from mlbatch.types import I64Array, Recording, StreamTable, Topic
+from mlbatch.types import Recording, StreamTable, Topic
 
 CONTAINER = "MCAP"
 # How far to look for topics in a file that has no summary; recorders tell them at the front.

@@ -11,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array, U32Array
+from mlbatch.decode.kernels.capture import NO_ROOM, TOO_LONG
+from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
-from mlbatch.kernels.capture import NO_ROOM, TOO_LONG
-from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers import _links
 from mlbatch.readers._bytes import records
 from mlbatch.readers._capture import MAX_FRAME_BYTES, CaptureRecording, Walk
 from mlbatch.readers._frames import Frames
 from mlbatch.readers._source import read_head
-from mlbatch.types import I64Array, Recording, StreamTable, U8Array, U32Array
+from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 CONTAINER = "pcap"

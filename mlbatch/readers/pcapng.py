@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers._bytes import records
 from mlbatch.readers._capture import MAX_RECORD_BYTES, CaptureRecording, Walk
 from mlbatch.readers._frames import Frames
 from mlbatch.readers._links import NO_LINK
 from mlbatch.readers._source import read_head
 from mlbatch.readers._ticks import Resolution, U64Array
-from mlbatch.types import I64Array, Recording, StreamTable, U8Array
+from mlbatch.types import Recording, StreamTable
 
 CONTAINER = "pcapng"
 

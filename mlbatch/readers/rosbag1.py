@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers._bag import BagRecording, Portion
 from mlbatch.readers._bytes import single
@@ -33,7 +34,7 @@ from mlbatch.readers._rosbag1_records import (
     walk,
 )
 from mlbatch.readers._source import read_head
-from mlbatch.types import Recording, StreamTable, Topic, U8Array
+from mlbatch.types import Recording, StreamTable, Topic
 
 CONTAINER = "ROS 1 bag"
 

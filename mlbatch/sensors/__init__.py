@@ -13,11 +13,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, cast
 
+from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
-from mlbatch.lidar import Calibration, SensorModel
+from mlbatch.lidar.interface import Calibration, SensorModel
 from mlbatch.sensors._options import DECODE_OPTIONS
 from mlbatch.sensors._turning_lidar import content_keys
-from mlbatch.types import U8Array
 
 __all__ = [
     "DECODE_OPTIONS",

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import U8Array
+from mlbatch.arrays import U8Array
 
 U64Array = npt.NDArray[np.uint64]
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.geometry import Projection, read_rotor_words
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import Projection, read_rotor_words
 from mlbatch.sensors._hesai_corrections import At128File
-from mlbatch.types import F32Array, F64Array, I64Array
 
 _TURN_RAD = 2 * np.pi
 

@@ -17,8 +17,8 @@ from typing import NoReturn
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
-from mlbatch.types import F64Array
 from mlbatch.units import RAD_PER_DEG
 
 _CHANNEL_TITLES = ("laser id", "laserid", "laser", "channel", "channel id")

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import U8Array, U32Array
+from mlbatch.arrays import U8Array, U32Array
 
 _POLYNOMIAL = np.uint32(0x04C11DB7)
 _TOP = np.uint32(0x80000000)

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 
 NEVER = -1
 HIGH, STANDARD, SAVING = "high", "standard", "saving"

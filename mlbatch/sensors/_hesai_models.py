@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mlbatch.arrays import I64Array
 from mlbatch.sensors import _hesai_firing as firing
-from mlbatch.types import I64Array
 
 # Operation mode in the tail of the 128-channel families: what it fires like, and how many blocks
 # of the fast mode its block takes.

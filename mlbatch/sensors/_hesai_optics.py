@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mlbatch.geometry import BeamTable, Turning
-from mlbatch.types import F32Array, F64Array, I64Array
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import BeamTable, Turning
 
 # Closer returns are taken to come from the axis.
 _NEAREST_M = np.float32(0.09)

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.geometry import rotor_words
-from mlbatch.lidar import FAULTS, Records
-from mlbatch.pixels import PixelTable, readings
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.interface import FAULTS, Records
+from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors._hesai_crc import crc32
 from mlbatch.sensors._hesai_firing import NEVER
 from mlbatch.sensors._hesai_layout import CRC_SIZE, RETURN_MODES, SAFETY, SAFETY_SIZE, Layout
 from mlbatch.sensors._hesai_models import OPERATIONS
 from mlbatch.sensors._hesai_time import packet_times
 from mlbatch.sensors._recognise_bytes import number
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import Heads, Pixels
 from mlbatch.units import MM_PER_M
 
 _BAD_HEADER, _BAD_CRC = np.uint8(FAULTS.index("bad_header")), np.uint8(FAULTS.index("bad_crc"))

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.sensors._recognise_bytes import number
-from mlbatch.types import BoolArray, I64Array, U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CENTURY = 70  # Years below are of this century, others of the last.

@@ -14,9 +14,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.lidar import FAULTS
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors._recognise_livox import HEADER_SIZE, IMU, PointKind
-from mlbatch.types import F32Array, F64Array, I64Array, ImuSamples, U8Array
+from mlbatch.types import ImuSamples
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
 # 1 + 2 + 2 + 2 + 2 + 1 + 1 + 1 + 12 + 4 + 8 = 36 bytes; interval: 0.1 us.

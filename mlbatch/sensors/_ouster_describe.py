@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mlbatch.arrays import F64Array, I64Array, U8Array
 from mlbatch.sensors._ouster_imu import (
     LEGACY_IMU,
     LEGACY_SIZE,
@@ -33,7 +34,6 @@ from mlbatch.sensors._ouster_profiles import (
     ZONE_PACKET,
     PacketLayout,
 )
-from mlbatch.types import F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
 
 _COLUMNS = 16

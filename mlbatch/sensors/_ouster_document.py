@@ -14,8 +14,8 @@ from typing import NoReturn
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
-from mlbatch.types import F64Array
 from mlbatch.units import M_PER_MM
 
 # Later ones win: config_params repeats fields of the data format as they were asked for.

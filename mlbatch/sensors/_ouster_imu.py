@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.sensors._ouster_profiles import FOOTER_SIZE
-from mlbatch.types import F32Array, F64Array, ImuSamples, U8Array
+from mlbatch.types import ImuSamples
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
 # 3 x 8 + 2 x 12 = 48 bytes, no header.

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.sensors._ouster_document import Document
 from mlbatch.sensors._ouster_profiles import (
     HEADER_TYPES,
@@ -20,7 +21,6 @@ from mlbatch.sensors._ouster_profiles import (
     PROFILES,
     PacketLayout,
 )
-from mlbatch.types import F64Array
 from mlbatch.units import M_PER_MM, MM_PER_M, RAD_PER_DEG
 
 _DEFAULT_LIDAR_PORT = 7502

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.lidar import FAULTS
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors._crc import crc64
 from mlbatch.sensors._ouster_profiles import (
     COLUMN,
@@ -24,7 +25,7 @@ from mlbatch.sensors._ouster_profiles import (
     HeaderLayout,
     PacketLayout,
 )
-from mlbatch.types import BoolArray, Heads, I64Array, U8Array
+from mlbatch.types import Heads
 
 BAD_HEADER = FAULTS.index("bad_header")
 BAD_CRC = FAULTS.index("bad_crc")

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.pixels import Bits, Echo, PixelTable, Run
+from mlbatch.arrays import F32Array, I32Array, U8Array, U32Array
+from mlbatch.lidar.pixel_table import Bits, Echo, PixelTable, Run
 from mlbatch.sensors._ouster_profiles import Field, PacketLayout, Profile
-from mlbatch.types import F32Array, I32Array, Pixels, U8Array, U32Array
+from mlbatch.types import Pixels
 from mlbatch.units import MM_PER_M
 
 _WORD_BITS = 32

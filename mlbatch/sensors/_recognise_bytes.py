@@ -9,8 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from mlbatch.median import median
-from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
 
 # What `discover` and `survey` look for in a description.
 NO_DECODER = ": no decoder in this version"

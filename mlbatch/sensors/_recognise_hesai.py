@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, U8Array
 from mlbatch.sensors import _hesai_models as rows
 from mlbatch.sensors._hesai_layout import (
     AMBIENT,
@@ -27,7 +28,6 @@ from mlbatch.sensors._hesai_layout import (
 )
 from mlbatch.sensors._hesai_models import Model
 from mlbatch.sensors._recognise_bytes import NO_DECODER, mostly, number, starts, usual
-from mlbatch.types import BoolArray, U8Array
 
 _SOP = b"\xee\xff"
 _BLOCK_FLAG = b"\xff\xee"

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mlbatch.arrays import U8Array
 from mlbatch.sensors._recognise_bytes import NO_DECODER, mostly, number, usual
-from mlbatch.types import U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 HEADER_SIZE, _HEADER1_SIZE = 36, 18

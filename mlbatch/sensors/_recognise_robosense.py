@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.sensors import _robosense_models as rows
 from mlbatch.sensors._recognise_bytes import (
     NO_DECODER,
@@ -22,7 +23,6 @@ from mlbatch.sensors._recognise_bytes import (
     usual,
 )
 from mlbatch.sensors._robosense_models import MAKER, SECOND_KIND, Layout, Model
-from mlbatch.types import BoolArray, I64Array, U8Array
 
 _SOLID_STATE = bytes.fromhex("55aa5aa5")
 DIFOP = bytes.fromhex("a5ff005a11115555")

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.sensors._recognise_bytes import (
     NO_DECODER,
     block_azimuths,
@@ -20,7 +21,6 @@ from mlbatch.sensors._recognise_bytes import (
     starts,
     usual,
 )
-from mlbatch.types import BoolArray, I64Array, U8Array
 
 BLOCKS, STRIDE, BLOCK_LASERS = 12, 100, 32
 PACKET_SIZE, POSITION_SIZE = 1206, 512

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F64Array, U8Array
 from mlbatch.errors import RigError
-from mlbatch.lidar import Evidence
+from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors._recognise_bytes import number, starts
 from mlbatch.sensors._recognise_robosense import is_difop
 from mlbatch.sensors._robosense_models import ROWS, Model
-from mlbatch.types import F64Array, U8Array
 
 _SIZE, _TAIL_AT, _TAIL = 1248, 1246, b"\x0f\xf0"
 _PORTS_AT, _PORTS = 24, 4

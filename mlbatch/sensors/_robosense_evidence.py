@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.median import median
+from mlbatch.arrays import I64Array, U8Array, median
 from mlbatch.sensors._recognise_bytes import number, usual
 from mlbatch.sensors._recognise_robosense import identify, returns_of
 from mlbatch.sensors._robosense_difop import Difop
@@ -21,7 +21,6 @@ from mlbatch.sensors._robosense_models import (
     Model,
     ReturnMode,
 )
-from mlbatch.types import I64Array, U8Array
 
 COUNTER_MODULUS = 1 << 32
 _COUNTED_PACKETS = 16

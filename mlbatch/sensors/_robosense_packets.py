@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.geometry import rotor_words
-from mlbatch.lidar import FAULTS, Records
-from mlbatch.median import median
-from mlbatch.pixels import PixelTable, readings
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array, median
+from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.interface import FAULTS, Records
+from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors._recognise_bytes import number, starts
 from mlbatch.sensors._robosense_models import READING, Layout, Model
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
+from mlbatch.types import Heads, Pixels
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CDEG_PER_TURN = 36000

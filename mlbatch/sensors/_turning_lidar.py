@@ -7,10 +7,11 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.geometry import BeamTable, Projection
-from mlbatch.lidar import Records
-from mlbatch.pixels import PixelTable
-from mlbatch.types import BoolArray, F64Array, I64Array, ImuSamples, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import Records
+from mlbatch.lidar.pixel_table import PixelTable
+from mlbatch.types import ImuSamples
 
 
 class TurningLidar:

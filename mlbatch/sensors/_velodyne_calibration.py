@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, F64Array
 from mlbatch.errors import RigError
-from mlbatch.types import BoolArray, F64Array
 from mlbatch.units import RAD_PER_DEG
 
 if TYPE_CHECKING:

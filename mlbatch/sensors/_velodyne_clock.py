@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mlbatch.lidar import Beside
-from mlbatch.median import median
+from mlbatch.arrays import F64Array, I64Array, U8Array, median
+from mlbatch.lidar.interface import Beside
 from mlbatch.sensors._recognise_bytes import usual
 from mlbatch.sensors._recognise_velodyne import (
     NMEA_AT,
@@ -25,7 +25,6 @@ from mlbatch.sensors._recognise_velodyne import (
     TURN_CDEG,
     are_positions,
 )
-from mlbatch.types import F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 HOUR_NS = 3600 * NS_PER_S

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.geometry import Projection, read_rotor_words
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import Projection, read_rotor_words
 from mlbatch.sensors._velodyne_calibration import VelodyneFile
-from mlbatch.types import BoolArray, F32Array, F64Array, I64Array
 
 _FAR_M = 25.04
 _NEAR_RIGHT_M = 2.40

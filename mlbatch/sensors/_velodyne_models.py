@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.geometry import BeamTable, spherical
-from mlbatch.lidar import Records
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.lidar.geometry import BeamTable, spherical
+from mlbatch.lidar.interface import Records
 from mlbatch.sensors._recognise_velodyne import BLOCKS, HDL_64E, STRIDE, VLS_128
 from mlbatch.sensors._velodyne_calibration import VelodyneFile
-from mlbatch.types import F64Array, I64Array
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 _BLOCK_HEAD, _READING, _READINGS = 4, 3, 32

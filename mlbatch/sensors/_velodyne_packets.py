@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.geometry import Projection, rotor_words
-from mlbatch.lidar import FAULTS
-from mlbatch.pixels import PixelTable, readings
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array
+from mlbatch.lidar.geometry import Projection, rotor_words
+from mlbatch.lidar.interface import FAULTS
+from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors._recognise_velodyne import (
     DUAL,
     MODE_AT,
@@ -27,7 +28,7 @@ from mlbatch.sensors._velodyne_calibration import VelodyneFile
 from mlbatch.sensors._velodyne_clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors._velodyne_hdl64 import hdl64_projection
 from mlbatch.sensors._velodyne_models import Layout, Model, beam_table, layout, ranks
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
+from mlbatch.types import Heads, Pixels
 from mlbatch.units import NS_PER_S
 
 MAKER = "Velodyne"

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, Projection, spherical
-from mlbatch.lidar import Calibration, Evidence, SensorModel
-from mlbatch.median import median
+from mlbatch.lidar.geometry import BeamTable, Projection, spherical
+from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
 from mlbatch.sensors import _hesai_models as rows
 from mlbatch.sensors._hesai_at128 import at128_projection
 from mlbatch.sensors._hesai_corrections import At128File, HesaiAngles, read_angles, read_at128
@@ -27,7 +27,7 @@ from mlbatch.sensors._hesai_packets import PacketReader
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_hesai import hesai, identify
 from mlbatch.sensors._turning_lidar import TurningLidar, content_keys
-from mlbatch.types import F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import Heads, Pixels
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 MAKER = "HESAI"

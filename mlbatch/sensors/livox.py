@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, Projection
-from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
-from mlbatch.median import median
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
 from mlbatch.sensors._livox_packets import (
     IMU_SIZE,
     faults,
@@ -29,7 +29,7 @@ from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_bytes import usual
 from mlbatch.sensors._recognise_livox import HEADER_SIZE, PointKind, identify, livox
 from mlbatch.sensors._turning_lidar import TurningLidar, content_keys
-from mlbatch.types import F32Array, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
+from mlbatch.types import Heads, ImuSamples, Pixels
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "LivoxCalibration", "LivoxLidar", "describe"]
 

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, Projection
-from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._ouster_describe import describe
 from mlbatch.sensors._ouster_document import read_document
@@ -35,7 +36,7 @@ from mlbatch.sensors._ouster_packets import (
 )
 from mlbatch.sensors._ouster_pixels import PixelReader, pixel_table
 from mlbatch.sensors._ouster_profiles import FUSA, LEGACY
-from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
+from mlbatch.types import Heads, ImuSamples, Pixels
 from mlbatch.units import NS_PER_S
 
 __all__ = [

@@ -15,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.clouds import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, Projection, rotor_words
-from mlbatch.lidar import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
+from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
+from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._turning_lidar import TurningLidar
-from mlbatch.types import F32Array, F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import Heads, Pixels
 
 MAKER = "any"
 # In the order of KINDS.

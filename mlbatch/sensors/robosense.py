@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RigError
-from mlbatch.geometry import BeamTable, spherical
-from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.lidar.geometry import BeamTable, spherical
+from mlbatch.lidar.interface import READABLE, Calibration, Evidence, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_bytes import mostly, number
 from mlbatch.sensors._recognise_robosense import (
@@ -37,7 +38,7 @@ from mlbatch.sensors._robosense_evidence import (
 from mlbatch.sensors._robosense_models import MAKER, ROWS, Model
 from mlbatch.sensors._robosense_packets import PacketReader, shape_of, times_ns
 from mlbatch.sensors._turning_lidar import TurningLidar
-from mlbatch.types import BoolArray, Heads, I64Array, Pixels, U8Array
+from mlbatch.types import Heads, Pixels
 from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "RobosenseLidar", "describe", "read_calibration"]

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import U8Array, median
 from mlbatch.errors import RigError
-from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
-from mlbatch.median import median
+from mlbatch.lidar.interface import READABLE, Calibration, Evidence, SensorModel
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._recognise_velodyne import BLOCK_LASERS, Identity, identify, takes, velodyne
 from mlbatch.sensors._velodyne_calibration import VelodyneFile, read_velodyne
@@ -35,7 +35,6 @@ from mlbatch.sensors._velodyne_packets import (
     mean_step,
     steps,
 )
-from mlbatch.types import U8Array
 from mlbatch.units import NS_PER_US, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]

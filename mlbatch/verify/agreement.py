@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.verify.document import Document
 from mlbatch.verify.grid import Lines
 from mlbatch.verify.table import Table

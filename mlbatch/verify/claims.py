@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
 from mlbatch.errors import UsageError
-from mlbatch.rate import parse_rate
+from mlbatch.units import parse_rate
 from mlbatch.verify.grid import Lines
 from mlbatch.verify.verdict import Judge, VerifyError
 

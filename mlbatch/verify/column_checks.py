@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import F32Array, F64Array, I64Array, U8Array
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.verify.scan import HeldScan
 from mlbatch.verify.verdict import Judge
 

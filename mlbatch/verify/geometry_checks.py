@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import BoolArray, F64Array
+from mlbatch.arrays import BoolArray, F64Array
 from mlbatch.verify.scan import HeldScan, Points
 from mlbatch.verify.verdict import Judge
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import F64Array
+from mlbatch.arrays import F64Array
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.clouds import held, read_cloud
 from mlbatch.verify.cursor import Cursor

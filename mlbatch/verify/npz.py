@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import F32Array, I64Array, U8Array, U16Array, U32Array
+from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.folders import ScanFile, check_name
 from mlbatch.verify.scan import HeldScan

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import F32Array, F64Array, I64Array, U8Array
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.folders import ScanFile, check_name
 from mlbatch.verify.scan import HeldScan

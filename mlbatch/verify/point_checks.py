@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.types import BoolArray, I64Array
+from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.verify.scan import COLUMN_NS, HeldScan, Points
 from mlbatch.verify.verdict import Judge
 

@@ -6,9 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.errors import UsageError
-from mlbatch.rate import parse_rate
-from mlbatch.types import F64Array
+from mlbatch.units import parse_rate
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.document import Document, Json
 from mlbatch.verify.verdict import Judge

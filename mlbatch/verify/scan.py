@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mlbatch.types import (
-    BoolArray,
-    F32Array,
-    F64Array,
-    I64Array,
-    U8Array,
-    U16Array,
-    U32Array,
-)
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
 # Longest time from a column's stamp to its last firing that any supported lidar has, with room:
 # 0.14 ms of a PandarQT64.

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import BoolArray, I64Array
+from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.verify.grid import Lines
 from mlbatch.verify.verdict import Judge
 

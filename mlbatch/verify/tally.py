@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.types import BoolArray, I64Array
+from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.verify.scan import COLUMN_NS, HeldScan, Points
 from mlbatch.verify.table import Table
 from mlbatch.verify.verdict import Judge

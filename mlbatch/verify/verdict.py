@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mlbatch.arrays import BoolArray
 from mlbatch.errors import MlbatchError
-from mlbatch.types import BoolArray
 
 # Every check with what it proves, in the order in which a verdict shows them.
 CHECKS = {

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.pipeline.workers import Steps
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
-from mlbatch.workers import Steps
 from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
 from mlbatch.writers._chunk import Chunk
 from mlbatch.writers._gathered import taken

@@ -14,12 +14,8 @@ from typing import TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.arrays import F64Array, I64Array, U32Array
 from mlbatch.errors import ExportError
-from mlbatch.types import (
-    F64Array,
-    I64Array,
-    U32Array,
-)
 from mlbatch.units import MM_PER_M, NS_PER_S
 from mlbatch.writers._points import LABEL, PAIR, REALS, Points, Values
 

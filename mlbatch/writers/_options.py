@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from mlbatch.pipeline.workers import Steps
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
-    from mlbatch.workers import Steps
 
 DEFAULT_POINT_LAYOUT = "standard"
 

@@ -12,7 +12,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import F32Array, Scan, SensorInfo, U8Array, U16Array, U32Array
+from mlbatch.arrays import F32Array, U8Array, U16Array, U32Array
+from mlbatch.types import Scan, SensorInfo
 
 Values: TypeAlias = npt.NDArray[np.generic]
 # Four float32 as one item, whatever they mean; time_ns, ring, return type and sensor as one; the

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mlbatch.types import F64Array, ImuSamples, RunInfo
+from mlbatch.arrays import F64Array
+from mlbatch.types import ImuSamples, RunInfo
 from mlbatch.writers._layouts import Layout
 from mlbatch.writers._points import Points
 from mlbatch.writers._ros2_types import FIELD_CODES

@@ -20,14 +20,15 @@ from typing import Final
 
 import numpy as np
 
-from mlbatch.assembly import boxes_of, run_info, source_of
-from mlbatch.decode import Decoder, Due, Label
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
-from mlbatch.kernels import ENGINES
-from mlbatch.pipeline import Conversion
+from mlbatch.arrays import BoolArray
+from mlbatch.decode.decoder import Decoder, Due, Label
+from mlbatch.decode.kernels import ENGINES
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.session import boxes_of, run_info, source_of
 from mlbatch.readers import merge
-from mlbatch.types import BoolArray, PacketBatch
+from mlbatch.types import PacketBatch
 from mlbatch.units import NS_PER_US
 
 QUANTILES: Final = (0.5, 0.99, 1.0)

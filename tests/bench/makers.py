@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import I64Array, U8Array
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.units import NS_PER_S
 from tests.builders import hesai, robosense, velodyne
 from tests.builders.captures import udp_frame

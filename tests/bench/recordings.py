@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from mlbatch.types import BoolArray, I64Array, U8Array
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 from tests.bench.capture import (
     COLUMN_STAMPS_AT,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6

@@ -11,13 +11,13 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from mlbatch import _compiled_tables
-from mlbatch.assembly import boxes_of, run_info, source_of
-from mlbatch.decode import Decoder, Due, Label
-from mlbatch.decoding import LeftOut
-from mlbatch.job import Job
-from mlbatch.kernels import is_installed
-from mlbatch.pipeline import Conversion
+from mlbatch.decode import numba_engine
+from mlbatch.decode.decoder import Decoder, Due, Label
+from mlbatch.decode.kernels import is_installed
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.scan_task import LeftOut
+from mlbatch.pipeline.session import boxes_of, run_info, source_of
 from mlbatch.types import EXTRAS, Scan
 
 needs_numba = pytest.mark.skipif(
@@ -50,7 +50,7 @@ def few_kernels(factory: pytest.TempPathFactory) -> Iterator[None]:
     own = os.environ | {"XDG_CACHE_HOME": str(session / "kernels")}
     with (
         patch.dict(os.environ, own),
-        patch.object(_compiled_tables, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
     ):
         yield
 

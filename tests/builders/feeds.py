@@ -15,8 +15,7 @@ from typing import TypeAlias
 
 from hypothesis import strategies as st
 
-from mlbatch.batching.reference import FeedPacket, Settings
-from mlbatch.batching.reference_intake import Intake
+from mlbatch.batching.reference import FeedPacket, Intake, Settings
 from mlbatch.errors import ClockError
 from tests.builders.faults import spoiled
 

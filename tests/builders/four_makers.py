@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import F64Array
+from mlbatch.arrays import F64Array
 from tests.builders import hesai, robosense, two_lidars, velodyne
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.hesai_angles import Angles, angles_csv

@@ -14,7 +14,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 
-from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from tests.builders.hesai_angles import Angles as Angles
 from tests.builders.hesai_angles import Beams
 from tests.builders.hesai_angles import MirrorAngles as MirrorAngles

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mlbatch.types import F64Array
+from mlbatch.arrays import F64Array
 
 
 class Beams(Protocol):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 
 CARTESIAN32, CARTESIAN16, SPHERICAL, DUAL, IMU = 1, 2, 3, 0x11, 0
 # Three coordinates, reflectivity, tag.

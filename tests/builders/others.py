@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mlbatch.types import U8Array
+from mlbatch.arrays import U8Array
 
 EE, DD, CC, BB = b"\xff\xee", b"\xff\xdd", b"\xff\xcc", b"\xff\xbb"
 CDEG_PER_US = 0.36  # 600 rpm

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch.arrays import BoolArray, U8Array
 from mlbatch.sensors._crc import crc64
 from mlbatch.sensors._ouster_imu import (
     ACCEL32,
@@ -33,7 +34,6 @@ from mlbatch.sensors._ouster_profiles import (
     STANDARD,
     PacketLayout,
 )
-from mlbatch.types import BoolArray, U8Array
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
 IntLike: TypeAlias = npt.NDArray[np.integer[Any]]

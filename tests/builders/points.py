@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mlbatch.types import U8Array
+from mlbatch.arrays import U8Array
 from tests.builders.bags import Body, Recorded
 
 CLOUD, CUSTOM, CUSTOM2 = (

@@ -14,7 +14,7 @@ from datetime import datetime, timedelta, timezone
 
 import numpy as np
 
-from mlbatch.types import F64Array, I64Array, U8Array
+from mlbatch.arrays import F64Array, I64Array, U8Array
 from tests.builders.robosense_models import (
     AIRY_MOUNTS,
     DUAL,

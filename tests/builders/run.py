@@ -15,21 +15,20 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch import pipeline
+from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.cli import main
-from mlbatch.converting import convert
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
-from mlbatch.pipeline import Conversion
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline import conversion
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.run import convert
+from mlbatch.pipeline.workers import Steps
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
-from mlbatch.report import ReportInputs
+from mlbatch.report.report import ReportInputs
 from mlbatch.types import (
     EXTRAS,
     IMU,
-    BoolArray,
-    F32Array,
-    I64Array,
     ImuSamples,
     Message,
     Recording,
@@ -37,11 +36,7 @@ from mlbatch.types import (
     Scan,
     StreamTable,
     Summary,
-    U8Array,
-    U16Array,
-    U32Array,
 )
-from mlbatch.workers import Steps
 from mlbatch.writers import Safe, ScanWriter, WriterOptions, extras, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -209,7 +204,7 @@ def buffers_of(size: int) -> Iterator[None]:
             recording.buffer_bytes = size
         return recording
 
-    with patch.object(pipeline, "open_recording", opened):
+    with patch.object(conversion, "open_recording", opened):
         yield
 
 

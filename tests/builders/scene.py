@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mlbatch.types import BoolArray, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 
 Vector = tuple[float, float, float]
 

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 from tests.builders import hesai, robosense, two_lidars, velodyne
 from tests.builders.hesai_angles import Beams
 from tests.builders.scene import Scene

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import BoolArray, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.seen import Seen
 
 # facts/outputs.md section 3.

@@ -29,8 +29,8 @@ from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS
+from tests.builders.sessions import Unit
 from tests.builders.traffic import read_pcap
-from tests.unit.sessions import Unit
 
 Write = Callable[[Path], Path]
 # A message record (opcode 5) that announces more bytes than follow.

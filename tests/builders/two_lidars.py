@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from tests.builders.scene import Scene
 
 COLUMNS_PER_TURN, COLUMNS_PER_PACKET, BEAMS = 512, 16, 32

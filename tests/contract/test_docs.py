@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch import ledger
-from mlbatch.converting import convert
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers
-from mlbatch.report import build_report
-from mlbatch.rig import read_rig
+from mlbatch.report import ledger
+from mlbatch.report.report import build_report
+from mlbatch.rig.rig import read_rig
 from mlbatch.sensors import models
 from mlbatch.writers import formats
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, PLY_LAYOUT

@@ -16,9 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.errors import MlbatchError
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import (
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import (
     FAULTS,
     READABLE,
     Beside,
@@ -29,7 +30,7 @@ from mlbatch.lidar import (
     SensorModel,
 )
 from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
-from mlbatch.types import I64Array, Pixels, Stream, U8Array
+from mlbatch.types import Pixels, Stream
 from mlbatch.units import NS_PER_S
 from tests.builders import hesai_models, livox, ouster, points, robosense_models, velodyne_tables
 from tests.builders.others import rows

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.sessions import SMALL, Unit, write_session
 from tests.contract.tree import modules, run_python
-from tests.unit.sessions import SMALL, Unit, write_session
 
 
 def test_the_command_line_spares_the_collector() -> None:
@@ -29,7 +29,7 @@ def test_the_library_leaves_the_collector_alone() -> None:
     printed = run_python(
         "import gc, sys\n"
         "before = gc.get_threshold(), gc.get_freeze_count(), gc.isenabled()\n"
-        "import mlbatch.api, mlbatch.cli.app, mlbatch.converting\n"
+        "import mlbatch.api, mlbatch.cli.app, mlbatch.pipeline.run\n"
         "print(before == (gc.get_threshold(), gc.get_freeze_count(), gc.isenabled()))\n"
     )
     assert printed.strip() == "True"
@@ -42,7 +42,7 @@ NEEDLESS = (
     *("mlbatch.sensors._recognise_robosense", "mlbatch.sensors._recognise_velodyne"),
     *("mlbatch.readers.mcap", "mlbatch.readers.pcapng", "mlbatch.readers.rosbag1"),
     *("mlbatch.readers._bag", "mlbatch.readers._envelopes", "mlbatch.readers._folder"),
-    *("mlbatch.clouds", "mlbatch.faults", "mlbatch.urdf", "mlbatch.survey"),
+    *("mlbatch.clouds", "mlbatch.faults", "mlbatch.frames.urdf", "mlbatch.discovery.inspect"),
     *("mlbatch.compare", "mlbatch.verify", "mlbatch.bench", "mlbatch.api"),
     *("mlbatch.writers.npz", "mlbatch.writers.ply", "mlbatch.writers.rosbag1"),
     *("mlbatch.cli.bench", "mlbatch.cli.compare", "mlbatch.cli.inspect", "mlbatch.cli.verify"),

@@ -8,12 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from mlbatch import sensors
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.discovery.match import best_fits, match
+from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import FAULTS, Calibration, Lidar
-from mlbatch.matching import best_fits, match
-from mlbatch.streams import Sampler
-from mlbatch.types import Heads, I64Array, PacketBatch, Pixels, Stream, StreamTable, U8Array
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import FAULTS, Calibration, Lidar
+from mlbatch.types import Heads, PacketBatch, Pixels, Stream, StreamTable
 from tests.fuzz.framing import Part
 from tests.fuzz.harness import BrokenLaw
 

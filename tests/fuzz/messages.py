@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.frames import Candidate
-from mlbatch.looking import look, with_clouds
+from mlbatch.discovery.probe import look, with_clouds
+from mlbatch.frames.tree import Candidate
 from mlbatch.readers._bag import BagRecording, Portion
 from mlbatch.readers._definitions import definition_text
 from mlbatch.readers._packet_types import PACKET_TYPES

@@ -17,8 +17,8 @@ from unittest.mock import patch
 import numpy as np
 import zstandard
 
+from mlbatch.decode.kernels import is_installed
 from mlbatch.errors import MlbatchError
-from mlbatch.kernels import is_installed
 from mlbatch.readers import open_recording, use_engine
 from mlbatch.readers._capture import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable

@@ -16,12 +16,12 @@ from functools import lru_cache
 from pathlib import Path
 from unittest.mock import patch
 
-from mlbatch import _compiled_tables, compiled
-from mlbatch.discover import Wishes
+from mlbatch.decode import numba_engine
+from mlbatch.decode.kernels import is_installed
+from mlbatch.decode.kernels.native import Constant, Kernel, load
+from mlbatch.discovery.discover import Wishes
 from mlbatch.errors import MlbatchError
-from mlbatch.job import Job
-from mlbatch.kernels import is_installed
-from mlbatch.kernels.native import Constant, Kernel, load
+from mlbatch.pipeline.job import Job
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.run import in_memory, prints
 from tests.fuzz.framing import mutated_parts, parts_of
@@ -118,8 +118,8 @@ def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
     """Kernels are made for 128 channels or more, and kept from run to run."""
     with (
         kernels_kept(),
-        patch.object(_compiled_tables, "_LEAST_PAD", _CHANNELS),
-        patch.object(compiled, "load", loading),
+        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "load", loading),
     ):
         yield
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import zstandard
 
+from mlbatch.discovery.probe import calibrations_for, read_given
 from mlbatch.errors import MlbatchError, RigError
-from mlbatch.looking import calibrations_for, read_given
 from mlbatch.readers import open_recording
-from mlbatch.rig import read_rig
+from mlbatch.rig.rig import read_rig
 from mlbatch.types import Recording, StreamTable
 from tests.builders.bags import Recorded
 from tests.builders.captures import Section, pcap_bytes, section_bytes

@@ -16,7 +16,7 @@ import pytest
 from mlbatch.errors import RecordingError, RigError, one_line
 from mlbatch.readers import decode_transforms, open_recording
 from mlbatch.readers._envelopes import Unpacker
-from mlbatch.rig import read_rig
+from mlbatch.rig.rig import read_rig
 from mlbatch.types import StreamTable, Topic
 from tests.builders.bags import Recorded, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2

@@ -10,14 +10,14 @@ from functools import lru_cache
 from pathlib import Path
 
 from mlbatch import sensors
-from mlbatch._rigged import Wanted, match_rig
-from mlbatch.cli import values
+from mlbatch.cli import options
+from mlbatch.discovery.match import Wanted, match_rig
+from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
-from mlbatch.rig import Rig, StreamSelector, read_rig, write_rig
+from mlbatch.frames.urdf import fixed_joints, joints
+from mlbatch.rig.rig import Rig, StreamSelector, read_rig, write_rig
 from mlbatch.sensors._options import check_options
-from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
-from mlbatch.urdf import fixed_joints, joints
 from tests.builders.four_makers import RIG
 from tests.builders.sessions_of_bags import urdf
 from tests.contract.tree import ROOT
@@ -124,24 +124,24 @@ def _urdf(data: bytes, folder: Path) -> None:
 
 
 _TYPED: Sequence[tuple[Callable[[str], object], tuple[str, ...]]] = (
-    (values.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
-    (values.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
-    (values.max_wait_ns, ("1.0", "inf", "0.05", "1e9")),
-    (lambda text: values.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
-    (lambda text: values.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
-    (lambda text: values.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
+    (options.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
+    (options.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
+    (options.max_wait_ns, ("1.0", "inf", "0.05", "1e9")),
+    (lambda text: options.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
+    (lambda text: options.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
+    (lambda text: options.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
     (
         lambda text: check_options(dict(pair.partition("=")[::2] for pair in text.split(";"))),
         ("packet_stamp=end", "crc=check;optical_centre=on"),
     ),
     (
-        lambda text: values.faults(text.split(" ")),
+        lambda text: options.faults(text.split(" ")),
         (
             *("drop:left:5%", "stall:left:5s-8s", "delay:left:60ms", "jump:left:37s@10s"),
             *("dup:left:1%", "reorder", "bitflip:*:0.1%", "drift:left:50ppm", "late:left:3s"),
         ),
     ),
-    (lambda text: values.choice("--layout", text, ("dense", "organized")), ("dense",)),
+    (lambda text: options.choice("--layout", text, ("dense", "organized")), ("dense",)),
 )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 from tests.builders.run import RECORDINGS
 from tests.golden.references import read_pcd, xyz_of
 

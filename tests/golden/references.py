@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.types import BoolArray, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.run import Cloud, command, load, scan_files
 
 HOUR_NS = 3_600_000_000_000

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch.rig import read_rig
+from mlbatch.rig.rig import read_rig
 from tests.builders.bags import Recorded, imu_message
 from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
+from tests.builders.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
 from tests.builders.sessions_of_bags import (
     description,
     frame_message,
@@ -30,7 +31,6 @@ from tests.builders.sessions_of_bags import (
     write_mcap,
 )
 from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
-from tests.unit.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
 
 Write = Callable[[Path], Path]
 # SOURCE.md of the fixture: seven whole windows, 512 columns of each lidar in each.

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.compare import WINDOWS, Comparison, compare
-from mlbatch.job import Job
-from mlbatch.tally import WayReport
+from mlbatch.compare.compare import WINDOWS, Comparison, compare
+from mlbatch.compare.statistics import WayReport
+from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, slug, write_case
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.clock_compare import SYNCHRONISED, UNSYNCHRONISED, compare
-from mlbatch.doctor import ClockFinding, ClockWatch
-from mlbatch.looking import calibrations_for, look
-from mlbatch.matching import match
+from mlbatch.clocks.compare import SYNCHRONISED, UNSYNCHRONISED, compare
+from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.discovery.match import match
+from mlbatch.discovery.probe import calibrations_for, look
+from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
-from mlbatch.streams import split_by_kind
 from mlbatch.types import StreamTable
 
 RECORDINGS = Path(__file__).resolve().parents[2] / ".." / "shared" / "recordings"

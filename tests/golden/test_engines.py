@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
-from mlbatch.report import report_text
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline.job import Job
+from mlbatch.report.report import report_text
 from tests.builders import four_makers
 from tests.builders.engines import WANTED, check_conversion, few_kernels, needs_numba
 from tests.builders.run import FIXTURE, RECORDINGS, command, in_memory, prints

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
-from mlbatch.types import F64Array, I64Array, Scan
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline.job import Job
+from mlbatch.types import Scan
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv

@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 from tests.builders.make_fixtures import END_NS, SECOND_NS, START_NS, TURNS
 from tests.builders.run import FIXTURE, Cloud, load, scan_files, to_file
 from tests.builders.scene import MACHINE_HIGH_M, MACHINE_LOW_M, hall

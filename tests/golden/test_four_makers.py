@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window, reference_scans
-from mlbatch.types import BoolArray, F64Array, I64Array
 from tests.builders.four_makers import FOLDER, HOUR_NS, PLACES, VELODYNE, arrivals, main, seen
 from tests.builders.run import Cloud, command, load, scan_files
 from tests.builders.scene import hall

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.types import BoolArray, I64Array
+from mlbatch.arrays import BoolArray, I64Array
 from tests.builders.run import Cloud
 from tests.golden.hesai_recordings import CASES, FOLDER, Case
 from tests.golden.references import (

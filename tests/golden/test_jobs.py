@@ -17,13 +17,13 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.decode import Decoder
+from mlbatch.decode.decoder import Decoder
 from mlbatch.errors import ExportError, PacketError
 from mlbatch.writers import _gathered
 from mlbatch.writers._chunk import Chunk
 from tests.builders.run import command
+from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, TWO, Case, contents, write_recordings
-from tests.unit.sessions import REPOSITORY
 
 _HANGS_AFTER_S = 240
 _TURNS = 14

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from mlbatch import sensors
-from mlbatch.lidar import Calibration, ModelFile
-from mlbatch.matching import best_fits, match
+from mlbatch.arrays import BoolArray
+from mlbatch.discovery.match import best_fits, match
+from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
-from mlbatch.types import BoolArray
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.hesai_angles import MirrorAngles, angles_csv
 from tests.builders.velodyne_tables import MODELS as VELODYNES

@@ -13,13 +13,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import PacketLoss
-from mlbatch.lidar import Lidar
-from mlbatch.looking import calibrations_for, look
-from mlbatch.matching import match
+from mlbatch.discovery.match import match
+from mlbatch.discovery.probe import calibrations_for, look
+from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import merge, open_recording
-from mlbatch.streams import split_by_kind
-from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
+from mlbatch.types import Heads, StreamTable
 from tests.golden.test_doctor_recordings import CASES, RECORDINGS, Case, needs_recordings
 
 # Fewer tell no pace.

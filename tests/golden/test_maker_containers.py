@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discover import Wishes
-from mlbatch.job import Job
+from mlbatch.discovery.discover import Wishes
+from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders import hesai, velodyne

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.types import BoolArray, F32Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, I64Array
 from tests.builders.run import RECORDINGS, Cloud, command
 
 FOLDER = RECORDINGS / "ouster"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, contents, write_recordings
-from tests.unit.sessions import REPOSITORY
 
 KILLS, SEED = 18, 3
 LIMITED = """

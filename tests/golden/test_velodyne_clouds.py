@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mlbatch.types import BoolArray, F32Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, I64Array
 from tests.builders.velodyne_tables import MODELS
 from tests.golden.references import (
     ONLY,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.types import F64Array
+from mlbatch.arrays import F64Array
 from tests.builders.run import Cloud
 from tests.builders.traffic import read_pcap
 from tests.builders.velodyne_tables import MODELS

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import BoolArray, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.run import RECORDINGS
 from tests.builders.velodyne_tables import MODELS
 from tests.golden.references import Decoded

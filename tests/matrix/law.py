@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from tests.matrix.lidars import NS_PER_MS, NS_PER_S, Sent
 
 PERIOD_NS = 50 * NS_PER_MS

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from tests.builders import hesai, robosense, velodyne
 from tests.builders.hesai_angles import angles_csv
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json

@@ -16,10 +16,10 @@ from types import FrameType
 import numpy as np
 import pytest
 
-from mlbatch.discover import Wishes
+from mlbatch.discovery.discover import Wishes
 from mlbatch.errors import MlbatchError
-from mlbatch.job import Job
-from mlbatch.report import ReportInputs, build_report
+from mlbatch.pipeline.job import Job
+from mlbatch.report.report import ReportInputs, build_report
 from mlbatch.types import Scan
 from tests.builders.captures import pcap_bytes
 from tests.builders.damage import (

@@ -18,11 +18,11 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from mlbatch import pipeline
-from mlbatch.discover import Wishes
-from mlbatch.faults import Fault, parse_fault
-from mlbatch.job import Job
-from mlbatch.pipeline import Conversion
+from mlbatch.discovery.discover import Wishes
+from mlbatch.faults.replay import Fault, parse_fault
+from mlbatch.pipeline import conversion
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable, Topic
 from tests.builders import livox
 from tests.builders.run import Values, csv_without_arrival, print_of
@@ -105,7 +105,7 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(pipeline, "open_recording", opened):
+        with patch.object(conversion, "open_recording", opened):
             return printed(replace(self.job, faults=faults))
 
     @property

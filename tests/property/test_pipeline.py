@@ -13,7 +13,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from mlbatch.job import Job
+from mlbatch.pipeline.job import Job
 from tests.builders.captures import SLL2, Interface, Packet, Section, pcap_bytes, section_bytes
 from tests.builders.make_fixtures import START_NS
 from tests.builders.run import BY_HOST, FIXTURE, Values, buffers_of, in_memory, prints, to_file

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.sessions import FIXTURE, NS_PER_MS, REPOSITORY, Shell, Unit, twin, write_session
+from tests.builders.sessions import FIXTURE, NS_PER_MS, REPOSITORY, Shell, Unit, twin, write_session
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 MAKERS = REPOSITORY / "fixtures" / "four_makers"

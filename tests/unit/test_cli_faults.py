@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.unit.sessions import FIXTURE, Shell
+from tests.builders.sessions import FIXTURE, Shell
 
 Report = dict[str, Any]
 RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"

@@ -12,8 +12,8 @@ import pytest
 
 from mlbatch._cloud_packets import Layout
 from mlbatch.clouds import CloudRecording, cloud_topics
-from mlbatch.ledger import check_capture
 from mlbatch.readers import merge, open_recording
+from mlbatch.report.ledger import check_capture
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
 from tests.builders.points import (

@@ -9,10 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.geometry import rotor_words
-from mlbatch.tally import Tally
-from mlbatch.turns import Collected, Nearest, Newest, Turn, TurnCutter, TurnSet, Way, in_order
-from mlbatch.types import F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.compare.statistics import Tally
+from mlbatch.compare.sweeps import (
+    Collected,
+    Nearest,
+    Newest,
+    Turn,
+    TurnCutter,
+    TurnSet,
+    Way,
+    in_order,
+)
+from mlbatch.lidar.geometry import rotor_words
 from mlbatch.units import NS_PER_MS
 
 Spans = list[tuple[int, int, int]]  # (first, last, ready) of turns, ms

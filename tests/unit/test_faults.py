@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch import _fault_chance as chance
+from mlbatch.arrays import I64Array
 from mlbatch.errors import UsageError
-from mlbatch.faults import KINDS, FaultCount, FaultLedger, FaultReplay, parse_fault
-from mlbatch.types import I64Array, Message, PacketBatch, Topic
+from mlbatch.faults import specs as chance
+from mlbatch.faults.replay import KINDS, FaultCount, FaultLedger, FaultReplay, parse_fault
+from mlbatch.types import Message, PacketBatch, Topic
 
 MS, S = 10**6, 10**9
 BEGIN_NS = 1_700_000_000 * S

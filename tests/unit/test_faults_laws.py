@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.faults import Fault, FaultReplay, parse_fault
-from mlbatch.types import I64Array, PacketBatch
+from mlbatch.arrays import I64Array
+from mlbatch.faults.replay import Fault, FaultReplay, parse_fault
+from mlbatch.types import PacketBatch
 
 MS, S = 10**6, 10**9
 BEGIN_NS = 1_700_000_000 * S

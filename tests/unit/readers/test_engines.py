@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
-from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers._bytes import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.engines import few_kernels, needs_numba

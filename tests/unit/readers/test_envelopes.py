@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers._definitions import definition_text, definitions_of
 from mlbatch.readers._envelopes import (
@@ -23,7 +24,7 @@ from mlbatch.readers._envelopes import (
     decode_string,
     decode_transforms,
 )
-from mlbatch.types import Topic, U8Array
+from mlbatch.types import Topic
 from tests.builders.bags import Body, definition, transforms_message
 
 S = 1_000_000_000

@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.lidar import Beside, Evidence
-from mlbatch.types import Stream, U8Array
+from mlbatch.arrays import U8Array
+from mlbatch.lidar.interface import Beside, Evidence
+from mlbatch.types import Stream
 
 OUSTER = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "ouster"
 Reference: TypeAlias = dict[str, npt.NDArray[Any]]

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.geometry import Turning
-from mlbatch.lidar import Calibration, Evidence, Lidar
+from mlbatch.arrays import F32Array, I64Array, U8Array
+from mlbatch.lidar.geometry import Turning
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import open_recording
 from mlbatch.sensors import hesai
-from mlbatch.types import F32Array, Heads, I64Array, Pixels, Stream, StreamTable, U8Array
+from mlbatch.types import Heads, Pixels, Stream, StreamTable
 
 HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
 STREAM = Stream("192.168.1.201", 2368)

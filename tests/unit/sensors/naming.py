@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from mlbatch.arrays import U8Array
 from mlbatch.sensors import plugins
-from mlbatch.types import U8Array
 
 LACKING = ": no decoder in this version"
 

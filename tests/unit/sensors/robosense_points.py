@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import Beside, Evidence, Lidar
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import Beside, Evidence, Lidar
 from mlbatch.sensors import robosense
-from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
+from mlbatch.types import Pixels, Stream
 from tests.builders.others import rows
 
 SOURCE = "192.168.1.200"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.geometry import Projection, read_rotor_words, rotor_words
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import Projection, read_rotor_words, rotor_words
 from mlbatch.sensors._hesai_at128 import at128_projection
 from mlbatch.sensors._hesai_corrections import At128File, read_at128
-from mlbatch.types import F32Array, F64Array, I64Array
 
 FILE = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
 FILE = FILE / "calibration-without-recording" / "PandarAT128.dat"

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.arrays import F64Array, I64Array, U8Array
 from mlbatch.errors import MlbatchError, RigError, UsageError
-from mlbatch.geometry import Turning
-from mlbatch.lidar import FAULTS
+from mlbatch.lidar.geometry import Turning
+from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors import _hesai_crc as crc
 from mlbatch.sensors import hesai
-from mlbatch.types import F64Array, I64Array, U8Array
 from tests.builders import hesai as builder
 from tests.builders.hesai import HesaiSpec, angles_csv, encode_packets
 from tests.builders.hesai_angles import Angles, Beams, MirrorAngles

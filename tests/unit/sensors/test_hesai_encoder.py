@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from tests.builders.hesai import (
     DUAL,
     TRIPLE,

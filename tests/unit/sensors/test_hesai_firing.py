@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mlbatch.arrays import I64Array
 from mlbatch.sensors import _hesai_firing as firing
 from mlbatch.sensors._hesai_firing import E128, E128_NEAR, HIGH, NEVER, OT128, SAVING, STANDARD
-from mlbatch.types import I64Array
 
 # Channel (from 1) and its ns, picked by eye in the sheet.
 SPOTS = {

@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from mlbatch.types import U8Array
+from mlbatch.arrays import U8Array
 from tests.builders.others import (
     EE,
     filled,

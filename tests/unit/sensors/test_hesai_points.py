@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mlbatch.types import U8Array
+from mlbatch.arrays import U8Array
 from tests.builders.hesai import angles_csv
 from tests.builders.hesai_angles import MirrorAngles
 from tests.unit.sensors.hesai_packets import decode, rows

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from mlbatch.geometry import read_rotor_words
-from mlbatch.types import BoolArray, F32Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, I64Array
+from mlbatch.lidar.geometry import read_rotor_words
 from tests.unit.sensors.hesai_packets import HESAI, Decoded, decode, evidence, recorded
 from tests.unit.sensors.hesai_packets import calibration as calibration_of
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError, UsageError
-from mlbatch.lidar import FAULTS, Evidence
+from mlbatch.lidar.interface import FAULTS, Evidence
 from mlbatch.sensors import livox
-from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
+from mlbatch.types import Pixels, Stream
 from tests.builders.livox import (
     CARTESIAN16,
     CARTESIAN32,

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch import sensors
+from mlbatch.discovery.sampler import Sampler
 from mlbatch.readers import open_recording
 from mlbatch.sensors._ouster_profiles import PROFILES
-from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
 from tests.builders.others import (
     filled,

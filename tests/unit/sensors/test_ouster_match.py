@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.lidar import Evidence
+from mlbatch.arrays import U8Array
+from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors import describe, ouster, read_calibration
 from mlbatch.sensors.ouster import OusterCalibration
 from mlbatch.sensors.ouster import read_calibration as read_content
-from mlbatch.types import Stream, U8Array
+from mlbatch.types import Stream
 from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
 from tests.unit.sensors.captures import (
     CASES,

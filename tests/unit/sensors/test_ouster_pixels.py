@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mlbatch.arrays import U8Array
 from mlbatch.sensors._ouster_pixels import PixelReader
 from mlbatch.sensors._ouster_profiles import PROFILES, PacketLayout
 from mlbatch.sensors.ouster import OusterLidar, read_calibration
-from mlbatch.types import Pixels, U8Array
+from mlbatch.types import Pixels
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets, metadata_json
 
 # One pixel a profile, worked by hand from the sheet. Words that occur again and again:

@@ -8,11 +8,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from mlbatch.lidar import Evidence
+from mlbatch.arrays import F32Array, F64Array, U8Array, U16Array
+from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors import read_calibration
 from mlbatch.sensors._crc import crc64
 from mlbatch.sensors.ouster import OusterCalibration, OusterLidar
-from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array, U16Array
+from mlbatch.types import Pixels, Stream
 from tests.unit.sensors.captures import CASES, OUSTER, Case, Reference, needs_recordings
 
 pytestmark = needs_recordings

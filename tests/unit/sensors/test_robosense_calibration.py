@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError, UsageError
-from mlbatch.lidar import READABLE, Beside, Evidence, ModelFile
+from mlbatch.lidar.interface import READABLE, Beside, Evidence, ModelFile
 from mlbatch.sensors import models, robosense
 from mlbatch.sensors._robosense_difop import Angles, find_difop
 from mlbatch.sensors._robosense_models import AIRY_96, BPEARL_V4, RS16, RS32, Model

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.arrays import F32Array, I64Array
 from mlbatch.sensors import robosense
-from mlbatch.types import F32Array, I64Array
 from tests.builders.robosense import (
     Angles,
     RobosenseSpec,

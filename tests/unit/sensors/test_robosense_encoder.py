@@ -11,7 +11,7 @@ import math
 import numpy as np
 import pytest
 
-from mlbatch.types import I64Array
+from mlbatch.arrays import I64Array
 from tests.builders.robosense import (
     Angles,
     RobosenseSpec,

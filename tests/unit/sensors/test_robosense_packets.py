@@ -7,9 +7,9 @@ import struct
 import numpy as np
 import pytest
 
+from mlbatch.arrays import U8Array
 from mlbatch.sensors._robosense_models import BPEARL_V3, BPEARL_V4
 from mlbatch.sensors._robosense_packets import times_ns
-from mlbatch.types import U8Array
 from tests.builders.others import filled, robosense_packets, rows
 from tests.builders.robosense import RobosenseSpec, difop, fan, msop
 from tests.builders.robosense_models import DUAL

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch import sensors
+from mlbatch.arrays import U8Array
 from mlbatch.sensors import robosense
-from mlbatch.types import U8Array
 from tests.builders.others import EE, filled, robosense_packets, rows
 
 FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")

@@ -9,7 +9,7 @@ import pytest
 
 from tests.builders.captures import udp_frame
 from tests.builders.others import EE, filled
-from tests.unit.sessions import EPOCH_NS, Records, Shell, Unit, write_session
+from tests.builders.sessions import EPOCH_NS, Records, Shell, Unit, write_session
 
 WHAT = "ROBOSENSE lidar M1: no decoder in this version"
 WHERE = "10.0.0.8 > port 6699"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.lidar import Beside, Evidence
+from mlbatch.arrays import I64Array
+from mlbatch.lidar.interface import Beside, Evidence
 from mlbatch.sensors import velodyne
 from mlbatch.sensors._velodyne_clock import (
     HOUR_NS,
@@ -16,7 +17,7 @@ from mlbatch.sensors._velodyne_clock import (
     rmc_ns,
     rotor_speed,
 )
-from mlbatch.types import I64Array, Stream
+from mlbatch.types import Stream
 from tests.builders.velodyne import Sent, VelodyneSpec, encode, firing_times_ns, position_packets
 
 STREAM, POSITIONS = Stream("192.168.1.201", 2368), Stream("192.168.1.201", 8308)

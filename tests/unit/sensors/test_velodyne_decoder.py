@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import UsageError
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import FAULTS, READABLE, Evidence, ModelFile
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import FAULTS, READABLE, Evidence, ModelFile
 from mlbatch.sensors import velodyne
 from tests.builders.velodyne import (
     VelodyneSpec,

@@ -11,7 +11,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from mlbatch.types import F64Array, U8Array
+from mlbatch.arrays import F64Array, U8Array
 from tests.builders.velodyne import (
     Rays,
     VelodyneSpec,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError
-from mlbatch.lidar import READABLE
+from mlbatch.lidar.interface import READABLE
 from mlbatch.sensors import velodyne
 from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_tables import MODELS, calibration_yaml

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.geometry import rotor_words
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors._velodyne_calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors._velodyne_hdl64 import hdl64_projection
-from mlbatch.types import F32Array, F64Array, I64Array
 from tests.builders.velodyne_tables import calibration_yaml
 
 LASERS = 64

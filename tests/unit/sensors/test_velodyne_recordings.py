@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import Evidence
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.discovery.sampler import Sampler
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import Evidence
 from mlbatch.readers import open_recording
 from mlbatch.sensors import velodyne
 from mlbatch.sensors._velodyne_packets import VelodyneLidar
-from mlbatch.streams import Sampler
-from mlbatch.types import BoolArray, F64Array, I64Array, StreamTable, U8Array
+from mlbatch.types import StreamTable
 from tests.builders.velodyne import Sent
 from tests.unit.sensors.velodyne_streams import fired, pixels, pointing
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.geometry import read_rotor_words
-from mlbatch.lidar import Evidence
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors import velodyne
 from mlbatch.sensors._velodyne_packets import VelodyneLidar
-from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
+from mlbatch.types import Pixels, Stream
 from tests.builders.velodyne import Sent, VelodyneSpec, encode
 from tests.builders.velodyne_tables import calibration_yaml
 

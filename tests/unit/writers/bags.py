@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Message, Scan, Topic
-from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .scans import PERIOD_NS, START_NS, SUMMARY, imu_samples

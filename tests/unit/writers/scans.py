@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mlbatch.types import F64Array, ImuSamples, RunInfo, Scan, SensorInfo, Summary
+from mlbatch.arrays import F64Array
+from mlbatch.types import ImuSamples, RunInfo, Scan, SensorInfo, Summary
 
 START_NS = 1_700_000_000_100_000_000
 PERIOD_NS = 100_000_000

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.workers import in_one_go
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 from mlbatch.writers._atomic import check_free_space, prepare, write_text
 

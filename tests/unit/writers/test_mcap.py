@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Scan, Summary
-from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .scans import (

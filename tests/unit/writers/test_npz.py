@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Scan
-from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 from mlbatch.writers._folder import scan_name
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.buffers import Buffer
+from mlbatch.decode.scan_buffer import Buffer
 from mlbatch.types import Scan
 from mlbatch.writers._layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from mlbatch.writers._points import points_of

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Message
-from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
 
 from .bags import ODD_TEXT, ROS1_NOTE, ROS1_ODD, ROS2_NOTE, note, odd, read_back, written

@@ -11,8 +11,8 @@ import yaml
 from mcap.reader import make_reader
 
 from mlbatch.errors import ExportError
+from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Summary, Topic
-from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, extras, open_writer
 
 from .bags import ODD_TEXT, ROS1_NOTE, ROS2_NOTE, ROS2_ODD, note, odd, read_back, written

@@ -1,0 +1,1 @@
+"""Timescales of sensors, their offsets, drifts and steps against the capture host."""

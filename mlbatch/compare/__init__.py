@@ -1,0 +1,1 @@
+"""Window scans against frame-level fusion of the sweeps of drivers."""

@@ -1,0 +1,1 @@
+"""Raw columns of a window to the points of a scan."""

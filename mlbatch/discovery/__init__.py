@@ -1,0 +1,1 @@
+"""What a session of recordings contains: sensors, calibrations, extrinsics."""

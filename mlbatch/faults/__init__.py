@@ -1,0 +1,1 @@
+"""Fault injection: packets dropped, delayed, repeated or damaged on purpose."""

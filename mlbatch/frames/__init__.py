@@ -1,0 +1,1 @@
+"""Coordinate frames: transforms, trees of frames, URDF."""

@@ -1,0 +1,1 @@
+"""The interface between vendors and decoding: lidars, beam geometry, pixel layouts."""

@@ -1,0 +1,1 @@
+"""One run: packets of a session to the scans of an output."""

@@ -1,0 +1,1 @@
+"""Packet, column and point accounting; report.json, scans.csv and the summary."""

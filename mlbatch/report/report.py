@@ -1,0 +1,293 @@
+"""What a run says of itself: report.json and a summary for people (CONTRACT.md, section 4)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from typing import TypeAlias
+
+import mlbatch
+from mlbatch.arrays import F64Array
+from mlbatch.report.ledger import (
+    CAPTURE_REASONS,
+    COLUMN_REASONS,
+    IMU_REASONS,
+    PACKET_REASONS,
+    SensorLedger,
+    check_capture,
+    check_datagrams,
+    check_messages,
+    ordered,
+)
+from mlbatch.report.scan_table import ScanStatistics, ScanTable, Spread
+from mlbatch.types import CaptureCounts
+from mlbatch.units import NS_PER_S
+
+__all__ = ["ScanStatistics", "ScanTable", "Spread"]
+
+Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
+Section: TypeAlias = dict[str, Json]
+
+SCHEMA = "mlbatch.report/1"
+
+
+@dataclass(frozen=True, slots=True)
+class InputReport:
+    """One recording."""
+
+    path: str
+    bytes: int
+    container: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unassigned:
+    """A stream that no sensor claimed; `what` says what it looks like."""
+
+    stream: str
+    packets: int
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReport:
+    """How a sensor's clock relates to the common one and to the recorder's."""
+
+    source: str
+    epoch: str
+    offset_to_host_ms: float | None = None
+    drift_ppm: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReport:
+    """One sensor; texts name files without their folders."""
+
+    name: str
+    model: str
+    lidar_id: int
+    stream: str
+    mode: str
+    ledger: SensorLedger
+    clock: ClockReport
+    extrinsics_source: str
+    body_from_sensor: F64Array
+    calibration: str
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Costs of a run; recorded_s: length of the recording; engine: what decoded it."""
+
+    wall_s: float
+    cpu_s: float
+    read_s: float
+    decode_s: float
+    merge_s: float
+    write_s: float
+    recorded_s: float
+    points_per_s: float
+    peak_rss_mb: float
+    engine: str
+
+    @property
+    def realtime_factor(self) -> float:
+        """Recorded time per time of the run."""
+        return self.recorded_s / self.wall_s if self.wall_s > 0 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """Messages of a topic that were to pass through: read = written + sum(dropped)."""
+
+    topic: str
+    read: int
+    written: int
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class FaultReport:
+    """A fault that was replayed, and how many packets it touched."""
+
+    fault: str
+    packets: int
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """A warning; `sensor` is empty where it concerns the run."""
+
+    code: str
+    sensor: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReportInputs:
+    """All that a report is made of; `t_init_ns` is None when the run never started.
+
+    repeated: datagrams that faults had come twice, less those they removed.
+    """
+
+    inputs: tuple[InputReport, ...]
+    timescale: str
+    rate_hz: str
+    t_init_ns: int | None
+    slices: int
+    capture: CaptureCounts
+    sensors: tuple[SensorReport, ...]
+    scans: ScanStatistics
+    unassigned: tuple[Unassigned, ...] = ()
+    timing: Timing | None = None
+    warnings: tuple[Warned, ...] = ()
+    messages: tuple[Passed, ...] = ()
+    faults: tuple[FaultReport, ...] = ()
+    repeated: int = 0
+
+
+def build_report(run: ReportInputs) -> Section:
+    """The report in the order of the contract."""
+    return {
+        "schema": SCHEMA,
+        "version": mlbatch.__version__,
+        "inputs": [asdict(item) for item in run.inputs],
+        "timescale": run.timescale,
+        "grid": {
+            "rate_hz": run.rate_hz,
+            # Text, since a period need not be whole: 200000000/3 at 15 Hz.
+            "period_ns": str(NS_PER_S / Fraction(run.rate_hz)),
+            "t_init_ns": run.t_init_ns,
+            "slices": run.slices,
+        },
+        "capture": {
+            "frames": run.capture.frames,
+            "datagrams": run.capture.datagrams,
+            "skipped": ordered(run.capture.skipped, CAPTURE_REASONS),
+        },
+        "unassigned": [asdict(item) for item in run.unassigned],
+        "sensors": [_sensor(sensor) for sensor in run.sensors],
+        "messages": [asdict(item) for item in run.messages],
+        **({"faults": [asdict(item) for item in run.faults]} if run.faults else {}),
+        "scans": asdict(run.scans),
+        "timing": {} if run.timing is None else _timing(run.timing),
+        "warnings": [asdict(item) for item in run.warnings],
+    }
+
+
+def without_machine(report: Section, inputs: Sequence[InputReport]) -> Section:
+    """The report without timings and paths: what only depends on the recordings."""
+    kept = {key: value for key, value in report.items() if key != "timing"}
+    kept["inputs"] = [{"bytes": item.bytes, "container": item.container} for item in inputs]
+    return kept
+
+
+def report_text(run: ReportInputs, machine: bool = True, in_a_line: bool = False) -> str:
+    """report.json as text; `machine`: with timings and paths."""
+    report = build_report(run)
+    if not machine:
+        report = without_machine(report, run.inputs)
+    indent = None if in_a_line else 1
+    text = json.dumps(report, indent=indent, ensure_ascii=False, allow_nan=False)
+    # Names of files need not be text: their odd bytes stand as escapes of JSON, which give the name
+    # back, where UTF-8 has no place for them.
+    return text.encode("utf-8", "backslashreplace").decode() + "\n"
+
+
+def imbalances(run: ReportInputs) -> list[str]:
+    """Ledgers of a run that do not balance, a line each."""
+    lines = [f"capture: {line}" for line in check_capture(run.capture)]
+    ledgers = [sensor.ledger for sensor in run.sensors]
+    unassigned = sum(stream.packets for stream in run.unassigned)
+    lines += check_datagrams(run.capture.datagrams + run.repeated, ledgers, unassigned)
+    for sensor in run.sensors:
+        lines += [f"{sensor.name}: {line}" for line in sensor.ledger.check()]
+    for one in run.messages:
+        lines += check_messages(one.topic, one.read, one.written, one.dropped)
+    return lines
+
+
+def summary_lines(run: ReportInputs) -> list[str]:
+    """The outcome of a run as a small table for people."""
+    head = ("sensor", "model", "packets", "lost", "rejected", "columns", "dropped", "points")
+    rows = [head, *(_summary_row(sensor) for sensor in run.sensors)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if i < 2 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
+    scans = run.scans
+    lines.append(
+        f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
+        f"{scans.empty} empty windows), {scans.points} points, clock {run.timescale}"
+    )
+    if run.timing is not None:
+        timing = run.timing
+        lines.append(
+            f"{timing.recorded_s:.1f} s recorded in {timing.wall_s:.1f} s: "
+            f"{timing.realtime_factor:.1f} x real time, "
+            f"{timing.points_per_s / 1e6:.1f} million points/s, {timing.peak_rss_mb:.0f} MB"
+        )
+    return lines + [f"warning {item.code}: {item.message}" for item in run.warnings]
+
+
+def _timing(timing: Timing) -> Section:
+    costs: Section = asdict(timing)
+    # In the contract's place, before the rates that end the section.
+    tail = {key: costs.pop(key) for key in ("points_per_s", "peak_rss_mb", "engine")}
+    return {**costs, "realtime_factor": timing.realtime_factor, **tail}
+
+
+def _sensor(sensor: SensorReport) -> Section:
+    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    return {
+        "name": sensor.name,
+        "model": sensor.model,
+        "lidar_id": sensor.lidar_id,
+        "stream": sensor.stream,
+        "mode": sensor.mode,
+        "packets": {
+            "read": packets.read,
+            "accepted": packets.accepted,
+            "rejected": ordered(packets.rejected, PACKET_REASONS),
+            "lost": packets.lost,
+            "reordered": packets.reordered,
+        },
+        "imu_packets": sensor.ledger.imu_packets,
+        "imu_samples": {
+            "decoded": sensor.ledger.imu_samples.decoded,
+            "written": sensor.ledger.imu_samples.written,
+            "dropped": ordered(sensor.ledger.imu_samples.dropped, IMU_REASONS),
+        },
+        "columns": {
+            "decoded": columns.decoded,
+            "written": columns.written,
+            "dropped": ordered(columns.dropped, COLUMN_REASONS),
+        },
+        "points": asdict(sensor.ledger.points),
+        "clock": asdict(sensor.clock),
+        "extrinsics": {
+            "source": sensor.extrinsics_source,
+            "body_from_sensor": sensor.body_from_sensor.tolist(),
+        },
+        "calibration": sensor.calibration,
+    }
+
+
+def _summary_row(sensor: SensorReport) -> tuple[str, ...]:
+    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    counts = (
+        packets.read,
+        packets.lost,
+        sum(packets.rejected.values()),
+        columns.written,
+        sum(columns.dropped.values()),
+        sensor.ledger.points.written,
+    )
+    return (sensor.name, sensor.model, *map(str, counts))

@@ -1,0 +1,1 @@
+"""Rig files: the sensors, extrinsics and streams of one vehicle."""

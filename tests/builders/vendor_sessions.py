@@ -1,0 +1,110 @@
+"""Short sessions of lidars of all makers, as records of a capture or messages of a bag.
+
+Every lidar sees walls at one distance; all begin at the same time by their clocks.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tests.builders import hesai, livox, robosense, velodyne
+from tests.builders.bags import Body, Recorded
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.hesai_angles import angles_csv
+from tests.builders.sessions import Records, Unit
+
+# 800 s past the full hour.
+BEGIN_NS = 1_700_000_000 * 10**9
+BEGIN_US = 800_000_000.0
+RAW_RANGE, LEVEL = 2000, 50
+Payloads = list[tuple[int, bytes]]
+
+
+def velodyne_payloads(spec: velodyne.VelodyneSpec, packets: int) -> Payloads:
+    """(arrival, payload) of data packets."""
+    shape = packets * spec.columns_per_packet, len(spec.table.elevation_deg), spec.returns
+    sent = velodyne.encode(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
+    return listed(sent)
+
+
+def listed(sent: velodyne.Sent) -> Payloads:
+    """(arrival, payload)."""
+    rows = [payload.tobytes() for payload in sent.payloads]
+    return list(zip(sent.host_ns.tolist(), rows, strict=True))
+
+
+def hesai_payloads(spec: hesai.HesaiSpec, packets: int) -> Payloads:
+    """(arrival, payload) of point packets."""
+    shape = packets * spec.groups, spec.row.channels, spec.returns
+    levels = np.full(shape, LEVEL)
+    payloads = hesai.encode_packets(spec, np.full(shape, RAW_RANGE), levels)
+    return list(zip(hesai.host_times_ns(spec, packets).tolist(), payloads, strict=True))
+
+
+def robosense_payloads(spec: robosense.RobosenseSpec, packets: int) -> Payloads:
+    """(arrival, payload) of point packets."""
+    shape = round(packets * spec.columns_per_packet), spec.row.channels, spec.returns
+    return robosense.msop(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
+
+
+def difop_payloads(spec: robosense.RobosenseSpec, count: int = 4) -> Payloads:
+    """(arrival, payload) of device packets, ten a second."""
+    payload = robosense.difop(spec, robosense.fan(spec))
+    return [(spec.start_ns + n * 100_000_000, payload) for n in range(count)]
+
+
+def livox_payloads(spec: livox.LivoxSpec, packets: int) -> Payloads:
+    """(arrival, payload) of point packets."""
+    points = packets * spec.points
+    coordinates = np.full((points, spec.returns, 3), RAW_RANGE)
+    return livox.point_packets(spec, coordinates, np.full((points, spec.returns), LEVEL))
+
+
+def framed(payloads: Payloads, ip: str, port: int) -> Records:
+    """Payloads as frames of a capture; none is too large for one."""
+    return [(host_ns, udp_frame(payload, ip, dport=port)[0]) for host_ns, payload in payloads]
+
+
+def write_capture(folder: Path, *records: Records) -> Path:
+    """`drive.pcap` in a folder of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    every = [record for some in records for record in some]
+    return write_pcap(folder / "drive.pcap", sorted(every, key=lambda record: record[0]))
+
+
+def hesai_csv(path: Path, channels: int, lowest_deg: float = -15.0) -> None:
+    """An angle file of a unit whose beams are spread evenly from 15 degrees on downward."""
+    elevation = np.linspace(15.0, lowest_deg, channels).round(3).tolist()
+    path.write_bytes(angles_csv(elevation, [0.0] * channels))
+
+
+def robosense_csv(path: Path, channels: int) -> None:
+    """An angle file of the maker."""
+    path.write_text("".join(f"{n - 8}.0,0.5\n" for n in range(channels)), encoding="utf-8")
+
+
+def rslidar_message(payload: bytes) -> bytes:
+    """An rslidar_msg/RslidarPacket: header, is_difop, is_frame_begin, data."""
+    is_difop = payload.startswith(robosense.DIFOP_MAGIC)
+    return Body("cdr").header(0, "rslidar").put("B", is_difop, 0).blob(payload).done()
+
+
+def rslidar_messages(payloads: Payloads, topic: str = "/rslidar_packets") -> list[Recorded]:
+    """Point and device packets on one topic, as the maker's driver publishes them."""
+    return [
+        Recorded(topic, "rslidar_msg/RslidarPacket", host_ns, rslidar_message(payload))
+        for host_ns, payload in sorted(payloads)
+    ]
+
+
+def ouster(turns: int = 3) -> Unit:
+    """An Ouster that begins with the others."""
+    return Unit(begin_ns=BEGIN_NS, turns=turns)
+
+
+def write_rig(path: Path, *sensors: str) -> None:
+    """A rig; sensors: text in braces of each."""
+    lines = [f"- {{{sensor}}}\n" for sensor in sensors]
+    path.write_text("sensors:\n" + "".join(lines), encoding="utf-8")

@@ -1,0 +1,251 @@
+"""The command line as its users see it: what is printed where, and what is left when it stops."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import mlbatch
+from tests.builders.sessions import FIXTURE, REPOSITORY, Report, Shell, names, report_of
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+FIX = f"{CAPTURE} --rig {RIG}"
+# Points of a window: fixtures/two_lidars/SOURCE.md.
+POINTS = 27998
+
+
+def without_timing(report: Report) -> Report:
+    """What does not depend on the machine."""
+    return {key: value for key, value in report.items() if key != "timing"}
+
+
+# -- what is printed ------------------------------------------------------------------------------
+
+
+def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} -o out")
+    assert (outcome.code, outcome.err) == (0, "")
+    head, left, right, scans, speed, wrote = outcome.out.splitlines()
+    assert head.split() == [
+        "sensor",
+        "model",
+        "packets",
+        "lost",
+        "rejected",
+        "columns",
+        "dropped",
+        "points",
+    ]
+    # 7 windows of 512 columns; head and tail hold the other 752 of 4336 (SOURCE.md).
+    assert left.split() == ["left", "OS-0-32-U1", "271", "0", "0", "3584", "752", "90790"]
+    assert right.split() == ["right", "OS-1-32-U1", "271", "0", "0", "3584", "752", "105196"]
+    assert scans == (
+        f"7 scans at 10 Hz (0 incomplete, 0 empty windows), {7 * POINTS} points, clock utc"
+    )
+    assert speed.startswith("0.8 s recorded in ")
+    assert wrote == "wrote out, report out/report.json"
+
+
+def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
+    quiet = shell(f"convert {FIX} -o quiet --quiet")
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
+    verbose = shell(f"convert {FIX} -o verbose -v")
+    first, second, third = verbose.out.splitlines()[:3]
+    assert first.startswith("left: OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16, calibration ")
+    assert first.endswith("left.json, extrinsics from rig")
+    assert second.startswith("right: OS-1-32-U1 512x10 RNG15_RFL8_NIR8, calibration ")
+    assert third == "decoded by numpy"
+
+
+def test_warnings_go_to_stderr_and_into_the_report(shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} -o out --max-wait inf --quiet")
+    line = "max_wait: --max-wait inf: memory grows while a sensor is silent"
+    assert (outcome.code, outcome.out) == (0, "")
+    assert outcome.err == f"mlbatch: warning: {line}\n"
+    assert report_of("out/report.json")["warnings"] == [
+        {"code": "max_wait", "sensor": "", "message": line.removeprefix("max_wait: ")}
+    ]
+
+
+def test_a_dry_run_prints_the_report_that_a_run_writes(shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} --dry-run")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert list(Path().iterdir()) == []
+    printed = without_timing(json.loads(outcome.out))
+    to_file = shell(f"convert {FIX} --dry-run --report report.json")
+    assert to_file.out.splitlines()[0].startswith("sensor ")
+    assert names(".", "") == ["report.json"]
+    assert without_timing(report_of("report.json")) == printed
+    assert shell(f"convert {FIX} -o out.mcap").code == 0
+    assert without_timing(report_of("out.mcap.report.json")) == printed
+
+
+def test_a_dry_run_ignores_the_output(shell: Shell) -> None:
+    Path("out").mkdir()
+    assert shell(f"convert {FIX} -o out --dry-run").code == 0
+    assert list(Path("out").iterdir()) == []
+
+
+def test_the_version_and_the_help_go_to_stdout(shell: Shell) -> None:
+    version, help_ = shell("--version"), shell("convert --help")
+    assert (version.code, version.out) == (0, f"mlbatch {mlbatch.__version__}\n")
+    assert (help_.code, help_.err) == (0, "")
+    assert "--max-wait" in help_.out
+
+
+def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:
+    table, listed = shell("sensors"), json.loads(shell("sensors --json").out)
+    lines = table.out.splitlines()
+    assert lines[0].split() == list(listed[0])
+    # Columns of the table are two blanks or more apart; names hold one at most.
+    cells = [re.split(r" {2,}", line)[0] for line in lines[1:]]
+    assert cells == [row["model"] for row in listed]
+    assert {"OS0-32", "VLP-16", "PandarXT-32", "Helios 16", "Livox SDK2"} <= set(cells)
+
+
+# -- progress, interruption, disks ----------------------------------------------------------------
+
+
+def _run_on_a_terminal(folder: Path, *options: str) -> tuple[int, bytes]:
+    """Exit code of a conversion whose stderr is a terminal, and what came there."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "mlbatch", "convert", str(CAPTURE), "--rig", str(RIG)]
+    with subprocess.Popen(
+        [*command, "-o", "out", *options],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY), "TERM": "xterm", "COLUMNS": "80"},
+    ) as process:
+        os.close(theirs)
+        said = b""
+        while True:
+            try:
+                piece = os.read(ours, 65536)
+            except OSError:
+                break
+            if not piece:
+                break
+            said += piece
+    os.close(ours)
+    return process.returncode, said
+
+
+def test_progress_is_shown_on_a_terminal_only(shell: Shell, tmp_path: Path) -> None:
+    code, said = _run_on_a_terminal(tmp_path)
+    assert code == 0
+    assert b"\x1b[" in said
+    assert b"2.5/2.5 MB" in said
+    code, said = _run_on_a_terminal(tmp_path, "--overwrite", "--quiet")
+    assert (code, said) == (0, b"")
+
+
+SLOW = """\
+import time
+from mlbatch import cli, pipeline, resume
+tasks = pipeline.Conversion.tasks
+def slowly(self, progress=None):
+    for task in tasks(self, progress):
+        yield task
+        print("a scan", flush=True)
+        time.sleep(0.5)
+pipeline.Conversion.tasks = slowly
+resume.INTERVAL_S = 0.0
+cli.main()
+"""
+
+
+def test_an_interrupted_run_leaves_nothing_under_the_final_name(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW, "convert", str(CAPTURE), "--rig", str(RIG), "-o", "out"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        text=True,
+    ) as process:
+        until_s = time.monotonic() + 60
+        while not list(tmp_path.glob("out.partial/*.npz")) and time.monotonic() < until_s:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out.splitlines()[0] == "a scan"
+    assert err == (
+        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
+        "on\n"
+    )
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["out.partial", "out.partial.state"]
+
+
+@pytest.mark.parametrize("words", [("convert", "--dry-run"), ("compare",)])
+def test_an_interrupt_of_what_writes_nothing_speaks_of_no_output(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mlbatch.pipeline.conversion.Batcher.push", interrupt)
+    outcome = shell(*words, CAPTURE, "--rig", RIG)
+    assert (outcome.code, outcome.out) == (130, "")
+    assert outcome.err == "mlbatch: error: interrupted\n"
+
+
+def test_a_reader_that_goes_away_is_no_error_worth_a_traceback() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "mlbatch", "sensors"],
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 1
+
+
+def _with_free_bytes(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
+    usage = shutil.disk_usage("/")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+
+
+def test_too_little_disk_is_said_before_anything_is_read(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorded = CAPTURE.stat().st_size
+    _with_free_bytes(monkeypatch, recorded // 4 - 1)
+    outcome = shell(f"convert {FIX} -o out")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err == (
+        "mlbatch: error: out: wanted about 0 MB of free disk, got 0 MB; free space or choose "
+        "another output\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+    _with_free_bytes(monkeypatch, recorded // 4)
+    outcome = shell(f"convert {FIX} -o out")
+    assert (outcome.code, outcome.warnings) == (0, ["disk"])
+    _with_free_bytes(monkeypatch, recorded)
+    assert shell(f"convert {FIX} -o out --overwrite").err == ""
+
+
+@pytest.mark.parametrize("part", ["--end +0.1", "--only left", "--max-range 5", "--dry-run"])
+def test_a_part_of_a_recording_may_need_little_disk(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    _with_free_bytes(monkeypatch, 1)
+    outcome = shell(f"convert {FIX} -o out {part}")
+    assert (outcome.code, outcome.err) == (0, "")

@@ -1,0 +1,135 @@
+"""What users do wrong: one line says what, where, wanted, got and what to do; no traceback."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.builders.mistakes import MISTAKES, REAL_MISTAKES
+from tests.builders.sessions import (
+    EPOCH_NS,
+    FIXTURE,
+    NO_RECORDINGS,
+    NS_PER_S,
+    RECORDINGS,
+    SMALL,
+    Shell,
+    Unit,
+    twin,
+    write_metadata,
+    write_session,
+)
+
+UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with everything that the mistakes are made with."""
+    folder = tmp_path_factory.mktemp("mistakes")
+    (folder / "fix").mkdir()
+    for file in FIXTURE.iterdir():
+        (folder / "fix" / file.name).write_bytes(file.read_bytes())
+    rig = (FIXTURE / "rig.yaml").read_text()
+    rear = "  - name: rear\n    stream: {source_ip: 10.5.5.99}\n    extrinsics: {matrix: M}\n"
+    rear = rear.replace("M", "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]")
+    cut = rig.index("# The machine's own body")
+    (folder / "fix" / "astray.yaml").write_text(rig[:cut] + rear)
+    silent = f"{rig[:cut]}{rear}    metadata: left.json\n"
+    (folder / "fix" / "silent.yaml").write_text(silent)
+    (folder / "fix" / "frame.yaml").write_text(
+        "sensors:\n- {name: left, metadata: left.json, extrinsics: {frame: os_left}}\n"
+    )
+    (folder / "empty.yaml").write_text("sensors: []\n")
+    (folder / "misspelt.yaml").write_text("sensors:\n- {name: left, extrinsic: {}}\n")
+    (folder / "serial.yaml").write_text('sensors:\n- {name: left, stream: {serial: "5"}}\n')
+    (folder / "text.txt").write_text("hello\n")
+    (folder / "empty.pcap").touch()
+    (folder / "old").mkdir()
+    (folder / "old" / "diary.txt").touch()
+    if RECORDINGS.is_dir():
+        (folder / "R").symlink_to(RECORDINGS.resolve())
+    _write_sessions(folder)
+    return folder
+
+
+def _write_sessions(folder: Path) -> None:
+    one = Unit()
+    write_session(folder / "bare", one, metadata=False)
+    write_session(folder / "uptime", UPTIME)
+    write_session(folder / "pair", one, twin(one, 222))
+    behind = replace(twin(one, 222), begin_ns=one.begin_ns - 3600 * NS_PER_S)
+    late = replace(twin(one, 222), begin_ns=one.begin_ns + 9 * NS_PER_S)
+    write_session(folder / "apart", one, replace(behind, host_ns=one.host_ns + 3600 * NS_PER_S))
+    write_session(folder / "parted", one, late)
+    write_session(folder / "short", replace(one, turns=1))
+    write_session(folder / "twice", one, more=[one.records[7]])
+    whole = write_session(folder / "cut", one)
+    whole.write_bytes(whole.read_bytes()[:-338])
+
+
+def _files(folder: Path) -> list[Path]:
+    """All that stands under a final name."""
+    return sorted(path for path in folder.rglob("*") if ".partial" not in str(path))
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
+) -> Shell:
+    monkeypatch.chdir(place)
+    return Shell(monkeypatch, capsys)
+
+
+def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
+    """Run a mistake; nothing but the one line may come of it."""
+    arguments, code, message = mistake
+    before = _files(place)
+    named = " -o " in f" {arguments}" or "--quiet" in arguments
+    outcome = shell(f"convert {arguments}" if named else f"convert {arguments} -o out")
+    assert outcome.out == ""
+    lines = [line for line in outcome.err.splitlines() if "warning" not in line]
+    assert len(lines) == 1
+    wanted = ".*".join(map(re.escape, message.split("{*}")))
+    assert re.fullmatch(f"mlbatch: error: {wanted}", lines[0]), lines[0]
+    assert outcome.code == code
+    assert _files(place) == before
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistake(shell: Shell, place: Path, name: str) -> None:
+    check(shell, place, MISTAKES[name])
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
+@pytest.mark.parametrize("name", REAL_MISTAKES)
+def test_mistake_with_a_real_recording(shell: Shell, place: Path, name: str) -> None:
+    check(shell, place, REAL_MISTAKES[name])
+
+
+def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:
+    """LEGACY packets say nothing of their sender, so two equal lidars need a rig."""
+    old = replace(Unit(), spec=replace(SMALL, profile="LEGACY"))
+    folder = place / "legacy"
+    write_session(folder, old)
+    write_metadata(folder / "222.json", replace(old.spec, serial=222))
+    outcome = shell("convert legacy/drive.pcap -o out")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: packets of 10.0.0.1 > port 7502 (3392 bytes) carry no serial number and "
+        "fit 2 metadata files: legacy/111.json, legacy/222.json; wanted one; name the sensor of "
+        "each source with stream.source_ip in a rig file (--rig), or give only its --metadata\n"
+    )
+
+
+def test_wrong_usage_without_a_command_shows_the_help(shell: Shell) -> None:
+    bare, unknown = shell(), shell("convrt x")
+    assert (bare.code, bare.out) == (2, "")
+    assert bare.err.startswith("Usage: ")
+    assert "convert" in bare.err
+    assert (unknown.code, unknown.out) == (2, "")
+    assert len(unknown.err.splitlines()) == 1
+    assert unknown.err.startswith("mlbatch: error: No such command 'convrt'")

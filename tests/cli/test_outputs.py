@@ -1,0 +1,289 @@
+"""What the options of `mlbatch convert` do to its output, its report and its ledger."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.builders.sessions import (
+    EPOCH_NS,
+    FIXTURE,
+    NS_PER_MS,
+    NS_PER_S,
+    Report,
+    Shell,
+    Unit,
+    arrays,
+    names,
+    report_of,
+    twin,
+    write_session,
+)
+from tests.builders.sessions_of_bags import unit_messages, write_mcap
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+FIX = f"{CAPTURE} --rig {FIXTURE / 'rig.yaml'}"
+# From fixtures/two_lidars/SOURCE.md.
+T_INIT_NS = 1777881600_100_000_000
+POINTS = 27998
+HEAD_POINTS = 22440
+
+
+@pytest.fixture
+def dry(shell: Shell) -> Callable[[str], Report]:
+    """The report of a dry run, from stdout."""
+
+    def run(arguments: str) -> Report:
+        outcome = shell(f"convert {arguments} --dry-run")
+        assert outcome.code == 0, outcome.err
+        report: Report = json.loads(outcome.out)
+        return report
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        "--start 1777881600.3 --end 1777881600.5",
+        "--start 2026-05-04T08:00:00.3 --end 2026-05-04T08:00:00.5Z",
+        "--start 2026-05-04T10:00:00.300000+02:00 --end 1777881600.5",
+        "--start +0.2 --end +0.4",
+        "--start +0.100000001 --end +0.300000001",
+    ],
+)
+def test_limits_keep_index_and_grid(shell: Shell, limits: str) -> None:
+    assert shell(f"convert {FIX} -o out {limits}").code == 0
+    assert names("out") == ["000002.npz", "000003.npz"]
+    assert int(arrays("out/000002.npz")["start_ns"]) == T_INIT_NS + 2 * 100 * NS_PER_MS
+    report = report_of("out/report.json")
+    assert report["grid"]["t_init_ns"] == T_INIT_NS
+    assert report["scans"]["written"] == 2
+    for sensor in report["sensors"]:
+        assert sensor["columns"]["written"] == 2 * 512
+
+
+def test_scans_of_a_part_are_those_of_the_whole(shell: Shell) -> None:
+    shell(f"convert {FIX} -o whole")
+    shell(f"convert {FIX} -o part --start +0.3 --end +0.5")
+    for name in names("part"):
+        assert Path("part", name).read_bytes() == Path("whole", name).read_bytes()
+
+
+def _ledger_balances(report: Report) -> None:
+    """Every datagram is in a sensor's packets, its IMU packets or unassigned."""
+    capture = report["capture"]
+    assert capture["frames"] == capture["datagrams"] + sum(capture["skipped"].values())
+    unassigned = sum(row["packets"] for row in report["unassigned"])
+    own = sum(s["packets"]["read"] + s["imu_packets"] for s in report["sensors"])
+    assert capture["datagrams"] == own + unassigned
+    for sensor in report["sensors"]:
+        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        assert packets["read"] == packets["accepted"] + sum(packets["rejected"].values())
+        assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
+        assert points["slots"] == sum(points.values()) - points["slots"]
+
+
+def test_an_end_stops_the_reading(dry: Callable[[str], Report], tmp_path: Path) -> None:
+    """Of 90 s in two files the end lies in the first, whose buffer holds some 30 s."""
+    first = Unit(turns=450)
+    second = replace(first, begin_ns=first.begin_ns + 45 * NS_PER_S, first_frame=455)
+    one, two = write_session(tmp_path / "1", first), write_session(tmp_path / "2", second)
+    report = dry(f"{one} {two} --end +0.2")
+    assert report["scans"]["written"] == 2
+    assert 0 < report["capture"]["frames"] < 450 * 32
+    _ledger_balances(report)
+
+
+def test_an_end_balances_with_recordings_side_by_side(
+    dry: Callable[[str], Report], tmp_path: Path
+) -> None:
+    one = write_session(tmp_path / "1", Unit(turns=300))
+    two = write_session(tmp_path / "2", twin(Unit(turns=450), 222))
+    report = dry(f"{one} {two} --end +0.2 --identity-extrinsics")
+    assert report["scans"]["written"] == 2
+    _ledger_balances(report)
+
+
+def test_range_limits(shell: Shell) -> None:
+    shell(f"convert {FIX} -o all")
+    shell(f"convert {FIX} -o near --min-range 3 --max-range 6.5")
+    whole, near = arrays("all/000003.npz"), arrays("near/000003.npz")
+    inside = (whole["range_m"] >= 3) & (whole["range_m"] <= 6.5)
+    assert 0 < np.count_nonzero(inside) < POINTS
+    for key in ("xyz", "range_m", "intensity", "time_ns", "ring"):
+        np.testing.assert_array_equal(near[key], whole[key][inside])
+    before, after = report_of("all/report.json"), report_of("near/report.json")
+    for old, new in zip(before["sensors"], after["sensors"], strict=True):
+        fates = ("range", "box", "written")
+        assert sum(new["points"][fate] for fate in fates) == sum(
+            old["points"][fate] for fate in fates
+        )
+        assert (old["points"]["range"], new["points"]["slots"]) == (0, old["points"]["slots"])
+
+
+def test_boxes_add_to_those_of_the_rig(shell: Shell) -> None:
+    shell(f"convert {FIX} -o all")
+    shell(f"convert {FIX} -o cut --exclude-box=0,-8,-1,20,8,9 --exclude-box=-20,0,-1,0,8,9")
+    whole, cut = arrays("all/000000.npz")["xyz"], arrays("cut/000000.npz")["xyz"]
+    x, y = whole[:, 0], whole[:, 1]
+    np.testing.assert_array_equal(cut, whole[(x < 0) & (y < 0)])
+    first, second = (report_of(f"{name}/report.json") for name in ("all", "cut"))
+    # 763 returns of `left` a window hit the machine, none of `right` (SOURCE.md).
+    assert [sensor["points"]["box"] for sensor in first["sensors"]] == [7 * 763, 0]
+    assert all(sensor["points"]["box"] > 7 * 763 for sensor in second["sensors"])
+
+
+def test_partial_windows_and_slices_have_their_own_names(shell: Shell) -> None:
+    shell(f"convert {FIX} -o plain --keep-partial")
+    windows = [f"{index:06d}" for index in range(8)]
+    assert names("plain") == [f"{name}.npz" for name in [*windows, "head"]]
+    head = arrays("plain/head.npz")
+    assert (int(head["index"]), bool(head["complete"]), len(head["xyz"])) == (
+        -1,
+        False,
+        HEAD_POINTS,
+    )
+    shell(f"convert {FIX} -o sliced --keep-partial --slices 4")
+    # The first stamps lie 22 ms after the second: all slices of the head hold columns.
+    whole = [f"{name}-{j}.npz" for name in [*windows[:7], "head"] for j in range(4)]
+    # The last stamps lie 69 ms into window 7.
+    assert names("sliced") == sorted([*whole, *(f"000007-{j}.npz" for j in range(3))])
+    last = arrays("sliced/head-3.npz")
+    assert (int(last["index"]), int(last["slice"]), int(last["slices"])) == (-1, 3, 4)
+    assert int(last["start_ns"]) == T_INIT_NS - 25 * NS_PER_MS
+    assert int(last["end_ns"]) == T_INIT_NS
+
+
+def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
+    shell(f"convert {FIX} -o merged")
+    shell(f"convert {FIX} -o split --split")
+    assert names("split") == [
+        f"{sensor}/{index:06d}.npz" for sensor in ("left", "right") for index in range(7)
+    ]
+    whole = arrays("merged/000004.npz")
+    for number, sensor in enumerate(("left", "right")):
+        own, part = whole["lidar_id"] == number, arrays(f"split/{sensor}/000004.npz")
+        np.testing.assert_array_equal(part["xyz"], whole["xyz"][own])
+        np.testing.assert_array_equal(part["ring"], whole["ring"][own] - 32 * number)
+        assert (int(part["index"]), bool(part["complete"])) == (4, True)
+
+
+@pytest.mark.parametrize("wish", ["--only right", "--only 122648000456", "--ignore left"])
+def test_sensors_are_chosen_by_name_or_serial(dry: Callable[[str], Report], wish: str) -> None:
+    report = dry(f"{FIX} {wish}")
+    assert [sensor["name"] for sensor in report["sensors"]] == ["right"]
+    left_out = [row for row in report["unassigned"] if row["what"].startswith("ignored: ")]
+    assert [row["packets"] for row in left_out] == [271]
+    assert report["warnings"] == []
+    _ledger_balances(report)
+
+
+def test_overwrite_replaces_the_scans_of_a_run_before(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o out").code == 0
+    before = Path("out/000000.npz").read_bytes()
+    assert shell(f"convert {FIX} -o out --overwrite --end +0.1").code == 0
+    assert names("out") == ["000000.npz"]
+    assert Path("out/000000.npz").read_bytes() == before
+
+
+def test_a_report_may_lie_in_the_output_folder(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o out --report out/other.json").code == 0
+    assert names("out", ".json") == ["other.json"]
+    assert shell(f"convert {FIX} -o out --report out/third.json --overwrite").code == 0
+    assert names("out", ".json") == ["third.json"]
+
+
+def test_another_file_of_json_keeps_its_folder(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o out").code == 0
+    for text in ('{"schema": "mlbatch.rig/1"}', "[]", "", '{"title": "mlbatch.report/1"}'):
+        Path("out/notes.json").write_text(text)
+        outcome = shell(f"convert {FIX} -o out --overwrite")
+        assert outcome.code == 1
+        assert "got notes.json in it as well" in outcome.err
+
+
+def test_strict_is_silent_on_a_clean_recording(shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} -o out --strict -q")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+def test_checksums_are_checked_on_wish(dry: Callable[[str], Report], tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit())
+    raw = bytearray(capture.read_bytes())
+    raw[24 + 40 * 1338 + 600] ^= 4  # one bit of a pixel in packet 40
+    capture.write_bytes(raw)
+    assert dry(str(capture))["sensors"][0]["packets"]["rejected"] == {}
+    packets = dry(f"{capture} --decode crc=check")["sensors"][0]["packets"]
+    assert packets["rejected"] == {"bad_crc": 1}
+    assert packets["lost"] == 1
+
+
+def test_a_rate_that_is_no_whole_number_is_kept_exact(dry: Callable[[str], Report]) -> None:
+    report = dry(f"{FIX} --rate 29.97")
+    assert report["grid"]["rate_hz"] == "29.97"
+    assert report["grid"]["period_ns"] == "100000000000/2997"
+    assert (report["scans"]["incomplete"], report["scans"]["empty"]) == (0, 0)
+
+
+def test_host_clock_makes_uptime_clocks_comparable(
+    dry: Callable[[str], Report], tmp_path: Path
+) -> None:
+    one = Unit(begin_ns=50 * NS_PER_S, host_ns=EPOCH_NS)
+    two = twin(replace(one, begin_ns=7000 * NS_PER_S, host_ns=EPOCH_NS - 6950 * NS_PER_S), 222)
+    capture = write_session(tmp_path, one, two)
+    report = dry(f"{capture} --identity-extrinsics --clock host")
+    assert report["timescale"] == "utc"
+    assert [sensor["clock"]["source"] for sensor in report["sensors"]] == ["host", "host"]
+    assert report["scans"]["written"] == 2
+
+
+def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
+    write_mcap(tmp_path / "drive.mcap", unit_messages(Unit(turns=3), "a\x1b[31m\x07\n"))
+    outcome = shell("convert drive.mcap -o out -v")
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.startswith("ouster_111: ")
+    assert r"calibration /a\x1b[31m\x07\n/ouster/metadata" in outcome.out
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["partial", "partial.state", "scans.csv", "scans.csv.partial", "report.json", "old.partial"],
+)
+def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, name: str) -> None:
+    """A run would have removed them, or written over them."""
+    recording = Path(f"drive.mcap.{name}")
+    shutil.copy(CAPTURE, recording)
+    outcome = shell(f"convert {recording} --identity-extrinsics -o drive.mcap")
+    assert outcome.code == 1
+    assert f"wanted an output that leaves {recording} as it is" in outcome.err
+    assert recording.read_bytes() == CAPTURE.read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == [recording.name]
+
+
+@pytest.mark.parametrize(
+    ("output", "report"),
+    [
+        *(("out.mcap", f"out.mcap{suffix}") for suffix in ("", ".partial", ".scans.csv")),
+        ("out.mcap", "out.mcap.partial.state"),
+        *(("out", f"out/{name}") for name in ("000003.npz", "scans.csv", "left/report.json")),
+        *(("out", name) for name in ("out", "out.partial", "out.old.partial")),
+    ],
+)
+def test_a_report_takes_the_place_of_no_output(shell: Shell, output: str, report: str) -> None:
+    outcome = shell(f"convert {FIX} -o {output} --report {report}")
+    assert outcome.code == 1
+    assert f"{report}: wanted a report besides the files of the output" in outcome.err
+    assert not Path(output).exists()
+
+
+def test_a_bag_is_not_read_where_it_is_replaced(shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o bag --format rosbag2").code == 0
+    outcome = shell("convert bag/bag_0.mcap -o bag --format rosbag2 --overwrite")
+    assert (outcome.code, "leaves bag/bag_0.mcap as it is" in outcome.err) == (1, True)

@@ -1,0 +1,261 @@
+"""What users do wrong with lidars of all makers; the table is in `maker_mistakes.py`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.builders.bags import Recorded
+from tests.builders.hesai import DUAL, HesaiSpec
+from tests.builders.livox import LivoxSpec
+from tests.builders.others import EE, filled
+from tests.builders.points import CLOUD, OUSTER, cloud_message
+from tests.builders.robosense import RobosenseSpec
+from tests.builders.rosbag2 import write_rosbag2
+from tests.builders.sessions import NS_PER_S, Report, Shell, report_of, write_metadata
+from tests.builders.velodyne import VelodyneSpec, position_packets
+from tests.builders.velodyne_tables import calibration_yaml
+from tests.builders.vendor_mistakes import MAKER_MISTAKES, RIGS
+from tests.builders.vendor_sessions import (
+    BEGIN_NS,
+    BEGIN_US,
+    difop_payloads,
+    framed,
+    hesai_csv,
+    hesai_payloads,
+    listed,
+    livox_payloads,
+    ouster,
+    robosense_csv,
+    robosense_payloads,
+    rslidar_messages,
+    velodyne_payloads,
+    write_capture,
+    write_rig,
+)
+from tests.cli.test_mistakes import check
+
+VLP16 = VelodyneSpec("VLP-16", start_us=BEGIN_US)
+XT16 = HesaiSpec("PandarXT-16")
+P40 = HesaiSpec("Pandar40P")
+HELIOS = RobosenseSpec("Helios 16")
+# Packets that suffice to be recognised, and those of more than a few windows.
+FEW, MANY = 20, 400
+PORT, RS_PORT, DIFOP_PORT = 2368, 6699, 7788
+IP, OTHER_IP = "10.0.0.8", "10.0.0.9"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with everything that the mistakes are made with."""
+    folder = tmp_path_factory.mktemp("makers")
+    _write_velodyne(folder)
+    _write_velodyne_sessions(folder)
+    _write_hesai(folder)
+    _write_robosense(folder)
+    _write_others(folder)
+    for name, texts in RIGS.items():
+        write_rig(folder / f"{name}.yaml", *texts)
+    return folder
+
+
+def _write_velodyne(folder: Path) -> None:
+    few = velodyne_payloads(VLP16, FEW)
+    many = velodyne_payloads(VLP16, MANY)
+    write_capture(folder / "vlp16", framed(many, IP, PORT))
+    for name, model in (("vlp32c", "VLP-32C"), ("hdl64", "HDL-64E S3")):
+        payloads = velodyne_payloads(replace(VLP16, model=model), FEW)
+        write_capture(folder / name, framed(payloads, IP, PORT))
+    positions = listed(position_packets(VLP16, np.arange(0.0, 4e5, 1e5, dtype=np.float64)))
+    write_capture(folder / "positions", framed(positions, IP, 8308))
+    alike = [(host_ns, payload + bytes(6)) for host_ns, payload in few]
+    write_capture(folder / "alike", framed(alike, IP, PORT))
+    dual = replace(VLP16, mode="dual", start_us=BEGIN_US + 532_000)
+    changed = many + velodyne_payloads(dual, MANY)
+    write_capture(folder / "changed", framed(changed, IP, PORT))
+    (folder / "files").mkdir()
+    for name, model in (("vlp16", "VLP-16"), ("vlp32c", "VLP-32C")):
+        (folder / "files" / f"{name}.yml").write_text(calibration_yaml(model), encoding="utf-8")
+    cut = calibration_yaml("VLP-16")[:400]
+    (folder / "files" / "cut.yml").write_text(cut, encoding="utf-8")
+
+
+def _write_velodyne_sessions(folder: Path) -> None:
+    few = velodyne_payloads(VLP16, FEW)
+    behind_us = 20 * 60_000_000
+    late = replace(VLP16, start_us=BEGIN_US + behind_us, host_ahead_ns=-behind_us * 1000)
+    other = framed(velodyne_payloads(late, FEW), OTHER_IP, PORT)
+    write_capture(folder / "apart", framed(few, IP, PORT), other)
+    write_capture(folder / "twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
+    write_capture(folder / "pair", framed(few, IP, PORT), ouster().records)
+    silent = velodyne_payloads(replace(VLP16, start_us=BEGIN_US + 12e6), FEW)
+    write_capture(folder / "silent", ouster(125).records, framed(silent, IP, PORT))
+    for name in ("pair", "silent"):
+        write_metadata(folder / name / "111.json", ouster().spec)
+
+
+def _write_hesai(folder: Path) -> None:
+    few = hesai_payloads(XT16, FEW)
+    for name in ("bare", "other", "alike", "broken"):
+        write_capture(folder / f"xt16_{name}", framed(few, IP, PORT))
+    hesai_csv(folder / "xt16_other" / "32.csv", 32)
+    hesai_csv(folder / "xt16_alike" / "a.csv", 16)
+    hesai_csv(folder / "xt16_alike" / "b.csv", 16)
+    broken = "Laser id,Elevation,Azimuth\n1,15,zero\n"
+    (folder / "xt16_broken" / "16.csv").write_text(broken, encoding="utf-8")
+    write_capture(folder / "xt16_twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
+    hesai_csv(folder / "xt16_twins" / "16.csv", 16)
+    hesai_csv(folder / "files" / "xt16.csv", 16)
+    gps = filled(512, {0: EE + b"712190403180", 18: b"$GPRMC"})
+    write_capture(folder / "gps", framed([(BEGIN_NS, gps)], IP, 10110))
+    many = hesai_payloads(XT16, MANY)
+    dual = hesai_payloads(replace(XT16, mode=DUAL, start_ns=BEGIN_NS + 160_000_000), MANY)
+    write_capture(folder / "xt16_changed", framed(many + dual, IP, PORT))
+    hesai_csv(folder / "xt16_changed" / "16.csv", 16)
+    later = hesai_payloads(replace(P40, start_ns=BEGIN_NS + 240_000_000), MANY)
+    counted = [
+        (host_ns, payload + number.to_bytes(4, "little"))
+        for number, (host_ns, payload) in enumerate(later)
+    ]
+    write_capture(folder / "p40", framed(hesai_payloads(P40, MANY) + counted, IP, PORT))
+    hesai_csv(folder / "p40" / "40.csv", 40, lowest_deg=-25.0)
+
+
+def _write_robosense(folder: Path) -> None:
+    many, device = robosense_payloads(HELIOS, MANY), difop_payloads(HELIOS)
+    write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
+    write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
+    write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))
+    robosense_csv(folder / "files" / "rs15.csv", 15)
+    robosense_csv(folder / "files" / "rs16.csv", 16)
+    robosense_csv(folder / "files" / "rs32.csv", 32)
+    write_rosbag2(folder / "helios.db3", rslidar_messages(many + device))
+
+
+def _write_others(folder: Path) -> None:
+    uptime = LivoxSpec(time_type=0, start_ns=1000 * NS_PER_S)
+    since_ns = BEGIN_NS - uptime.start_ns
+    livox = [(host_ns + since_ns, payload) for host_ns, payload in livox_payloads(uptime, MANY)]
+    write_capture(folder / "livox", framed(livox, IP, 56301), ouster().records)
+    write_metadata(folder / "livox" / "111.json", ouster().spec)
+    points = [(1.0, 2.0, 3.0, 9.0, n * 100_000, 1) for n in range(4)]
+    clouds = [
+        Recorded(
+            "/points",
+            CLOUD,
+            BEGIN_NS + (number + 1) * NS_PER_S // 10,
+            cloud_message(OUSTER, points, BEGIN_NS + number * NS_PER_S // 10),
+        )
+        for number in range(5)
+    ]
+    write_rosbag2(folder / "clouds.db3", clouds)
+    raw = rslidar_messages(robosense_payloads(HELIOS, MANY) + difop_payloads(HELIOS))
+    write_rosbag2(folder / "both.db3", raw + clouds)
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
+) -> Shell:
+    monkeypatch.chdir(place)
+    return Shell(monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("name", MAKER_MISTAKES)
+def test_mistake_with_a_maker(shell: Shell, place: Path, name: str) -> None:
+    check(shell, place, MAKER_MISTAKES[name])
+
+
+def _converted(shell: Shell, arguments: str, folder: Path) -> Report:
+    """Report of a run that works."""
+    outcome = shell(f"convert {arguments} --keep-partial -o {folder / 'out'}")
+    assert outcome.code == 0, outcome.err
+    return report_of(str(folder / "out" / "report.json"))
+
+
+def _told(report: Report) -> list[tuple[str, str]]:
+    return [(one["sensor"], one["message"]) for one in report["warnings"]]
+
+
+def test_device_packets_on_the_topic_of_the_points_give_angles(
+    shell: Shell, tmp_path: Path
+) -> None:
+    report = _converted(shell, "helios.db3", tmp_path)
+    (sensor,) = report["sensors"]
+    assert sensor["calibration"] == "DIFOP packets of 0a1b2c3d4e5f"
+    assert sensor["packets"]["accepted"] == MANY
+    assert [one["packets"] for one in report["unassigned"]] == [4]
+
+
+def test_a_rig_may_name_a_model_that_packets_do_not(shell: Shell, tmp_path: Path) -> None:
+    report = _converted(shell, "vlp16/drive.pcap --rig lite.yaml", tmp_path)
+    assert report["sensors"][0]["model"] == "Puck LITE"
+    assert _told(report) == []
+
+
+def test_a_rig_that_names_another_model_than_packets_is_told(shell: Shell, tmp_path: Path) -> None:
+    rig = tmp_path / "hires.yaml"
+    rig.write_text("sensors: [{name: top, model: Puck Hi-Res}]\n", encoding="utf-8")
+    report = _converted(shell, f"vlp16/drive.pcap --rig {rig}", tmp_path)
+    assert report["sensors"][0]["model"] == "Puck Hi-Res"
+    told = "read as Puck Hi-Res, which the rig names; it looks like Velodyne lidar VLP-16,"
+    assert _told(report) == [("top", f"{told} strongest return")]
+
+
+def test_a_rig_chooses_the_lidar_of_its_model(shell: Shell, tmp_path: Path) -> None:
+    """Though another one fits as well, and comes first."""
+    report = _converted(shell, "pair/drive.pcap --rig vlp16.yaml", tmp_path)
+    (sensor,) = report["sensors"]
+    assert (sensor["model"], sensor["stream"]) == ("VLP-16", f"{IP} > port {PORT}")
+
+
+def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Path) -> None:
+    report = _converted(shell, "p40/drive.pcap", tmp_path)
+    (sensor,) = report["sensors"]
+    assert sensor["packets"]["rejected"] == {"bad_size": MANY}
+    (name, told), (same, counted) = _told(report)
+    assert name == same == "hesai_1"
+    assert counted == f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size)"
+    assert told == (
+        f"{IP} > port {PORT}: wanted packets of 1262 bytes as at first, got 1266 bytes as well, "
+        "which are rejected as bad_size; split the recording where the settings of the lidar change"
+    )
+
+
+@pytest.mark.parametrize("session", ["changed", "xt16_changed"])
+def test_packets_of_another_return_mode_are_rejected(
+    shell: Shell, tmp_path: Path, session: str
+) -> None:
+    report = _converted(shell, f"{session}/drive.pcap", tmp_path)
+    assert report["sensors"][0]["packets"]["rejected"] == {"bad_header": MANY}
+    assert report["sensors"][0]["packets"]["accepted"] == MANY
+    ((_, told),) = _told(report)
+    assert told.endswith(f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header)")
+
+
+def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> None:
+    for session, path in (("vlp32c/drive.pcap", "vlp16.yml"), ("clouds.db3", "xt16.csv")):
+        folder = tmp_path / path
+        folder.mkdir()
+        told = _told(_converted(shell, f"{session} --metadata files/{path}", folder))
+        unused = "it is not used; leave it out, or name its sensor in a rig file (--rig)"
+        assert ("", f"files/{path}: wanted a sensor that it fits, got none; {unused}") in told
+
+
+def test_clouds_beside_raw_packets_are_left_alone(shell: Shell, tmp_path: Path) -> None:
+    report = _converted(shell, "both.db3", tmp_path)
+    assert [one["model"] for one in report["sensors"]] == ["Helios 16"]
+    assert report["warnings"] == []
+
+
+def test_a_lidar_of_the_rig_that_begins_late_joins_by_its_model(
+    shell: Shell, tmp_path: Path
+) -> None:
+    report = _converted(shell, "silent/drive.pcap --rig silent_vlp16.yaml", tmp_path)
+    accepted = {one["name"]: one["packets"]["accepted"] for one in report["sensors"]}
+    assert accepted == {"left": 125 * 32, "top": FEW}
+    codes = {one["code"] for one in report["warnings"]}
+    assert "not_seen_yet" in codes

@@ -1,0 +1,318 @@
+"""Columns to points: places, labels and counts by hand, and laws on what tiles and buffers do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.decode.decoder import Decoder, Due, Label, Source
+from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.projector import tile_columns
+from mlbatch.frames.transforms import from_rpy_deg
+from mlbatch.sensors import read_calibration
+from mlbatch.types import RunInfo, Scan, SensorInfo
+from tests.builders.ouster import IntLike, OusterSpec, encode_packets
+from tests.builders.sessions import write_metadata
+
+START_NS = 1_800_000_000_100_000_000
+TURN = 512
+# Beam 0 looks 30 degrees up, beam 1 is turned by 90 degrees, the others look along the column's
+# angle; no offset of the beams from the axis, and no lift.
+FLAT = OusterSpec(
+    beams=16,
+    columns_per_frame=TURN,
+    altitude_deg=(30.0, *[0.0] * 15),
+    azimuth_deg=(0.0, 90.0, *[0.0] * 14),
+    beam_offset_mm=(0.0, 0.0),
+    lidar_to_sensor_mm=np.diag([-1.0, -1.0, 1.0, 1.0]).ravel().tolist(),
+)
+DUAL = replace(FLAT, profile="RNG19_RFL8_SIG16_NIR16_DUAL")
+
+
+@dataclass
+class Bench:
+    """A sensor whose whole turn lies in its ring; ranges_mm: (columns, beams) by field name."""
+
+    folder: Path
+    spec: OusterSpec
+    fields: dict[str, IntLike]
+    body_from_sensor: F64Array = field(default_factory=lambda: np.eye(4))
+    ring_base: int = 0
+    min_range_m: float = 0.0
+    max_range_m: float = math.inf
+    source: Source = field(init=False)
+    place: I64Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        calibration = read_calibration(write_metadata(self.folder / "lidar.json", self.spec))
+        assert calibration is not None
+        lidar = calibration.lidar({}, None)
+        mids = np.arange(TURN)
+        payloads = encode_packets(self.spec, mids, mids, np.zeros(TURN, np.int64), self.fields)
+        data = np.frombuffer(b"".join(payloads), np.uint8)
+        ring = RawRing(lidar.packet_size, lidar.records)
+        start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
+        _, first = ring.store(data.copy(), start, None)
+        self.place = (first[:, None] + np.arange(16)).ravel()
+        self.source = Source(
+            lidar,
+            ring,
+            self.body_from_sensor,
+            self.ring_base,
+            self.min_range_m,
+            self.max_range_m,
+        )
+
+
+def _ranges(value: int = 0, **cells: int) -> IntLike:
+    """(TURN, 16) ranges in mm; `c3_b1=4000` sets column 3, beam 1."""
+    ranges = np.full((TURN, 16), value, np.int64)
+    for name, value_mm in cells.items():
+        column, beam = (int(part[1:]) for part in name.split("_"))
+        ranges[column, beam] = value_mm
+    return ranges
+
+
+def _decoder(
+    *benches: Bench, layout: str = "dense", boxes: Sequence[Sequence[float]] = ()
+) -> Decoder:
+    sensors = tuple(
+        SensorInfo(f"s{number}", "", 16, bench.source.lidar.returns, bench.ring_base, np.eye(4))
+        for number, bench in enumerate(benches)
+    )
+    info = RunInfo(sensors, "base_link", "10", "utc", layout=layout)
+    boxes_m = np.array(boxes, np.float64).reshape(-1, 6)
+    return Decoder(info, [bench.source for bench in benches], boxes_m)
+
+
+def _scan(decoder: Decoder, benches: Sequence[Bench], columns: Sequence[tuple[int, int]]) -> Scan:
+    """A scan of (sensor, measurement id), 100 us apart."""
+    sensor = np.array([number for number, _ in columns], np.int64)
+    mids = np.array([mid for _, mid in columns], np.int64)
+    place = np.array([benches[s].place[mid] for s, mid in columns], np.int64)
+    stamps = START_NS + np.arange(len(columns), dtype=np.int64) * 100_000
+    label = Label(3, 0, START_NS, START_NS + 10**8, True, 17)
+    return decoder.scan(Due(stamps, sensor, place, mids), label)
+
+
+def _xyz(scan: Scan) -> list[list[float]]:
+    return [[round(float(value), 4) + 0.0 for value in point] for point in scan.xyz]
+
+
+# -- where points lie -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cell", "xyz"),
+    [
+        # The lidar frame looks back, the sensor frame forward; the rotor turns clockwise.
+        ("c0_b2", [-4, 0, 0]),
+        ("c128_b2", [0, 4, 0]),
+        ("c256_b2", [4, 0, 0]),
+        ("c384_b2", [0, -4, 0]),
+        # sin 30 degrees is a half.
+        ("c256_b0", [4 * math.cos(math.pi / 6), 0, 2]),
+        # Azimuth offsets turn against the encoder: 90 degrees on from mid 128 is mid 256.
+        ("c128_b1", [4, 0, 0]),
+    ],
+)
+def test_a_point_at_four_metres(tmp_path: Path, cell: str, xyz: list[float]) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(**{cell: 4000})})
+    scan = _scan(_decoder(bench), [bench], [(0, mid) for mid in range(TURN)])
+    assert _xyz(scan) == [[round(value, 4) for value in xyz]]
+
+
+def test_extrinsics_turn_then_move(tmp_path: Path) -> None:
+    pose = from_rpy_deg((10.0, 20.0, 30.0), (0.0, 0.0, 90.0))
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(c256_b2=4000)}, pose)
+    scan = _scan(_decoder(bench), [bench], [(0, 256)])
+    assert _xyz(scan) == [[10, 24, 30]]
+    # The range is as measured.
+    assert scan.range_m is not None
+    assert scan.range_m.tolist() == [4.0]
+
+
+def test_beams_begin_beside_the_axis(tmp_path: Path) -> None:
+    """n = 15.8 mm: (r - n) along the beam, plus n along the column's angle (section 6)."""
+    spec = replace(FLAT, beam_offset_mm=(16.0, 0.0))
+    ranges = _ranges(c256_b2=4000, c256_b1=4000)
+    bench = Bench(tmp_path, spec, {"RANGE": ranges})
+    scan = _scan(_decoder(bench), [bench], [(0, 256)])
+    assert _xyz(scan) == [[0.016, -3.984, 0], [4, 0, 0]]
+
+
+# -- what points are called -----------------------------------------------------------------------
+
+
+def test_points_lie_by_column_then_channel(tmp_path: Path) -> None:
+    ranges = _ranges(c7_b3=1000, c7_b5=2000, c2_b9=3000)
+    bench = Bench(tmp_path, FLAT, {"RANGE": ranges}, ring_base=40)
+    scan = _scan(_decoder(bench), [bench], [(0, 7), (0, 0), (0, 2)])
+    assert scan.ring.tolist() == [43, 45, 49]
+    assert scan.column is not None
+    assert scan.column.tolist() == [0, 0, 2]
+    assert scan.time_ns.tolist() == [0, 0, 200_000]
+    assert scan.lidar_id.tolist() == [0, 0, 0]
+    assert (scan.points, scan.columns_per_sensor, scan.max_gap_ns) == (3, (3,), (100_000,))
+    assert (scan.index, scan.start_ns, scan.complete) == (3, START_NS, True)
+
+
+def test_two_returns_share_a_ring_and_say_which_is_nearer(tmp_path: Path) -> None:
+    """Numbering of facts/outputs.md section 3; the strongest comes first."""
+    strong = _ranges(c0_b0=1000, c0_b1=5000, c0_b2=3000)
+    weak = _ranges(c0_b0=4000, c0_b1=2000)
+    bench = Bench(tmp_path, DUAL, {"RANGE": strong, "RANGE2": weak})
+    scan = _scan(_decoder(bench), [bench], [(0, 0)])
+    assert scan.ring.tolist() == [0, 0, 1, 1, 2]
+    assert scan.range_m is not None
+    assert scan.range_m.tolist() == [1.0, 4.0, 5.0, 2.0, 3.0]
+    # strongest-first, weak-last; strongest-last, weak-first; the only one.
+    assert scan.return_type.tolist() == [3, 6, 4, 5, 7]
+
+
+def test_sensors_lie_between_each_other(tmp_path: Path) -> None:
+    first = Bench(tmp_path, FLAT, {"RANGE": _ranges(1000)})
+    second = Bench(tmp_path, DUAL, {"RANGE": _ranges(2000)}, ring_base=16)
+    order = [(1, 0), (0, 5), (0, 6), (1, 1), (0, 7)]
+    scan = _scan(_decoder(first, second), [first, second], order)
+    assert scan.lidar_id.tolist() == np.repeat([1, 0, 0, 1, 0], 16).tolist()
+    assert scan.column_lidar_id.tolist() == [1, 0, 0, 1, 0]
+    assert scan.ring[:32].tolist() == [*range(16, 32), *range(16)]
+    assert scan.range_m is not None
+    assert scan.range_m.tolist() == np.repeat([2.0, 1.0, 1.0, 2.0, 1.0], 16).tolist()
+    assert (scan.columns_per_sensor, scan.max_gap_ns) == ((3, 2), (200_000, 300_000))
+
+
+# -- what is left out -----------------------------------------------------------------------------
+
+
+def test_every_slot_is_written_or_counted(tmp_path: Path) -> None:
+    ranges = _ranges(c256_b2=400, c256_b3=4000, c256_b4=8000, c0_b5=4000)
+    bench = Bench(tmp_path, FLAT, {"RANGE": ranges}, min_range_m=0.5, max_range_m=6.0)
+    decoder = _decoder(bench, boxes=[[-5, -1, -1, -3, 1, 1]])
+    scan = _scan(decoder, [bench], [(0, 256), (0, 0)])
+    assert _xyz(scan) == [[4, 0, 0]]
+    (counts,) = decoder.counts
+    assert (counts.slots, counts.no_return, counts.range, counts.box) == (32, 28, 2, 1)
+    assert (counts.repeated, counts.written) == (0, 1)
+
+
+@pytest.mark.parametrize(("low", "high", "kept"), [(4.0, 4.0001, 1), (4.001, 9, 0), (0, 3.999, 0)])
+def test_limits_are_kept(tmp_path: Path, low: float, high: float, kept: int) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(c0_b2=4000)}, min_range_m=low, max_range_m=high)
+    assert _scan(_decoder(bench), [bench], [(0, 0)]).points == kept
+
+
+def test_an_empty_window_gives_an_empty_scan(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges()})
+    scan = _scan(_decoder(bench), [bench], [(0, 0), (0, 1)])
+    assert (scan.points, scan.xyz.shape, len(scan.column_stamp_ns)) == (0, (0, 3), 2)
+
+
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+def test_a_window_without_a_column_gives_an_empty_scan(tmp_path: Path, layout: str) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges()})
+    scan = _scan(_decoder(bench, layout=layout), [bench], [])
+    assert (scan.points, len(scan.xyz), len(scan.column_stamp_ns)) == (0, 0, 0)
+
+
+# -- organized ------------------------------------------------------------------------------------
+
+
+def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
+    first = Bench(tmp_path, FLAT, {"RANGE": _ranges(c0_b3=1000)})
+    weak = _ranges(c1_b2=2000)
+    second = Bench(tmp_path, DUAL, {"RANGE": _ranges(c1_b2=3000), "RANGE2": weak}, ring_base=16)
+    decoder = _decoder(first, second, layout="organized")
+    scan = _scan(decoder, [first, second], [(0, 0), (1, 1)])
+    assert scan.xyz.shape == (2, 32, 3)
+    assert scan.range_m is not None
+    assert np.argwhere(~np.isnan(scan.range_m)).tolist() == [[0, 3], [1, 4], [1, 5]]
+    assert scan.range_m[1, 4:6].tolist() == [3.0, 2.0]
+    assert scan.ring[0, 3] == 3
+    assert scan.ring[1, 4:6].tolist() == [18, 18]
+    empty = np.isnan(scan.range_m)
+    assert np.isnan(scan.xyz[empty]).all()
+    assert not scan.ring[empty].any()
+    assert not scan.time_ns[empty].any()
+    assert scan.lidar_id.tolist() == [[0] * 32, [1] * 32]
+    assert (scan.points, scan.column) == (3, None)
+
+
+# -- tiles and buffers ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
+    """A scan of many tiles is that of its columns, one after the other."""
+    rng = np.random.default_rng(4)
+    first, second = (
+        Bench(
+            tmp_path,
+            spec,
+            {
+                "RANGE": rng.integers(0, 900, (TURN, 16)) * 8 * rng.integers(0, 2, (TURN, 16)),
+                "REFLECTIVITY": rng.integers(0, 256, (TURN, 16)),
+            },
+            ring_base=base,
+        )
+        for spec, base in ((FLAT, 0), (DUAL, 16))
+    )
+    benches = [first, second]
+    count = 2 * tile_columns(32) + 100
+    columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, TURN], (count, 2))]
+    whole = _scan(_decoder(*benches, layout=layout), benches, columns)
+    decoder = _decoder(*benches, layout=layout)
+    singles = [_arrays(_scan(decoder, benches, [column])) for column in columns]
+    for number, array in enumerate(_arrays(whole)):
+        np.testing.assert_array_equal(array, np.concatenate([one[number] for one in singles]))
+
+
+def _arrays(scan: Scan) -> list[npt.NDArray[np.generic]]:
+    """Copies, since the next scan reuses the arrays."""
+    assert scan.reflectivity is not None
+    return [a.copy() for a in (scan.xyz, scan.ring, scan.lidar_id, scan.reflectivity)]
+
+
+def test_a_smaller_scan_after_a_larger_one_holds_nothing_of_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(1000, c9_b4=0)})
+    decoder = _decoder(bench)
+    assert _scan(decoder, [bench], [(0, mid) for mid in range(100)]).points == 1599
+    scan = _scan(decoder, [bench], [(0, 9)])
+    assert (scan.points, len(scan.xyz), len(scan.ring)) == (15, 15, 15)
+    assert decoder.counts[0].written == 1599 + 15
+
+
+# -- how much of a turn a scan saw ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mids", "coverage", "overlap"),
+    [
+        (range(TURN), 1.0, 0.0),
+        (range(TURN // 2), 0.5, 0.0),
+        # A turn and a quarter: the first quarter was passed twice.
+        ([*range(TURN), *range(TURN // 4)], 1.0, 0.25),
+        ([*range(TURN), *range(TURN), *range(TURN)], 1.0, 1.0),
+        ([5], 1 / 120, 0.0),
+    ],
+)
+def test_how_much_of_a_turn_was_seen(
+    tmp_path: Path, mids: Sequence[int], coverage: float, overlap: float
+) -> None:
+    for name in ("1", "2"):
+        (tmp_path / name).mkdir()
+    one = Bench(tmp_path / "1", FLAT, {"RANGE": _ranges(4000)})
+    two = Bench(tmp_path / "2", FLAT, {"RANGE": _ranges(4000)}, ring_base=16)
+    columns = [(0, mid) for mid in mids]
+    assert _scan(_decoder(one), [one], columns).coverage == pytest.approx((coverage,))
+    scan = _scan(_decoder(one, two), [one, two], [*columns, (1, 7)])
+    assert scan.coverage == pytest.approx((coverage, 1 / 120))
+    assert scan.overlap == pytest.approx((overlap, 0.0))

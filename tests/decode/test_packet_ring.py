@@ -1,0 +1,109 @@
+"""The ring of raw packets: what was stored at a place is found there while it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mlbatch.arrays import U8Array
+from mlbatch.decode.packet_ring import RawRing
+from mlbatch.lidar.interface import Records
+
+
+@dataclass
+class Stored:
+    """A ring beside a plain dictionary of what each place holds."""
+
+    packet_size: int
+    record_start: int
+    record_size: int
+    columns: int
+    ring: RawRing = field(init=False)
+    records: dict[int, bytes] = field(default_factory=dict)
+    count: int = 0
+
+    def __post_init__(self) -> None:
+        self.ring = RawRing(
+            self.packet_size, Records(self.record_start, self.record_size, self.record_size)
+        )
+
+    def store(self, count: int, gap: int = 0) -> U8Array:
+        """Store packets that lie `gap` bytes apart in a batch; give what the ring shows of them."""
+        rng = np.random.default_rng(self.count)
+        stride = self.packet_size + gap
+        data = rng.integers(0, 256, max(1, count * stride), np.uint8)
+        start = np.arange(count, dtype=np.int64) * stride
+        packets, place = self.ring.store(data, start, min(self.records, default=None))
+        assert packets.shape == (count, self.packet_size)
+        for number, first in enumerate(place.tolist()):
+            payload = data[number * stride :][: self.packet_size]
+            np.testing.assert_array_equal(packets[number], payload)
+            for column in range(self.columns):
+                begin = self.record_start + column * self.record_size
+                self.records[first + column] = payload[begin : begin + self.record_size].tobytes()
+        self.count += 1
+        return packets
+
+    def forget(self, count: int) -> None:
+        """The oldest places are no longer needed."""
+        for place in sorted(self.records)[:count]:
+            del self.records[place]
+
+    def check(self) -> None:
+        """Every needed record is found where it was put."""
+        place = np.array(sorted(self.records), np.int64)
+        out = np.empty((len(place), self.record_size), np.uint8)
+        self.ring.gather(place, out)
+        assert [row.tobytes() for row in out] == [self.records[p] for p in place.tolist()]
+
+
+steps = st.lists(
+    st.tuples(st.integers(0, 150), st.integers(0, 9), st.integers(0, 600)), min_size=1, max_size=12
+)
+
+
+@given(steps, st.sampled_from([(50, 7, 12, 3), (36, 0, 12, 3), (33, 32, 1, 1), (64, 8, 24, 2)]))
+@settings(max_examples=60, deadline=None)
+def test_needed_records_survive_growth_and_wrap(
+    plan: list[tuple[int, int, int]], sizes: tuple[int, int, int, int]
+) -> None:
+    stored = Stored(*sizes)
+    for count, gap, forgotten in plan:
+        stored.store(count, gap)
+        stored.check()
+        stored.forget(forgotten)
+
+
+def test_a_ring_that_is_emptied_does_not_grow() -> None:
+    """Millions of packets pass through the memory that a window needs."""
+    stored = Stored(50, 7, 12, 3)
+    sizes = set()
+    for _ in range(200):
+        stored.store(60)
+        sizes.add(stored.ring.nbytes)
+        stored.check()
+        stored.forget(3 * 60)
+    assert len(sizes) == 1
+
+
+def test_places_never_come_twice() -> None:
+    ring, seen = RawRing(36, Records(0, 12, 12)), set[int]()
+    for count in (3, 64, 1, 70, 5, 64):
+        data = np.zeros(count * 36, np.uint8)
+        _, place = ring.store(data, np.arange(count, dtype=np.int64) * 36, None)
+        assert not seen & set(place.tolist())
+        assert place.tolist() == sorted(place.tolist())
+        seen |= set(place.tolist())
+
+
+@pytest.mark.parametrize("waiting", [1, 63, 64, 65, 500])
+def test_all_of_a_stalled_sensor_is_kept(waiting: int) -> None:
+    stored = Stored(36, 0, 12, 3)
+    for _ in range(waiting):
+        stored.store(1)
+    stored.check()
+    assert len(stored.records) == 3 * waiting

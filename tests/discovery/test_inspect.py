@@ -1,0 +1,250 @@
+"""`mlbatch inspect`: what it says of recordings, and the rig file it writes."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mlbatch.rig.rig import read_rig
+from tests.builders.sessions import (
+    FIXTURE,
+    NO_RECORDINGS,
+    NS_PER_MS,
+    NS_PER_S,
+    RECORDINGS,
+    SMALL,
+    Shell,
+    Unit,
+    twin,
+    write_session,
+)
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+OUSTER = RECORDINGS / "ouster"
+needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
+LEFT, RIGHT = "ouster_122647000123", "ouster_122648000456"
+
+
+def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
+    outcome = shell(f"inspect {arguments} --json")
+    assert (outcome.code, outcome.err) == (0, "")
+    told = json.loads(outcome.out)
+    assert told["schema"] == "mlbatch.inspect/1"
+    streams: list[dict[str, Any]] = told["streams"]
+    return streams
+
+
+def test_the_table_of_the_fixture(shell: Shell) -> None:
+    outcome = shell(f"inspect {CAPTURE}")
+    assert (outcome.code, outcome.err) == (0, "")
+    table_text, clocks = outcome.out.split("\n\n")
+    head, *rows = table_text.splitlines()
+    starts = [head.index(word) for word in head.split()]
+    ends = [*starts[1:], None]
+    cells = [[row[a:b].strip() for a, b in zip(starts, ends, strict=True)] for row in [head, *rows]]
+    assert cells[0] == [
+        *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
+        *("clock", "calibration", "extrinsics", "missing"),
+    ]
+    table = {row[0]: row[1:] for row in cells[1:]}
+    # Packets, rates and spans by fixtures/two_lidars/SOURCE.md.
+    assert table["10.5.5.87 > port 7502"][:6] == [
+        *("OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16", LEFT, "271", "320.0", "0", "0.844")
+    ]
+    assert table["10.5.5.87 > port 7502"][6].startswith("utc -")
+    assert table["10.5.5.87 > port 7502"][7:] == ["left.json", "", ""]
+    assert table["10.5.5.87 > port 7503"] == [
+        *("Ouster IMU", LEFT, "85", "100.0", "", "0.840", "", "", "", "")
+    ]
+    assert table["10.5.5.88 > port 7503"][1] == RIGHT
+    assert table["10.5.5.20 > port 5353"][:3] == ["unknown", "", "2"]
+    assert len(table) == 5
+    assert re.match(r"clocks: synchronised within \d\.\d+ ms\n", clocks)
+    assert clocks.count("clock: UTC, -") == 2
+
+
+def test_json_tells_the_same_with_all_digits(shell: Shell) -> None:
+    (left,) = [s for s in _streams(shell, str(CAPTURE)) if s["serial"] == "122647000123"]
+    assert (left["model"], left["mode"]) == ("OS-0-32-U1", "512x10 RNG19_RFL8_SIG16_NIR16")
+    assert (left["bytes"], left["packets"], left["lost"]) == (6400, 271, 0)
+    assert left["timescale"] == "utc"
+    # The first column is 16 columns of 99.99 ms / 512 older than its packet, which takes a while.
+    assert -5 < left["offset_ms"] < -3
+
+
+def test_loss_and_clock_of_an_unsynchronised_lidar(shell: Shell, tmp_path: Path) -> None:
+    unit = Unit(begin_ns=1000 * NS_PER_S, host_ns=1_700_000_000 * NS_PER_S)
+    capture = write_session(tmp_path, unit)
+    raw = capture.read_bytes()
+    gone = slice(24 + 10 * 1338, 24 + 13 * 1338)
+    capture.write_bytes(raw[: gone.start] + raw[gone.stop :])
+    outcome = shell(f"inspect {capture}")
+    # 16 columns of a 512x10 turn last 3.125 ms.
+    assert "uptime -1700000000.003 s" in outcome.out
+    (stream,) = _streams(shell, str(capture))
+    assert (stream["packets"], stream["lost"], stream["timescale"]) == (93, 3, "uptime")
+
+
+def test_a_stream_without_metadata_says_what_is_missing(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), metadata=False)
+    (stream,) = _streams(shell, str(capture))
+    assert (stream["sensor"], stream["missing"]) == ("", "metadata")
+    assert stream["what"] == "Ouster lidar, serial 111, 1280 bytes: needs its metadata"
+    outcome = shell(f"inspect {capture}")
+    assert outcome.out.splitlines()[-1] == (
+        "note: no lidar with its metadata; files looked at: none"
+    )
+
+
+def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit())
+    capture.write_bytes(capture.read_bytes()[:-100])
+    outcome = shell(f"inspect {capture}")
+    assert outcome.out.splitlines()[-1] == (
+        "note: drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1238"
+    )
+
+
+def test_only_the_first_ten_seconds_are_looked_at(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(turns=110))
+    (stream,) = _streams(shell, str(capture))
+    # Packets come every 3.125 ms; one of them just 10 s after the first.
+    assert stream["packets"] == 10_000 * 1000 // 3125 + 1
+
+
+def test_extrinsics_of_the_metadata_are_told_and_written(shell: Shell, tmp_path: Path) -> None:
+    pose = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -0.25, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
+    capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=pose)))
+    (stream,) = _streams(shell, str(capture))
+    assert stream["extrinsics"] == "metadata"
+    assert shell(f"inspect {capture} --write-rig rig.yaml").code == 0
+    (sensor,) = read_rig(Path("rig.yaml")).sensors
+    np.testing.assert_array_equal(sensor.extrinsics, np.reshape(pose, (4, 4)))
+
+
+def test_the_rig_is_accepted_and_gives_the_same_scans(shell: Shell) -> None:
+    written = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
+    assert (written.code, written.err) == (0, "")
+    assert written.out.splitlines()[-1] == "wrote rig.yaml"
+    text = Path("rig.yaml").read_text()
+    assert text.count("# extrinsics unknown: measure them") == 2
+    zero = "extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}"
+    assert text.count(zero) == 2
+    with_rig = shell(f"convert {CAPTURE} --rig rig.yaml -o with-rig")
+    assert (with_rig.code, with_rig.err) == (0, "")
+    found = shell(f"convert {CAPTURE} --identity-extrinsics -o found")
+    assert (found.code, found.err) == (0, "")
+    names = sorted(path.name for path in Path("found").iterdir())
+    for name in names:
+        if name != "report.json":
+            assert Path("with-rig", name).read_bytes() == Path("found", name).read_bytes()
+    assert names.count("000006.npz") == 1
+
+
+def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
+    Path("rig.yaml").write_text("mine\n")
+    outcome = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err == (
+        "mlbatch: error: rig.yaml: wanted a new rig file, got an existing one; choose another "
+        "name\n"
+    )
+    assert Path("rig.yaml").read_text() == "mine\n"
+
+
+def test_no_rig_is_written_of_nothing(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), metadata=False)
+    outcome = shell(f"inspect {capture} --write-rig rig.yaml")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: --write-rig: wanted at least one lidar with its metadata, got none; "
+        "give --metadata FILE\n"
+    )
+    assert not Path("rig.yaml").exists()
+
+
+def test_a_rig_of_legacy_lidars_names_their_addresses(shell: Shell, tmp_path: Path) -> None:
+    old = Unit(spec=replace(SMALL, profile="LEGACY"))
+    other = replace(old, ip="10.0.0.2", spec=replace(old.spec, serial=222, beams=32))
+    capture = write_session(tmp_path, old, other)
+    assert shell(f"inspect {capture} --write-rig rig.yaml").code == 0
+    first, second = read_rig(Path("rig.yaml")).sensors
+    assert (first.name, str(first.stream)) == ("ouster_111", "source_ip 10.0.0.1, port 7502")
+    assert (second.name, str(second.stream)) == ("ouster_222", "source_ip 10.0.0.2, port 7502")
+    assert shell(f"convert {capture} --rig rig.yaml -o out").code == 0
+
+
+def test_the_order_of_sensors_is_that_of_serial_numbers(shell: Shell, tmp_path: Path) -> None:
+    first = Unit(spec=replace(SMALL, serial=1000), ip="10.0.0.9")
+    early = twin(replace(first, begin_ns=first.begin_ns - NS_PER_MS), 999, "10.0.0.8")
+    capture = write_session(tmp_path, first, early)
+    shell(f"inspect {capture} --write-rig rig.yaml")
+    names = [sensor.name for sensor in read_rig(Path("rig.yaml")).sensors]
+    assert names == ["ouster_999", "ouster_1000"]
+
+
+# (case, streams with what sensor) by recordings/MANIFEST.md.
+REAL = {
+    "os0-128_512x10_crc/crc_test.pcap": {
+        7502: ("ouster_122247000785", 34, "uptime"),
+        7503: ("ouster_122247000785", 10, ""),
+    },
+    "os1-128_v2.3.0_rng15_3frames/OS-1-128_v2.3.0_1024x10_lb_n3.pcap": {
+        7502: ("ouster_122201000998", 192, "uptime"),
+        7503: ("ouster_122201000998", 30, ""),
+    },
+    "os1-64_fw1_legacy_broadcast/ouster_example.pcap": {7502: ("ouster_1", 100, "utc")},
+    "os1-64_fw2.0_legacy_reduced-config/OS-1-64_1024x10_fw20.pcap": {
+        7502: ("ouster_1", 64, "uptime"),
+        7503: ("ouster_1", 11, ""),
+    },
+    "os0-128_windowed/windowed_frame1.pcap": {
+        53750: ("ouster_992108000265", 17, "uptime"),
+        7503: ("ouster_992108000265", 10, ""),
+    },
+    # 540.8 s ahead of the recorder: neither UTC nor TAI.
+    "os2-128_duplicate-ip-id/duplicate_id.pcap": {34636: ("ouster_992219000042", 1, "unknown")},
+    "os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap": {7513: ("", 8, ""), 7514: ("", 1, "")},
+    "empty-pcap/empty_pcap.pcap": {},
+}
+
+
+@needs_recordings
+@pytest.mark.parametrize("case", REAL)
+def test_real_recordings(shell: Shell, case: str) -> None:
+    found = {
+        int(stream["stream"].split()[-1]): (
+            stream["sensor"],
+            stream["packets"],
+            stream["timescale"],
+        )
+        for stream in _streams(shell, str(OUSTER / case))
+    }
+    assert found == REAL[case]
+
+
+@needs_recordings
+@pytest.mark.parametrize("kind", ["legacy", "nonlegacy"])
+def test_two_real_sensors_on_one_port(shell: Shell, kind: str) -> None:
+    case = OUSTER / f"two-sensors_same-ports_{kind}" / f"same_ports_{kind}.pcap"
+    streams = _streams(shell, str(case))
+    found = {(s["stream"].split()[0], s["sensor"], s["bytes"]) for s in streams}
+    first, second = (
+        ("169.254.92.158", "ouster_122247000785"),
+        (
+            "169.254.238.111",
+            "ouster_122239000672",
+        ),
+    )
+    sizes = {"legacy": (24896, 12608), "nonlegacy": (16640, 16640)}[kind]
+    wanted = {(*first, sizes[0]), (*second, sizes[1])}
+    if kind == "nonlegacy":
+        wanted |= {(*first, 48), (*second, 48)}
+    assert found == wanted
+    assert all("same_ports" in s["calibration"] for s in streams if s["bytes"] > 48)

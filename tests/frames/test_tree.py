@@ -1,0 +1,400 @@
+"""Chains of transforms by hand and by their laws; frames that drivers and people give names to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.arrays import F64Array
+from mlbatch.errors import RigError
+from mlbatch.frames.transforms import compose, from_rpy_deg
+from mlbatch.frames.tree import (
+    Edge,
+    FrameTree,
+    candidates,
+    difference,
+    edge_of,
+    named_frame,
+    nearest_topic,
+    same_namespace,
+)
+
+NO_TURN = (0.0, 0.0, 0.0, 1.0)
+HALF = math.sqrt(0.5)
+QUARTER_YAW = (0.0, 0.0, HALF, HALF)
+QUARTER_ROLL = (HALF, 0.0, 0.0, HALF)
+
+
+def _tree(*edges: Edge) -> FrameTree:
+    tree = FrameTree()
+    for edge in edges:
+        tree.add(edge)
+    return tree
+
+
+def _edge(
+    parent: str,
+    child: str,
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turn: Sequence[float] = NO_TURN,
+    source: str = "tf_static",
+) -> Edge:
+    return edge_of(parent, child, xyz, turn, source)
+
+
+def _moved(tree: FrameTree, a: str, b: str, point: tuple[float, float, float]) -> list[float]:
+    """Where a point given in frame b lies in frame a."""
+    chain = tree.chain(a, b)
+    assert chain is not None
+    rows = chain.matrix.tolist()
+    return [r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3] for r in rows[:3]]
+
+
+def test_chain_of_three_by_hand() -> None:
+    # base 1 m below the roof; the roof turned left by 90 degrees, so its x is base's y; the lidar
+    # 2 m along the roof's x, rolled by 90 degrees, so its y is up.
+    tree = _tree(
+        _edge("base", "roof", (0.0, 0.0, 1.0), QUARTER_YAW),
+        _edge("roof", "lidar", (2.0, 0.0, 0.0), QUARTER_ROLL),
+    )
+    assert _moved(tree, "base", "lidar", (0, 0, 0)) == pytest.approx([0, 2, 1])
+    assert _moved(tree, "base", "lidar", (5, 0, 0)) == pytest.approx([0, 7, 1])
+    assert _moved(tree, "base", "lidar", (0, 5, 0)) == pytest.approx([0, 2, 6])
+    # And back: 3 m above base's origin is 2 m above the roof, which in the lidar is y, and x = -2.
+    assert _moved(tree, "lidar", "base", (0, 0, 3)) == pytest.approx([-2, 2, 0])
+    assert str(tree.chain("base", "lidar")) == "base -> roof -> lidar"
+
+
+def test_chain_over_a_common_ancestor() -> None:
+    # Looking the same way, the right one sits 2 m to the right (y = -2) of the left one.
+    tree = _tree(
+        _edge("base", "mast", (0.0, 0.0, 3.0)),
+        _edge("mast", "left", (0.0, 1.0, 0.0)),
+        _edge("mast", "right", (0.0, -1.0, 0.0)),
+    )
+    chain = tree.chain("left", "right")
+    assert chain is not None
+    assert chain.frames == ("left", "mast", "right")
+    assert _moved(tree, "left", "right", (0, 0, 0)) == [0, -2, 0]
+    assert tree.ancestor(["left", "right"]) == "mast"
+    assert tree.ancestor(["left", "mast"]) == "mast"
+    assert tree.ancestor(["left"]) == "left"
+    assert tree.ancestor([]) is None
+
+
+def test_a_frame_is_itself_exactly() -> None:
+    chain = _tree(_edge("a", "b", (0.1, 0.2, 0.3))).chain("b", "b")
+    assert chain is not None
+    assert np.array_equal(chain.matrix, np.eye(4))
+    assert chain.edges == ()
+
+
+def test_slashes_in_front_are_no_part_of_names() -> None:
+    tree = _tree(_edge("/base_link", "//robot/os_left"))
+    assert tree.frames == ("base_link", "robot/os_left")
+
+
+def test_the_later_edge_of_a_child_counts() -> None:
+    tree = _tree(_edge("base", "lidar", (1.0, 0.0, 0.0)), _edge("base", "lidar", (2.0, 0.0, 0.0)))
+    assert _moved(tree, "base", "lidar", (0, 0, 0)) == [2, 0, 0]
+
+
+def test_frames_that_nothing_connects() -> None:
+    tree = _tree(_edge("a", "b"), _edge("c", "d"))
+    assert tree.chain("b", "d") is None
+    assert tree.ancestor(["b", "d"]) is None
+    assert tree.top("d") == ("c", "")
+
+
+def test_a_missing_frame_is_told_with_the_nearest() -> None:
+    with pytest.raises(RigError) as caught:
+        _tree(_edge("base_link", "os_left")).chain("base_link", "os_lefft")
+    assert str(caught.value) == (
+        "wanted a frame of the recording's transforms, got 'os_lefft'; did you mean os_left?"
+    )
+
+
+def test_a_missing_frame_that_resembles_none() -> None:
+    with pytest.raises(RigError, match=r"got 'zz'; it has a, b$"):
+        _tree(_edge("a", "b")).chain("a", "zz")
+    with pytest.raises(RigError, match=r"got 'zz'; it has none$"):
+        FrameTree().chain("zz", "zz")
+
+
+def test_two_parents_are_refused_where_they_matter() -> None:
+    tree = _tree(_edge("base", "lidar"), _edge("os_sensor", "lidar"), _edge("lidar", "imu"))
+    with pytest.raises(RigError) as caught:
+        tree.chain("base", "imu")
+    assert str(caught.value) == (
+        "tf_static: frame lidar: wanted one parent, got base and os_sensor; "
+        "give the extrinsics in a rig file (--rig)"
+    )
+    # Below that frame nothing is unclear.
+    assert _moved(tree, "lidar", "imu", (1, 2, 3)) == [1, 2, 3]
+    assert tree.top("imu")[0] == "lidar"
+
+
+def test_two_parents_above_both_frames_do_not_matter() -> None:
+    tree = _tree(
+        _edge("odom", "base"), _edge("foot", "base"), _edge("base", "l"), _edge("base", "r")
+    )
+    assert tree.chain("l", "r") is not None
+    assert tree.ancestor(["l", "r"]) == "base"
+
+
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_circles_are_refused_in_any_order(first: int) -> None:
+    circle = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a")]
+    tree = _tree(*circle[first:], *circle[:first], _edge("c", "lidar", (1.0, 0.0, 0.0)))
+    with pytest.raises(RigError, match="wanted frames that form a tree, got the circle"):
+        tree.chain("a", "b")
+    with pytest.raises(RigError, match="circle"):
+        tree.chain("a", "lidar")
+    # What hangs on the circle is still well placed relative to where it hangs.
+    assert _moved(tree, "c", "lidar", (0, 0, 0)) == [1, 0, 0]
+
+
+def test_the_text_of_a_circle() -> None:
+    tree = _tree(_edge("a", "b"), _edge("b", "a"))
+    with pytest.raises(RigError) as caught:
+        tree.chain("a", "b")
+    assert str(caught.value) == (
+        "tf_static: wanted frames that form a tree, got the circle b -> a -> b; "
+        "give the extrinsics in a rig file (--rig)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "xyz", "turn", "wanted"),
+    [
+        ("a", "b", (0, math.nan, 0), NO_TURN, "wanted 3 finite metres, got 0, nan, 0"),
+        ("a", "b", (math.inf, 0, 0), NO_TURN, "wanted 3 finite metres, got inf, 0, 0"),
+        ("a", "b", (0, 0), NO_TURN, "wanted 3 finite metres, got 0, 0"),
+        ("a", "b", (0, 0, 0), (0, 0, 0, 0), "wanted a quaternion of norm 1 within 0.001, got"),
+        ("a", "b", (0, 0, 0), (0, 0, 0, 1.002), "norm 1.002"),
+        ("a", "b", (0, 0, 0), (0, 0, math.nan, 1), "norm nan"),
+        ("a", "/a", (0, 0, 0), NO_TURN, "wanted two frames, got the same twice"),
+        ("/", "b", (0, 0, 0), NO_TURN, "wanted two frames, got an empty name"),
+        ("a", " ", (0, 0, 0), NO_TURN, "wanted two frames, got an empty name"),
+    ],
+)
+def test_edges_that_are_none(
+    parent: str, child: str, xyz: Sequence[float], turn: Sequence[float], wanted: str
+) -> None:
+    with pytest.raises(RigError) as caught:
+        FrameTree().add(edge_of(parent, child, xyz, turn, "tf_static"))
+    text = str(caught.value)
+    assert text.startswith("tf_static: transform ")
+    assert wanted in text
+    assert "\n" not in text
+
+
+def test_a_quaternion_is_normalised_within_a_thousandth() -> None:
+    edge = _edge("a", "b", turn=(0.0, 0.0, 0.0, 1.0009))
+    assert np.array_equal(edge.matrix, np.eye(4))
+
+
+def test_of_several_sources_the_first_wins_by_child() -> None:
+    static = _tree(_edge("roof", "lidar", (0.0, 0.0, 1.0)))
+    urdf = _tree(
+        _edge("base", "roof", (5.0, 0.0, 0.0), source="urdf"),
+        _edge("roof", "lidar", (0.0, 0.0, 9.0), source="urdf"),
+    )
+    whole = FrameTree.merged([static, urdf])
+    assert _moved(whole, "base", "lidar", (0, 0, 0)) == [5, 0, 1]
+    chain = whole.chain("base", "lidar")
+    assert chain is not None
+    assert [edge.source for edge in chain.edges] == ["urdf", "tf_static"]
+
+
+def test_sources_that_start_from_opposite_ends() -> None:
+    static = _tree(_edge("lidar", "base", (-1.0, 0.0, 0.0)))
+    urdf = _tree(_edge("base", "lidar", (9.0, 0.0, 0.0), source="urdf"))
+    whole = FrameTree.merged([static, urdf])
+    # The lidar sees base 1 m behind it, so base sees it 1 m ahead.
+    assert _moved(whole, "base", "lidar", (0, 0, 0)) == [1, 0, 0]
+
+
+def test_a_circle_within_a_later_source_stays_one() -> None:
+    circle = _tree(_edge("a", "b", source="urdf"), _edge("b", "a", source="urdf"))
+    with pytest.raises(RigError, match="circle"):
+        FrameTree.merged([_tree(_edge("x", "y")), circle]).chain("a", "b")
+
+
+def test_difference_by_hand() -> None:
+    first = from_rpy_deg((1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+    turned = compose(first, from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.5, 0.0)))
+    assert difference(first, turned) == pytest.approx((0.0, math.radians(0.5)))
+    moved = from_rpy_deg((1.003, 2.004, 3.0), (10.0, 20.0, 30.0))
+    # 3 mm and 4 mm at a right angle are 5 mm.
+    assert difference(first, moved) == pytest.approx((0.005, 0.0), abs=1e-9)
+    # Half a turn about any axis: nothing beyond it.
+    half = from_rpy_deg((0.0, 0.0, 0.0), (180.0, 0.0, 0.0))
+    assert difference(np.eye(4), half) == pytest.approx((0.0, math.pi))
+
+
+LENGTHS = st.floats(min_value=-100.0, max_value=100.0)
+ANGLES = st.floats(min_value=-180.0, max_value=180.0)
+POSES = st.builds(from_rpy_deg, st.tuples(*[LENGTHS] * 3), st.tuples(*[ANGLES] * 3))
+
+
+@st.composite
+def _trees(draw: st.DrawFn) -> FrameTree:
+    """A tree of up to 8 frames, 0 the root, in any order of edges."""
+    count = draw(st.integers(min_value=3, max_value=8))
+    edges = [
+        Edge(str(draw(st.integers(0, child - 1))), str(child), draw(POSES), "tf_static")
+        for child in range(1, count)
+    ]
+    return _tree(*draw(st.permutations(edges)))
+
+
+def _matrix(tree: FrameTree, a: str, b: str) -> F64Array:
+    chain = tree.chain(a, b)
+    assert chain is not None
+    assert (chain.frames[0], chain.frames[-1]) == (a, b)
+    assert len(chain.edges) == len(chain.frames) - 1
+    return chain.matrix
+
+
+@given(_trees(), st.data())
+def test_chains_compose_and_turn_round(tree: FrameTree, data: st.DataObject) -> None:
+    a, b, c = (data.draw(st.sampled_from(tree.frames)) for _ in range(3))
+    a_from_c = _matrix(tree, a, c)
+    assert np.allclose(_matrix(tree, a, b) @ _matrix(tree, b, c), a_from_c, atol=1e-9)
+    assert np.allclose(a_from_c @ _matrix(tree, c, a), np.eye(4), atol=1e-9)
+
+
+@given(_trees(), st.data())
+def test_chains_keep_distances(tree: FrameTree, data: st.DataObject) -> None:
+    a, b = (data.draw(st.sampled_from(tree.frames)) for _ in range(2))
+    p, q = (data.draw(st.tuples(*[LENGTHS] * 3)) for _ in range(2))
+    there = [_moved(tree, a, b, point) for point in (p, q)]
+    assert math.dist(*there) == pytest.approx(math.dist(p, q), abs=1e-9)
+
+
+@given(_trees(), st.data())
+def test_all_frames_hang_on_their_ancestor(tree: FrameTree, data: st.DataObject) -> None:
+    frames = data.draw(st.lists(st.sampled_from(tree.frames), min_size=1, max_size=4))
+    ancestor = tree.ancestor(frames)
+    assert ancestor is not None
+    for frame in frames:
+        chain = tree.chain(ancestor, frame)
+        assert chain is not None
+        assert tuple(edge.parent for edge in chain.edges) == chain.frames[:-1]
+
+
+LIDAR = from_rpy_deg((0.0, 0.0, 0.03618), (0.0, 0.0, 180.0))
+LEFT = "/left/ouster/lidar_packets"
+
+
+def _found(maker: str, places: Sequence[str], alone: bool, frame: str) -> str:
+    """What kind of candidate a frame is: `points`, `lidar`, `whole`, or `` for none."""
+    for one in candidates(maker, places, alone=alone, sensor_from_lidar=LIDAR):
+        if one.frame == frame:
+            if one.sensor_from_frame is not None:
+                return "lidar"
+            return "points" if one.rank < 8 else "whole"
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("maker", "place", "alone", "frame", "kind"),
+    [
+        ("Ouster", LEFT, False, "left/os_sensor", "points"),
+        ("Ouster", LEFT, False, "left_os_sensor", "points"),
+        ("Ouster", LEFT, False, "os_sensor_left", "points"),
+        ("Ouster", LEFT, False, "os_left/os_sensor", "points"),
+        ("Ouster", LEFT, False, "left/ouster/os_sensor", "points"),
+        ("Ouster", LEFT, False, "left/os_lidar", "lidar"),
+        ("Ouster", LEFT, False, "os_lidar_left", "lidar"),
+        ("Ouster", LEFT, False, "os_left", "whole"),
+        ("Ouster", LEFT, False, "ouster_left", "whole"),
+        ("Ouster", LEFT, False, "left", "whole"),
+        # Plain names say which sensor only where there is one.
+        ("Ouster", LEFT, False, "os_sensor", ""),
+        ("Ouster", LEFT, True, "os_sensor", "points"),
+        ("Ouster", LEFT, True, "os_lidar", "lidar"),
+        # It could be either of the two frames of an Ouster.
+        ("Ouster", LEFT, True, "left_lidar", ""),
+        ("Ouster", LEFT, True, "right/os_sensor", ""),
+        ("Ouster", LEFT, True, "os_imu", ""),
+        ("Ouster", "/os_left/lidar_packets", False, "left", "whole"),
+        ("Ouster", "/os_left/lidar_packets", False, "os_left/os_sensor", "points"),
+        ("Ouster", "/ouster/lidar_packets", False, "ouster/os_sensor", "points"),
+        ("Ouster", "/lidar_packets", True, "os_sensor", "points"),
+        ("Ouster", "/lidar_packets", False, "os_sensor", ""),
+        ("Ouster", "/robot/left/ouster/lidar_packets", False, "robot/left/os_sensor", "points"),
+        ("Ouster", "/robot/left/ouster/lidar_packets", False, "left/os_sensor", "points"),
+        # The name in a rig.
+        ("Ouster", "left", False, "os_left", "whole"),
+        ("Velodyne", "/sensing/lidar/front/velodyne_packets", False, "velodyne_front", "points"),
+        ("Velodyne", "/velodyne_packets", True, "velodyne", "points"),
+        ("HESAI", "/front/pandar_packets", False, "front_lidar", "whole"),
+        ("RoboSense", "/rslidar_packets", True, "rslidar", "points"),
+        ("Someone", "/top/packets", False, "top_lidar", "points"),
+    ],
+)
+def test_table_of_candidates(maker: str, place: str, alone: bool, frame: str, kind: str) -> None:
+    assert _found(maker, [place], alone, frame) == kind
+
+
+def test_candidates_come_with_the_surest_first() -> None:
+    found = candidates("Ouster", [LEFT], alone=True, frame_id="/mine", sensor_from_lidar=LIDAR)
+    order = [one.frame for one in found]
+    frames = ["mine", "left/ouster/os_sensor", "left/os_sensor", "os_sensor", "left/os_lidar"]
+    places = [order.index(frame) for frame in [*frames, "os_left"]]
+    assert places == sorted(places)
+    assert places[0] == 0
+    assert len(set(order)) == len(order)
+
+
+def test_spellings_of_one_place_are_equally_sure() -> None:
+    found = {one.frame: one.rank for one in candidates("Ouster", [LEFT], alone=False)}
+    assert found["left/os_sensor"] == found["left_os_sensor"] == found["os_sensor_left"]
+    assert not any("os_lidar" in frame for frame in found)
+
+
+@pytest.mark.parametrize("frame", ["os_left/os_lidar", "/sensors/os_lidar", "os_lidar_1"])
+def test_a_lidar_frame_that_the_rig_names_is_turned_back(frame: str) -> None:
+    among = candidates("Ouster", [LEFT], alone=False, sensor_from_lidar=LIDAR)
+    assert named_frame(frame, among).sensor_from_frame is LIDAR
+    assert named_frame(frame.replace("lidar", "sensor"), among).sensor_from_frame is None
+
+
+@pytest.mark.parametrize(
+    ("topic", "other", "same"),
+    [
+        ("/left/ouster/metadata", "/left/ouster/lidar_packets", True),
+        ("/left/ouster/metadata", "/right/ouster/lidar_packets", False),
+        ("/left/metadata", "/left/ouster/lidar_packets", False),
+        ("left/metadata", "/left/lidar_packets", True),
+        ("/metadata", "/lidar_packets", True),
+    ],
+)
+def test_namespaces(topic: str, other: str, same: bool) -> None:
+    assert same_namespace(topic, other) is same
+
+
+@pytest.mark.parametrize(
+    ("topic", "others", "nearest"),
+    [
+        (LEFT, ["/right/ouster/metadata", "/left/ouster/metadata"], "/left/ouster/metadata"),
+        (LEFT, ["/left/metadata", "/right/ouster/metadata"], "/left/metadata"),
+        (LEFT, ["/left/metadata", "/left/ouster/metadata"], "/left/ouster/metadata"),
+        (LEFT, ["/left/ouster/a/metadata", "/left/ouster/metadata"], "/left/ouster/metadata"),
+        # Two that are equally near, a sibling, and one that has nothing to do with it.
+        (LEFT, ["/left/ouster/metadata", "/left/ouster/metadata2"], None),
+        ("/sensing/lidar/left/lidar_packets", ["/sensing/lidar/right/metadata"], None),
+        (LEFT, ["/metadata"], None),
+        ("/lidar_packets", ["/metadata"], "/metadata"),
+        (LEFT, [], None),
+    ],
+)
+def test_the_nearest_topic(topic: str, others: list[str], nearest: str | None) -> None:
+    assert nearest_topic(topic, others) == nearest

@@ -1,0 +1,236 @@
+"""A conversion from Python: clocks of the rig, progress, writers that fail, memory, timing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+
+import mlbatch
+from mlbatch.discovery.discover import Wishes
+from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job, wait_ns
+from mlbatch.pipeline.run import convert
+from mlbatch.pipeline.workers import Steps
+from mlbatch.report.report import ReportInputs
+from mlbatch.types import RunInfo, Scan
+from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
+from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
+
+CAPTURE = TWO_LIDARS / "two_lidars.pcap"
+RIG = TWO_LIDARS / "rig.yaml"
+
+
+def _job(capture: Path, **wishes: bool) -> Job:
+    return Job((capture,), Wishes(identity_extrinsics=wishes.get("identity", False)))
+
+
+def _rig(folder: Path, *clocks: str) -> Path:
+    """A rig of lidars 111 and 222 with these clocks."""
+    rig = folder / "rig.yaml"
+    lines = [
+        f'- {{name: s{serial}, stream: {{serial: "{serial}"}}, metadata: {serial}.json, '
+        f"extrinsics: {{translation_m: [0, 0, 0]}}, clock: {clock}}}\n"
+        for serial, clock in zip((111, 222), clocks, strict=True)
+    ]
+    rig.write_text("sensors:\n" + "".join(lines))
+    return rig
+
+
+# -- clocks ---------------------------------------------------------------------------------------
+
+
+def test_an_offset_of_the_rig_brings_clocks_together(tmp_path: Path) -> None:
+    """One lidar on UTC, one on TAI, 37 s ahead: the rig says so, and the run is on UTC."""
+    one = Unit()
+    tai = replace(twin(one, 222), begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S)
+    tai = replace(tai, host_ns=tai.host_ns + NS_PER_MS)
+    capture = write_session(tmp_path, one, tai)
+    with pytest.raises(ClockError, match=r"37\.000 s apart"):
+        in_memory(_job(capture, identity=True))
+    rig = _rig(tmp_path, "{source: sensor}", "{offset_s: -37}")
+    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    assert result.report.timescale == "utc"
+    for scan in result.scans:
+        assert scan.columns_per_sensor == (512, 512)
+        np.testing.assert_array_equal(
+            scan.column_stamp_ns[scan.column_lidar_id == 0],
+            scan.column_stamp_ns[scan.column_lidar_id == 1],
+        )
+
+
+def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
+    one = Unit()
+    uptime = replace(
+        twin(one, 222), begin_ns=77 * NS_PER_S, host_ns=one.begin_ns - 77 * NS_PER_S + NS_PER_MS
+    )
+    capture = write_session(tmp_path, one, uptime)
+    rig = _rig(tmp_path, "{source: sensor}", "{source: host}")
+    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    assert result.report.timescale == "utc"
+    assert [sensor.clock.source for sensor in result.report.sensors] == ["sensor", "host"]
+    # The last column of a packet counts as its arrival: 1 ms and a column's 0.195 ms after it was.
+    grid_ns = np.arange(1536) * 195_312.5 + 1_195_312.5 + one.begin_ns % NS_PER_S
+    for scan in result.scans:
+        start_ns = scan.start_ns % NS_PER_S
+        inside = (grid_ns >= start_ns) & (grid_ns < start_ns + 100 * NS_PER_MS)
+        stamps = scan.column_stamp_ns[scan.column_lidar_id == 1] % NS_PER_S
+        np.testing.assert_allclose(stamps, grid_ns[inside], atol=1.5, rtol=0)
+
+
+def test_mixed_timescales_are_told(tmp_path: Path) -> None:
+    """Half a second apart clocks compare, but 2.1 s off the recorder is no UTC."""
+    one = replace(Unit(), host_ns=1_900 * NS_PER_MS)
+    two = replace(twin(one, 222), host_ns=2_300 * NS_PER_MS)
+    run, report = convert(_job(write_session(tmp_path, one, two), identity=True), None)
+    assert report.timescale == "unknown"
+    assert [(note.code, note.message) for note in run.notes[:1]] == [
+        ("timescale", "sensors differ in timescale: utc, unknown")
+    ]
+    assert [note.code for note in run.notes[1:]] == ["clocks"]
+
+
+# -- what a run tells while and after it runs -----------------------------------------------------
+
+
+def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
+    captures = tuple(
+        write_session(tmp_path / name, replace(Unit(), begin_ns=EPOCH_NS + at * NS_PER_S))
+        for name, at in (("1", 1), ("2", 2))
+    )
+    told: list[tuple[int, int]] = []
+    convert(Job(captures, keep_partial=True), None, lambda done, total: told.append((done, total)))
+    size = sum(capture.stat().st_size for capture in captures)
+    assert told == sorted(told)
+    assert told[-1] == (size, size)
+
+
+def test_the_stages_take_no_longer_than_the_run() -> None:
+    result = in_memory(FIXTURE)
+    timing = result.report.timing
+    assert timing is not None
+    parts = timing.read_s + timing.decode_s + timing.merge_s + timing.write_s
+    assert 0 < parts <= timing.wall_s
+    # From the first frame's arrival to the last (SOURCE.md: 20 to 870 ms).
+    assert timing.recorded_s == pytest.approx(0.85, abs=0.01)
+
+
+def test_a_dry_run_reports_the_same() -> None:
+    def sums(report: ReportInputs) -> list[object]:
+        return [report.scans, report.t_init_ns, *(sensor.ledger for sensor in report.sensors)]
+
+    job = replace(FIXTURE, extras=frozenset())
+    _, dry = convert(job, None)
+    assert sums(dry) == sums(convert(job, Memory)[1])
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+    sizes = []
+    for turns in (150, 600):
+        folder = tmp_path / str(turns)
+        one = Unit(turns=turns)
+        run, _ = convert(_job(write_session(folder, one, twin(one, 222)), identity=True), None)
+        sizes.append([feed.ring.nbytes for feed in run.feeds])
+    assert sizes[0] == sizes[1]
+
+
+# -- when it fails --------------------------------------------------------------------------------
+
+
+class _FullDisk(Memory):
+    """Fails at the second scan."""
+
+    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
+        steps = super().write(scan, sensor)
+        next(steps)
+        yield
+        if self.scans:
+            raise ExportError("no space left")
+        yield from steps
+
+
+def test_a_writer_is_abandoned_when_the_run_fails() -> None:
+    opened: list[Memory] = []
+
+    def start(info: RunInfo) -> Memory:
+        opened.append(_FullDisk(info))
+        return opened[0]
+
+    with pytest.raises(ExportError):
+        convert(FIXTURE, start)
+    assert [(one.abandoned, one.summary, len(one.scans)) for one in opened] == [(True, None, 1)]
+
+
+def test_a_writer_is_opened_with_the_first_scan_only(tmp_path: Path) -> None:
+    """A run without a scan leaves nothing to abandon."""
+
+    def start(info: RunInfo) -> Memory:
+        raise AssertionError
+
+    capture = write_session(tmp_path, Unit(turns=1))
+    with pytest.raises(RecordingError, match="no scan"):
+        convert(_job(capture), start)
+
+
+# -- scans in Python ------------------------------------------------------------------------------
+
+
+def test_scans_in_python_are_those_of_the_command_line() -> None:
+    wanted = [scan for scan in in_memory(FIXTURE).scans if 0 <= scan.index < 7]
+    found = list(mlbatch.scans(CAPTURE, rig=RIG, rate=10))
+    assert [scan.index for scan in found] == list(range(7))
+    for mine, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(mine.xyz, theirs.xyz)
+        np.testing.assert_array_equal(mine.ring, theirs.ring)
+        assert mine.info.sensors[0].name == "left"
+
+
+def test_scans_in_python_may_be_kept() -> None:
+    found = list(mlbatch.scans(str(CAPTURE), rig=str(RIG)))
+    assert not np.shares_memory(found[0].xyz, found[1].xyz)
+    assert len({scan.xyz[:100].tobytes() for scan in found}) > 1
+
+
+def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
+    with pytest.raises(UsageError, match="clock: wanted sensor or host, got 'gps'"):
+        next(iter(mlbatch.scans(CAPTURE, clock="gps")))
+    with pytest.raises(RecordingError, match=r"none\.pcap: wanted a recording, got no such file"):
+        next(iter(mlbatch.scans("none.pcap")))
+    for seconds in (math.nan, 0.0, -1.0, -math.inf):
+        with pytest.raises(UsageError, match="max_wait: wanted seconds above 0, or inf, got "):
+            next(iter(mlbatch.scans(CAPTURE, max_wait=seconds)))
+    for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan)):
+        with pytest.raises(UsageError, match=r"m(in|ax)_range: wanted "):
+            next(iter(mlbatch.scans(CAPTURE, min_range=low_m, max_range=high_m)))
+
+
+@pytest.mark.parametrize("slices", [0, 2.5, 2.0, 10_001, "2", None])
+def test_scans_in_python_have_whole_numbers_of_slices(slices: object) -> None:
+    with pytest.raises(UsageError, match=r"slices: wanted a whole number from 1 to 10000, got "):
+        next(iter(mlbatch.scans(CAPTURE, slices=slices)))  # type: ignore[arg-type]
+
+
+def test_scans_in_python_take_numbers_of_numpy() -> None:
+    scan = next(iter(mlbatch.scans(CAPTURE, rig=RIG, slices=cast(int, np.int64(2)))))
+    assert scan.slices == 2
+
+
+def test_the_shortest_wait_is_a_nanosecond() -> None:
+    assert wait_ns("max_wait", 1e-12, 1e-12) == 1
+    assert wait_ns("max_wait", 2e-9, 2e-9) == 2
+
+
+def test_scans_in_python_wait_for_ever_from_some_time_on() -> None:
+    one, other = (list(mlbatch.scans(CAPTURE, rig=RIG, max_wait=s)) for s in (1e300, math.inf))
+    assert [scan.points for scan in one] == [scan.points for scan in other]
+
+
+def test_a_conversion_may_be_left_half_way() -> None:
+    run = Conversion(replace(FIXTURE, keep_partial=False))
+    scan, only = next(run.scans())
+    assert (scan.index, only) == (0, None)

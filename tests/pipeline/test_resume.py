@@ -1,0 +1,387 @@
+"""What `--resume` says and refuses, and what other ends of a run leave."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mlbatch.cli import run
+from mlbatch.errors import ExportError, RecordingError
+from mlbatch.pipeline import resume
+from mlbatch.pipeline import resume as _resume_state
+from mlbatch.readers import _source
+from mlbatch.types import Scan
+from mlbatch.writers import npz
+from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
+from tests.resume_storm import contents
+
+CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
+# From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
+SCANS = 7
+STATE = Path("out.partial.state")
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    """The command line, in an empty folder; every scan gets a line of the state file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
+    monkeypatch.setattr(os, "sync", lambda: None)
+    return Shell(monkeypatch, capsys)
+
+
+def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
+    """Have the writing of a scan fail, once."""
+    save, calls = npz.NpzSaver.save, 0
+
+    def failing(saver: npz.NpzSaver, file: object, found: Scan) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == scan + 1:
+            raise error
+        save(saver, file, found)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(npz.NpzSaver, "save", failing)
+
+
+def _interrupt(shell: Shell, words: str = f"{CAPTURE} -o out") -> None:
+    """Leave a `.partial` with three scans that are safe."""
+    with pytest.MonkeyPatch.context() as patch:
+        _fail_at(patch, 3, KeyboardInterrupt())
+        assert shell(f"convert {words}").code == 130
+    assert STATE.is_file()
+
+
+def _whole(shell: Shell, words: str = CAPTURE) -> dict[str, object]:
+    Path("whole").mkdir()
+    assert shell(f"convert {words} -o whole/out").code == 0
+    return contents(Path("whole"))
+
+
+def test_it_goes_on_after_the_scans_that_are_safe(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _whole(shell)
+    _interrupt(shell)
+    first = Path("out.partial/000000.npz").stat().st_mtime_ns
+    saved = []
+    save = npz.NpzSaver.save
+
+    def counting(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
+        saved.append(scan.index)
+        save(saver, file, scan)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(npz.NpzSaver, "save", counting)
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.code == 0
+    assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
+    assert saved == [3, 4, 5, 6]
+    assert Path("out/000000.npz").stat().st_mtime_ns == first
+    assert contents(Path()) == whole
+
+
+def test_an_interrupt_tells_of_it(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    _fail_at(monkeypatch, 2, KeyboardInterrupt())
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert outcome.err == (
+        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
+        "on\n"
+    )
+
+
+def test_a_request_to_end_is_an_interrupt(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    save = npz.NpzSaver.save
+
+    def ending(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
+        save(saver, file, scan)  # type: ignore[arg-type]
+        if scan.index == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(npz.NpzSaver, "save", ending)
+    assert shell(f"convert {CAPTURE} -o out").code == 130
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert '"synced":true' in STATE.read_text().splitlines()[-1]
+
+
+def test_nothing_to_resume_is_said(shell: Shell) -> None:
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.code == 0
+    assert outcome.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert contents(Path()) == _whole(shell)
+
+
+def test_a_complete_output_is_left_alone(shell: Shell) -> None:
+    shell(f"convert {CAPTURE} -o out")
+    before = Path("out/report.json").read_bytes()
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert (outcome.code, outcome.out) == (0, "")
+    assert outcome.err == "mlbatch: out: is complete; there is nothing to resume\n"
+    assert Path("out/report.json").read_bytes() == before
+    again = shell(f"convert {CAPTURE} -o out --resume --overwrite")
+    assert again.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert Path("out/report.json").read_bytes() != before
+
+
+def test_without_it_a_partial_is_replaced_and_the_way_on_named(shell: Shell) -> None:
+    _interrupt(shell)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "mlbatch: warning: interrupted: out.partial with 3 finished scans is begun anew; with "
+        "--resume a run goes on after them\n"
+    )
+    assert contents(Path()) == _whole(shell)
+
+
+@pytest.mark.parametrize(
+    ("words", "difference"),
+    [
+        (f"{CAPTURE} --rate 20", "rate '20' instead of 'not given'"),
+        (f"{CAPTURE} --format ply", "format 'ply' instead of 'npz'"),
+        (f"{CAPTURE} --min-range 2", "min range m '2.0' instead of '0.0'"),
+        (f"{CAPTURE} --decode crc=check", "decode 'crc=check' instead of 'not given'"),
+        (f"{CAPTURE} --fault drop:left:1%", "faults"),
+        (f"{CAPTURE} --keep-partial", "keep partial 'True' instead of 'False'"),
+    ],
+)
+def test_another_job_is_refused(shell: Shell, words: str, difference: str) -> None:
+    _interrupt(shell)
+    outcome = shell(f"convert {words} -o out --resume")
+    assert outcome.code == 2
+    line = outcome.err.splitlines()[-1]
+    assert line.startswith(
+        "mlbatch: error: out.partial: wanted the job of the interrupted run to go on with, got "
+        f"{difference}"
+    )
+    assert line.endswith("; give the same, or leave out --resume to begin anew")
+    # And the right one still goes on.
+    assert shell(f"convert {CAPTURE} -o out --resume").err.count("resumed after 3 scans") == 1
+
+
+def test_another_recording_calibration_or_pose_is_refused(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path / "in", Unit(turns=8))
+    words = f"{capture} -o out"
+    _interrupt(shell, words)
+    os.utime(capture, ns=(1, 1))
+    assert "got recording 1 'drive.pcap (" in shell(f"convert {words} --resume").err
+    _interrupt(shell, words)
+    metadata = tmp_path / "in" / "111.json"
+    found = json.loads(metadata.read_text())
+    angles = found["beam_intrinsics"]["beam_altitude_angles"]
+    angles[0] += 0.01
+    metadata.write_text(json.dumps(found))
+    assert "got calibration of ouster_111 '" in shell(f"convert {words} --resume").err
+
+
+def test_a_lost_scan_is_refused(shell: Shell) -> None:
+    _interrupt(shell)
+    Path("out.partial/000001.npz").unlink()
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1] == (
+        "mlbatch: error: out.partial/000001.npz: wanted a scan of the interrupted run to go on "
+        "after it, got none; leave out --resume to begin anew"
+    )
+
+
+def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
+    spec = replace(SMALL, beams=128, columns_per_frame=512)
+    capture = write_session(tmp_path / "in", Unit(spec, turns=30))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resume.Course, "complete", _refuse)
+        assert shell(f"convert {capture} -o out.mcap").code == 1
+    partial = Path("out.mcap.partial")
+    kept = json.loads(Path("out.mcap.partial.state").read_text().splitlines()[-2])["kept_bytes"]
+    os.truncate(partial, kept - 1)
+    outcome = shell(f"convert {capture} -o out.mcap --resume")
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1] == (
+        f"mlbatch: error: out.mcap.partial: wanted {kept} bytes of the interrupted run to go on "
+        f"after them, got {kept - 1}; leave out --resume to begin anew"
+    )
+
+
+def _refuse(course: resume.Course) -> None:
+    raise ExportError("stopped")
+
+
+@pytest.mark.parametrize("option", ["", "--resume"])
+def test_a_run_that_lives_is_not_disturbed(shell: Shell, option: str) -> None:
+    _interrupt(shell)
+    with STATE.open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        outcome = shell(f"convert {CAPTURE} -o out {option}")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: out: wanted to write it alone, got another run that does; wait for its "
+        "end or choose another output\n"
+    )
+    assert STATE.is_file()
+
+
+@pytest.mark.parametrize("output", ["out", "out.mcap"])
+def test_a_run_that_began_after_the_look_is_not_disturbed(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    """Two runs may both find nothing before one of them writes."""
+    state, scan = Path(f"{output}.partial.state"), Path(f"{output}.partial")
+    with contextlib.ExitStack() as files:
+
+        def other_run(*_: object) -> None:
+            file = files.enter_context(state.open("wb", buffering=0))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(b"what it did")
+            scan.write_bytes(b"what it wrote")
+
+        monkeypatch.setattr(run, "check_target", other_run)
+        outcome = shell(f"convert {CAPTURE} -o {output}")
+    assert (outcome.code, "got another run that does" in outcome.err) == (1, True)
+    assert state.read_bytes() == b"what it did"
+    assert scan.read_bytes() == b"what it wrote"
+
+
+def test_an_output_that_cannot_be_opened_leaves_no_state(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        Path("out").mkdir()
+
+    monkeypatch.setattr(run, "check_target", refuse)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert (outcome.code, "got an existing one" in outcome.err) == (1, True)
+    assert [path.name for path in Path().iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]\n", "nonsense\n", '{"boot":"","schema":"mlbatch.state/2"}\n']
+)
+def test_a_state_that_says_nothing_is_none(shell: Shell, text: str) -> None:
+    _interrupt(shell)
+    STATE.write_text(text)
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert outcome.code == 0
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"kept_bytes":0,"scans":[[[1,2,3,4,"5"],[0,0,0,0,0]]]}',
+        '{"kept_bytes":-1,"scans":[]}',
+        '{"kept_bytes":"0","scans":[]}',
+        '{"kept_bytes":0,"scans":7}',
+        '{"kept_bytes":0,"sca',
+    ],
+)
+def test_lines_after_a_damaged_one_count_for_nothing(shell: Shell, line: str) -> None:
+    whole = _whole(shell)
+    _interrupt(shell)
+    head, first, *others = STATE.read_text().splitlines()
+    STATE.write_text("\n".join([head, first, line, *others]) + "\n")
+    assert "resumed after 1 scans" in shell(f"convert {CAPTURE} -o out --resume").err
+    assert contents(Path()) == whole
+
+
+def test_after_a_restart_only_what_reached_the_disk_counts(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _whole(shell)
+    _interrupt(shell)
+    lines = STATE.read_text().splitlines()
+    monkeypatch.setattr(_resume_state, "_boot", lambda: "later")
+    assert "synced" in lines[-1]
+    STATE.write_text("\n".join(lines[:-1]) + "\n")
+    found = resume.find(Path("out"))
+    assert (found.state, found.is_complete) == (None, False)
+    STATE.write_text("\n".join([*lines, *lines[-2:-1]]) + "\n")
+    assert "resumed after 3 scans" in shell(f"convert {CAPTURE} -o out --resume").err
+    assert contents(Path()) == whole
+
+
+def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _whole(shell)
+    _fail_at(monkeypatch, 4, OSError(28, "No space left on device"))
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: out.partial/000004.npz: wanted to write it, got 'No space left on "
+        "device'; free space on this disk or choose another output; then --resume goes on after "
+        "the 4 scans that are safe\n"
+    )
+    assert shell(f"convert {CAPTURE} -o out --resume").code == 0
+    assert contents(Path()) == whole
+
+
+def test_an_unreadable_disk_names_the_way_on(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The reader's buffer holds 8 MB: the recording is longer, and breaks at its end."""
+    spec = replace(SMALL, beams=128, columns_per_frame=512)
+    capture = write_session(tmp_path / "in", Unit(spec, turns=60))
+    whole = _whole(shell, str(capture))
+    fill = _source.Source.fill
+
+    def failing(source: _source.Source, target: memoryview) -> int:
+        if source.position_bytes > 0.9 * source.size_bytes and Path("out.partial").exists():
+            raise RecordingError(
+                _source._unreadable(source.path, OSError(5, "Input/output error"))
+            ) from OSError(5, "Input/output error")
+        return fill(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_source.Source, "fill", failing)
+        outcome = shell(f"convert {capture} -o out")
+    assert outcome.code == 1
+    assert (
+        "could not read it (Input/output error); check the disk; then --resume goes on after"
+        in (outcome.err)
+    )
+    assert shell(f"convert {capture} -o out --resume").code == 0
+    assert contents(Path()) == whole
+
+
+def test_bad_input_says_nothing_of_it(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    _fail_at(monkeypatch, 4, ExportError("what cannot be mended"))
+    assert shell(f"convert {CAPTURE} -o out").err == "mlbatch: error: what cannot be mended\n"
+
+
+def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
+    whole = _whole(shell)
+    shell(f"convert {CAPTURE} -o out --rate 5")
+    _interrupt(shell, f"{CAPTURE} -o out --overwrite")
+    refused = shell(f"convert {CAPTURE} -o out --resume")
+    assert refused.code == 1
+    assert "wanted a new output, got an existing one" in refused.err
+    assert shell(f"convert {CAPTURE} -o out --resume --overwrite").code == 0
+    assert contents(Path()) == whole
+
+
+@pytest.mark.parametrize("option", ["", "--overwrite"])
+def test_a_kill_after_the_last_rename_leaves_nothing_to_do(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.setattr(_resume_state.StateFile, "remove", lambda file: None)
+    assert shell(f"convert {CAPTURE} -o out").code == 0
+    Path("out.old.partial").mkdir()
+    outcome = shell(f"convert {CAPTURE} -o out --resume {option}")
+    assert (outcome.code, outcome.err) == (
+        0,
+        "mlbatch: out: is complete; there is nothing to resume\n",
+    )
+    assert sorted(path.name for path in Path().iterdir()) == ["out"]
+
+
+def test_a_dry_run_leaves_nothing_to_resume(shell: Shell) -> None:
+    outcome = shell(f"convert {CAPTURE} --dry-run --resume")
+    assert outcome.code == 2
+    assert "--resume: wanted an output to go on with, got --dry-run" in outcome.err

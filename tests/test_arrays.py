@@ -1,0 +1,38 @@
+"""The median is numpy's."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from mlbatch.arrays import median
+
+SHAPES = arrays.array_shapes(min_dims=1, max_dims=2, max_side=40)
+
+
+@given(arrays.arrays(np.float64, SHAPES))
+def test_of_reals(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    with np.errstate(all="ignore"):
+        got, wanted = median(values), float(np.median(values))
+    assert got == wanted or (math.isnan(got) and math.isnan(wanted))
+
+
+@given(arrays.arrays(np.int64, SHAPES, elements=st.integers(-(2**63), 2**63 - 1)))
+def test_of_whole_numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> None:
+    assert median(values) == float(np.median(values))
+
+
+@pytest.mark.parametrize(("values", "wanted"), [([3, 1, 2], 2.0), ([4, 1, 3, 2], 2.5)])
+def test_by_hand(values: list[int], wanted: float) -> None:
+    given_values = np.array(values)
+    assert median(given_values) == wanted
+    assert given_values.tolist() == values
+
+
+def test_of_nothing() -> None:
+    assert math.isnan(median(np.empty(0)))
