@@ -153,14 +153,15 @@ def test_progress_is_shown_on_a_terminal_only(shell: Shell, tmp_path: Path) -> N
 
 SLOW = """\
 import time
-from mlbatch import cli, pipeline, resume
-tasks = pipeline.Conversion.tasks
+from mlbatch import cli
+from mlbatch.pipeline import conversion, resume
+tasks = conversion.Conversion.tasks
 def slowly(self, progress=None):
     for task in tasks(self, progress):
         yield task
         print("a scan", flush=True)
         time.sleep(0.5)
-pipeline.Conversion.tasks = slowly
+conversion.Conversion.tasks = slowly
 resume.INTERVAL_S = 0.0
 cli.main()
 """
