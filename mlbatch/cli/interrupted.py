@@ -14,7 +14,7 @@ import typer
 from mlbatch.errors import ExportError, MlbatchError, RecordingError
 from mlbatch.pipeline import resume as resuming
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import Course
+from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.writers import WriterOptions
 
 
@@ -46,7 +46,7 @@ def is_complete(output: Path, *, overwrite: bool) -> bool:
     return True
 
 
-def course(job: Job, output: Path, name: str, options: WriterOptions, *, resume: bool) -> Course:
+def course(job: Job, output: Path, name: str, options: WriterOptions, *, resume: bool) -> ResumeLog:
     """The way of an output: on from where the last run was interrupted, or anew."""
     state = resuming.find(output).state
     if state is not None and not resume:
@@ -55,7 +55,7 @@ def course(job: Job, output: Path, name: str, options: WriterOptions, *, resume:
             "scans is begun anew; with --resume a run goes on after them",
             err=True,
         )
-    found = Course(output, job, name, options, state if resume else None)
+    found = ResumeLog(output, job, name, options, state if resume else None)
     if found.kept_bytes is None:
         resuming.forget(output)
         if resume:
@@ -81,7 +81,7 @@ def discard(output: Path | None) -> None:
         resuming.abandon(output)
 
 
-def with_advice(err: MlbatchError, course: Course | None) -> MlbatchError:
+def with_advice(err: MlbatchError, course: ResumeLog | None) -> MlbatchError:
     """The same error; where a disk failed and scans are safe, it says how to go on."""
     if course is None or not course.recorded or not isinstance(err.__cause__, OSError):
         return err

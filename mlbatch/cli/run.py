@@ -15,7 +15,7 @@ from mlbatch.errors import ClockJump, Interrupted, MlbatchError, NoScanError, on
 from mlbatch.pipeline import preflight
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import Course
+from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import Part
 from mlbatch.report.report import ReportInputs, report_text, summary_lines
@@ -63,7 +63,7 @@ def _run_parts(job: Job, wanted: Wanted) -> None:
     """Convert each stretch between clock jumps; a jump is found where a part runs into it."""
     if job.faults:
         # Times of faults count from the start of the session, in all parts of it.
-        job = replace(job, fault_begin_ns=Conversion(job).begin_ns)
+        job = replace(job, fault_begin_ns=Conversion(job).session.begin_ns)
     number, part, scans = 1, Part(), 0
     while True:
         # Without a jump there is one part, which needs no number.
@@ -153,7 +153,7 @@ def _converted(
     job: Job,
     opener: OpenWriter | None,
     progress: Progress | None,
-    course: Course | None,
+    course: ResumeLog | None,
     last: Last,
 ) -> tuple[Conversion, ReportInputs]:
     try:
@@ -192,16 +192,16 @@ def _opener(name: str, target: Path, options: WriterOptions) -> OpenWriter:
 
 
 def _tell(conversion: Conversion) -> None:
-    for sensor in conversion.setup.sensors:
-        lidar = sensor.found.lidar
+    for sensor in conversion.sensors:
+        lidar = sensor.lidar
         # Topics name calibrations and frames, and may be named anything.
         typer.echo(
             one_line(
                 f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-                f"extrinsics from {sensor.origin}"
+                f"extrinsics from {sensor.detected.origin}"
             )
         )
-    typer.echo(f"decoded by {conversion.engine}")
+    typer.echo(f"decoded by {conversion.session.engine}")
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ before its start (eq. 1) to the end, so that all ways are given the same.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TypeAlias
 
@@ -23,13 +23,12 @@ from mlbatch.compare.sweeps import (
     Way,
     in_order,
 )
-from mlbatch.discovery.discover import Note, absent
+from mlbatch.discovery.discover import Note
 from mlbatch.discovery.extrinsics import Mounted
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline import accounts
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
-from mlbatch.readers import merge
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 SCHEMA = "mlbatch.compare/1"
@@ -124,7 +123,7 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     # Where the sensors sit plays no part; whole turns may reach into the partial windows.
     wishes = replace(job.wishes, identity_extrinsics=True)
     run = Conversion(replace(job, wishes=wishes, keep_partial=True))
-    sensors, period_ns = run.setup.sensors, int(NS_PER_S / run.grid.rate)
+    sensors, period_ns = [sensor.detected for sensor in run.sensors], int(NS_PER_S / run.grid.rate)
     if len(sensors) < 2:
         raise RecordingError(
             f"{job.recordings[0]}: compare: wanted two or more lidars, whose turns can be joined, "
@@ -155,31 +154,20 @@ def _join(run: Conversion, joiner: Joiner, ours: Tally) -> tuple[int, int]:
     """Run through all windows; gives the columns that were due in ours, and the time of all."""
     columns, first_ns, end_ns = 0, None, 0
     held: Window | None = None
-    for window in _windows(run):
+    for window in run.windows():
         joiner.add(window)
         first_ns = window.start_ns if first_ns is None else first_ns
         end_ns = window.end_ns
         if held is not None:
-            ours.add(_parts(held, len(run.feeds)))
+            ours.add(_parts(held, len(run.sensors)))
             columns += len(held.stamp_ns)
         # As in a conversion, the head and the window of the very last stamp do not count.
         held = window if window.index >= 0 else None
-    _refuse_absent(run)
+    run.session.refuse_absent()
     if not columns or first_ns is None:
         raise RecordingError(accounts.why_nothing(run))
     late = sum(dropped.get("late", 0) for dropped in run.batcher.dropped)
     return columns + late, end_ns - first_ns
-
-
-def _windows(run: Conversion) -> Iterator[Window]:
-    """All windows of a run, whose pixels nobody reads."""
-    host_ns = 0
-    for batch in merge(run.recordings):
-        places = [run.batcher.oldest_place(number) for number in range(len(run.feeds))]
-        fed = run.feeder.feed(batch, places)
-        host_ns = int(batch.host_ns[-1]) if len(batch) else host_ns
-        yield from run.batcher.push(fed.arrivals, batch.host_ns)
-    yield from run.batcher.finish(host_ns)
 
 
 def _parts(window: Window, sensors: int) -> TurnSet:
@@ -203,10 +191,3 @@ def _cutter(number: int, sensor: Mounted) -> TurnCutter:
 def _sensor_turns(sensor: Mounted, lengths_ns: array[int]) -> SensorTurns:
     usual = Figures.of(lengths_ns).p50
     return SensorTurns(sensor.name, sensor.found.lidar.model, len(lengths_ns), usual)
-
-
-def _refuse_absent(run: Conversion) -> None:
-    """A sensor that the rig demands must have sent something."""
-    for sensor, feed in zip(run.setup.sensors, run.feeds, strict=True):
-        if sensor.rig is not None and not sensor.rig.optional and not feed.ledger.packets.read:
-            raise absent(sensor, run.job.wishes.rig)

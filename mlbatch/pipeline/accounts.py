@@ -12,6 +12,8 @@ from mlbatch.discovery import discover
 from mlbatch.discovery.discover import Note
 from mlbatch.discovery.sampler import Kind
 from mlbatch.pipeline.passthrough import PASS_REASONS
+from mlbatch.pipeline.sensor import Sensor
+from mlbatch.pipeline.session import CLOUDS
 from mlbatch.report.ledger import PointCounts, ordered
 from mlbatch.report.report import (
     ClockReport,
@@ -41,13 +43,15 @@ def report_inputs(run: Conversion) -> ReportInputs:
     """All that report.json is made of."""
     table = run.table
     return ReportInputs(
-        inputs=tuple(InputReport(str(r.path), r.size_bytes, r.container) for r in run.recordings),
+        inputs=tuple(
+            InputReport(str(r.path), r.size_bytes, r.container) for r in run.session.recordings
+        ),
         timescale="unknown" if run.info is None else run.info.timescale,
         rate_hz=rate_text(run.grid.rate),
         t_init_ns=run.batcher.t_init_ns,
         slices=run.job.slices,
         capture=_capture(run),
-        sensors=tuple(_sensor(run, number) for number in range(len(run.feeds))),
+        sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
         if table is None
         else table.statistics(run.batcher.empty, run.dropped_incomplete),
@@ -55,18 +59,16 @@ def report_inputs(run: Conversion) -> ReportInputs:
         timing=_timing(run),
         messages=tuple(
             Passed(topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS))
-            for topic, counts in sorted(run.passed.counts.items())
+            for topic, counts in sorted(run.passthrough.messages.counts.items())
         ),
         faults=()
-        if run.replay is None
-        else tuple(FaultReport(one.fault, one.packets) for one in run.replay.counts),
+        if run.session.replay is None
+        else tuple(FaultReport(one.fault, one.packets) for one in run.session.replay.counts),
         repeated=_repeated(run),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
 
-# A note, not a fault: what the times of clouds were taken for.
-CLOUDS = "clouds"
 # Share of a sensor's packets, or columns, that is worth a warning: a change of mode, a wrong
 # calibration; one damaged stamp that lies ahead makes those that follow it late.
 MANY = 0.01
@@ -74,12 +76,12 @@ MANY = 0.01
 
 def _cloud_notes(run: Conversion) -> Iterator[Note]:
     """What the times of clouds were taken for."""
-    if not any(recording.topics for recording in run.recordings):
+    if not any(recording.topics for recording in run.session.recordings):
         return
     # Captures have no topics, and so no clouds: they need not wait for what reads these.
     from mlbatch.clouds import CloudRecording
 
-    for recording in run.recordings:
+    for recording in run.session.recordings:
         if isinstance(recording, CloudRecording):
             for text in recording.verdicts:
                 yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
@@ -89,12 +91,12 @@ def late_notes(run: Conversion) -> list[Note]:
     """Warnings that only the end of a run knows: damaged recordings, lidars that came late."""
     notes = [
         Note("recording", "", f"{recording.path.name}: {text}")
-        for recording in run.recordings
+        for recording in run.session.recordings
         for text in recording.notes
     ]
     notes += _cloud_notes(run)
-    for sensor, feed in zip(run.setup.sensors, run.feeds, strict=True):
-        packets = feed.ledger.packets
+    for sensor in run.sensors:
+        packets = sensor.ledger.packets
         # What was captured twice is no loss.
         reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
         rejected = sum(reasons_of.values())
@@ -102,18 +104,18 @@ def late_notes(run: Conversion) -> list[Note]:
             reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
             text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
             notes.append(Note("rejected", sensor.name, text))
-        decoded, late = feed.ledger.columns.decoded, feed.ledger.columns.dropped.get("late", 0)
+        decoded, late = sensor.ledger.columns.decoded, sensor.ledger.columns.dropped.get("late", 0)
         if late > MANY * decoded:
             text = (
                 f"{sensor.name}: {late} of {decoded} columns came too late for their scans, after "
                 "a stamp that lay ahead (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
-    table, seen = run.setup.sampler.table, run.setup.sampler.samples
-    for kind in sorted(run.feeder.samples):
+    table, seen = run.session.setup.sampler.table, run.session.setup.sampler.samples
+    for kind in sorted(run.session.ingest.samples):
         what = _what(run, kind)
         # A rig says which sensors are wanted, so that others need no warning.
-        if run.setup.rig is None and kind not in seen and "lidar" in what:
+        if run.session.setup.rig is None and kind not in seen and "lidar" in what:
             notes.append(
                 Note(
                     "late_stream",
@@ -126,11 +128,26 @@ def late_notes(run: Conversion) -> list[Note]:
     return notes
 
 
+def message_notes(run: Conversion) -> list[Note]:
+    """Warnings about messages that could not be forwarded."""
+    notes = []
+    for topic, counts in run.passthrough.messages.counts.items():
+        if run.passthrough.messages.has_place and (other := counts.dropped.get("no_place")):
+            text = f"{topic}: {other} message(s) dropped: the output cannot hold its ROS version"
+            notes.append(Note("other_ros", "", text))
+        if other := counts.dropped.get("other_clock"):
+            text = (
+                f"{topic}: {other} message(s) dropped: their clock differs from that of the scans"
+            )
+            notes.append(Note("imu_clock", "", text))
+    return notes
+
+
 def why_nothing(run: Conversion) -> str:
     """Why no scan came out, with the stamps of each sensor and what to do."""
     where = ", ".join(str(path) for path in run.job.recordings)
     spans = []
-    for sensor, span in zip(run.setup.sensors, run.batcher.spans_ns, strict=True):
+    for sensor, span in zip(run.sensors, run.batcher.spans_ns, strict=True):
         if span is None:
             spans.append(f"{sensor.name} gave no valid column")
         else:
@@ -159,14 +176,14 @@ def why_nothing(run: Conversion) -> str:
 
 def _capture(run: Conversion) -> CaptureCounts:
     total = CaptureCounts()
-    for recording in run.recordings:
+    for recording in run.session.recordings:
         total.frames += recording.counts.frames
         total.datagrams += recording.counts.datagrams
         for reason, count in recording.counts.skipped.items():
             total.skip(reason, count)
     if run.batcher.past_end:
         # What several recordings read ahead of each other was never looked at.
-        ahead = total.datagrams - run.delivered
+        ahead = total.datagrams - run.session.delivered
         total.frames -= ahead
         total.datagrams -= ahead
     return total
@@ -174,43 +191,44 @@ def _capture(run: Conversion) -> CaptureCounts:
 
 def _repeated(run: Conversion) -> int:
     """Datagrams that faults repeated less those they removed."""
-    if run.replay is None or run.batcher.past_end:
+    if run.session.replay is None or run.batcher.past_end:
         # Up to an end only those are counted that the faults gave.
         return 0
-    return sum(one.repeated - one.removed for one in run.replay.ledgers)
+    return sum(one.repeated - one.removed for one in run.session.replay.ledgers)
 
 
-def _sensor(run: Conversion, number: int) -> SensorReport:
-    sensor, feed = run.setup.sensors[number], run.feeds[number]
-    lidar, sampler = feed.lidar, run.setup.sampler
-    streams = sorted({str(sampler.table.streams[stream]) for stream, _ in sensor.found.kinds})
+def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
+    table = run.session.setup.sampler.table
+    kinds = sensor.detected.found.kinds
+    streams = sorted({str(table.streams[stream]) for stream, _ in kinds})
     return SensorReport(
         name=sensor.name,
-        model=lidar.model,
-        lidar_id=number,
+        model=sensor.lidar.model,
+        lidar_id=sensor.index,
         stream="; ".join(streams),
-        mode=lidar.mode,
-        ledger=feed.ledger,
-        clock=_clock(run, number),
-        extrinsics_source=sensor.origin,
+        mode=sensor.lidar.mode,
+        ledger=sensor.ledger,
+        clock=_clock(run, sensor),
+        extrinsics_source=sensor.detected.origin,
         body_from_sensor=sensor.body_from_sensor,
-        calibration=Path(lidar.calibration).name,
+        calibration=Path(sensor.lidar.calibration).name,
     )
 
 
-def _clock(run: Conversion, number: int) -> ClockReport:
-    sensor, first = run.setup.sensors[number], run.batcher.firsts[number]
-    source = "host" if run.uses_host_clock(sensor) else "sensor"
-    mode = sensor.found.lidar.timestamp_mode
+def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
+    first = run.batcher.firsts[sensor.index]
+    source = sensor.clock.source
+    mode = sensor.lidar.timestamp_mode
     notes: tuple[str, ...] = (f"timestamp mode {mode}",) if mode else ()
     if first is None:
         return ClockReport(source, "unknown", notes=notes)
-    epoch, offset_ns = run.timescale_of(sensor, *first), first[0] - first[1]
-    finding = dict(run.clocks.findings()).get(sensor.name)
+    epoch = sensor.clock.timescale(*first)
+    offset_ns = first[0] - first[1]
+    finding = dict(run.session.clocks.findings()).get(sensor.name)
     if finding is None:
         return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
-    if run.clocks.maps and (found := run.clocks.maps[number]) is not None:
-        notes += (found.in_words(),)
+    if sensor.clock.map is not None:
+        notes += (sensor.clock.map.in_words(),)
     return ClockReport(
         source,
         epoch,
@@ -221,11 +239,11 @@ def _clock(run: Conversion, number: int) -> ClockReport:
 
 
 def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
-    setup, rows = run.setup, []
+    setup, rows = run.session.setup, []
     streams = setup.sampler.table.streams
     # Not by the streams' numbers, which follow the order in which files are read.
     by_name = sorted(
-        run.feeder.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
+        run.session.ingest.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
     )
     for kind, count in by_name:
         stream = streams[kind[0]]
@@ -242,27 +260,27 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
 
 def _what(run: Conversion, kind: Kind) -> str:
     """What unassigned packets look like: one of them, else those seen at first."""
-    sample = run.feeder.samples.get(kind)
+    sample = run.session.ingest.samples.get(kind)
     if sample is not None and (text := sensors.describe(kind[1], sample)):
         return text
-    if kind in run.setup.sampler.samples:
-        return discover.describe(run.setup.sampler, kind) or "unknown"
+    if kind in run.session.setup.sampler.samples:
+        return discover.describe(run.session.setup.sampler, kind) or "unknown"
     return "unknown"
 
 
 def _timing(run: Conversion) -> Timing:
-    wall_s, cpu_s = run.elapsed_s
+    wall_s, cpu_s = run.stages.elapsed_s
     stages = run.stages
-    points = sum(feed.ledger.points.written for feed in run.feeds)
+    points = sum(sensor.ledger.points.written for sensor in run.sensors)
     return Timing(
         wall_s=wall_s,
         cpu_s=cpu_s,
         read_s=stages.read_s,
         decode_s=stages.decode_s,
-        merge_s=stages.merge_s,
+        merge_s=stages.merge_s - stages.read_s,
         write_s=stages.write_s,
-        recorded_s=run.recorded_s,
+        recorded_s=run.session.recorded_s,
         points_per_s=points / wall_s if wall_s > 0 else 0.0,
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB,
-        engine=run.engine,
+        engine=run.session.engine,
     )

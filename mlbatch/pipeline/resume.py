@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import io
-import itertools
 import json
 import os
 import time
@@ -23,10 +22,9 @@ from typing import TypeAlias
 import numpy as np
 
 import mlbatch
-from mlbatch.errors import ClockJump, ExportError, NoScanError, UsageError
+from mlbatch.errors import ClockJump, ExportError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
-from mlbatch.report.ledger import POINT_FATES
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,
@@ -77,18 +75,15 @@ def abandon(target: Path) -> None:
 def jump_in(job: Job) -> ClockJump | None:
     """Where the clock of a sensor jumps; nothing is decoded."""
     run = Conversion(job)
-    run.finished = itertools.repeat([[0] * len(POINT_FATES)] * len(run.feeds))
     try:
-        for _ in run.scans():
+        for _ in run.windows():
             pass
     except ClockJump as jump:
         return jump
-    except NoScanError:
-        return None
     return None
 
 
-class Course:
+class ResumeLog:
     """How far the output of one run has come, in the run's memory and in its state file."""
 
     def __init__(
@@ -129,7 +124,7 @@ class Course:
                 f"{partial_path(self._target)}: wanted the job of the interrupted run to go on "
                 f"with, got {changed}; give the same, or leave out --resume to begin anew"
             )
-        run.finished = iter(self._state.rows)
+        run.earlier = iter(self._state.rows)
 
     def begin(self) -> None:
         """Open the state file, before the output: from now on no other run writes it."""
@@ -152,7 +147,7 @@ class Course:
             self._due_s = time.monotonic() + INTERVAL_S
 
     def _record(self, writer: ScanWriter) -> None:
-        safe = writer.safe()
+        safe = writer.checkpoint()
         # With several jobs later scans may be safe, of which nothing is known so far.
         scans = min(safe.scans, self._given)
         fresh = scans - self.recorded
@@ -168,12 +163,12 @@ class Course:
                 f"again, got {self._given}; leave out --resume to begin anew"
             )
 
-    def settle(self) -> None:
+    def sync(self) -> None:
         """The run ends early: force to the disk what it has done."""
         if self._file is None:
             return
         if partial_path(self._target).exists():
-            self._file.settle()
+            self._file.sync()
         else:
             # The output could not be opened.
             self._file.remove()
@@ -264,7 +259,7 @@ class StateFile:
         """Say that these scans are safe, too, within so many bytes of the output's file."""
         self._append({"kept_bytes": kept_bytes, "scans": rows})
 
-    def settle(self) -> None:
+    def sync(self) -> None:
         """Force to the disk what all lines tell of, as far as it will."""
         with contextlib.suppress(OSError, ExportError):
             os.sync()
@@ -390,13 +385,13 @@ def of_inputs(run: Conversion) -> dict[str, str]:
     found = {}
     for number, path in enumerate(run.job.recordings):
         found[f"recording {number + 1}"] = f"{path.name} ({_size_and_time(path)})"
-    for sensor in run.setup.sensors:
-        lidar = sensor.found.lidar
+    for sensor in run.sensors:
+        lidar = sensor.lidar
         what = (lidar.model, lidar.mode, lidar.beams, lidar.firing_ns, lidar.channel)
         found[f"calibration of {sensor.name}"] = _digest(what)
-        found[f"pose of {sensor.name}"] = _digest((sensor.body_from_sensor, sensor.offset_ns))
-    found["rig"] = _digest(run.setup.rig)
-    found["sensors"] = ", ".join(sensor.name for sensor in run.setup.sensors)
+        found[f"pose of {sensor.name}"] = _digest((sensor.body_from_sensor, sensor.clock.offset_ns))
+    found["rig"] = _digest(run.session.setup.rig)
+    found["sensors"] = ", ".join(sensor.name for sensor in run.sensors)
     return found
 
 
