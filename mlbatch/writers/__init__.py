@@ -9,7 +9,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
 from mlbatch.errors import UsageError
-from mlbatch.writers._atomic import (
+from mlbatch.writers import formats
+from mlbatch.writers.atomic import (
     REPORT_JSON,
     SCANS_CSV,
     check_free_space,
@@ -24,7 +25,7 @@ from mlbatch.writers._atomic import (
     side_path,
     write_text,
 )
-from mlbatch.writers._options import Safe, ScanWriter, WriterModule, WriterOptions
+from mlbatch.writers.base import Safe, ScanWriter, WriterModule, WriterOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +46,7 @@ __all__ = [
     "discard_old",
     "export_errors",
     "extras",
-    "formats",
+    "format_names",
     "is_report",
     "is_taken",
     "old_path",
@@ -68,20 +69,19 @@ LATER_SUFFIXES = {
 
 
 @lru_cache(maxsize=1)
-def formats() -> tuple[str, ...]:
+def format_names() -> tuple[str, ...]:
     """Names of all formats, sorted; no plug-in is imported."""
-    found = pkgutil.iter_modules(__path__)
-    return tuple(sorted(module.name for module in found if not module.name.startswith("_")))
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(formats.__path__)))
 
 
 def plugin(name: str) -> WriterModule:
     """The module that writes the format called `name`."""
-    if name not in formats():
+    if name not in format_names():
         later = " (not in this version)" if name in LATER_FORMATS else ""
         raise UsageError(
-            f"--format: wanted one of {', '.join(formats())}, got {name!r}{later}; choose one"
+            f"--format: wanted one of {', '.join(format_names())}, got {name!r}{later}; choose one"
         )
-    return cast(WriterModule, importlib.import_module(f"{__name__}.{name}"))
+    return cast(WriterModule, importlib.import_module(f"{formats.__name__}.{name}"))
 
 
 def choose_format(target: Path, asked: str | None) -> str:
@@ -109,7 +109,7 @@ def _of_suffix(suffix: str) -> str | None:
     if not suffix:
         return None
     # Importing them all takes long: the one that is likely comes first.
-    likely = sorted(formats(), key=lambda name: name != suffix.removeprefix("."))
+    likely = sorted(format_names(), key=lambda name: name != suffix.removeprefix("."))
     suffixes = ((plugin(name).SUFFIX, name) for name in likely)
     return next((name for own, name in suffixes if own == suffix), None)
 
@@ -170,7 +170,7 @@ def check_target(name: str, target: Path, options: WriterOptions, layout: str) -
 def _refuse_file_name(target: Path, suffix: str) -> None:
     """Refuse names of single files for outputs that are not single files."""
     name = suffix.removeprefix(".")
-    if name in formats() and plugin(name).SUFFIX is None:
+    if name in format_names() and plugin(name).SUFFIX is None:
         raise UsageError(
             f"-o {target}: wanted a folder, since {name} output is a file a scan, got a file "
             f"name; give -o {target.with_suffix('')} --format {name}"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from mlbatch.writers._gathered import Bytes, crc32
+from mlbatch.writers.output_file import Bytes, crc32
 
 # Bytes of so many parts in all, compressed as one.
 Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from mlbatch.errors import UsageError
 from mlbatch.writers._chunk import Compress
-from mlbatch.writers._gathered import Bytes
+from mlbatch.writers.output_file import Bytes
 
 NONE = "none"
 # What the library takes, and its own default.

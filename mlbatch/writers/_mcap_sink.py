@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mlbatch.types import Message, Summary
-from mlbatch.writers._atomic import SCANS_CSV
 from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._gathered import OutputFile
-from mlbatch.writers._mcap_file import Container
+from mlbatch.writers.atomic import SCANS_CSV
+from mlbatch.writers.mcap_container import Container
+from mlbatch.writers.output_file import OutputFile
 
 
 class McapSink:

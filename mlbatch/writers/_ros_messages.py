@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from mlbatch.types import F64Array, ImuSamples, RunInfo
-from mlbatch.writers._layouts import Layout
 from mlbatch.writers._points import Points
 from mlbatch.writers._ros2_types import FIELD_CODES
 from mlbatch.writers._wire import Wire
+from mlbatch.writers.point_layouts import Layout
 
 NewWire = Callable[[], Wire]
 

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable, Sequence
 
 from mlbatch.errors import ExportError
-from mlbatch.writers._gathered import Bytes, crc32
+from mlbatch.writers.output_file import Bytes, crc32
 
 # Signature, version needed, flags, method, time, date, CRC, size stored and real, length of the
 # name and of further fields.

@@ -19,7 +19,7 @@ import pytest
 
 from mlbatch.decode import Decoder
 from mlbatch.errors import ExportError, PacketError
-from mlbatch.writers import _gathered
+from mlbatch.writers import output_file
 from mlbatch.writers._chunk import Chunk
 from tests.builders.run import command
 from tests.resume_storm import CASES, TWO, Case, contents, write_recordings
@@ -131,7 +131,7 @@ def test_an_error_of_any_stage_ends_the_run(
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
     error, wanted = STAGES[stage]
     nth = Nth(number, error)
-    scan, seal, write_all = Decoder.scan, Chunk.seal, _gathered.write_all
+    scan, seal, write_all = Decoder.scan, Chunk.seal, output_file.write_all
 
     def failing_scan(*given: object) -> object:
         nth.call()
@@ -150,7 +150,7 @@ def test_an_error_of_any_stage_ends_the_run(
     elif stage == "seal":
         monkeypatch.setattr(Chunk, "seal", failing_seal)
     else:
-        monkeypatch.setattr(_gathered, "write_all", failing_write)
+        monkeypatch.setattr(output_file, "write_all", failing_write)
     told = command(*_words("mcap", "--jobs", str(jobs)))
     assert told.code == 1
     assert told.err.count("\n") == 1
@@ -182,7 +182,7 @@ def test_the_earliest_scan_that_fails_is_told(
 SLOW = """
 import sys, time
 from mlbatch import cli, resume
-from mlbatch.writers import npz
+from mlbatch.writers.formats import npz
 resume.INTERVAL_S = 0.0
 save = npz.NpzSaver.save
 def slow(*given):

@@ -17,7 +17,7 @@ from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.readers import _source
 from mlbatch.types import Scan
-from mlbatch.writers import npz
+from mlbatch.writers.formats import npz
 from tests.resume_storm import contents
 from tests.unit.sessions import FIXTURE, SMALL, Shell, Unit, write_session
 

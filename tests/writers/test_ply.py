@@ -12,8 +12,7 @@ import pytest
 from mlbatch.types import Scan
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import SUMMARY, dense_scan, point_scan
+from tests.builders.scans import SUMMARY, dense_scan, point_scan
 
 
 def written(folder: Path, scan: Scan) -> bytes:

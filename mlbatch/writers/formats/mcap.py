@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RunInfo
-from mlbatch.writers._atomic import prepare
-from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
-from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
+from mlbatch.writers.atomic import prepare
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"

@@ -19,8 +19,7 @@ from mcap.stream_reader import StreamReader
 from mlbatch.types import Scan, Summary
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import (
+from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
     SUMMARY,

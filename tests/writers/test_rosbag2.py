@@ -14,9 +14,25 @@ from mlbatch.errors import ExportError
 from mlbatch.types import Summary, Topic
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, extras, open_writer
-
-from .bags import ODD_TEXT, ROS1_NOTE, ROS2_NOTE, ROS2_ODD, note, odd, read_back, written
-from .scans import PERIOD_NS, START_NS, SUMMARY, dense_scan, imu_samples, organized_scan, run_info
+from tests.builders.scans import (
+    PERIOD_NS,
+    START_NS,
+    SUMMARY,
+    dense_scan,
+    imu_samples,
+    organized_scan,
+    run_info,
+)
+from tests.builders.written_bags import (
+    ODD_TEXT,
+    ROS1_NOTE,
+    ROS2_NOTE,
+    ROS2_ODD,
+    note,
+    odd,
+    read_back,
+    written,
+)
 
 SCANS = [dense_scan(0), dense_scan(1, 30)]
 MESSAGES = [

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary
-from mlbatch.writers._atomic import prepare
-from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._wire import Cdr
+from mlbatch.writers.atomic import prepare
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
 
 if TYPE_CHECKING:
-    from mlbatch.writers._mcap_file import Container
     from mlbatch.writers._mcap_sink import McapSink
+    from mlbatch.writers.mcap_container import Container
 
 FORMAT = "rosbag2"
 SUFFIX: str | None = None

@@ -35,8 +35,8 @@ from mlbatch.errors import ExportError
 from mlbatch.types import Message, Topic
 from mlbatch.writers._chunk import Chunk, Compress
 from mlbatch.writers._compression import compression_of
-from mlbatch.writers._gathered import OutputFile, crc32, taken
 from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
+from mlbatch.writers.output_file import OutputFile, crc32, taken
 
 CHUNK_BYTES = 4 * 2**20
 # Messages of this size end the chunk they are in; smaller ones are collected.

@@ -10,9 +10,9 @@ from typing import Protocol
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.workers import Steps
-from mlbatch.writers._atomic import SCANS_CSV, export_errors, prepare
-from mlbatch.writers._gathered import Trail, forget, taken
-from mlbatch.writers._options import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
+from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare
+from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, Safe, WriterOptions
+from mlbatch.writers.output_file import Trail, forget, taken
 
 
 class Saver(Protocol):

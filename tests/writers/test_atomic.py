@@ -15,11 +15,10 @@ import pytest
 from mlbatch.errors import ExportError
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers._atomic import check_free_space, prepare, write_text
+from mlbatch.writers.atomic import check_free_space, prepare, write_text
+from tests.builders.scans import SUMMARY, dense_scan, run_info
 
-from .scans import SUMMARY, dense_scan, run_info
-
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = [("mcap", "out.mcap"), ("npz", "out"), ("ply", "out")]
 OUTPUTS += [("rosbag1", "out.bag"), ("rosbag2", "out")]
 
@@ -30,7 +29,7 @@ from pathlib import Path
 from mlbatch.workers import in_one_go
 from mlbatch.errors import ExportError
 from mlbatch.writers import WriterOptions, open_writer
-from tests.unit.writers.scans import SUMMARY, dense_scan, run_info
+from tests.builders.scans import SUMMARY, dense_scan, run_info
 
 writer = open_writer(sys.argv[1], Path(sys.argv[2]), run_info(), WriterOptions())
 try:

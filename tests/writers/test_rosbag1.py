@@ -13,9 +13,7 @@ from mlbatch.errors import ExportError
 from mlbatch.types import Message
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-
-from .bags import ODD_TEXT, ROS1_NOTE, ROS1_ODD, ROS2_NOTE, note, odd, read_back, written
-from .scans import (
+from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
     SUMMARY,
@@ -23,6 +21,16 @@ from .scans import (
     organized_scan,
     point_scan,
     run_info,
+)
+from tests.builders.written_bags import (
+    ODD_TEXT,
+    ROS1_NOTE,
+    ROS1_ODD,
+    ROS2_NOTE,
+    note,
+    odd,
+    read_back,
+    written,
 )
 
 SCANS = [dense_scan(0), dense_scan(1, 30)]

@@ -10,9 +10,8 @@ import pytest
 from mlbatch.types import Scan
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers._folder import scan_name
-
-from .scans import SUMMARY, dense_scan, imu_samples, organized_scan, run_info
+from mlbatch.writers.scan_folder import scan_name
+from tests.builders.scans import SUMMARY, dense_scan, imu_samples, organized_scan, run_info
 
 TYPES = {
     "xyz": "<f4",

@@ -14,11 +14,7 @@ from typing import Protocol, TypeAlias
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.workers import Steps
-from mlbatch.writers._atomic import SCANS_CSV, Output, export_errors, side_path, write_text
 from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._gathered import taken
-from mlbatch.writers._layouts import CLOUD_LAYOUTS, Layout
-from mlbatch.writers._options import Safe, WriterOptions
 from mlbatch.writers._points import points_of
 from mlbatch.writers._ros_messages import (
     CloudMessage,
@@ -26,6 +22,10 @@ from mlbatch.writers._ros_messages import (
     imu_message,
     static_transforms,
 )
+from mlbatch.writers.atomic import SCANS_CSV, Output, export_errors, side_path, write_text
+from mlbatch.writers.base import Safe, WriterOptions
+from mlbatch.writers.output_file import taken
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout
 
 # IMU samples that may wait for the first scan: minutes at the rates of built-in IMUs.
 WAITING_SAMPLES = 65536

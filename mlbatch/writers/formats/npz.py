@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.types import EXTRAS, RunInfo, Scan
-from mlbatch.writers._folder import FolderWriter
-from mlbatch.writers._gathered import Bytes, write_all
-from mlbatch.writers._options import ScanWriter, WriterOptions
 from mlbatch.writers._zip import stored_zip
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.output_file import Bytes, write_all
+from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "npz"
 SUFFIX: str | None = None

@@ -12,8 +12,7 @@ import pytest
 from mlbatch.types import Message, Scan, Topic
 from mlbatch.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import PERIOD_NS, START_NS, SUMMARY, imu_samples
+from tests.builders.scans import PERIOD_NS, START_NS, SUMMARY, imu_samples
 
 QOS_WORDS = """\
 - history: keep_last

@@ -1,0 +1,1 @@
+"""One module per output format; each is found by its place here."""
