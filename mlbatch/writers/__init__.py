@@ -146,7 +146,7 @@ def extras(name: str, options: WriterOptions) -> frozenset[str]:
 def check_compression(name: str, options: WriterOptions) -> None:
     """Refuse a compression that is none, or that the format called `name` has no place for."""
     # Imported here, since it knows the types that need numpy.
-    from mlbatch.writers._compression import compression_of, refuse_compression
+    from mlbatch.writers.mcap_container import compression_of, refuse_compression
 
     if plugin(name).COMPRESSES:
         compression_of(options.compression)

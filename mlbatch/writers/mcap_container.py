@@ -6,9 +6,14 @@ while here a large message goes from the buffer it was assembled in straight to 
 
 from __future__ import annotations
 
+import importlib
+import re
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -31,12 +36,106 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
-from mlbatch.errors import ExportError
-from mlbatch.types import Message, Topic
-from mlbatch.writers._chunk import Chunk, Compress
-from mlbatch.writers._compression import compression_of
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.types import Message, Summary, Topic
 from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
-from mlbatch.writers.output_file import OutputFile, crc32, taken
+from mlbatch.writers.atomic import SCANS_CSV
+from mlbatch.writers.output_file import Bytes, OutputFile, crc32, taken
+
+# Bytes of so many parts in all, compressed as one.
+Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]
+
+
+@dataclass(slots=True)
+class Chunk:
+    """Records that are complete and in order.
+
+    records: parts, one after the other; the last may lie in a buffer that is used again once the
+    chunk is written; places: log time and offset of the messages of each channel; is_kept: a
+    continued file holds it. crc, stored: of the records, once it is sealed.
+    """
+
+    records: list[Bytes]
+    places: dict[int, list[tuple[int, int]]]
+    is_kept: bool = False
+    crc: int = 0
+    stored: list[Bytes] = field(default_factory=list)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the records."""
+        return sum(map(len, self.records))
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time."""
+        times_ns = [log_ns for places in self.places.values() for log_ns, _ in places]
+        return min(times_ns), max(times_ns)
+
+    def seal(self, compress: Compress | None) -> None:
+        """Compress the records and compute their checksum, which takes long."""
+        if self.is_kept:
+            return
+        for part in self.records:
+            self.crc = crc32(part, self.crc)
+        self.stored = self.records if compress is None else compress(self.records, self.size)
+
+
+NONE = "none"
+# What the library takes, and its own default.
+_ZSTD_LEVELS = range(1, 23)
+_ZSTD_DEFAULT = 3
+NewCompress: TypeAlias = Callable[[], Compress]
+
+
+def compression_of(text: str) -> tuple[str, NewCompress | None]:
+    """Name in the file of `--compression`, and what makes a compressor for each thread."""
+    if text == NONE:
+        return "", None
+    if text == "lz4":
+        return "lz4", _lz4
+    found = re.fullmatch(r"zstd(?::(\d{1,2}))?", text)
+    level = int(found[1] or _ZSTD_DEFAULT) if found else 0
+    if level not in _ZSTD_LEVELS:
+        raise UsageError(
+            f"--compression: wanted none, lz4, zstd or zstd:1 to zstd:{_ZSTD_LEVELS[-1]}, got "
+            f"{text!r}; choose one"
+        )
+    return "zstd", lambda: _zstd(level)
+
+
+def refuse_compression(text: str, name: str) -> None:
+    """Refuse it for a format without a place for it."""
+    if text != NONE:
+        compression_of(text)
+        raise UsageError(
+            f"--compression: wanted {NONE} for {name}, got {text!r}; leave it out, or write a "
+            ".mcap or rosbag2 output"
+        )
+
+
+def _zstd(level: int) -> Compress:
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=level)
+
+    def compress(parts: Sequence[Bytes], size: int) -> list[Bytes]:
+        frame = compressor.compressobj(size=size)
+        return [*map(frame.compress, parts), frame.flush()]
+
+    return compress
+
+
+def _lz4() -> Compress:
+    # The package tells no types, so that a plain import would not pass the type checker.
+    frames = importlib.import_module("lz4.frame")
+
+    def compress(parts: Sequence[Bytes], size: int) -> list[Bytes]:
+        frame = frames.LZ4FrameCompressor()
+        return [frame.begin(size), *map(frame.compress, parts), frame.flush()]
+
+    return compress
+
 
 CHUNK_BYTES = 4 * 2**20
 # Messages of this size end the chunk they are in; smaller ones are collected.
@@ -331,3 +430,55 @@ def encoded(record: McapRecord) -> bytes:
 def _ros2_name(kind: str) -> str:
     """`package/Type` as ROS 2 writes it; services and actions carry their kind already."""
     return kind.replace("/", "/msg/") if kind.count("/") == 1 else kind
+
+
+class McapSink:
+    """Messages, metadata records `mlbatch.grid` and `mlbatch.report`, attachment scans.csv."""
+
+    def __init__(self, path: Path, kept_bytes: int | None, compression: str) -> None:
+        self._file = OutputFile(path, kept_bytes)
+        self.container = Container(self._file, compression)
+
+    @property
+    def ended(self) -> int:
+        """Chunks that are complete."""
+        return self.container.ended
+
+    def safe(self) -> tuple[int, int]:
+        """Chunks that are written, and the bytes up to their end; nothing is buffered."""
+        return self.container.chunks, self._file.position_bytes
+
+    def take(self) -> list[Chunk]:
+        """The chunks that are complete since the last call."""
+        return self.container.take()
+
+    def seal(self, chunks: Sequence[Chunk]) -> None:
+        """Make chunks ready to be written; by any thread."""
+        self.container.seal(chunks)
+
+    def put(self, chunks: Sequence[Chunk]) -> None:
+        """Write sealed chunks, in the order in which they were taken."""
+        self.container.put(chunks)
+
+    def send(
+        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+    ) -> None:
+        """Append a message of type `kind`, package/Type; a topic is made at its first message."""
+        self.container.send(topic, kind, log_ns, message, latched)
+
+    def forward(self, message: Message) -> None:
+        """Append a message as it was recorded, whatever its encoding."""
+        self.container.forward(message)
+
+    def finish(self, summary: Summary, grid: dict[str, str]) -> None:
+        """Add metadata and scans.csv, complete and close the file."""
+        self.container.note("mlbatch.grid", grid)
+        self.container.note("mlbatch.report", {"json": summary.report_json})
+        log_ns = summary.t_init_ns or 0
+        self.container.attach(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)
+        self.container.finish()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._file.close()

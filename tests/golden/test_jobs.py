@@ -20,7 +20,7 @@ import pytest
 from mlbatch.decode import Decoder
 from mlbatch.errors import ExportError, PacketError
 from mlbatch.writers import output_file
-from mlbatch.writers._chunk import Chunk
+from mlbatch.writers.mcap_container import Chunk
 from tests.builders.run import command
 from tests.resume_storm import CASES, TWO, Case, contents, write_recordings
 from tests.unit.sessions import REPOSITORY

@@ -10,8 +10,7 @@ import pytest
 
 from mlbatch.buffers import Buffer
 from mlbatch.types import Scan
-from mlbatch.writers._points import points_of
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
 from tests.builders.scans import dense_scan, organized_scan
 
 SCANS: dict[str, Callable[[], Scan]] = {"dense": dense_scan, "organized": organized_scan}

@@ -33,6 +33,6 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
 def _sink(compression: str, path: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
-    from mlbatch.writers._mcap_sink import McapSink
+    from mlbatch.writers.mcap_container import McapSink
 
     return McapSink(path, kept_bytes, compression)

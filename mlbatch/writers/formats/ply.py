@@ -13,10 +13,9 @@ import numpy as np
 import mlbatch
 from mlbatch.errors import UsageError, one_line
 from mlbatch.types import RunInfo, Scan
-from mlbatch.writers._points import points_of
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.output_file import write_all
-from mlbatch.writers.point_layouts import PLY_LAYOUT
+from mlbatch.writers.point_layouts import PLY_LAYOUT, points_of
 from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "ply"

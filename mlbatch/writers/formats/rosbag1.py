@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary, Topic
-from mlbatch.writers._chunk import Chunk
-from mlbatch.writers._kept import open_output
 from mlbatch.writers._wire import Ros1
 from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.mcap_container import Chunk
 from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers.output_file import open_output
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary
-from mlbatch.writers._chunk import Chunk
 from mlbatch.writers._wire import Cdr
 from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.mcap_container import Chunk
 from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
 
 if TYPE_CHECKING:
-    from mlbatch.writers._mcap_sink import McapSink
-    from mlbatch.writers.mcap_container import Container
+    from mlbatch.writers.mcap_container import Container, McapSink
 
 FORMAT = "rosbag2"
 SUFFIX: str | None = None
@@ -45,7 +44,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
 def _sink(name: str, compression: str, folder: Path, kept_bytes: int | None) -> Sink:
     # The library comes in here, so that naming the format does not load it.
-    from mlbatch.writers._mcap_sink import McapSink
+    from mlbatch.writers.mcap_container import McapSink
 
     return _BagSink(folder, name, McapSink(folder / name, kept_bytes, compression))
 
