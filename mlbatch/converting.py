@@ -21,7 +21,7 @@ from mlbatch.report import ReportInputs, imbalances, report_text
 from mlbatch.resume import Course
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.workers import Steps, Workers, in_one_go
-from mlbatch.writers import ScanWriter
+from mlbatch.writers import ScanJob, ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Given what the report is made of, and the complete output before it gets its final name.
@@ -159,18 +159,18 @@ class _Output:
             bench = self._idle.pop()
             decoded = bench.decode(piece.task)
         decode_s = time.perf_counter() - began_s
-        watch, writing = _Watch(), self._writing(piece, decoded)
-        watch.do(writing)
+        watch, job = _Watch(), self._job(piece, decoded)
+        watch.do(job.pack)
         yield
         if decoded is not None:
             self._run.account(decoded.scan)
         for item in piece.before:
             _hand_over(item, self.writer)
-        watch.do(writing)
+        watch.do(job.append)
         yield
-        watch.do(writing)
+        watch.do(job.compress)
         yield
-        watch.do(writing)
+        watch.do(job.commit)
         if decoded is not None and self._course is not None and self.writer is not None:
             self._course.note(decoded.fates, self.writer)
         self._run.stages.write_s += watch.spent_s
@@ -178,25 +178,25 @@ class _Output:
             self._run.stages.decode_s += decode_s
             self._idle.append(bench)
 
-    def _writing(self, piece: _Piece, decoded: Decoded | None) -> Steps:
+    def _job(self, piece: _Piece, decoded: Decoded | None) -> ScanJob:
         if self.writer is None:
-            return iter(())
+            return ScanJob()
         if piece.task is None or decoded is None:
             return self.writer.flush()
-        write = self.writer.pass_over if piece.is_kept else self.writer.write
+        write = self.writer.skip if piece.is_kept else self.writer.write
         return write(decoded.scan, piece.task.only)
 
 
 @dataclass(slots=True)
 class _Watch:
-    """Measures the time that parts of a task take, without the waiting between them."""
+    """Measures the time that stages of a job take, without the waiting between them."""
 
     spent_s: float = 0.0
 
-    def do(self, steps: Steps) -> None:
-        """Do the next part."""
+    def do(self, stage: Callable[[], None]) -> None:
+        """Do a stage."""
         began_s = time.perf_counter()
-        next(steps, None)
+        stage()
         self.spent_s += time.perf_counter() - began_s
 
 

@@ -137,7 +137,7 @@ class Course:
             self._due_s = time.monotonic() + INTERVAL_S
 
     def _record(self, writer: ScanWriter) -> None:
-        safe = writer.safe()
+        safe = writer.checkpoint()
         # With several jobs later scans may be safe, of which nothing is known so far.
         scans = min(safe.scans, self._given)
         fresh = scans - self.recorded

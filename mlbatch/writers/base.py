@@ -1,4 +1,4 @@
-"""What every writer plug-in is given, and the face it shows (CONTRACT.md, sections 2 and 3)."""
+"""The interface of writers: what a format module offers, and what it is given."""
 
 from __future__ import annotations
 
@@ -10,96 +10,117 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
-    from mlbatch.workers import Steps
 
 DEFAULT_POINT_LAYOUT = "standard"
+NO_COMPRESSION = "none"
 
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """Options of an output.
+    """Options of an output."""
 
-    point_layout: preset of a PointCloud2; overwrite: replace an existing output at the end;
-    split: one output stream per sensor instead of merged scans; kept_bytes: what stays of the file
-    in an existing `.partial` that is continued (its scans, where they are files), None: start anew;
-    compression: none, lz4 or zstd[:level].
-    """
-
-    point_layout: str = DEFAULT_POINT_LAYOUT
-    overwrite: bool = False
-    split: bool = False
+    point_layout: str = DEFAULT_POINT_LAYOUT  # preset of PointCloud2 fields
+    overwrite: bool = False  # replace an existing output at the end
+    split: bool = False  # one output stream per sensor instead of merged scans
+    # Bytes to keep of the file in an existing `.partial` (0 where each scan is a file); None: start
+    # a new `.partial`.
     kept_bytes: int | None = None
-    compression: str = "none"
+    compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
 
 
 @dataclass(frozen=True, slots=True)
-class Safe:
-    """What a killed process would leave: the first `scans`, in the first `kept_bytes` of a file."""
+class Checkpoint:
+    """Written data that survive a kill of the process: the first `scans`, and their bytes."""
 
     scans: int
-    kept_bytes: int = 0
+    kept_bytes: int = 0  # length of the part of the output file with these scans
+
+
+class ScanJob:
+    """The work of a writer for one scan, in four stages; a stage without work does nothing.
+
+    The caller runs all four in this order, each once. `pack` and `compress` run in any thread, at
+    the same time as stages of other jobs. `append` and `commit` run in the order of the scans,
+    each after the same stage of all earlier jobs.
+    """
+
+    def pack(self) -> None:
+        """Convert the points to the bytes of a message or file. Any thread."""
+
+    def append(self) -> None:
+        """Assign the position in the output: sequence number, chunk. In order."""
+
+    def compress(self) -> None:
+        """Compress what is complete, compute its checksums. Any thread."""
+
+    def commit(self) -> None:
+        """Write what is complete. In order."""
 
 
 class ScanWriter(Protocol):
-    """Writes one run; nothing stands under the final name before `finish`.
+    """Writer of one run; there is no file at the final path before `finish`.
 
-    The steps of scans may be done by several threads; all else is called in turn (see `workers`).
+    Stages of jobs may run in several threads, see `ScanJob`. IMU samples and messages are written
+    right before an `append`, `checkpoint` is called right after a `commit`, both in that order;
+    other jobs may be in other stages then. `finish` is called when all jobs are done.
     """
 
-    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
-        """Write one scan; its arrays must be valid until the last of the steps.
+    def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that writes a scan; its arrays must stay valid until the last stage.
 
         sensor: index of the only sensor in the scan with `--split`, None for a merged scan.
         """
         ...
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
-        """Go past a scan that the continued `.partial` holds; its point arrays mean nothing."""
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job for a scan that the kept part of a `.partial` contains.
+
+        Only the number of its points is used, not their values.
+        """
         ...
 
-    def flush(self) -> Steps:
-        """Write what messages and IMU samples have completed, where no scan follows them."""
+    def flush(self) -> ScanJob:
+        """Return the job that writes complete chunks of messages where no scan follows them."""
         ...
 
-    def safe(self) -> Safe:
-        """Hand what was written to the system, and say what of it needs no second writing."""
+    def checkpoint(self) -> Checkpoint:
+        """Return what a resumed run need not write again; hands it to the system first."""
         ...
 
     def write_imu(self, samples: ImuSamples) -> None:
-        """Write IMU samples; formats without a place for them ignore the call."""
+        """Write IMU samples; formats without IMU ignore the call."""
         ...
 
     def write_message(self, message: Message) -> None:
-        """Write a message of the recording as it is; formats without a place ignore the call."""
+        """Forward a recorded message unchanged; formats without messages ignore the call."""
         ...
 
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
-        """Complete the output and move it to its final name.
+        """Complete the output and move it to its final path.
 
-        last: called with the path of the complete output, just before that.
+        last: called with the path of the complete output, just before the move.
         """
         ...
 
     def abandon(self) -> None:
-        """Close files after an error; what was written stays under `.partial`."""
+        """Close all files after an error; the `.partial` stays."""
         ...
 
 
 class WriterModule(Protocol):
-    """A plug-in: a module of this package whose name has no leading underscore.
+    """A format: a module in `writers/formats/`, called by the name of the format."""
 
-    FORMAT equals the module's name; SUFFIX is that of an output file, None for a folder; COMPRESSES
-    tells whether there is a place for `--compression`.
-    """
-
-    FORMAT: str
-    SUFFIX: str | None
-    COMPRESSES: bool
+    FORMAT: str  # name of the module
+    SUFFIX: str | None  # of the output file; None: the output is a folder
+    COMPRESSES: bool  # whether `--compression` applies
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
-        """Those of `types.EXTRAS` that the output holds, `types.IMU`, `types.MESSAGE_ENCODINGS`."""
+        """Return the optional contents that the output includes.
+
+        A subset of `types.EXTRAS`, `types.IMU` and `types.MESSAGE_ENCODINGS`.
+        """
         ...
 
     def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
-        """Start an output; nothing stands at `target` before the writer's `finish`."""
+        """Start the output `target`; nothing is created at that path before `finish`."""
         ...

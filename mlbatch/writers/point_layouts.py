@@ -1,7 +1,8 @@
-"""Point records: which field lies where and how it is filled (facts/outputs.md, sections 2, 3, 5).
+"""Layouts of point records as tables, and how records are filled (docs/sources/outputs.md).
 
-A layout is a table; `Layout.pack` fills records of any layout block by block, so that the strided
-writes of a block stay in the processor's cache.
+`Layout.pack` fills records of any layout block by block, so that the strided writes of a block stay
+in the processor's cache. Decoders put the values of a point side by side in memory; where a record
+has them side by side as well, they are copied as one wide word, in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ from mlbatch.types import (
 from mlbatch.units import MM_PER_M, NS_PER_S
 
 Values: TypeAlias = npt.NDArray[np.generic]
-# Four float32 as one item, whatever they mean; time_ns, ring, return type and sensor as one; the
-# last two of them as one.
-REALS, LABEL, PAIR = "<c16", "<u8", "<u2"
+# Types of wide words; what their parts are in memory.
+REALS = "<c16"  # x, y, z, intensity: four float32
+LABEL = "<u8"  # time_ns, ring, return_type, lidar_id
+PAIR = "<u2"  # return_type, lidar_id
+# Offsets of the parts, bytes.
 _PARTS = {REALS: (0, 4, 8, 12), LABEL: (0, 4, 6, 7)}
 
 
@@ -38,8 +41,8 @@ _PARTS = {REALS: (0, 4, 8, 12), LABEL: (0, 4, 6, 7)}
 class Points:
     """The point arrays of a scan in the order of the file: (p,), or (slots, n) when organized.
 
-    reals: x, y, z and intensity, labels: time_ns, ring, return_type and lidar_id of every point in
-    one word, None where they do not lie side by side.
+    reals, labels: the same values as wide words `REALS` and `LABEL`; None if the arrays are not
+    side by side in memory.
     """
 
     sensors: tuple[SensorInfo, ...]
@@ -56,7 +59,7 @@ class Points:
     labels: Values | None = None
 
     def take(self, rows: slice) -> Points:
-        """The points in `rows` of the first axis."""
+        """Return the points in `rows` of the first axis."""
         return Points(
             self.sensors,
             self.start_ns,
@@ -74,16 +77,17 @@ class Points:
 
 
 def points_of(scan: Scan) -> Points:
-    """The points of a scan; organized ones are turned so that a column is a column of the image."""
-    turned = scan.info.layout == "organized"
-    reflectivity, range_m = scan.reflectivity, scan.range_m
+    """Return the points of a scan; organized ones are transposed to rows of slots."""
+    organized = scan.info.layout == "organized"
+    reflectivity = scan.reflectivity
+    range_m = scan.range_m
     x, y, z = (scan.xyz[..., axis] for axis in range(3))
-    reals = _as_one(REALS, x, y, z, scan.intensity)
-    labels = _as_one(LABEL, scan.time_ns, scan.ring, scan.return_type, scan.lidar_id)
+    reals = _as_words(REALS, x, y, z, scan.intensity)
+    labels = _as_words(LABEL, scan.time_ns, scan.ring, scan.return_type, scan.lidar_id)
     return Points(
         scan.info.sensors,
         scan.start_ns,
-        scan.xyz.transpose(1, 0, 2) if turned else scan.xyz,
+        scan.xyz.transpose(1, 0, 2) if organized else scan.xyz,
         scan.intensity.T,
         None if reflectivity is None else reflectivity.T,
         None if range_m is None else range_m.T,
@@ -96,53 +100,56 @@ def points_of(scan: Scan) -> Points:
     )
 
 
-def _as_one(word: str, *parts: Values) -> Values | None:
-    """Arrays whose items lie side by side in one array, as items of this type; None if they don't.
+def _as_words(word: str, *parts: Values) -> Values | None:
+    """Return arrays with items side by side as one array of wide words; None if they are not.
 
-    That array is what they are all views of: its rows are words, or end with the parts of one.
+    The parts are views of one array, with a row of words for each row of items.
     """
-    base, first, size = parts[0].base, parts[0], np.dtype(word).itemsize
+    first = parts[0]
+    base = first.base
     if not isinstance(base, np.ndarray) or not base.flags.c_contiguous:
         return None
-    steps = _steps(first.shape, base, size)
-    if steps != first.strides or any(part.base is not base for part in parts):
+    strides = _word_strides(first.shape, base, np.dtype(word).itemsize)
+    if strides is None:
+        return None
+    if any(part.base is not base or part.strides != strides for part in parts):
         return None
     begin = base.__array_interface__["data"][0]
-    at = [part.__array_interface__["data"][0] - begin for part in parts]
-    if at != list(_PARTS[word]) or any(part.strides != steps for part in parts):
+    offsets = [part.__array_interface__["data"][0] - begin for part in parts]
+    if offsets != list(_PARTS[word]):
         return None
     words: Values = base.reshape(-1).view(word).reshape(base.shape[: first.ndim])
     return words[: len(first)]
 
 
-def _steps(shape: tuple[int, ...], base: Values, size: int) -> tuple[int, ...] | None:
-    """Steps of views of this shape if the base's rows are words of this size, else None."""
-    deep = len(shape)
-    if base.ndim < deep or base.shape[1:deep] != shape[1:]:
+def _word_strides(shape: tuple[int, ...], base: Values, size: int) -> tuple[int, ...] | None:
+    """Return the strides of views of this shape if rows of `base` are words of `size` bytes."""
+    depth = len(shape)
+    if base.ndim < depth or base.shape[1:depth] != shape[1:]:
         return None
-    steps = base.strides[:deep]
-    return steps if steps and steps[-1] == size else None
+    strides = base.strides[:depth]
+    return strides if strides and strides[-1] == size else None
 
 
 Records: TypeAlias = npt.NDArray[np.void]
 _Fill: TypeAlias = Callable[[Points], Values]
 
 BLOCK_POINTS = 8192
-# The lowest 29 of the 52 mantissa bits of a float64 are those a float32 has no room for.
+# A float64 has 52 mantissa bits, a float32 the upper 23 of them: mask of the bits to keep.
 _FLOAT32_BITS = np.uint64(2**64 - 2**29)
 _MAX_U8 = 255
 
 
 def seconds(time_ns: U32Array) -> F64Array:
-    """Nanoseconds as the nearest float64 seconds."""
+    """Convert nanoseconds to the nearest float64 seconds."""
     return np.divide(time_ns, NS_PER_S, dtype=np.float64)
 
 
 def seconds_toward_zero(time_ns: U32Array) -> F64Array:
-    """Seconds that a float32 holds exactly and that never exceed the true time.
+    """Convert nanoseconds to seconds that are exact in float32 and never exceed the true time.
 
-    Rounding up could put a point past its scan's end. The division cannot cross a float32 value:
-    ns/1e9 lies on it or further away than a float64 rounds.
+    Rounding up could put a point after the end of its scan. The division cannot cross a float32
+    value: ns/1e9 is equal to it, or further away than a float64 rounds.
     """
     value = seconds(time_ns)
     bits = value.view(np.uint64)
@@ -152,75 +159,68 @@ def seconds_toward_zero(time_ns: U32Array) -> F64Array:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field of a record; `dtype` little endian, `values` gives its values in any type."""
+    """One field of a record."""
 
     name: str
-    dtype: str
-    offset: int
-    values: Callable[[Points], Values]
+    dtype: str  # little endian
+    offset: int  # bytes
+    values: Callable[[Points], Values]  # returns any type that converts to `dtype`
 
 
 @dataclass(frozen=True, slots=True)
-class Wide:
-    """Several fields that move as one; `values` gives None where a scan does not allow it.
-
-    parts: name, offset and type of each; spoilt: that which is filled on its own after the move.
-    """
+class WideWord:
+    """Several fields that are copied as one."""
 
     dtype: str
-    parts: tuple[tuple[str, int, str], ...]
-    values: Callable[[Points], Values | None]
-    spoilt: str = ""
+    parts: tuple[tuple[str, int, str], ...]  # name, offset in the word, type
+    values: Callable[[Points], Values | None]  # None if the arrays are not side by side
+    overwritten: str = ""  # part that is filled on its own after the copy
 
-    def at(self, fields: Sequence[Field]) -> int | None:
-        """Offset in records of these fields, None where the parts do not lie so."""
-        places = {field.name: field for field in fields}
-        first = places.get(self.parts[0][0])
+    def offset_in(self, fields: Sequence[Field]) -> int | None:
+        """Return the offset of the word in a record, None if its parts are not side by side."""
+        by_name = {field.name: field for field in fields}
+        first = by_name.get(self.parts[0][0])
+        if first is None:
+            return None
         for name, offset, dtype in self.parts:
-            field = places.get(name)
-            if first is None or field is None:
+            field = by_name.get(name)
+            if field is None or (field.offset - first.offset, field.dtype) != (offset, dtype):
                 return None
-            if (field.offset - first.offset, field.dtype) != (offset, dtype):
-                return None
-        return None if first is None else first.offset
+        return first.offset
 
 
 def _pair(points: Points) -> Values | None:
-    """Return type and sensor: the last two of the eight bytes of a label."""
+    """Return the last two of the eight bytes of a label: return type and sensor."""
     if points.labels is None:
         return None
     last: Values = np.right_shift(points.labels, np.uint64(48)).astype(PAIR)
     return last
 
 
-_PAIR_PARTS = (("return_type", 0, "u1"), ("lidar_id", 1, "u1"))
-_WIDE = (
-    Wide(
+_WIDE_WORDS = (
+    WideWord(
         REALS,
         (("x", 0, "<f4"), ("y", 4, "<f4"), ("z", 8, "<f4"), ("intensity", 12, "<f4")),
         lambda points: points.reals,
     ),
-    Wide(
+    WideWord(
         LABEL,
         (("time", 0, "<f4"), ("ring", 4, "<u2"), ("return_type", 6, "u1"), ("lidar_id", 7, "u1")),
         lambda points: points.labels,
-        spoilt="time",
+        overwritten="time",
     ),
-    Wide(PAIR, _PAIR_PARTS, _pair),
+    WideWord(PAIR, (("return_type", 0, "u1"), ("lidar_id", 1, "u1")), _pair),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Fields of a point record of `step` bytes; bytes between fields are zero.
-
-    extras: those of `types.EXTRAS` that the fields are made of.
-    """
+    """Fields of a point record; bytes between fields are zero."""
 
     name: str
-    step: int
+    step: int  # bytes of a record
     fields: tuple[Field, ...]
-    extras: frozenset[str] = frozenset()
+    extras: frozenset[str] = frozenset()  # members of `types.EXTRAS` that the fields need
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -237,28 +237,29 @@ class Layout:
     def pack(self, points: Points, out: Records) -> None:
         """Fill `out`, records of this layout in the shape of the point arrays."""
         rows, *rest = points.time_ns.shape
-        step = max(1, BLOCK_POINTS // max(1, math.prod(rest)))
-        moves = [(out.view(place)["value"], values) for place, values in self._moves(points)]
-        for start in range(0, rows, step):
-            block = points.take(slice(start, start + step))
-            for target, values in moves:
-                target[start : start + step] = values(block)
+        block_rows = max(1, BLOCK_POINTS // max(1, math.prod(rest)))
+        copies = [(out.view(place)["value"], values) for place, values in self._copies(points)]
+        for start in range(0, rows, block_rows):
+            rows_of_block = slice(start, start + block_rows)
+            block = points.take(rows_of_block)
+            for target, values in copies:
+                target[rows_of_block] = values(block)
 
-    def _moves(self, points: Points) -> list[tuple[np.dtype[np.void], _Fill]]:
-        """What fills records one after the other: the place of a field in a record, its values."""
-        left = list(self.fields)
-        moves = []
-        for wide in _WIDE:
-            offset = wide.at(left)
+    def _copies(self, points: Points) -> list[tuple[np.dtype[np.void], _Fill]]:
+        """Return the copies that fill records, in order: the place in a record, and its values."""
+        fields = list(self.fields)
+        copies = []
+        for wide in _WIDE_WORDS:
+            offset = wide.offset_in(fields)
             if offset is None or wide.values(points.take(slice(0))) is None:
                 continue
-            names = {name for name, _, _ in wide.parts} - {wide.spoilt}
-            left = [field for field in left if field.name not in names]
-            moves.append((self._place(wide.dtype, offset), cast(_Fill, wide.values)))
-        return moves + [(self._place(f.dtype, f.offset), f.values) for f in left]
+            names = {name for name, _, _ in wide.parts} - {wide.overwritten}
+            fields = [field for field in fields if field.name not in names]
+            copies.append((self._place(wide.dtype, offset), cast(_Fill, wide.values)))
+        return copies + [(self._place(f.dtype, f.offset), f.values) for f in fields]
 
     def _place(self, dtype: str, offset: int) -> np.dtype[np.void]:
-        """A record in which nothing but one place is known."""
+        """Return a record type whose only field, `value`, is at an offset."""
         return np.dtype(
             {
                 "names": ["value"],
@@ -270,34 +271,34 @@ class Layout:
 
 
 def _in_sensor(points: Points) -> list[F64Array]:
-    """x, y and z, m, of every point in the frame of its sensor; poses are rigid."""
+    """Return x, y and z, m, of every point in the frame of its sensor; poses are rigid."""
     poses = np.stack([sensor.body_from_sensor for sensor in points.sensors])
-    which = points.lidar_id
-    offset = [points.xyz[..., axis] - poses[:, axis, 3][which] for axis in range(3)]
+    sensor = points.lidar_id
+    offset = [points.xyz[..., axis] - poses[:, axis, 3][sensor] for axis in range(3)]
     # The inverse of a rotation is its transpose: columns of the matrix are the sensor's axes.
     return [
-        poses[:, 0, axis][which] * offset[0]
-        + poses[:, 1, axis][which] * offset[1]
-        + poses[:, 2, axis][which] * offset[2]
+        poses[:, 0, axis][sensor] * offset[0]
+        + poses[:, 1, axis][sensor] * offset[1]
+        + poses[:, 2, axis][sensor] * offset[2]
         for axis in range(3)
     ]
 
 
 def _azimuth(points: Points) -> Values:
-    """rad, from x to y."""
+    """Return the azimuth, rad, from x to y."""
     x, y, _ = _in_sensor(points)
     return np.arctan2(y, x)
 
 
 def _elevation(points: Points) -> Values:
-    """rad, upwards from the xy plane."""
+    """Return the elevation, rad, upwards from the xy plane."""
     x, y, z = _in_sensor(points)
     angle: F64Array = np.arctan2(z, np.sqrt(x * x + y * y))
     return angle
 
 
 def _distance(points: Points) -> Values:
-    """m, from the sensor's origin."""
+    """Return the distance from the sensor's origin, m."""
     x, y, z = _in_sensor(points)
     return np.sqrt(x * x + y * y + z * z)
 
@@ -305,7 +306,7 @@ def _distance(points: Points) -> Values:
 def _channel(points: Points) -> Values:
     bases = np.array([sensor.ring_base for sensor in points.sensors], dtype=np.uint16)
     base = bases[points.lidar_id]
-    # Empty slots of an organized scan have ring 0 whatever the sensor.
+    # Empty slots of an organized scan have ring 0 for every sensor.
     return np.where(points.ring < base, np.uint16(0), points.ring - base)
 
 
@@ -315,7 +316,9 @@ def _reflectivity(points: Points) -> Values:
 
 def _range_mm(points: Points) -> Values:
     if points.range_m is None:
-        raise ExportError("point layout with ranges: wanted them decoded, got none; please report")
+        raise ExportError(
+            "point layout: expected ranges in the scan, found none; please report this"
+        )
     range_mm: F64Array = np.multiply(np.nan_to_num(points.range_m), MM_PER_M, dtype=np.float64)
     np.rint(range_mm, out=range_mm)
     return range_mm
@@ -326,7 +329,7 @@ def _intensity_u8(points: Points) -> Values:
 
 
 def _seconds_absolute(points: Points) -> Values:
-    # A float64 of seconds since 1970 only resolves 0.24 us: it is rounded once, in the last sum.
+    # A float64 of seconds since 1970 resolves 0.24 us only: round once, in the last sum.
     whole_s, rest_ns = divmod(points.start_ns, NS_PER_S)
     stamp_ns: I64Array = np.add(points.time_ns, rest_ns, dtype=np.int64)
     stamp_s: F64Array = np.divide(stamp_ns, NS_PER_S, dtype=np.float64)
@@ -372,7 +375,7 @@ _OUSTER = (
     _time_ns("t", 20),
     Field("reflectivity", "<u2", 24, _reflectivity),
     _ring(26),
-    # Near infrared light is not part of a scan; the field must be there for PCL, at 0.
+    # Near infrared is not part of a scan; PCL needs the field, it is 0.
     Field("ambient", "<u2", 28, lambda points: np.zeros_like(points.ring)),
     Field("range", "<u4", 32, _range_mm),
 )
@@ -396,7 +399,7 @@ _PLY = (
     _lidar_id(29),
 )
 
-# Presets of `--point-layout`: facts/outputs.md, section 3.
+# Presets of `--point-layout`.
 CLOUD_LAYOUTS = {
     layout.name: layout
     for layout in (
@@ -409,5 +412,4 @@ CLOUD_LAYOUTS = {
         Layout("minimal", 12, _XYZ),
     )
 }
-# Section 5 of the same page.
 PLY_LAYOUT = Layout("ply", 30, _PLY)

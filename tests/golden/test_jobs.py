@@ -117,7 +117,7 @@ class Nth:
 # What fails in a stage, and what is said of it.
 STAGES: dict[str, tuple[BaseException, str]] = {
     "decode": (PacketError("spoilt"), "spoilt"),
-    "seal": (MemoryError(), "out of memory"),
+    "compress": (MemoryError(), "out of memory"),
     "write": (OSError(28, "No space left on device"), "No space left on device"),
 }
 
@@ -131,15 +131,15 @@ def test_an_error_of_any_stage_ends_the_run(
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
     error, wanted = STAGES[stage]
     nth = Nth(number, error)
-    scan, seal, write_all = Decoder.scan, Chunk.seal, output_file.write_all
+    scan, compress, write_all = Decoder.scan, Chunk.compress, output_file.write_all
 
     def failing_scan(*given: object) -> object:
         nth.call()
         return scan(*given)  # type: ignore[arg-type]
 
-    def failing_seal(*given: object) -> None:
+    def failing_compress(*given: object) -> None:
         nth.call()
-        seal(*given)  # type: ignore[arg-type]
+        compress(*given)  # type: ignore[arg-type]
 
     def failing_write(*given: object) -> None:
         nth.call()
@@ -147,8 +147,8 @@ def test_an_error_of_any_stage_ends_the_run(
 
     if stage == "decode":
         monkeypatch.setattr(Decoder, "scan", failing_scan)
-    elif stage == "seal":
-        monkeypatch.setattr(Chunk, "seal", failing_seal)
+    elif stage == "compress":
+        monkeypatch.setattr(Chunk, "compress", failing_compress)
     else:
         monkeypatch.setattr(output_file, "write_all", failing_write)
     told = command(*_words("mcap", "--jobs", str(jobs)))

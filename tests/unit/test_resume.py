@@ -188,8 +188,8 @@ def test_a_lost_scan_is_refused(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        "mlbatch: error: out.partial/000001.npz: wanted a scan of the interrupted run to go on "
-        "after it, got none; leave out --resume to begin anew"
+        "mlbatch: error: out.partial/000001.npz: expected a scan of the interrupted run, "
+        "found no file; leave out --resume to start over"
     )
 
 
@@ -205,8 +205,8 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"convert {capture} -o out.mcap --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        f"mlbatch: error: out.mcap.partial: wanted {kept} bytes of the interrupted run to go on "
-        f"after them, got {kept - 1}; leave out --resume to begin anew"
+        f"mlbatch: error: out.mcap.partial: expected {kept} bytes of the interrupted run, "
+        f"found {kept - 1}; leave out --resume to start over"
     )
 
 
@@ -257,7 +257,7 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
 
     monkeypatch.setattr(run, "check_target", refuse)
     outcome = shell(f"convert {CAPTURE} -o out")
-    assert (outcome.code, "got an existing one" in outcome.err) == (1, True)
+    assert (outcome.code, "found an existing one" in outcome.err) == (1, True)
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
@@ -313,7 +313,7 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: out.partial/000004.npz: wanted to write it, got 'No space left on "
+        "mlbatch: error: out.partial/000004.npz: expected to write it, found 'No space left on "
         "device'; free space on this disk or choose another output; then --resume goes on after "
         "the 4 scans that are safe\n"
     )
@@ -360,7 +360,7 @@ def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
     _interrupt(shell, f"{CAPTURE} -o out --overwrite")
     refused = shell(f"convert {CAPTURE} -o out --resume")
     assert refused.code == 1
-    assert "wanted a new output, got an existing one" in refused.err
+    assert "expected a new output, found an existing one" in refused.err
     assert shell(f"convert {CAPTURE} -o out --resume --overwrite").code == 0
     assert contents(Path()) == whole
 

@@ -1,1 +1,1 @@
-"""One module per output format; each is found by its place here."""
+"""Output formats, one module each; `mlbatch.writers` finds them by their place here."""

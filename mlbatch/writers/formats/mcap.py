@@ -1,18 +1,17 @@
-"""One MCAP file with PointCloud2, Imu and /tf_static of ROS 2 (facts/outputs.md, section 4).
+"""One MCAP file with PointCloud2, Imu and /tf_static of ROS 2 (docs/sources/outputs.md).
 
-Recorded messages are passed on as they are, also those of ROS 1: MCAP can hold both.
+Recorded messages are forwarded unchanged, also those of ROS 1: MCAP can contain both.
 """
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RunInfo
 from mlbatch.writers._wire import Cdr
 from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, layout_of
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
@@ -20,19 +19,19 @@ COMPRESSES = True
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """What the fields of the point layout are made of, IMU samples and messages."""
+    """Return the inputs of the point layout, IMU samples and messages."""
     return extras_of(options, "cdr", "ros1")
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
     layout_of(options)
+
+    def open_file(path: Path, kept_bytes: int | None) -> MessageFile:
+        # Imported here, so that naming the format does not load the library.
+        from mlbatch.writers.mcap_container import McapContainer
+
+        return McapContainer(path, kept_bytes, options.compression)
+
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
-    return BagWriter(output, info, options, Cdr, partial(_sink, options.compression))
-
-
-def _sink(compression: str, path: Path, kept_bytes: int | None) -> Sink:
-    # The library comes in here, so that naming the format does not load it.
-    from mlbatch.writers.mcap_container import McapSink
-
-    return McapSink(path, kept_bytes, compression)
+    return MessageWriter(output, info, options, Cdr, open_file)

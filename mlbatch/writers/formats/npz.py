@@ -1,8 +1,8 @@
-"""A folder of npz files, one array a key (CONTRACT.md, section 3).
+"""A folder of npz files, one array a key (docs/formats.md).
 
-The container is a zip without compression (PKWARE APPNOTE 6.3) around npy files of version 1.0
-(NEP 1). It is made here and not by `numpy.savez`, which stamps files with the time of day and
-copies arrays on the way.
+An npz is an uncompressed zip (PKWARE APPNOTE 6.3, sections 4.3 and 4.4) of npy files, version 1.0
+(NEP 1). `numpy.savez` would stamp files with the time of day and copy arrays; `zipfile` would write
+each part on its own and go back for checksums. The bytes are those of `zipfile`; tests compare.
 """
 
 from __future__ import annotations
@@ -22,48 +22,6 @@ from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.output_file import Bytes, crc32, write_all
 from mlbatch.writers.scan_folder import FolderWriter
 
-# Signature, version needed, flags, method, time, date, CRC, size stored and real, length of the
-# name and of further fields.
-_LOCAL = struct.Struct("<4s5HIIIHH")
-# Signature, version and system that made it, and the same as above; length of a comment, disk,
-# attributes inside and outside, place of the local head.
-_CENTRAL = struct.Struct("<4s6HIII5HII")
-# Signature, disks, entries here and in all, size and place of the central directory, comment.
-_END = struct.Struct("<4s4HIIH")
-_VERSION, _UNIX = 20, 3
-# 1 January 1980, the earliest date a zip can hold: files must not depend on when they were written.
-_TIME, _DATE = 0, (1 << 5) + 1
-# Readable and writable by the owner.
-_ATTRIBUTES = 0o600 << 16
-# Sizes and places of a zip are 32 bits wide.
-_LARGEST_BYTES = (1 << 32) - 1
-
-
-def stored_zip(members: Iterable[tuple[str, Sequence[Bytes]]]) -> list[Bytes]:
-    """The parts of a zip whose members have these names (ASCII) and bytes."""
-    parts: list[Bytes] = []
-    central, at, count = b"", 0, 0
-    for name, content in members:
-        crc, size = 0, sum(map(len, content))
-        for part in content:
-            crc = crc32(part, crc)
-        if at + size > _LARGEST_BYTES:
-            raise ExportError(
-                f"{name}: wanted a scan of at most 4 GiB for an npz, got more; write a .mcap, or "
-                "cut scans by --slices"
-            )
-        same = (_VERSION, 0, 0, _TIME, _DATE, crc, size, size, len(name), 0)
-        local = _LOCAL.pack(b"PK\3\4", *same) + name.encode()
-        made = _VERSION | _UNIX << 8
-        central += _CENTRAL.pack(b"PK\1\2", made, *same, 0, 0, 0, _ATTRIBUTES, at)
-        central += name.encode()
-        parts += [local, *content]
-        at += len(local) + size
-        count += 1
-    end = _END.pack(b"PK\5\6", 0, 0, count, count, len(central), at, 0)
-    return [*parts, central, end]
-
-
 FORMAT = "npz"
 SUFFIX: str | None = None
 COMPRESSES = False
@@ -71,9 +29,27 @@ SCHEMA = "mlbatch.scan/1"
 
 Array: TypeAlias = npt.NDArray[np.generic]
 
+# Signature, version needed, flags, method, time, date, CRC, stored size, size, length of the name
+# and of extra fields.
+_LOCAL = struct.Struct("<4s5HIIIHH")
+# Signature, version made by, and the same as above; length of a comment, disk, internal and
+# external attributes, offset of the local header.
+_CENTRAL = struct.Struct("<4s6HIII5HII")
+# Signature, disks, entries here and in all, size and offset of the central directory, comment.
+_END = struct.Struct("<4s4HIIH")
+_VERSION = 20
+_UNIX = 3
+# 1 January 1980, the earliest date of a zip: files must not depend on when they were written.
+_TIME = 0
+_DATE = (1 << 5) + 1
+# Readable and writable by the owner.
+_ATTRIBUTES = 0o600 << 16
+# Sizes and offsets of a zip are 32 bits wide.
+_MAX_BYTES = (1 << 32) - 1
+
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """All: an npz keeps what was decoded."""
+    """Return all: an npz contains everything that was decoded."""
     return EXTRAS
 
 
@@ -83,7 +59,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
 
 class NpzSaver:
-    """Saves scans of one run; owns the buffers in which arrays come without gaps."""
+    """Encodes scans of one run; owns the buffers that make arrays contiguous."""
 
     def __init__(self, info: RunInfo) -> None:
         self._packed: dict[str, Array] = {}
@@ -99,12 +75,11 @@ class NpzSaver:
     def save(self, file: io.FileIO, scan: Scan) -> None:
         """Write the scan as a zip of npy files."""
         arrays = self._arrays(scan) | self._constant
-        write_all(
-            file, stored_zip((f"{key}.npy", self._npy(key, array)) for key, array in arrays.items())
-        )
+        members = ((f"{key}.npy", self._npy(key, array)) for key, array in arrays.items())
+        write_all(file, stored_zip(members))
 
     def _arrays(self, scan: Scan) -> dict[str, Array]:
-        """The keys of the contract that change from scan to scan, in its order."""
+        """Return the arrays that change from scan to scan, in the order of the file."""
         arrays: dict[str, Array | None] = {
             "xyz": scan.xyz,
             "intensity": scan.intensity,
@@ -126,14 +101,14 @@ class NpzSaver:
         return {key: array for key, array in arrays.items() if array is not None}
 
     def _npy(self, key: str, array: Array) -> list[Bytes]:
-        """The parts of an npy file."""
-        array = self._without_gaps(key, array)
+        """Return the parts of an npy file."""
+        array = self._contiguous(key, array)
         head = io.BytesIO()
         np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
         return [head.getvalue(), array.reshape(-1).view(np.uint8).data]
 
-    def _without_gaps(self, key: str, array: Array) -> Array:
-        """The same values one after the other, in a buffer that is used for the next scan again."""
+    def _contiguous(self, key: str, array: Array) -> Array:
+        """Return the same values in contiguous memory; the buffer is reused by the next scan."""
         if array.flags.c_contiguous:
             return array
         buffer = self._packed.get(key)
@@ -143,7 +118,35 @@ class NpzSaver:
         if key != "xyz":
             packed[...] = array
             return packed
-        # Axis by axis, since an innermost axis of three is slow to go through.
+        # Axis by axis, since copies with an innermost axis of three are slow.
         for axis in range(3):
             packed[..., axis] = array[..., axis]
         return packed
+
+
+def stored_zip(members: Iterable[tuple[str, Sequence[Bytes]]]) -> list[Bytes]:
+    """Return the parts of a zip with these names (ASCII) and contents."""
+    parts: list[Bytes] = []
+    central = b""
+    offset = 0
+    count = 0
+    for name, content in members:
+        size = sum(map(len, content))
+        crc = 0
+        for part in content:
+            crc = crc32(part, crc)
+        if offset + size > _MAX_BYTES:
+            raise ExportError(
+                f"{name}: expected a scan of at most 4 GiB for an npz, found more; write a .mcap, "
+                "or cut scans by --slices"
+            )
+        same = (_VERSION, 0, 0, _TIME, _DATE, crc, size, size, len(name), 0)
+        local = _LOCAL.pack(b"PK\3\4", *same) + name.encode()
+        made_by = _VERSION | _UNIX << 8
+        central += _CENTRAL.pack(b"PK\1\2", made_by, *same, 0, 0, 0, _ATTRIBUTES, offset)
+        central += name.encode()
+        parts += [local, *content]
+        offset += len(local) + size
+        count += 1
+    end = _END.pack(b"PK\5\6", 0, 0, count, count, len(central), offset, 0)
+    return [*parts, central, end]

@@ -1,24 +1,23 @@
-"""A ROS 1 bag, written by `rosbags` (facts/outputs.md, section 4).
+"""A ROS 1 bag, written by `rosbags` (docs/sources/outputs.md).
 
-Types come with their MD5 and full definition, as `rosbag play` wants them; /tf_static is latched.
+Connections have the MD5 and full definition of their type, as `rosbag play` expects; /tf_static is
+latched.
 """
 
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Message, RunInfo, Summary, Topic
 from mlbatch.writers._wire import Ros1
 from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.mcap_container import Chunk
-from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
-from mlbatch.writers.output_file import open_output
+from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of, layout_of
+from mlbatch.writers.output_file import open_buffered
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -27,13 +26,13 @@ FORMAT = "rosbag1"
 SUFFIX: str | None = ".bag"
 COMPRESSES = False
 
-# Not among the types that `rosbags` brings along.
+# Not among the types of `rosbags`.
 _TF = "tf2_msgs/msg/TFMessage"
 _TF_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """What the fields of the point layout are made of, IMU samples and messages."""
+    """Return the inputs of the point layout, IMU samples and messages."""
     return extras_of(options, "ros1")
 
 
@@ -41,18 +40,21 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
     """Start a ROS 1 bag."""
     layout_of(options)
     output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
-    return BagWriter(output, info, options, Ros1, _sink)
+    return MessageWriter(output, info, options, Ros1, _Rosbag1File)
 
 
-def _sink(path: Path, kept_bytes: int | None) -> Sink:
-    if kept_bytes is None:
-        # It creates the file itself, and only where none is.
-        path.unlink()
-    return _Rosbag1Sink(path, kept_bytes)
+class _OpenPath:
+    """Acts as the path of an open file: `rosbags` opens its path, and only to create a file."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def open(self, mode: str) -> BinaryIO:
+        return self._file
 
 
-class _Rosbag1Sink:
-    """Connections and messages of one bag."""
+class _Rosbag1File:
+    """Connections and messages of one bag; `rosbags` writes each chunk when it is complete."""
 
     def __init__(self, path: Path, kept_bytes: int | None) -> None:
         from rosbags.rosbag1 import Writer
@@ -61,90 +63,72 @@ class _Rosbag1Sink:
         self._types = get_typestore(Stores.ROS1_NOETIC)
         self._types.register(get_types_from_msg(_TF_TEXT, _TF))
         self._connections: dict[str | Topic, Connection] = {}
-        self._safe = (0, 0)
-        if kept_bytes is None:
-            self._bag = Writer(path)
-            self._bag.open()
-            return
-        # The library only begins new bags: the head of one, made elsewhere, is written again.
-        with tempfile.TemporaryDirectory() as folder:
-            self._bag = Writer(Path(folder) / path.name)
-            self._bag.open()
-            self._file.close()
-            head = self._bag.path.read_bytes()
-        self._bag.path, self._bag.bio = path, open_output(path, kept_bytes)
-        self._bag.bio.write(head)
+        self._file = open_buffered(path, kept_bytes)
+        # The library refuses a path that exists: it gets one below a file, which cannot exist.
+        self._bag = Writer(path / path.name)
+        self._bag.path = cast(Path, _OpenPath(self._file))
+        self._bag.open()
+        # Chunks that the system has, and the bytes up to their end.
+        self._written = (0, self._file.tell())
 
     @property
-    def ended(self) -> int:
-        """Chunks that are complete; the library's last one is open."""
-        return len(self._bag.chunks) - 1
+    def complete_chunks(self) -> int:
+        """Number of written chunks: the next message is added to this chunk."""
+        return self._written[0]
 
-    def safe(self) -> tuple[int, int]:
-        """Chunks that the system has, and the bytes up to their end."""
-        return self._safe
+    def written(self) -> tuple[int, int]:
+        """Return the number of chunks that the system has, and the bytes up to their end."""
+        return self._written
 
-    def take(self) -> list[Chunk]:
-        """None, as they are written already."""
-        return []
-
-    def seal(self, chunks: Sequence[Chunk]) -> None:
-        """Nothing to do."""
-
-    def put(self, chunks: Sequence[Chunk]) -> None:
-        """Nothing to do."""
+    def take_chunks(self) -> Sequence[PendingChunk]:
+        """Return nothing: chunks are written at once."""
+        return ()
 
     def send(
         self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
     ) -> None:
-        """Append a message of type `kind`, package/Type; a topic is made at its first message."""
+        """Append a message of type `kind`, package/Type; the first one creates the topic."""
         connection = self._connections.get(topic)
         if connection is None:
-            name = kind.replace("/", "/msg/")
-            latching = 1 if latched else None
-            connection = self._bag.add_connection(
-                topic, name, typestore=self._types, latching=latching
+            connection = self._connections[topic] = self._bag.add_connection(
+                topic,
+                kind.replace("/", "/msg/"),
+                typestore=self._types,
+                latching=1 if latched else None,
             )
-            self._connections[topic] = connection
         self._write(connection, log_ns, message)
 
     def forward(self, message: Message) -> None:
-        """Append a message as it was recorded."""
+        """Append a recorded message unchanged."""
         connection = self._connections.get(message.topic)
         if connection is None:
-            connection = self._connections[message.topic] = self._adopt(message.topic)
+            connection = self._connections[message.topic] = self._forwarded(message.topic)
         self._write(connection, message.host_ns, message.data)
 
-    def _write(self, connection: Connection, log_ns: int, message: bytes | memoryview) -> None:
-        self._bag.write(connection, log_ns, message)
-        if self.ended > self._safe[0]:
-            # Noted here and not when it is asked: then another scan may be under way.
-            self._file.flush()
-            self._safe = (self.ended, self._file.tell())
-
     def finish(self, summary: Summary, grid: dict[str, str]) -> None:
-        """Complete and close the file; a bag has no place for what tells of the run."""
+        """Complete and close the file; a bag has no place for metadata."""
         self._bag.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
-        # Closing flushes once more, onto the disk that has just refused.
+        """Close the incomplete file."""
+        # Closing flushes again, perhaps to the disk that has just failed.
         with contextlib.suppress(OSError):
-            if self._bag.bio is not None:
-                self._bag.bio.close()
+            self._file.close()
 
-    @property
-    def _file(self) -> BinaryIO:
-        if self._bag.bio is None:
-            raise ExportError(f"{self._bag.path}: wanted an open bag, got a closed one; report it")
-        return self._bag.bio
+    def _write(self, connection: Connection, log_ns: int, message: bytes | memoryview) -> None:
+        self._bag.write(connection, log_ns, message)
+        # The library collects messages in memory: the file grows when a chunk is complete.
+        if self._file.tell() > self._written[1]:
+            self._file.flush()
+            # One assignment: `written` is called while another scan is appended.
+            self._written = (self._written[0] + 1, self._file.tell())
 
-    def _adopt(self, topic: Topic) -> Connection:
-        """A connection that says of a topic what its recording said."""
+    def _forwarded(self, topic: Topic) -> Connection:
+        """Return a new connection with the type that the recording has for a topic."""
         if topic.encoding != "ros1":
             raise ExportError(
-                f"{topic.name}: wanted messages of ROS 1 to pass on to a ROS 1 bag, got "
-                f"{topic.encoding!r}; leave the topic out, or write a .mcap, which holds both"
+                f"{topic.name}: expected messages of ROS 1 for a ROS 1 bag, found "
+                f"{topic.encoding!r}; do not pass the topic, or write a .mcap, which takes both"
             )
         name = topic.type.replace("/", "/msg/")
         return self._bag.add_connection(
@@ -157,7 +141,7 @@ class _Rosbag1Sink:
 
 
 def _md5(topic: Topic, name: str) -> str:
-    """The number by which ROS 1 knows a definition."""
+    """Return the MD5 by which ROS 1 identifies a definition."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.EMPTY)
@@ -166,6 +150,6 @@ def _md5(topic: Topic, name: str) -> str:
         return types.generate_msgdef(name)[1]
     except TypesysError as err:
         raise ExportError(
-            f"{topic.name}: wanted the definition of {topic.type} to pass it on, got one that "
-            f"cannot be read ({err}); leave the topic out, or write a .mcap"
+            f"{topic.name}: expected a definition of {topic.type}, found one that cannot be read "
+            f"({err}); do not pass the topic, or write a .mcap"
         ) from err

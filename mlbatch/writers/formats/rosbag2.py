@@ -1,26 +1,23 @@
-"""A ROS 2 bag: a folder with one MCAP file and metadata.yaml (facts/outputs.md, section 4).
+"""A ROS 2 bag: a folder with one MCAP file and metadata.yaml (docs/sources/outputs.md).
 
-metadata.yaml is that of version 5 (Humble), which later players read as well.
+metadata.yaml has version 5 (Humble), which later players read as well.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
-from mlbatch.types import Message, RunInfo, Summary
+from mlbatch.types import RunInfo, Topic
 from mlbatch.writers._wire import Cdr
 from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.mcap_container import Chunk
-from mlbatch.writers.message_writer import BagWriter, Sink, extras_of, layout_of
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, layout_of
 
 if TYPE_CHECKING:
-    from mlbatch.writers.mcap_container import Container, McapSink
+    from mlbatch.writers.mcap_container import McapContainer
 
 FORMAT = "rosbag2"
 SUFFIX: str | None = None
@@ -30,83 +27,41 @@ METADATA = "metadata.yaml"
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """What the fields of the point layout are made of, IMU samples and messages."""
+    """Return the inputs of the point layout, IMU samples and messages."""
     return extras_of(options, "cdr")
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
     layout_of(options)
+
+    def open_file(folder: Path, kept_bytes: int | None) -> MessageFile:
+        # Imported here, so that naming the format does not load the library.
+        from mlbatch.writers.mcap_container import McapContainer
+
+        path = folder / f"{target.name}_0.mcap"
+
+        def write_metadata(container: McapContainer) -> None:
+            text = _metadata(container, path.name)
+            (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
+
+        return McapContainer(path, kept_bytes, options.compression, _check_topic, write_metadata)
+
     output = prepare(target, options.overwrite, folder=True, keep=options.kept_bytes is not None)
-    sink = partial(_sink, f"{target.name}_0.mcap", options.compression)
-    return BagWriter(output, info, options, Cdr, sink)
+    return MessageWriter(output, info, options, Cdr, open_file)
 
 
-def _sink(name: str, compression: str, folder: Path, kept_bytes: int | None) -> Sink:
-    # The library comes in here, so that naming the format does not load it.
-    from mlbatch.writers.mcap_container import McapSink
-
-    return _BagSink(folder, name, McapSink(folder / name, kept_bytes, compression))
-
-
-class _BagSink:
-    """The file in a bag's folder; a player refuses messages of ROS 1 in it."""
-
-    def __init__(self, folder: Path, name: str, file: McapSink) -> None:
-        self._folder = folder
-        self._name = name
-        self._file = file
-
-    @property
-    def ended(self) -> int:
-        """Chunks that are complete."""
-        return self._file.ended
-
-    def safe(self) -> tuple[int, int]:
-        """Chunks that are written, and the bytes up to their end."""
-        return self._file.safe()
-
-    def take(self) -> list[Chunk]:
-        """The chunks that are complete since the last call."""
-        return self._file.take()
-
-    def seal(self, chunks: Sequence[Chunk]) -> None:
-        """Make chunks ready to be written; by any thread."""
-        self._file.seal(chunks)
-
-    def put(self, chunks: Sequence[Chunk]) -> None:
-        """Write sealed chunks, in the order in which they were taken."""
-        self._file.put(chunks)
-
-    def send(
-        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
-    ) -> None:
-        """Append a message of type `kind`, package/Type; a topic is made at its first message."""
-        self._file.send(topic, kind, log_ns, message, latched)
-
-    def forward(self, message: Message) -> None:
-        """Append a message as it was recorded."""
-        topic = message.topic
-        if topic.encoding != "cdr":
-            raise ExportError(
-                f"{topic.name}: wanted messages of ROS 2 (cdr) to pass on to a ROS 2 bag, got "
-                f"{topic.encoding!r}; leave the topic out, or write a .mcap, which holds both"
-            )
-        self._file.forward(message)
-
-    def finish(self, summary: Summary, grid: dict[str, str]) -> None:
-        """Complete the file and describe it in metadata.yaml."""
-        self._file.finish(summary, grid)
-        text = _metadata(self._file.container, self._name)
-        (self._folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        self._file.abandon()
+def _check_topic(topic: Topic) -> None:
+    """Refuse messages of ROS 1: a player of ROS 2 bags cannot read them."""
+    if topic.encoding != "cdr":
+        raise ExportError(
+            f"{topic.name}: expected messages of ROS 2 (cdr) for a ROS 2 bag, found "
+            f"{topic.encoding!r}; do not pass the topic, or write a .mcap, which takes both"
+        )
 
 
-def _metadata(container: Container, name: str) -> str:
-    """Text of metadata.yaml; strings of JSON are strings of YAML."""
+def _metadata(container: McapContainer, name: str) -> str:
+    """Return the text of metadata.yaml; JSON strings are valid YAML strings."""
     first_ns, last_ns = container.span_ns
     contents = container.contents()
     count = sum(sent for _, _, sent in contents)
