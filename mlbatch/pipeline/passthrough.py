@@ -20,6 +20,7 @@ from mlbatch.batching.intake import STAMP_LIMIT_NS
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
+from mlbatch.report.ledger import DecodedCounts
 from mlbatch.types import IMU, MESSAGE_ENCODINGS, ImuSamples, Message, Recording, Topic
 from mlbatch.units import NS_PER_S
 
@@ -40,7 +41,11 @@ class Passthrough:
     """What a run forwards beside its scans: IMU samples of lidars, messages of bags."""
 
     def __init__(self, sensors: Sequence[Sensor], job: Job) -> None:
-        self.imu = ImuQueue(sensors, has_place=IMU in job.extras)
+        self.imu = ImuQueue(
+            [sensor.ledger.imu_samples for sensor in sensors],
+            [sensor.clock.imu_offset_ns for sensor in sensors],
+            has_place=IMU in job.extras,
+        )
         self.messages = MessageQueue(job.passed, MESSAGE_ENCODINGS & job.extras, job.part.begin_ns)
 
     def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
@@ -78,14 +83,17 @@ class Passthrough:
 
 
 class ImuQueue:
-    """IMU samples of all lidars, counted in the ledgers of their sensors.
+    """IMU samples of all lidars.
 
-    has_place: False if the output has no place for them; then none is kept.
+    counts: counters of each sensor; offsets_ns: added to the timestamps of each sensor; has_place:
+    False if the output has no place for samples; then none is kept.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], *, has_place: bool) -> None:
-        self._counts = [sensor.ledger.imu_samples for sensor in sensors]
-        self._offsets_ns = [sensor.clock.imu_offset_ns for sensor in sensors]
+    def __init__(
+        self, counts: Sequence[DecodedCounts], offsets_ns: Sequence[int], *, has_place: bool
+    ) -> None:
+        self._counts = list(counts)
+        self._offsets_ns = list(offsets_ns)
         self._has_place = has_place
         self._waiting: list[ImuSamples] = []
 

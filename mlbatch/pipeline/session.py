@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, Part
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
 from mlbatch.readers import merge, open_recording, use_engine
+from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -71,8 +73,6 @@ class Session:
         """The next sensor, with an empty ring and ledger."""
         job, rig, lidar = self.job, found.rig, found.found.lidar
         sampler = self.setup.sampler
-        min_range_m = 0.0 if rig is None else rig.min_range_m or 0.0
-        max_range_m = float("inf") if rig is None else rig.max_range_m or float("inf")
         ring_base = 0
         if self.sensors:
             last = self.sensors[-1]
@@ -86,11 +86,7 @@ class Session:
                 has_receive_times=has_receive_times(sampler.table.untimed, found.found),
                 watch=clock_watch(lidar),
             ),
-            limits=Limits(
-                max(job.min_range_m, min_range_m),
-                min(job.max_range_m, max_range_m),
-                job.keep_repeated,
-            ),
+            limits=limits(job, rig),
             ring_base=ring_base,
             columns_per_s=sampler.columns_per_s(found.found),
             ring=new_ring(lidar),
@@ -165,10 +161,7 @@ class Session:
     @property
     def boxes_m(self) -> F64Array:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
-        boxes_m = np.array(self.job.boxes_m, np.float64).reshape(-1, 6)
-        if self.setup.rig is None:
-            return boxes_m
-        return np.concatenate([self.setup.rig.exclude_boxes_m, boxes_m])
+        return excluded_boxes_m(self.job, self.setup.rig)
 
     def run_info(self, rate_hz: str, timescale: str) -> RunInfo:
         """What is the same for all scans; rate_hz: exact rate as text."""
@@ -208,3 +201,20 @@ class Session:
         if self.job.strict and note.code != CLOUDS:
             raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
         self.notes.append(note)
+
+
+def limits(job: Job, rig: RigSensor | None) -> Limits:
+    """The narrower of the job's and the rig's ranges for a sensor."""
+    min_range_m = 0.0 if rig is None else rig.min_range_m or 0.0
+    max_range_m = math.inf if rig is None else rig.max_range_m or math.inf
+    return Limits(
+        max(job.min_range_m, min_range_m), min(job.max_range_m, max_range_m), job.keep_repeated
+    )
+
+
+def excluded_boxes_m(job: Job, rig: Rig | None) -> F64Array:
+    """Excluded boxes of rig and job: (k, 6), m, body frame."""
+    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
+    if rig is None:
+        return boxes_m
+    return np.concatenate([rig.exclude_boxes_m, boxes_m])

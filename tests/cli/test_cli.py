@@ -232,7 +232,7 @@ def test_too_little_disk_is_said_before_anything_is_read(
     outcome = shell(f"convert {FIX} -o out")
     assert (outcome.code, outcome.out) == (1, "")
     assert outcome.err == (
-        "mlbatch: error: out: wanted about 0 MB of free disk, got 0 MB; free space or choose "
+        "mlbatch: error: out: expected about 0 MB of free disk, found 0 MB; free space or choose "
         "another output\n"
     )
     assert list(tmp_path.iterdir()) == []

@@ -18,7 +18,7 @@ from mlbatch.pipeline import resume
 from mlbatch.pipeline import resume as _resume_state
 from mlbatch.readers import _source
 from mlbatch.types import Scan
-from mlbatch.writers import npz
+from mlbatch.writers.formats import npz
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
 from tests.resume_storm import contents
 
@@ -189,8 +189,8 @@ def test_a_lost_scan_is_refused(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        "mlbatch: error: out.partial/000001.npz: wanted a scan of the interrupted run to go on "
-        "after it, got none; leave out --resume to begin anew"
+        "mlbatch: error: out.partial/000001.npz: expected a scan of the interrupted run, "
+        "found no file; leave out --resume to start over"
     )
 
 
@@ -198,7 +198,7 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=30))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.Course, "complete", _refuse)
+        patch.setattr(resume.ResumeLog, "complete", _refuse)
         assert shell(f"convert {capture} -o out.mcap").code == 1
     partial = Path("out.mcap.partial")
     kept = json.loads(Path("out.mcap.partial.state").read_text().splitlines()[-2])["kept_bytes"]
@@ -206,12 +206,12 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"convert {capture} -o out.mcap --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        f"mlbatch: error: out.mcap.partial: wanted {kept} bytes of the interrupted run to go on "
-        f"after them, got {kept - 1}; leave out --resume to begin anew"
+        f"mlbatch: error: out.mcap.partial: expected {kept} bytes of the interrupted run, "
+        f"found {kept - 1}; leave out --resume to start over"
     )
 
 
-def _refuse(course: resume.Course) -> None:
+def _refuse(course: resume.ResumeLog) -> None:
     raise ExportError("stopped")
 
 
@@ -258,7 +258,7 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
 
     monkeypatch.setattr(run, "check_target", refuse)
     outcome = shell(f"convert {CAPTURE} -o out")
-    assert (outcome.code, "got an existing one" in outcome.err) == (1, True)
+    assert (outcome.code, "found an existing one" in outcome.err) == (1, True)
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
@@ -314,7 +314,7 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: out.partial/000004.npz: wanted to write it, got 'No space left on "
+        "mlbatch: error: out.partial/000004.npz: expected to write it, found 'No space left on "
         "device'; free space on this disk or choose another output; then --resume goes on after "
         "the 4 scans that are safe\n"
     )
@@ -361,7 +361,7 @@ def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
     _interrupt(shell, f"{CAPTURE} -o out --overwrite")
     refused = shell(f"convert {CAPTURE} -o out --resume")
     assert refused.code == 1
-    assert "wanted a new output, got an existing one" in refused.err
+    assert "expected a new output, found an existing one" in refused.err
     assert shell(f"convert {CAPTURE} -o out --resume --overwrite").code == 0
     assert contents(Path()) == whole
 

@@ -122,7 +122,7 @@ def printed(job: Job) -> Print:
     assert len(scans) > LENGTH_NS * RATE / 10**9 - 1
     assert run.table is not None
     table = csv_without_arrival(run.table.text())
-    ledgers = [repr(feed.ledger) for feed in run.feeds]
+    ledgers = [repr(sensor.ledger) for sensor in run.sensors]
     return scans, table, ledgers, repr(run.info)
 
 

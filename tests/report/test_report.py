@@ -27,7 +27,7 @@ from mlbatch.report.report import (
     summary_lines,
 )
 from mlbatch.types import CaptureCounts
-from tests.unit.writers.scans import PERIOD_NS, START_NS, dense_scan, run_info
+from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 
 
 def ledger() -> SensorLedger:

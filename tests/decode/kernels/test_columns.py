@@ -76,8 +76,8 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
     found = []
     for make, words in OTHERS:
         job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
-        (sensor,) = Conversion(job).setup.sensors
-        found.append(sensor.found.lidar)
+        (sensor,) = Conversion(job).sensors
+        found.append(sensor.lidar)
     return found
 
 

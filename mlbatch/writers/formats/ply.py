@@ -1,6 +1,7 @@
-"""A folder of binary PLY files, properties of facts/outputs.md, section 5.
+"""A folder of binary PLY files with the properties of `point_layouts.PLY_LAYOUT`.
 
-The format: G. Turk, "The PLY Polygon File Format", 1994; one element `vertex`, scalars only.
+Source: G. Turk, "The PLY Polygon File Format", 1994, and docs/sources/outputs.md; one element
+`vertex`, scalars only.
 """
 
 from __future__ import annotations
@@ -13,34 +14,35 @@ import numpy as np
 import mlbatch
 from mlbatch.errors import UsageError, one_line
 from mlbatch.types import RunInfo, Scan
-from mlbatch.writers._folder import FolderWriter
-from mlbatch.writers._gathered import write_all
-from mlbatch.writers._layouts import PLY_LAYOUT
-from mlbatch.writers._options import ScanWriter, WriterOptions
-from mlbatch.writers._points import points_of
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.output_file import write_all
+from mlbatch.writers.point_layouts import PLY_LAYOUT, points_of
+from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "ply"
 SUFFIX: str | None = None
 COMPRESSES = False
 
-# Classic names of PLY types: some readers know no others.
+# Names of PLY types as of 1994, which all readers know.
 _TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
-    """None: the properties are those of `_layouts.PLY_LAYOUT`."""
+    """Return nothing: the properties are fixed."""
     return frozenset()
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of PLY files."""
     if info.layout == "organized":
-        raise UsageError("--layout organized: PLY has no organized form; use npz or mcap")
+        raise UsageError(
+            "--layout organized: expected dense for ply, found organized; write npz or mcap"
+        )
     return FolderWriter(target, info, options, ".ply", PlySaver)
 
 
 class PlySaver:
-    """Saves scans; owns the buffer of vertices."""
+    """Encodes scans in a buffer of vertices that is reused."""
 
     def __init__(self) -> None:
         self._vertices = np.zeros(0, dtype=PLY_LAYOUT.dtype)
@@ -56,7 +58,7 @@ class PlySaver:
 
 
 def header(scan: Scan, count: int) -> str:
-    """Header of a PLY file of `count` vertices."""
+    """Return the header of a PLY file of `count` vertices."""
     info = scan.info
     names = " ".join(sensor.name for sensor in info.sensors)
     lines = [
@@ -69,7 +71,7 @@ def header(scan: Scan, count: int) -> str:
         f"comment complete {str(scan.complete).lower()}",
         f"comment timescale {info.timescale}",
         f"comment rate_hz {info.rate_hz}",
-        # A recording may call a frame anything, also what ends a line.
+        # Frame names come from recordings and may contain line ends.
         f"comment frame_id {one_line(info.frame_id)}",
         "comment units: x y z m; time s after start_ns; intensity as sent by the sensor",
         f"comment lidar_id from 0: {names}",

@@ -9,17 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Scan
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import SUMMARY, dense_scan, point_scan
+from tests.builders.scans import (
+    SUMMARY,
+    dense_scan,
+    point_scan,
+    run_job,
+)
 
 
 def written(folder: Path, scan: Scan) -> bytes:
     """Write one scan; its file."""
     writer = open_writer("ply", folder, scan.info, WriterOptions())
-    in_one_go(writer.write(scan))
+    run_job(writer.write(scan))
     writer.finish(SUMMARY)
     return (folder / "000000.ply").read_bytes()
 

@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Message
 from mlbatch.writers import WriterOptions, open_writer
-
-from .bags import ODD_TEXT, ROS1_NOTE, ROS1_ODD, ROS2_NOTE, note, odd, read_back, written
-from .scans import (
+from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
     SUMMARY,
@@ -23,6 +20,17 @@ from .scans import (
     organized_scan,
     point_scan,
     run_info,
+    run_job,
+)
+from tests.builders.written_bags import (
+    ODD_TEXT,
+    ROS1_NOTE,
+    ROS1_ODD,
+    ROS2_NOTE,
+    note,
+    odd,
+    read_back,
+    written,
 )
 
 SCANS = [dense_scan(0), dense_scan(1, 30)]
@@ -137,7 +145,7 @@ def test_the_table_of_scans_lies_beside(tmp_path: Path) -> None:
 
 def test_messages_of_ros_2_are_refused_by_name(tmp_path: Path) -> None:
     writer = open_writer("rosbag1", tmp_path / "out.bag", run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     with pytest.raises(ExportError, match=r"^/note: wanted messages of ROS 1 .* got 'cdr'"):
         writer.write_message(note(ROS2_NOTE, "x", 0))
     writer.abandon()
@@ -145,7 +153,7 @@ def test_messages_of_ros_2_are_refused_by_name(tmp_path: Path) -> None:
 
 def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     writer = open_writer("rosbag1", tmp_path / "out.bag", run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     for text in ("what ever this is !!", "other_msgs/Missing x\n"):
         topic = replace(ROS1_NOTE, definition=text, type="my_msgs/Lost")
         with pytest.raises(ExportError, match=r"^/note: wanted the definition of my_msgs/Lost"):

@@ -9,11 +9,15 @@ from typing import Any
 
 import pytest
 
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Message, Scan, Topic
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import PERIOD_NS, START_NS, SUMMARY, imu_samples
+from tests.builders.scans import (
+    PERIOD_NS,
+    START_NS,
+    SUMMARY,
+    imu_samples,
+    run_job,
+)
 
 QOS_WORDS = """\
 - history: keep_last
@@ -69,7 +73,7 @@ def written(name: str, target: Path, scans: list[Scan], messages: list[Message])
     for message in messages[:1]:
         writer.write_message(message)
     for scan in scans:
-        in_one_go(writer.write(scan))
+        run_job(writer.write(scan))
     for message in messages[1:]:
         writer.write_message(message)
     writer.write_imu(imu_samples(1, START_NS + PERIOD_NS // 2, 1))

@@ -13,20 +13,19 @@ from mlbatch.writers import (
     WriterOptions,
     check_target,
     choose_format,
-    formats,
+    format_names,
     open_writer,
     plugin,
     report_paths,
 )
-
-from .scans import run_info
+from tests.builders.scans import run_info
 
 
 def test_formats_are_the_modules_of_the_package() -> None:
-    assert formats() == ("mcap", "npz", "ply", "rosbag1", "rosbag2")
+    assert format_names() == ("mcap", "npz", "ply", "rosbag1", "rosbag2")
 
 
-@pytest.mark.parametrize("name", formats())
+@pytest.mark.parametrize("name", format_names())
 def test_a_plug_in_is_called_as_its_format(name: str) -> None:
     assert name == plugin(name).FORMAT
 
@@ -94,10 +93,10 @@ def test_ply_has_no_organized_form(tmp_path: Path) -> None:
 
 def test_listing_formats_loads_no_heavy_package() -> None:
     code = (
-        "import sys; from mlbatch.writers import formats; formats(); "
+        "import sys; from mlbatch.writers import format_names; format_names(); "
         "sys.exit(any(name in sys.modules for name in ('numpy', 'mcap')))"
     )
-    root = Path(__file__).resolve().parents[3]
+    root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 
 

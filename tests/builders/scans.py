@@ -9,6 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.types import ImuSamples, RunInfo, Scan, SensorInfo, Summary
+from mlbatch.writers import ScanJob
 
 START_NS = 1_700_000_000_100_000_000
 PERIOD_NS = 100_000_000
@@ -117,6 +118,14 @@ def imu_samples(sensor: int = 0, first_ns: int = START_NS - 5, count: int = 2) -
         np.array([[1.0, 2.0, 3.0]]) + step,
         np.array([[4.0, 5.0, 6.0]]) + step,
     )
+
+
+def run_job(job: ScanJob) -> None:
+    """Run all stages of a job."""
+    job.pack()
+    job.append()
+    job.compress()
+    job.commit()
 
 
 SUMMARY = Summary(START_NS, '{"schema": "mlbatch.report/1"}\n', "index,slice\n0,0\n")

@@ -16,11 +16,9 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Scan, Summary
 from mlbatch.writers import WriterOptions, open_writer
-
-from .scans import (
+from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
     SUMMARY,
@@ -29,6 +27,7 @@ from .scans import (
     organized_scan,
     point_scan,
     run_info,
+    run_job,
 )
 
 
@@ -38,7 +37,7 @@ def written(folder: Path, *scans: Scan, layout: str = "standard", split: bool = 
     writer = open_writer("mcap", target, scans[0].info, WriterOptions(layout, split=split))
     writer.write_imu(imu_samples())
     for number, scan in enumerate(scans):
-        in_one_go(writer.write(scan, number if split else None))
+        run_job(writer.write(scan, number if split else None))
     writer.write_imu(imu_samples(1, START_NS + PERIOD_NS // 2, 1))
     writer.finish(SUMMARY)
     return target

@@ -7,12 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Scan
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers._folder import scan_name
-
-from .scans import SUMMARY, dense_scan, imu_samples, organized_scan, run_info
+from mlbatch.writers.scan_folder import scan_name
+from tests.builders.scans import (
+    SUMMARY,
+    dense_scan,
+    imu_samples,
+    organized_scan,
+    run_info,
+    run_job,
+)
 
 TYPES = {
     "xyz": "<f4",
@@ -40,7 +45,7 @@ def written(folder: Path, *scans: Scan, split: bool = False) -> Path:
     """Write scans into `folder`; one after the other by sensor 0, 1, ... if `split`."""
     writer = open_writer("npz", folder, scans[0].info, WriterOptions(split=split))
     for number, scan in enumerate(scans):
-        in_one_go(writer.write(scan, number if split else None))
+        run_job(writer.write(scan, number if split else None))
     writer.write_imu(imu_samples())
     writer.finish(SUMMARY)
     return folder
@@ -116,6 +121,6 @@ def test_split_gives_a_folder_a_sensor(tmp_path: Path) -> None:
 
 def test_nothing_stands_under_the_final_name_before_finish(tmp_path: Path) -> None:
     writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     writer.abandon()
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]

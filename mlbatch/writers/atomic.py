@@ -1,9 +1,8 @@
-"""Outputs that appear whole or not at all (CONTRACT.md, section 2).
+"""Atomic outputs: complete under the final name, or not there at all.
 
-An output grows under `<OUTPUT>.partial` and is renamed at the end. A killed run leaves its
-`.partial` behind; the next run to the same output continues it (`--resume`) or replaces it. Renames
-guard against killed processes; nothing is forced to the disk, so a power cut right after a run is
-not covered.
+An output is written to `<OUTPUT>.partial` and renamed at the end. A killed run leaves its
+`.partial`; the next run to the same output continues it (`--resume`) or replaces it. This covers
+killed processes. It does not cover a power failure right after a run: nothing is synced to disk.
 """
 
 from __future__ import annotations
@@ -22,12 +21,11 @@ from mlbatch.errors import ExportError
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
-# What a run writes into a folder; a folder with anything else is never replaced.
+# Files that a run writes into a folder. A folder with any other file is never replaced.
 _OWN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(npz|ply)|scans\.csv|report\.json")
-# The same of a ROS 2 bag. Recorders write such files, too: only a table of scans makes them ours.
+# The same for a ROS 2 bag. Recorders write such files as well: a scans.csv marks our own.
 _OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
-# A report may have any name (`--report`): what it begins with tells it, of any version, from
-# somebody's only copy.
+# A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
 _HEAD_BYTES = 64
 _ADVICE = {
@@ -44,30 +42,30 @@ _BYTES_PER_MB = 1_000_000
 
 @contextlib.contextmanager
 def export_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError while `path` is written into an ExportError of one line."""
+    """Convert an OSError while `path` is written to an ExportError of one line."""
     try:
         yield
     except OSError as err:
         advice = _ADVICE.get(err.errno or 0, "check the disk and the name of the output")
         reason = err.strerror or str(err)
-        raise ExportError(f"{path}: wanted to write it, got {reason!r}; {advice}") from err
+        raise ExportError(f"{path}: expected to write it, found {reason!r}; {advice}") from err
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """A file or folder under construction at `partial`, meant for `target`."""
+    """A file or folder under construction."""
 
-    target: Path
-    partial: Path
-    overwrite: bool
+    target: Path  # final path
+    partial: Path  # path until `publish`
+    overwrite: bool  # whether an earlier output at `target` may be replaced
 
     def publish(self) -> None:
-        """Give the finished output its final name; only now an older one is replaced."""
+        """Move the finished output to its final path, replacing an earlier output."""
         with export_errors(self.target):
             old = old_path(self.target)
             if not os.path.lexists(self.target):
                 self.partial.rename(self.target)
-                # Of a run that was killed between two renames.
+                # Left by a run that was killed between the two renames of a folder.
                 _remove(old)
                 return
             _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
@@ -90,12 +88,12 @@ class Output:
 
 
 def is_taken(name: str) -> bool:
-    """Whether a file of this name in an output folder may be one of the run's own."""
+    """Return whether a run may write a file of this name into an output folder."""
     return bool(_OWN_FILE.fullmatch(name) or _OWN_BAG_FILE.fullmatch(name))
 
 
 def is_report(path: Path) -> bool:
-    """Whether a file holds the report of a run."""
+    """Return whether a file is the report of a run."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -103,18 +101,20 @@ def is_report(path: Path) -> bool:
 
 
 def check_name(target: Path) -> None:
-    """Refuse what cannot be the name of an output, or stands in no folder."""
+    """Refuse a path that cannot be created: not a name, or without a parent folder."""
     if target.name in ("", ".", ".."):
-        raise ExportError(f"{target}: wanted the name of a new output, got a folder; add a name")
+        raise ExportError(
+            f"{target}: expected the name of a new output, found a folder; add a name"
+        )
     if not target.parent.is_dir():
         raise ExportError(
-            f"{target}: wanted an output in an existing folder, got {target.parent}, "
-            f"which is none; create it (mkdir -p) or choose another"
+            f"{target}: expected an output in an existing folder, found no folder {target.parent}; "
+            "create it (mkdir -p) or choose another"
         )
 
 
 def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
-    """Check that `target` can be written, and make a new `.partial` unless one is to be kept."""
+    """Check that `target` can be written; create a new `.partial` unless `keep`."""
     check_name(target)
     if os.path.lexists(target):
         _check_replaceable(target, overwrite, folder)
@@ -131,46 +131,46 @@ def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> 
 
 
 def discard(target: Path) -> None:
-    """Remove the `.partial` of an output that will not be."""
+    """Remove the `.partial` of an output."""
     partial = partial_path(target)
     with export_errors(partial):
         _remove(partial)
 
 
 def partial_path(target: Path) -> Path:
-    """Where an output grows."""
+    """Return the path of an output under construction."""
     return target.with_name(target.name + PARTIAL_SUFFIX)
 
 
 def old_path(target: Path) -> Path:
-    """Where a folder stands while another takes its name."""
+    """Return the path of an older output folder while the new one is moved into place."""
     return target.with_name(f"{target.name}.old{PARTIAL_SUFFIX}")
 
 
 def discard_old(target: Path) -> None:
-    """Remove a replaced folder that a killed run left beside its finished output."""
+    """Remove the replaced folder of a run that was killed right after its output was complete."""
     with export_errors(target):
         _remove(old_path(target))
 
 
 def side_path(target: Path, name: str) -> Path:
-    """Where `name` lies beside an output that is a file."""
+    """Return the path of the report or scan table of an output that is a file."""
     return target.with_name(f"{target.name}.{name}")
 
 
-def check_free_space(target: Path, wanted_bytes: int) -> None:
-    """Refuse an output for which its disk has too little room."""
+def check_free_space(target: Path, needed_bytes: int) -> None:
+    """Refuse an output if its disk has less free space than `needed_bytes`."""
     with export_errors(target):
         free_bytes = shutil.disk_usage(target.parent).free
-    if free_bytes < wanted_bytes:
+    if free_bytes < needed_bytes:
         raise ExportError(
-            f"{target}: wanted about {wanted_bytes // _BYTES_PER_MB} MB of free disk, got "
+            f"{target}: expected about {needed_bytes // _BYTES_PER_MB} MB of free disk, found "
             f"{free_bytes // _BYTES_PER_MB} MB; free space or choose another output"
         )
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a small file under its final name at once, replacing an older one."""
+    """Write a small file atomically, replacing an older one."""
     partial = partial_path(path)
     with export_errors(path):
         partial.write_text(text, encoding="utf-8", newline="\n")
@@ -178,25 +178,27 @@ def write_text(path: Path, text: str) -> None:
 
 
 def _check_replaceable(target: Path, overwrite: bool, folder: bool) -> None:
-    """Refuse to touch what stands at `target` unless a run wrote it and may replace it."""
+    """Refuse to replace what exists at `target` unless allowed and written by a run."""
     if not overwrite:
         raise ExportError(
-            f"{target}: wanted a new output, got an existing one; choose another or --overwrite"
+            f"{target}: expected a new output, found an existing one; choose another or --overwrite"
         )
-    wanted = "folder" if folder else "file"
+    expected = "folder" if folder else "file"
     if not (target.is_dir() if folder else target.is_file()):
-        raise ExportError(f"{target}: wanted a {wanted} to overwrite, got none; choose another")
+        raise ExportError(
+            f"{target}: expected a {expected} to overwrite, found none; choose another"
+        )
     with export_errors(target):
         stranger = next(_strangers(target, deep=True), None) if folder else None
     if stranger is not None:
         raise ExportError(
-            f"{target}: wanted a folder that only holds scans to overwrite, got {stranger.name} "
-            f"in it as well; choose another output"
+            f"{target}: expected a folder with nothing but scans to overwrite, found "
+            f"{stranger.name} in it; choose another output"
         )
 
 
 def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
-    """Entries of a folder that no run wrote; `deep`: folders of single sensors are allowed."""
+    """Yield entries of a folder that no run wrote; deep: enter folders of single sensors."""
     has_scans = (folder / SCANS_CSV).is_file()
     for entry in folder.iterdir():
         if has_scans and _OWN_BAG_FILE.fullmatch(entry.name):
@@ -208,7 +210,7 @@ def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file or a folder if it is there."""
+    """Remove a file or folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

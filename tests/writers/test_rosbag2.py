@@ -11,12 +11,28 @@ import yaml
 from mcap.reader import make_reader
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.types import Summary, Topic
 from mlbatch.writers import WriterOptions, extras, open_writer
-
-from .bags import ODD_TEXT, ROS1_NOTE, ROS2_NOTE, ROS2_ODD, note, odd, read_back, written
-from .scans import PERIOD_NS, START_NS, SUMMARY, dense_scan, imu_samples, organized_scan, run_info
+from tests.builders.scans import (
+    PERIOD_NS,
+    START_NS,
+    SUMMARY,
+    dense_scan,
+    imu_samples,
+    organized_scan,
+    run_info,
+    run_job,
+)
+from tests.builders.written_bags import (
+    ODD_TEXT,
+    ROS1_NOTE,
+    ROS2_NOTE,
+    ROS2_ODD,
+    note,
+    odd,
+    read_back,
+    written,
+)
 
 SCANS = [dense_scan(0), dense_scan(1, 30)]
 MESSAGES = [
@@ -147,7 +163,7 @@ def test_a_definition_that_was_not_stored_is_ours(tmp_path: Path) -> None:
 
 def test_messages_of_ros_1_are_refused_by_name(tmp_path: Path) -> None:
     writer = open_writer("rosbag2", tmp_path / "out", run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     with pytest.raises(ExportError, match=r"^/note: wanted messages of ROS 2 \(cdr\).*\.mcap"):
         writer.write_message(note(ROS1_NOTE, "x", 0))
     writer.abandon()
@@ -179,7 +195,7 @@ def test_messages_that_fill_the_memory_do_not_wait(tmp_path: Path) -> None:
     writer = open_writer("rosbag2", tmp_path / "out", run_info(), WriterOptions())
     for number in range(20):
         writer.write_message(note(ROS2_NOTE, "x" * 1_000_000, number))
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     writer.finish(SUMMARY)
     found = [(r.topic, r.log_ns - START_NS) for r in read_back(tmp_path / "out")]
     assert found[0] == ("/tf_static", 0)

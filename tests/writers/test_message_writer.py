@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.writers._ros_messages import quaternion
+from mlbatch.writers.message_writer import quaternion
 
 HALF = 0.5**0.5
 

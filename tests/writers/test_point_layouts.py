@@ -10,9 +10,8 @@ import pytest
 
 from mlbatch.decode.scan_buffer import Buffer
 from mlbatch.types import Scan
-from mlbatch.writers._layouts import CLOUD_LAYOUTS, PLY_LAYOUT
-from mlbatch.writers._points import points_of
-from tests.unit.writers.scans import dense_scan, organized_scan
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
+from tests.builders.scans import dense_scan, organized_scan
 
 SCANS: dict[str, Callable[[], Scan]] = {"dense": dense_scan, "organized": organized_scan}
 LAYOUTS = {layout.name: layout for layout in (*CLOUD_LAYOUTS.values(), PLY_LAYOUT)}

@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline.workers import in_one_go
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers._atomic import check_free_space, prepare, write_text
+from mlbatch.writers.atomic import check_free_space, prepare, write_text
+from tests.builders.scans import (
+    SUMMARY,
+    dense_scan,
+    run_info,
+    run_job,
+)
 
-from .scans import SUMMARY, dense_scan, run_info
-
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = [("mcap", "out.mcap"), ("npz", "out"), ("ply", "out")]
 OUTPUTS += [("rosbag1", "out.bag"), ("rosbag2", "out")]
 
@@ -27,15 +30,14 @@ OUTPUTS += [("rosbag1", "out.bag"), ("rosbag2", "out")]
 CHILD = """
 import sys
 from pathlib import Path
-from mlbatch.workers import in_one_go
 from mlbatch.errors import ExportError
 from mlbatch.writers import WriterOptions, open_writer
-from tests.unit.writers.scans import SUMMARY, dense_scan, run_info
+from tests.builders.scans import (SUMMARY, dense_scan, run_info, run_job,)
 
 writer = open_writer(sys.argv[1], Path(sys.argv[2]), run_info(), WriterOptions())
 try:
     for index in range(int(sys.argv[3])):
-        in_one_go(writer.write(dense_scan(index, 40_000)))
+        run_job(writer.write(dense_scan(index, 40_000)))
         if index == 8:
             print("ready", flush=True)
     writer.finish(SUMMARY)
@@ -66,7 +68,7 @@ def test_a_killed_run_leaves_only_a_partial(name: str, file: str, tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == [f"{file}.partial"]
     # The next run to the same output is not hindered by it.
     writer = open_writer(name, tmp_path / file, run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan()))
+    run_job(writer.write(dense_scan()))
     writer.finish(SUMMARY)
     assert (tmp_path / file).exists()
     assert not (tmp_path / f"{file}.partial").exists()
@@ -89,7 +91,7 @@ def test_a_full_disk_says_what_to_do(tmp_path: Path) -> None:
     writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
     os.symlink("/dev/full", tmp_path / "out.partial" / "000000.npz")
     with pytest.raises(ExportError, match=r"got 'No space left on device'; free space"):
-        in_one_go(writer.write(dense_scan()))
+        run_job(writer.write(dense_scan()))
 
 
 @pytest.mark.parametrize(("name", "file"), OUTPUTS)
@@ -108,7 +110,7 @@ def test_overwriting_happens_at_the_end(name: str, file: str, tmp_path: Path) ->
         writer = open_writer(name, target, run_info(), WriterOptions(overwrite=True))
         before = sorted(path.name for path in tmp_path.rglob("*") if ".partial" not in str(path))
         for index in scans:
-            in_one_go(writer.write(dense_scan(index)))
+            run_job(writer.write(dense_scan(index)))
         after = sorted(path.name for path in tmp_path.rglob("*") if ".partial" not in str(path))
         assert before == after
         writer.finish(SUMMARY)
@@ -130,11 +132,11 @@ def test_an_older_output_and_its_table_stay_if_the_report_fails(
         raise ExportError("no room for the report")
 
     writer = open_writer(name, tmp_path / file, run_info(), WriterOptions())
-    in_one_go(writer.write(dense_scan(0)))
+    run_job(writer.write(dense_scan(0)))
     writer.finish(SUMMARY)
     before = files()
     writer = open_writer(name, tmp_path / file, run_info(), WriterOptions(overwrite=True))
-    in_one_go(writer.write(dense_scan(1)))
+    run_job(writer.write(dense_scan(1)))
     with pytest.raises(ExportError, match="no room"):
         writer.finish(replace(SUMMARY, scans_csv="another table\n"), refuse)
     assert files() == before
@@ -219,7 +221,7 @@ def test_scans_are_only_read_during_the_call(tmp_path: Path) -> None:
     writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
     scan = dense_scan()
     wanted = scan.intensity.copy()
-    in_one_go(writer.write(scan))
+    run_job(writer.write(scan))
     scan.intensity[:] = -1
     writer.finish(SUMMARY)
     with np.load(tmp_path / "out" / "000000.npz") as loaded:
