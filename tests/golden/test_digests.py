@@ -474,7 +474,9 @@ def test_wording_is_what_it_was(workplace: Path) -> None:
     """Texts may change: then read the new ones and write the file again."""
     with inside(workplace):
         found = wording()
-    assert found == json.loads(_WORDING.read_text("utf-8"))
+    expected = json.loads(_WORDING.read_text("utf-8"))
+    lines = _lines(found), _lines(expected)
+    assert (sorted(lines[0] - lines[1]), sorted(lines[1] - lines[0])) == ([], []), "(new, gone)"
 
 
 def test_rows_cover_all_pairs() -> None:
@@ -508,6 +510,10 @@ def wording() -> dict[str, list[str]]:
     for name in WORDED_QUERIES:
         _join(texts, digests_of_query(QUERIES[name]), QUERIES[name][0])
     return {key: sorted(texts[key]) for key in sorted(texts)}
+
+
+def _lines(texts: Mapping[str, Sequence[str]]) -> set[str]:
+    return {f"{key}: {line}" for key, lines in texts.items() for line in lines}
 
 
 def _join(texts: dict[str, set[str]], found: Digests, command_name: str = "") -> None:
