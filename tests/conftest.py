@@ -1,18 +1,8 @@
-"""What tests of the command line share."""
+"""Settings of all tests: what hypothesis may take does not depend on how loaded the machine is."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from hypothesis import HealthCheck, settings
 
-import pytest
-
-from tests.builders.sessions import Shell
-
-
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
+settings.register_profile("mlbatch", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("mlbatch")

@@ -69,7 +69,7 @@ def test_fast_batcher_equals_the_reference(block: int) -> None:
         assert not found, f"random_feed({seed}), {options}, groups {sizes}: {found}"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(feeds(), st.randoms(use_true_random=False))
 def test_grouping_does_not_matter(case: Case, rng: random.Random) -> None:
     feed, options = case

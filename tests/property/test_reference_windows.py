@@ -131,7 +131,7 @@ def test_empty_windows_are_counted_within_start_and_end() -> None:
 # -- laws -----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(feeds())
 def test_every_column_is_written_or_dropped_under_one_reason(case: Case) -> None:
     feed, options = case
@@ -149,7 +149,7 @@ def test_every_column_is_written_or_dropped_under_one_reason(case: Case) -> None
     assert len(columns) == len(set(columns)) == sum(outcome.written)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(feeds())
 def test_windows_follow_each_other_and_the_grid(case: Case) -> None:
     feed, options = case

@@ -209,7 +209,7 @@ def drawn_faults(rng: random.Random, session: Sequence[One]) -> list[Fault]:
     return [parse_fault(spec) for spec in specs]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(RANDOM, LENGTHS)
 def test_faults_are_those_of_the_plain_loops(rng: random.Random, length: int) -> None:
     """In every grouping; and the counts too do not depend on it."""
@@ -224,7 +224,7 @@ def test_faults_are_those_of_the_plain_loops(rng: random.Random, length: int) ->
     assert len(counts) == 1
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(RANDOM, LENGTHS)
 def test_the_ledgers_balance(rng: random.Random, length: int) -> None:
     """Read = given + removed - repeated, and the last is what came out."""
@@ -245,14 +245,14 @@ def _removes(fault: Fault) -> bool:
     return fault.kind in ("drop", "stall", "late", "early")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(RANDOM)
 def test_without_faults_all_stays(rng: random.Random) -> None:
     session = packets(rng, 60)
     assert replayed(FaultReplay([], 3, NAMES), session, grouped(rng, 60)) == session
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(RANDOM, st.integers(1, 200))
 def test_a_delay_of_all_changes_arrivals_only(rng: random.Random, delay_ms: int) -> None:
     """Packets of no sensor apart."""
@@ -338,7 +338,7 @@ def test_a_delay_holds_no_more_than_its_worth() -> None:
     assert given_packets == 1000
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(-(10**5), 10**5).filter(bool), st.integers(-(10**12), 10**12).filter(bool))
 def test_clocks_with_drift_and_jumps_are_as_reckoned(milli_ppm: int, step_ns: int) -> None:
     """Against whole numbers of any size; shifts are rounded to the nanosecond."""
