@@ -19,7 +19,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.segments import ClippedRecording, Part
+from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
 from mlbatch.readers import merge, open_recording, use_engine
 from mlbatch.rig.rig import Rig, RigSensor
@@ -50,8 +50,8 @@ class Session:
         opened = [open_recording(path, streams) for path in job.recordings]
         self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
         use_engine(opened, self.engine)
-        if job.part != Part():
-            opened = [ClippedRecording(recording, job.part) for recording in opened]
+        if job.segment != TimeSegment():
+            opened = [ClippedRecording(recording, job.segment) for recording in opened]
         self.setup: Setup = discover(opened, streams, job.wishes)
         self.recordings: Sequence[Recording] = self.setup.recordings
         self.sensors: list[Sensor] = []
@@ -66,8 +66,6 @@ class Session:
         self.ingest = Ingest(
             self.setup.router, self.sensors, self.clocks.map_stamps if maps_stamps else None
         )
-        for note in self.setup.notes:
-            self.warn(note)
 
     def _sensor(self, found: Mounted) -> Sensor:
         """The next sensor, with an empty ring and ledger."""

@@ -21,11 +21,9 @@ from mlbatch.report.ledger import (
     check_messages,
     ordered,
 )
-from mlbatch.report.scan_table import ScanStatistics, ScanTable, Spread
+from mlbatch.report.scan_table import ScanStatistics
 from mlbatch.types import CaptureCounts
 from mlbatch.units import NS_PER_S
-
-__all__ = ["ScanStatistics", "ScanTable", "Spread"]
 
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 Section: TypeAlias = dict[str, Json]
