@@ -17,7 +17,6 @@ from mlbatch.report.report import (
     InputReport,
     Passed,
     ReportInputs,
-    ScanTable,
     SensorReport,
     Timing,
     Unassigned,
@@ -26,6 +25,7 @@ from mlbatch.report.report import (
     report_text,
     summary_lines,
 )
+from mlbatch.report.scan_table import ScanStatistics, ScanTable, Spread
 from mlbatch.types import CaptureCounts
 from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 
