@@ -30,7 +30,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.report.report import ReportInputs, report_text, summary_lines
+from mlbatch.report.report import RunReport, report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -138,7 +138,7 @@ def _converted(
     progress: Progress | None,
     resume_log: ResumeLog | None,
     last: Last,
-) -> tuple[Conversion, ReportInputs]:
+) -> tuple[Conversion, RunReport]:
     """Run a job; errors that leave a resumable output say so."""
     try:
         return convert(job, open_output, progress, resume_log, last)
@@ -160,7 +160,7 @@ def _converted(
 def _report_writer(target: Target, report_path: Path | None) -> Last:
     """Writes the report before the output has its name, so that no output is without one."""
 
-    def write(inputs: ReportInputs, partial: Path) -> None:
+    def write(inputs: RunReport, partial: Path) -> None:
         if report_path is None or target.output is None:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()

@@ -26,7 +26,7 @@ from mlbatch.compare.sweeps import (
 from mlbatch.discovery.discover import Note
 from mlbatch.discovery.extrinsics import Mounted
 from mlbatch.errors import RecordingError
-from mlbatch.pipeline import accounts
+from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
@@ -165,7 +165,7 @@ def _join(run: Conversion, joiner: Joiner, ours: Tally) -> tuple[int, int]:
         held = window if window.index >= 0 else None
     run.session.refuse_absent()
     if not columns or first_ns is None:
-        raise RecordingError(accounts.why_nothing(run))
+        raise RecordingError(run_report.why_no_scan(run))
     late = sum(dropped.get("late", 0) for dropped in run.batcher.dropped)
     return columns + late, end_ns - first_ns
 

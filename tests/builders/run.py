@@ -24,7 +24,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
-from mlbatch.report.report import ReportInputs
+from mlbatch.report.report import RunReport
 from mlbatch.types import (
     EXTRAS,
     IMU,
@@ -142,7 +142,7 @@ class Result:
     """A conversion that ended well; `memory` is None where the output went to a file."""
 
     run: Conversion
-    report: ReportInputs
+    report: RunReport
     memory: Memory | None = None
 
     @property

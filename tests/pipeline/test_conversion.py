@@ -16,7 +16,7 @@ from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.run import convert
-from mlbatch.report.report import ReportInputs
+from mlbatch.report.report import RunReport
 from mlbatch.types import RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
@@ -120,7 +120,7 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
 
 
 def test_a_dry_run_reports_the_same() -> None:
-    def sums(report: ReportInputs) -> list[object]:
+    def sums(report: RunReport) -> list[object]:
         return [report.scans, report.t_init_ns, *(sensor.ledger for sensor in report.sensors)]
 
     job = replace(FIXTURE, extras=frozenset())

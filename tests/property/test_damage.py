@@ -19,7 +19,7 @@ import pytest
 from mlbatch.discovery.discover import Wishes
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
-from mlbatch.report.report import ReportInputs, build_report
+from mlbatch.report.report import RunReport, build_report
 from mlbatch.types import Scan
 from tests.builders.captures import pcap_bytes
 from tests.builders.damage import (
@@ -117,7 +117,7 @@ def outcome(job: Job, frames_given: int | None = None) -> Outcome:
     return json.dumps(ledgers), prints(result)
 
 
-def check_ledgers(report: ReportInputs) -> None:
+def check_ledgers(report: RunReport) -> None:
     """The equations of CONTRACT.md section 4, and that no datagram is forgotten."""
     capture, unassigned = report.capture, sum(row.packets for row in report.unassigned)
     assert capture.frames == capture.datagrams + sum(capture.skipped.values())

@@ -1,4 +1,4 @@
-"""What a finished run has to say: the inputs of its report, and why there may be no scan."""
+"""Report of a run: figures of its session, batching and decoding; late warnings; why no scan."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mlbatch.discovery.sampler import Kind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
-from mlbatch.report.ledger import PointCounts, ordered
+from mlbatch.report.ledger import ordered
 from mlbatch.report.report import (
     ClockReport,
     FaultReport,
+    ForwardedMessages,
     InputReport,
-    Passed,
-    ReportInputs,
+    RunReport,
     SensorReport,
     Timing,
     Unassigned,
@@ -33,16 +33,14 @@ from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
 
-__all__ = ["PointCounts", "report_inputs", "why_nothing"]
-
 _KB_PER_MB = 1024
 _NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
 
 
-def report_inputs(run: Conversion) -> ReportInputs:
-    """All that report.json is made of."""
+def run_report(run: Conversion) -> RunReport:
+    """Collect the content of report.json."""
     table = run.table
-    return ReportInputs(
+    return RunReport(
         inputs=tuple(
             InputReport(str(r.path), r.size_bytes, r.container) for r in run.session.recordings
         ),
@@ -58,7 +56,9 @@ def report_inputs(run: Conversion) -> ReportInputs:
         unassigned=_unassigned(run),
         timing=_timing(run),
         messages=tuple(
-            Passed(topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS))
+            ForwardedMessages(
+                topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS)
+            )
             for topic, counts in sorted(run.passthrough.messages.counts.items())
         ),
         faults=()
@@ -69,16 +69,16 @@ def report_inputs(run: Conversion) -> ReportInputs:
     )
 
 
-# Share of a sensor's packets, or columns, that is worth a warning: a change of mode, a wrong
-# calibration; one damaged stamp that lies ahead makes those that follow it late.
+# Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
+# calibration; one damaged timestamp in the future makes those that follow it late.
 MANY = 0.01
 
 
 def _cloud_notes(run: Conversion) -> Iterator[Note]:
-    """What the times of clouds were taken for."""
+    """How the times of decoded clouds were read."""
     if not any(recording.topics for recording in run.session.recordings):
         return
-    # Captures have no topics, and so no clouds: they need not wait for what reads these.
+    # Captures have no topics, hence no clouds: do not load their reader.
     from mlbatch.clouds import CloudRecording
 
     for recording in run.session.recordings:
@@ -87,8 +87,8 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
                 yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
 
 
-def late_notes(run: Conversion) -> list[Note]:
-    """Warnings that only the end of a run knows: damaged recordings, lidars that came late."""
+def final_notes(run: Conversion) -> list[Note]:
+    """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
     notes = [
         Note("recording", "", f"{recording.path.name}: {text}")
         for recording in run.session.recordings
@@ -97,7 +97,7 @@ def late_notes(run: Conversion) -> list[Note]:
     notes += _cloud_notes(run)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
-        # What was captured twice is no loss.
+        # A packet captured twice is no loss.
         reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
         rejected = sum(reasons_of.values())
         if rejected > MANY * packets.read:
@@ -107,22 +107,22 @@ def late_notes(run: Conversion) -> list[Note]:
         decoded, late = sensor.ledger.columns.decoded, sensor.ledger.columns.dropped.get("late", 0)
         if late > MANY * decoded:
             text = (
-                f"{sensor.name}: {late} of {decoded} columns came too late for their scans, after "
-                "a stamp that lay ahead (damaged?) or a stall; see --decode crc=check, --max-wait"
+                f"{sensor.name}: {late} of {decoded} columns were late, after a timestamp in the "
+                "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
     table, seen = run.session.setup.sampler.table, run.session.setup.sampler.samples
     for kind in sorted(run.session.ingest.samples):
         what = _what(run, kind)
-        # A rig says which sensors are wanted, so that others need no warning.
+        # A rig lists the sensors to use; others need no warning.
         if run.session.setup.rig is None and kind not in seen and "lidar" in what:
             notes.append(
                 Note(
                     "late_stream",
                     "",
-                    f"{table.streams[kind[0]]}: {what}; it began after the first 10 s, where "
-                    "sensors are looked for, so that its packets are counted as unassigned; "
-                    "name the sensor in a rig file (--rig)",
+                    f"{table.streams[kind[0]]}: {what}; it started after the first 10 s, in "
+                    "which sensors are detected; its packets are counted as unassigned; name the "
+                    "sensor in a rig file (--rig)",
                 )
             )
     return notes
@@ -143,13 +143,13 @@ def message_notes(run: Conversion) -> list[Note]:
     return notes
 
 
-def why_nothing(run: Conversion) -> str:
-    """Why no scan came out, with the stamps of each sensor and what to do."""
+def why_no_scan(run: Conversion) -> str:
+    """Error text of a run without a scan: time span of each sensor, and a remedy."""
     where = ", ".join(str(path) for path in run.job.recordings)
     spans = []
     for sensor, span in zip(run.sensors, run.batcher.spans_ns, strict=True):
         if span is None:
-            spans.append(f"{sensor.name} gave no valid column")
+            spans.append(f"{sensor.name} has no valid column")
         else:
             spans.append(
                 f"{sensor.name} from {span[0] / NS_PER_S:.6f} to {span[1] / NS_PER_S:.6f} s"
@@ -161,7 +161,7 @@ def why_nothing(run: Conversion) -> str:
         if reason in ("head", "tail")
     )
     if all(span is None for span in run.batcher.spans_ns):
-        return f"{where}: no scan: wanted valid columns, got none ({'; '.join(spans)})"
+        return f"{where}: no scan: expected valid columns, found none ({'; '.join(spans)})"
     period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
     advice = (
         "write the partial ones with --keep-partial"
@@ -169,7 +169,7 @@ def why_nothing(run: Conversion) -> str:
         else "choose another --start/--end, or a recording where all sensors run together"
     )
     return (
-        f"{where}: no scan: wanted a whole window of {period_ms:g} ms seen by all sensors, got "
+        f"{where}: no scan: expected a whole window of {period_ms:g} ms with all sensors, found "
         f"{'; '.join(spans)}; {advice}"
     )
 
@@ -182,7 +182,7 @@ def _capture(run: Conversion) -> CaptureCounts:
         for reason, count in recording.counts.skipped.items():
             total.skip(reason, count)
     if run.batcher.past_end:
-        # What several recordings read ahead of each other was never looked at.
+        # Recordings are read ahead of each other; what was not used does not count.
         ahead = total.datagrams - run.session.delivered
         total.frames -= ahead
         total.datagrams -= ahead
@@ -190,9 +190,9 @@ def _capture(run: Conversion) -> CaptureCounts:
 
 
 def _repeated(run: Conversion) -> int:
-    """Datagrams that faults repeated less those they removed."""
+    """Datagrams that injected faults duplicated, less those that they removed."""
     if run.session.replay is None or run.batcher.past_end:
-        # Up to an end only those are counted that the faults gave.
+        # With an end, only datagrams after fault injection are counted.
         return 0
     return sum(one.repeated - one.removed for one in run.session.replay.ledgers)
 
@@ -241,7 +241,7 @@ def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
 def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     setup, rows = run.session.setup, []
     streams = setup.sampler.table.streams
-    # Not by the streams' numbers, which follow the order in which files are read.
+    # Not by stream number, which depends on the order of reading.
     by_name = sorted(
         run.session.ingest.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
     )
@@ -259,7 +259,7 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
 
 
 def _what(run: Conversion, kind: Kind) -> str:
-    """What unassigned packets look like: one of them, else those seen at first."""
+    """Description of unassigned packets: by one of them, else by those sampled by discovery."""
     sample = run.session.ingest.samples.get(kind)
     if sample is not None and (text := sensors.describe(kind[1], sample)):
         return text
