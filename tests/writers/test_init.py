@@ -69,7 +69,7 @@ def test_suffix_and_option_choose(target: str, asked: str | None, expected: str)
         ("x.bag", "mcap", "the name of a .mcap file for --format mcap, found that of a rosbag1"),
         ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
         ("x", "las", "'las' (not in this version)"),
-        ("x", "stl", "one of mcap, npz, ply, rosbag1, rosbag2"),
+        ("x", "stl", "one of mcap, npz, ply"),
     ],
 )
 def test_refusals_name_a_remedy(target: str, asked: str | None, hint: str) -> None:

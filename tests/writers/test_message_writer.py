@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.types import Message, Summary
-from mlbatch.writers import WriterOptions, open_writer
+from mlbatch.types import IMU, Message, Summary
+from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
 from mlbatch.writers.message_writer import quaternion
 from tests.builders.scans import (
     PERIOD_NS,
@@ -34,7 +34,11 @@ from tests.builders.written_bags import (
     written,
 )
 
-OUTPUTS = {"mcap": "out.mcap", "rosbag1": "out.bag", "rosbag2": "out"}
+OUTPUTS = {
+    name: f"out{plugin(name).SUFFIX or ''}"
+    for name in format_names()
+    if IMU in extras(name, WriterOptions())
+}
 each_container = pytest.mark.parametrize("name", OUTPUTS)
 # The first one has more points than a block of the packing, and not a multiple of it.
 SCANS = [dense_scan(0, 20_001), dense_scan(1, 30)]
