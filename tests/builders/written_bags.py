@@ -1,4 +1,4 @@
-"""Outputs with messages for tests: recorded messages, written outputs, rosbags as their reader."""
+"""Outputs with messages for tests: recorded messages, written outputs, and their readers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 from mlbatch.types import Message, Scan, Topic
 from mlbatch.writers import WriterOptions, open_writer
@@ -95,7 +96,7 @@ def written(
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A message as rosbags decodes it."""
+    """A message as a library decodes it."""
 
     topic: str
     type: str
@@ -105,7 +106,16 @@ class Read:
 
 
 def read_back(path: Path) -> list[Read]:
-    """Return all messages as rosbags reads them, by log time."""
+    """Return all messages by log time: bags by rosbags, MCAP by mcap and mcap-ros2-support."""
+    if path.suffix == ".mcap":
+        decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[decoder])
+            return [
+                Read(c.topic, schema.name, m.log_time, m.data, value)
+                for schema, c, m, value in reader.iter_decoded_messages()
+                if schema is not None
+            ]
     highlevel = pytest.importorskip("rosbags.highlevel")
     with highlevel.AnyReader([path]) as reader:
         return [
