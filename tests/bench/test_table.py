@@ -7,7 +7,7 @@ from dataclasses import replace
 from mlbatch.bench.ratios import CPU, MEMORY
 from mlbatch.bench.results import Changed, Counted, Ratio
 from mlbatch.bench.table import aligned, lines
-from tests.unit.bench.made import STAGES, result, row, run
+from tests.bench.made import STAGES, result, row, run
 
 
 def test_a_line_holds_medians_in_the_units_of_the_head() -> None:

@@ -19,7 +19,7 @@ from mlbatch.bench.ratios import (
     ratios,
 )
 from mlbatch.bench.results import FLOOR, PEER, Counted, Row
-from tests.unit.bench.made import row, run
+from tests.bench.made import row, run
 
 WRITTEN = Counted(1_000_000, 800_000, 100, 10.0, 4_000_000, 20_000_000)
 FLOORED = Counted(1_000_000, 800_000, 100, 10.0, 0, 20_000_000)

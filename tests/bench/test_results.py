@@ -11,7 +11,7 @@ import pytest
 from mlbatch.bench.measure import BenchError
 from mlbatch.bench.ratios import CPU
 from mlbatch.bench.results import Changed, Ratio, document, read_document
-from tests.unit.bench.made import STAGES, result, row, run
+from tests.bench.made import STAGES, result, row, run
 
 KEYS = ["schema", "date", "machine", "seconds", "repeat"]
 LISTS = ["rows", "ratios", "changes", "notes", "failed"]
