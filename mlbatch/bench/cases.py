@@ -2,12 +2,131 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
-from mlbatch.bench.ratios import COPY, DRY_RUN, LIBRARY, START, WRITE
-from mlbatch.bench.recordings import RECORDINGS, Recording
+from mlbatch.bench.results import COPY, DRY_RUN, LIBRARY, START, WRITE
+from mlbatch.units import NS_PER_MS
+
+CAPTURE, RIG = "capture.pcap", "rig.yaml"
+# Beside a capture: of what makes it, so that one that another version made is made anew.
+DIGEST: Final = "made-by.sha256"
+_MAKERS: Final = ("cases.py", "recordings.py")
+LOW, FULL = "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"
+VLP16, PANDAR64 = "VLP-16", "Pandar64"
+INIT_ID: Final = 7_109_750
+# Ethernet, IPv4 and UDP headers, and that of a pcap record.
+_HEADERS_BYTES: Final = 14 + 20 + 8 + 16
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a lidar sends in a second, and the suffix of the file it needs (empty: none)."""
+
+    packets: int
+    packet_bytes: int
+    slots: int
+    suffix: str
+
+
+# An Ouster profile, or a model of another maker.
+KINDS: Final[Mapping[str, Kind]] = {
+    LOW: Kind(640, 8448, 10_240 * 128, ".json"),
+    FULL: Kind(640, 24832, 10_240 * 128, ".json"),
+    VLP16: Kind(754, 1206, 18_084 * 16, ""),
+    PANDAR64: Kind(3000, 1198, 18_000 * 64, ".csv"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """A sensor of a rig; kind: a key of KINDS."""
+
+    name: str
+    kind: str
+    source_ip: str
+    port: int
+    phase_ns: int
+    translation_m: tuple[float, float, float]
+    yaw_deg: float
+    serial: int = 0
+
+    @property
+    def file(self) -> str:
+        """What lies beside the recording for it; empty: nothing."""
+        suffix = KINDS[self.kind].suffix
+        return f"{self.name}{suffix}" if suffix else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A standard recording."""
+
+    name: str
+    what: str
+    sensors: tuple[Mounted, ...]
+    fragments: bool = False
+
+    @property
+    def bytes_a_second(self) -> int:
+        """About what its capture takes."""
+        kinds = [KINDS[sensor.kind] for sensor in self.sensors]
+        return sum(kind.packets * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
+
+    @property
+    def slots_a_second(self) -> int:
+        """Most points that can come out of it."""
+        return sum(KINDS[sensor.kind].slots for sensor in self.sensors)
+
+
+def _dual(profile: str) -> tuple[Mounted, ...]:
+    behind_ns = 37_100_000
+    return (
+        Mounted("a", profile, "192.168.7.11", 7502, 0, (0.0, 0.6, 1.8), 0.0, 122201000998),
+        Mounted(
+            "b", profile, "192.168.7.12", 7504, behind_ns, (0.0, -0.6, 1.8), 90.0, 122201000999
+        ),
+    )
+
+
+_ROOF: Final = Mounted("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
+_REAR: Final = Mounted("rear", PANDAR64, "192.168.7.31", 2370, 0, (-1.0, 0.0, 1.8), 180.0)
+_TRIPLE: Final = (
+    _ROOF,
+    Mounted("left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0),
+    Mounted("right", VLP16, "192.168.7.23", 2368, 61 * NS_PER_MS, (0.0, -0.8, 1.6), -60.0),
+)
+RECORDINGS: Final[Mapping[str, Recording]] = {
+    recording.name: recording
+    for recording in (
+        Recording("dual-4", "two OS-1-128, 4 bytes a pixel", _dual(LOW)),
+        Recording("dual-4-fragments", "the same in 1500-byte fragments", _dual(LOW), True),
+        Recording("dual-12", "two OS-1-128, 12 bytes a pixel", _dual(FULL)),
+        Recording("dual-12-fragments", "the same in 1500-byte fragments", _dual(FULL), True),
+        Recording("three-vlp16", "three VLP-16, one return", _TRIPLE),
+        Recording("pandar64", "a HESAI Pandar64, one return", (_REAR,)),
+        Recording("mixed", "an OS-1-128, a VLP-16, a Pandar64", (_dual(LOW)[0], _ROOF, _REAR)),
+    )
+}
+
+
+@lru_cache(maxsize=1)
+def digest() -> str:
+    """Of the sources that make recordings."""
+    folder = Path(__file__).parent
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in _MAKERS)).hexdigest()
+
+
+def is_made(folder: Path) -> bool:
+    """Whether a recording stands in a folder as it would be made now."""
+    made = folder / DIGEST
+    is_whole = (folder / CAPTURE).is_file() and made.is_file()
+    return is_whole and made.read_text(encoding="utf-8") == digest()
+
 
 AUTO, NUMPY, NUMBA = "auto", "numpy", "numba"
 

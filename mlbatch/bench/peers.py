@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from mlbatch.bench.cases import CAPTURE, FULL, LOW, VLP16, Recording
 from mlbatch.bench.measure import BenchError, measure
-from mlbatch.bench.recordings import CAPTURE, FULL, LOW, VLP16, Recording
 from mlbatch.bench.results import Counted, Run
 
 _VERSIONS: Final = """

@@ -7,139 +7,324 @@ makes one of them in a process of its own, so that the measuring process stays s
 
 from __future__ import annotations
 
-import hashlib
+import ipaddress
 import json
+import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
-from mlbatch.units import NS_PER_MS
+import numpy as np
 
-CAPTURE, RIG = "capture.pcap", "rig.yaml"
-# Beside a capture: of what makes it, so that one that another version made is made anew.
-DIGEST: Final = "made-by.sha256"
-_MAKERS: Final = ("recordings.py", "captures.py", "lidars.py")
-LOW, FULL = "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"
-VLP16, PANDAR64 = "VLP-16", "Pandar64"
-INIT_ID: Final = 7_109_750
-# Ethernet, IPv4 and UDP headers, and that of a pcap record.
-_HEADERS_BYTES: Final = 14 + 20 + 8 + 16
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """What a lidar sends in a second, and the suffix of the file it needs (empty: none)."""
-
-    packets: int
-    packet_bytes: int
-    slots: int
-    suffix: str
-
-
-# An Ouster profile, or a model of another maker.
-KINDS: Final[Mapping[str, Kind]] = {
-    LOW: Kind(640, 8448, 10_240 * 128, ".json"),
-    FULL: Kind(640, 24832, 10_240 * 128, ".json"),
-    VLP16: Kind(754, 1206, 18_084 * 16, ""),
-    PANDAR64: Kind(3000, 1198, 18_000 * 64, ".csv"),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Mounted:
-    """A sensor of a rig; kind: a key of KINDS."""
-
-    name: str
-    kind: str
-    source_ip: str
-    port: int
-    phase_ns: int
-    translation_m: tuple[float, float, float]
-    yaw_deg: float
-    serial: int = 0
-
-    @property
-    def file(self) -> str:
-        """What lies beside the recording for it; empty: nothing."""
-        suffix = KINDS[self.kind].suffix
-        return f"{self.name}{suffix}" if suffix else ""
-
-
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """A standard recording."""
-
-    name: str
-    what: str
-    sensors: tuple[Mounted, ...]
-    fragments: bool = False
-
-    @property
-    def bytes_a_second(self) -> int:
-        """About what its capture takes."""
-        kinds = [KINDS[sensor.kind] for sensor in self.sensors]
-        return sum(kind.packets * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
-
-    @property
-    def slots_a_second(self) -> int:
-        """Most points that can come out of it."""
-        return sum(KINDS[sensor.kind].slots for sensor in self.sensors)
-
-
-def _dual(profile: str) -> tuple[Mounted, ...]:
-    behind_ns = 37_100_000
-    return (
-        Mounted("a", profile, "192.168.7.11", 7502, 0, (0.0, 0.6, 1.8), 0.0, 122201000998),
-        Mounted(
-            "b", profile, "192.168.7.12", 7504, behind_ns, (0.0, -0.6, 1.8), 90.0, 122201000999
-        ),
-    )
-
-
-_ROOF: Final = Mounted("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
-_REAR: Final = Mounted("rear", PANDAR64, "192.168.7.31", 2370, 0, (-1.0, 0.0, 1.8), 180.0)
-_TRIPLE: Final = (
-    _ROOF,
-    Mounted("left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0),
-    Mounted("right", VLP16, "192.168.7.23", 2368, 61 * NS_PER_MS, (0.0, -0.8, 1.6), -60.0),
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.bench.cases import (
+    CAPTURE,
+    DIGEST,
+    FULL,
+    INIT_ID,
+    KINDS,
+    LOW,
+    PANDAR64,
+    RECORDINGS,
+    RIG,
+    VLP16,
+    Mounted,
+    Recording,
+    digest,
 )
-RECORDINGS: Final[Mapping[str, Recording]] = {
-    recording.name: recording
-    for recording in (
-        Recording("dual-4", "two OS-1-128, 4 bytes a pixel", _dual(LOW)),
-        Recording("dual-4-fragments", "the same in 1500-byte fragments", _dual(LOW), True),
-        Recording("dual-12", "two OS-1-128, 12 bytes a pixel", _dual(FULL)),
-        Recording("dual-12-fragments", "the same in 1500-byte fragments", _dual(FULL), True),
-        Recording("three-vlp16", "three VLP-16, one return", _TRIPLE),
-        Recording("pandar64", "a HESAI Pandar64, one return", (_REAR,)),
-        Recording("mixed", "an OS-1-128, a VLP-16, a Pandar64", (_dual(LOW)[0], _ROOF, _REAR)),
-    )
+from mlbatch.types import Stream
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+EPOCH_NS: Final = 1_700_000_000 * NS_PER_S
+TURN_NS: Final = 100 * NS_PER_MS
+# A packet arrives so long after its last shot.
+_TRAVEL_NS: Final = 300 * NS_PER_US
+_CDEG_PER_TURN: Final = 36_000
+_SIGNAL_PEAK: Final = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Lidar:
+    """Packets of one turn, (packets, bytes), how long one lasts, and what changes in the next.
+
+    fill: writes stamps, angles and counters of packets (n,) with their first shots (n,), ns.
+    """
+
+    turn: U8Array
+    packet_ns: int
+    fill: Callable[[U8Array, I64Array, I64Array], None]
+
+    @property
+    def packet_bytes(self) -> int:
+        """Bytes of a packet."""
+        return int(self.turn.shape[1])
+
+    def packets(self, numbers: I64Array, phase_ns: int) -> tuple[I64Array, U8Array]:
+        """Arrival (n,) in ns and payloads (n, bytes) of these packets."""
+        begin_ns = EPOCH_NS + phase_ns + numbers * self.packet_ns
+        payloads = self.turn[numbers % len(self.turn)]
+        self.fill(payloads, numbers, begin_ns)
+        return begin_ns + self.packet_ns + _TRAVEL_NS, payloads
+
+
+def seen(columns: int, channels: int) -> tuple[I64Array, I64Array]:
+    """Ranges in mm, 0 for none, and levels 0 to 255 of a turn: (columns, channels) each."""
+    chance = np.random.default_rng(columns * channels)
+    column = np.arange(columns)[:, None] * (2 * np.pi / columns)
+    channel = np.arange(channels) * (8 / channels)
+    wave = np.sin(3 * column + channel) + 0.3 * np.sin(11 * column - channel)
+    range_mm = np.rint(14_000 + 9_000 * wave + chance.normal(0, 15, wave.shape)).astype(np.int64)
+    # Sky, and shots that miss here and there.
+    range_mm[(np.cos(5 * column + 2 * channel) > 0.85) | (chance.random(wave.shape) < 0.03)] = 0
+    level = np.rint(90 + 60 * wave + chance.normal(0, 10, wave.shape)).astype(np.int64)
+    return range_mm, np.where(range_mm > 0, level.clip(1, 255), 0)
+
+
+OUSTER_BEAMS, OUSTER_COLUMNS, OUSTER_PER_PACKET = 128, 1024, 16
+_PIXEL: Final[Mapping[str, np.dtype[np.void]]] = {
+    LOW: np.dtype([("range_8mm", "<u2"), ("reflectivity", "u1"), ("near_ir", "u1")]),
+    FULL: np.dtype(
+        [
+            *(("range_mm", "<u4"), ("reflectivity", "u1"), ("unused", "u1")),
+            *(("signal", "<u2"), ("near_ir", "<u2"), ("window", "<u2")),
+        ]
+    ),
 }
 
 
-@lru_cache(maxsize=1)
-def digest() -> str:
-    """Of the sources that make recordings."""
-    folder = Path(__file__).parent
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in _MAKERS)).hexdigest()
+def ouster(profile: str, serial: int) -> Lidar:
+    """An OS-1-128 at 1024x10."""
+    range_mm, level = seen(OUSTER_COLUMNS, OUSTER_BEAMS)
+    pixel = np.zeros(range_mm.shape, _PIXEL[profile])
+    values = {
+        "range_8mm": range_mm // 8,
+        "range_mm": range_mm,
+        "reflectivity": level,
+        "signal": np.where(range_mm > 0, _SIGNAL_PEAK * level // (1 + range_mm // 100), 0),
+        "near_ir": 40 + level // 4,
+    }
+    for name in set(values) & set(pixel.dtype.names or ()):
+        pixel[name] = values[name]
+    column = np.dtype(
+        [
+            *(("stamp_ns", "<u8"), ("measurement_id", "<u2"), ("status", "<u2")),
+            ("pixel", _PIXEL[profile], OUSTER_BEAMS),
+        ]
+    )
+    packet = np.dtype(
+        [
+            *(("type", "<u2"), ("frame_id", "<u2"), ("init_id", "u1", 3), ("serial", "u1", 5)),
+            *(("state", "u1", 20), ("column", column, OUSTER_PER_PACKET), ("footer", "u1", 32)),
+        ]
+    )
+    turn = np.zeros(OUSTER_COLUMNS // OUSTER_PER_PACKET, packet)
+    turn["type"] = 1
+    turn["init_id"] = np.frombuffer(INIT_ID.to_bytes(3, "little"), np.uint8)
+    turn["serial"] = np.frombuffer(serial.to_bytes(5, "little"), np.uint8)
+    turn["column"]["status"] = 1
+    turn["column"]["measurement_id"] = np.arange(OUSTER_COLUMNS).reshape(-1, OUSTER_PER_PACKET)
+    turn["column"]["pixel"] = pixel.reshape(-1, OUSTER_PER_PACKET, OUSTER_BEAMS)
+
+    def fill(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        now = payloads.view(packet)[:, 0]
+        now["frame_id"] = numbers // len(turn) % 2**16
+        step = np.arange(OUSTER_PER_PACKET) * TURN_NS // OUSTER_COLUMNS
+        now["column"]["stamp_ns"] = begin_ns[:, None] + step
+
+    packet_ns = TURN_NS * OUSTER_PER_PACKET // OUSTER_COLUMNS
+    return Lidar(turn.view(np.uint8).reshape(len(turn), -1), packet_ns, fill)
 
 
-def is_made(folder: Path) -> bool:
-    """Whether a recording stands in a folder as it would be made now."""
-    made = folder / DIGEST
-    is_whole = (folder / CAPTURE).is_file() and made.is_file()
-    return is_whole and made.read_text(encoding="utf-8") == digest()
+# A range in the makers' steps and a level, of both Velodyne and HESAI.
+_READING: Final = np.dtype([("range", "<u2"), ("level", "u1")])
+VLP16_CHANNELS, _VLP16_PER_BLOCK, _VLP16_BLOCKS = 16, 2, 12
+# Two sequences of 55.296 us.
+_VLP16_BLOCK_NS: Final = 110_592
+_US_PER_HOUR: Final = 3_600_000_000
+
+
+def vlp16(serial: int = 0) -> Lidar:
+    """A VLP-16 at 600 rpm with one return; steps of 2 mm; its packets hold no serial number."""
+    block = np.dtype(
+        [
+            *(("flag", "<u2"), ("azimuth_cdeg", "<u2")),
+            ("reading", _READING, (_VLP16_PER_BLOCK, VLP16_CHANNELS)),
+        ]
+    )
+    packet = np.dtype(
+        [
+            ("block", block, _VLP16_BLOCKS),
+            *(("past_hour_us", "<u4"), ("mode", "u1"), ("product", "u1")),
+        ]
+    )
+    packet_ns = _VLP16_BLOCK_NS * _VLP16_BLOCKS
+    turn = np.zeros(TURN_NS // packet_ns, packet)
+    turn["mode"], turn["product"] = 0x37, 0x22
+    turn["block"]["flag"] = 0xEEFF
+    columns = len(turn) * _VLP16_BLOCKS * _VLP16_PER_BLOCK
+    for name, values in _steps(columns, VLP16_CHANNELS, 2).items():
+        turn["block"]["reading"][name] = values.reshape(turn["block"]["reading"].shape)
+
+    def fill(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        now = payloads.view(packet)[:, 0]
+        now["past_hour_us"] = begin_ns // NS_PER_US % _US_PER_HOUR
+        shot_ns = begin_ns[:, None] + np.arange(_VLP16_BLOCKS) * _VLP16_BLOCK_NS
+        now["block"]["azimuth_cdeg"] = _cdeg(shot_ns)
+
+    return Lidar(turn.view(np.uint8).reshape(len(turn), -1), packet_ns, fill)
+
+
+PANDAR64_CHANNELS, _PANDAR64_BLOCKS, _PANDAR64_BLOCK_NS = 64, 6, 55_560
+
+
+def pandar64(serial: int = 0) -> Lidar:
+    """A Pandar64 at 600 rpm with one return; steps of 4 mm; packets hold no serial number."""
+    block = np.dtype([("azimuth_cdeg", "<u2"), ("reading", _READING, PANDAR64_CHANNELS)])
+    packet = np.dtype(
+        [
+            *(("head", "u1", 8), ("block", block, _PANDAR64_BLOCKS), ("reserved", "u1", 8)),
+            *(("speed_rpm", "<u2"), ("micros", "<u4"), ("mode", "u1"), ("factory", "u1")),
+            *(("date", "u1", 6), ("sequence", "<u4")),
+        ]
+    )
+    packet_ns = _PANDAR64_BLOCK_NS * _PANDAR64_BLOCKS
+    turn = np.zeros(TURN_NS // packet_ns, packet)
+    turn["head"] = [0xEE, 0xFF, PANDAR64_CHANNELS, _PANDAR64_BLOCKS, 0, 4, 0, 0]
+    turn["speed_rpm"], turn["mode"], turn["factory"] = 600, 0x37, 0x42
+    columns = len(turn) * _PANDAR64_BLOCKS
+    for name, values in _steps(columns, PANDAR64_CHANNELS, 4).items():
+        turn["block"]["reading"][name] = values.reshape(turn["block"]["reading"].shape)
+
+    def fill(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        now = payloads.view(packet)[:, 0]
+        now["micros"] = begin_ns // NS_PER_US % (NS_PER_S // NS_PER_US)
+        now["sequence"] = numbers
+        shot_ns = begin_ns[:, None] + np.arange(_PANDAR64_BLOCKS) * _PANDAR64_BLOCK_NS
+        now["block"]["azimuth_cdeg"] = _cdeg(shot_ns)
+        second, which = np.unique(begin_ns // NS_PER_S, return_inverse=True)
+        now["date"] = np.array([_date(one) for one in second.tolist()], np.uint8)[which]
+
+    return Lidar(turn.view(np.uint8).reshape(len(turn), -1), packet_ns, fill)
+
+
+def _steps(columns: int, channels: int, step_mm: int) -> dict[str, I64Array]:
+    range_mm, level = seen(columns, channels)
+    return {"range": range_mm // step_mm, "level": level}
+
+
+def _cdeg(shot_ns: I64Array) -> I64Array:
+    """Where the rotor is, 1/100 deg."""
+    return shot_ns % TURN_NS * _CDEG_PER_TURN // TURN_NS
+
+
+def _date(epoch_s: int) -> list[int]:
+    """Year since 1900, month, day, hour, minute, second (UTC)."""
+    now = time.gmtime(epoch_s)
+    return [now.tm_year - 1900, now.tm_mon, now.tm_mday, now.tm_hour, now.tm_min, now.tm_sec]
+
+
+# By kind of recordings.py; given the serial number, where packets carry one.
+MAKERS: Final[Mapping[str, Callable[[int], Lidar]]] = {
+    LOW: partial(ouster, LOW),
+    FULL: partial(ouster, FULL),
+    VLP16: vlp16,
+    PANDAR64: pandar64,
+}
+
+
+ETHERNET_MTU, JUMBO_MTU = 1500, 65535
+_FILE_HEAD: Final = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+_RECORD: Final = np.dtype([("s", "<u4"), ("us", "<u4"), ("kept", "<u4"), ("length", "<u4")])
+_ETHERNET: Final = np.frombuffer(bytes(12) + b"\x08\x00", np.uint8)
+_IP: Final = struct.Struct(">BBHHHBBH4s4s")
+_IP_ID_AT, _IP_CHECK_AT = 4, 10
+_UDP: Final = struct.Struct(">HHHH")
+_RECEIVER: Final = ipaddress.IPv4Address("192.168.7.2").packed
+_MORE_FRAGMENTS: Final = 0x2000
+# A full frame takes this long on 1 Gbit/s Ethernet; fragments of a packet arrive so far apart.
+_FRAGMENT_STEP_NS: Final = 12 * NS_PER_US
+_PIECE_NS: Final = 500 * NS_PER_MS
+Row = tuple[int, U8Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A lidar on the network, and how far (ns) its rotor runs behind."""
+
+    lidar: Lidar
+    stream: Stream
+    phase_ns: int
+
+
+def write_capture(path: Path, sources: Sequence[Source], seconds: float, mtu: int) -> None:
+    """Write so many seconds of all sources, a piece of time after the other."""
+    end_ns = EPOCH_NS + round(seconds * NS_PER_S)
+    waiting: list[Row] = []
+    sent = [0] * len(sources)
+    with path.open("wb") as file:
+        file.write(_FILE_HEAD)
+        for edge_ns in (*range(EPOCH_NS + _PIECE_NS, end_ns, _PIECE_NS), end_ns):
+            for number, source in enumerate(sources):
+                lidar = source.lidar
+                count = (edge_ns - EPOCH_NS - source.phase_ns) // lidar.packet_ns
+                numbers = np.arange(sent[number], max(sent[number], count))
+                sent[number] += len(numbers)
+                waiting += rows(source, numbers, mtu)
+            waiting.sort(key=itemgetter(0))
+            # What arrives later may still be overtaken by packets of the next piece.
+            whole = sum(arrival_ns < edge_ns for arrival_ns, _ in waiting)
+            file.writelines(row.data for _, row in waiting[:whole])
+            del waiting[:whole]
+        file.writelines(row.data for _, row in waiting)
+
+
+def rows(source: Source, numbers: I64Array, mtu: int) -> Iterator[Row]:
+    """Arrival and bytes of all records that carry these packets."""
+    if not len(numbers):
+        return
+    arrival_ns, payloads = source.lidar.packets(numbers, source.phase_ns)
+    port, size = source.stream.port, payloads.shape[1] + _UDP.size
+    udp = np.frombuffer(_UDP.pack(port, port, size, 0), np.uint8)
+    datagrams = np.concatenate([np.broadcast_to(udp, (len(numbers), _UDP.size)), payloads], 1)
+    step = (mtu - _IP.size) // 8 * 8
+    for place, offset in enumerate(range(0, size, step)):
+        part = datagrams[:, offset : offset + step]
+        flags = offset // 8 | (_MORE_FRAGMENTS if offset + step < size else 0)
+        ip = _ip_headers(source.stream.source_ip, numbers & 0xFFFF, flags, part.shape[1])
+        at_ns = arrival_ns + place * _FRAGMENT_STEP_NS
+        yield from zip(at_ns.tolist(), _records(at_ns, ip, part), strict=True)
+
+
+def _records(at_ns: I64Array, ip: U8Array, part: U8Array) -> U8Array:
+    """(n, bytes) pcap records."""
+    head = np.zeros(len(part), _RECORD)
+    head["s"], rest_ns = np.divmod(at_ns, NS_PER_S)
+    head["us"] = rest_ns // NS_PER_US
+    head["kept"] = head["length"] = len(_ETHERNET) + _IP.size + part.shape[1]
+    ethernet = np.broadcast_to(_ETHERNET, (len(part), len(_ETHERNET)))
+    return np.concatenate([head.view(np.uint8).reshape(len(part), -1), ethernet, ip, part], 1)
+
+
+def _ip_headers(source_ip: str, ids: I64Array, flags: int, size: int) -> U8Array:
+    """(n, 20) headers with their checksums."""
+    sender = ipaddress.IPv4Address(source_ip).packed
+    head = _IP.pack(0x45, 0, _IP.size + size, 0, flags, 64, 17, 0, sender, _RECEIVER)
+    total = sum(struct.unpack(">10H", head)) + ids
+    folded = (total & 0xFFFF) + (total >> 16)
+    check = ~((folded & 0xFFFF) + (folded >> 16)) & 0xFFFF
+    headers = np.tile(np.frombuffer(head, np.uint8), (len(ids), 1))
+    for at, words in ((_IP_ID_AT, ids), (_IP_CHECK_AT, check)):
+        headers[:, at], headers[:, at + 1] = words >> 8, words & 0xFF
+    return headers
 
 
 def make(recording: Recording, seconds: float, folder: Path) -> None:
     """Write capture, rig and what the sensors need into an existing folder."""
-    from mlbatch.bench.captures import ETHERNET_MTU, JUMBO_MTU, Source, write_capture
-    from mlbatch.bench.lidars import MAKERS
-    from mlbatch.types import Stream
-
     sources = []
     for sensor in recording.sensors:
         if sensor.file:

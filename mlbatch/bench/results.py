@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from mlbatch.bench.measure import BenchError
+from mlbatch.errors import one_line
+from mlbatch.units import NS_PER_S
 
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 
@@ -159,3 +161,165 @@ def read_document(path: Path) -> dict[tuple[str, str], dict[str, list[float]]]:
             f"{path}: wanted what `mlbatch bench --json` printed, got something else "
             f"({type(err).__name__}: {err}); give another file"
         ) from err
+
+
+COPY, WRITE, LIBRARY = "memory copy", "plain write", "mcap library"
+START, DRY_RUN = "python with numpy", "dry run"
+CPU, OWN_CPU, WALL, MEMORY = "CPU", "CPU without start", "time", "peak memory"
+WRITING: Final = "CPU above the dry run"
+_MEASURES: Final[Mapping[str, Callable[[Run], float]]] = {
+    CPU: lambda run: run.cpu_s,
+    OWN_CPU: lambda run: run.own_cpu_s,
+    WALL: lambda run: run.wall_s,
+    MEMORY: lambda run: run.rss_mb,
+}
+OFS: Final = tuple(_MEASURES)
+# What is compared with a peer, with the program that another one extends, and with a floor.
+_WITH_PEER: Final = (CPU, OWN_CPU)
+_WITH_BASE: Final = (CPU, WALL)
+_WITH_FLOOR: Final[Mapping[str, str]] = {START: MEMORY, COPY: OWN_CPU, WRITE: WALL}
+_NOW_AND_BEFORE: Final[Mapping[str, str]] = {
+    "cpu_s": CPU,
+    "own_cpu_s": OWN_CPU,
+    "wall_s": WALL,
+    "rss_mb": MEMORY,
+}
+
+
+def ratios(rows: Sequence[Row]) -> Iterator[Ratio]:
+    """All comparisons within the cases, in the order of the rows."""
+    for row in rows:
+        if row.role == OURS and row.program != DRY_RUN:
+            others = [other for other in rows if other.case == row.case and other is not row]
+            for other in others:
+                yield from _between(row, other, others)
+
+
+def _between(row: Row, other: Row, others: Sequence[Row]) -> Iterator[Ratio]:
+    writes = row.counted.written_bytes > 0
+    if other.role == PEER and other.counted.read_bytes == row.counted.read_bytes:
+        yield from (_ratio(row, other, of) for of in _WITH_PEER)
+    elif other.role == FLOOR and other.program == LIBRARY:
+        dry = next((one for one in others if one.program == DRY_RUN), None)
+        if writes and dry is not None:
+            yield _above(row, dry, other)
+    elif other.role == FLOOR and (writes or other.program != WRITE):
+        yield _ratio(row, other, _WITH_FLOOR[other.program])
+    elif other.program == row.base:
+        yield from (_ratio(row, other, of) for of in _WITH_BASE)
+
+
+def _ratio(row: Row, other: Row, of: str) -> Ratio:
+    value = _MEASURES[of]
+    pairs = zip(row.runs, other.runs, strict=True)
+    return Ratio(row.case, row.program, other.program, of, tuple(_over(value, *p) for p in pairs))
+
+
+def _over(value: Callable[[Run], float], run: Run, other: Run) -> float:
+    return value(run) / max(value(other), 1e-9)
+
+
+def _above(row: Row, dry: Row, library: Row) -> Ratio:
+    """What writing costs, against a library that only writes."""
+    runs = zip(row.runs, dry.runs, library.runs, strict=True)
+    values = tuple((a.own_cpu_s - b.own_cpu_s) / max(c.own_cpu_s, 1e-9) for a, b, c in runs)
+    return Ratio(row.case, row.program, library.program, WRITING, values)
+
+
+def changes(
+    rows: Sequence[Row], before: Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
+) -> Iterator[Changed]:
+    """Medians of now and of an earlier document, where both have the program."""
+    for row in rows:
+        old = before.get((row.case, row.program))
+        for name, of in _NOW_AND_BEFORE.items():
+            if old is not None and old[name] and median(old[name]) > 0:
+                now = median(getattr(run, name) for run in row.runs)
+                yield Changed(row.case, row.program, of, median(old[name]), now)
+
+
+_STAGES = ("read", "decode", "merge", "write")
+_HEAD = ("case", "program", "CPU s", "own s", "time s", "ns/slot", "x real", "MB", *_STAGES)
+_LEFT, _LEFT_OF_RATIOS = 2, 4
+
+
+def lines(result: Result) -> list[str]:
+    """Machine, programs, ratios, changes, notes."""
+    told = result.machine
+    versions = (f"{name} {value}" for name, value in told.items() if name not in _MACHINE)
+    head = [
+        f"{told['cpu']}, {told['cores']} cores, {told['memory_mb']} MB, {told['system']}",
+        f"{result.date}, load {told['load']:.1f}, {', '.join(versions)}",
+        f"{result.seconds:g} s of recording, medians of {result.repeat}, MB: largest; "
+        "own: CPU without start and imports; read to write: time of the stages, ns/slot",
+    ]
+    rows = aligned([_HEAD, *map(_row_cells, result.rows)], _LEFT)
+    parts = [head, rows]
+    if result.ratios:
+        parts.append(aligned([_RATIO_HEAD, *map(_ratio_cells, result.ratios)], _LEFT_OF_RATIOS))
+    if result.changes:
+        parts.append(aligned([_CHANGE_HEAD, *_changes(result.changes)], _LEFT))
+    if result.notes:
+        parts.append([f"note: {note}" for note in result.notes])
+    return [one_line(line) for part in parts for line in (*part, "")][:-1]
+
+
+_MACHINE = ("cpu", "cores", "memory_mb", "system", "load")
+_RATIO_HEAD = ("case", "program", "to", "of", "ratio", "least", "most")
+_CHANGE_HEAD = ("case", "program", *(f"{of}, now/before" for of in OFS))
+
+
+def _row_cells(row: Row) -> tuple[str, ...]:
+    runs, counted = row.runs, row.counted
+    cpu_s = median(run.cpu_s for run in runs)
+    wall_s = median(run.wall_s for run in runs)
+    stages = [
+        f"{median(run.stages_s[name] for run in runs) * NS_PER_S / counted.slots:.2f}"
+        if runs[0].stages_s and counted.slots
+        else ""
+        for name in _STAGES
+    ]
+    return (
+        row.case,
+        row.program,
+        f"{cpu_s:.3f}",
+        f"{median(run.own_cpu_s for run in runs):.3f}",
+        f"{wall_s:.3f}",
+        f"{cpu_s * NS_PER_S / counted.slots:.2f}" if counted.slots else "",
+        f"{counted.recorded_s / wall_s:.1f}" if wall_s > 0 else "",
+        f"{max(run.rss_mb for run in runs):.0f}",
+        *stages,
+    )
+
+
+def _ratio_cells(ratio: Ratio) -> tuple[str, ...]:
+    figures = (median(ratio.values), min(ratio.values), max(ratio.values))
+    return (
+        ratio.case,
+        ratio.program,
+        ratio.to,
+        ratio.of,
+        *(f"{figure:.2f}" for figure in figures),
+    )
+
+
+def _changes(found: Sequence[Changed]) -> Iterator[tuple[str, ...]]:
+    """A line a program."""
+    by_program: dict[tuple[str, str], dict[str, float]] = {}
+    for one in found:
+        by_program.setdefault((one.case, one.program), {})[one.of] = one.ratio
+    for (case, program), ratio in by_program.items():
+        cells = (f"{ratio[of]:.2f}" if of in ratio else "" for of in OFS)
+        yield (case, program, *cells)
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Rows as lines; the first cells start, the others end below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if place < left else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

@@ -15,12 +15,24 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from mlbatch.bench import peers
-from mlbatch.bench.cases import Case, Conversion, disk_bytes
-from mlbatch.bench.machine import machine
-from mlbatch.bench.measure import BenchError, measure
-from mlbatch.bench.ratios import COPY, LIBRARY, START, WRITE, changes, ratios
-from mlbatch.bench.recordings import CAPTURE, RIG, is_made
-from mlbatch.bench.results import FLOOR, OURS, PEER, Counted, Result, Row, Run, read_document
+from mlbatch.bench.cases import CAPTURE, RIG, Case, Conversion, disk_bytes, is_made
+from mlbatch.bench.measure import BenchError, machine, measure
+from mlbatch.bench.results import (
+    COPY,
+    FLOOR,
+    LIBRARY,
+    OURS,
+    PEER,
+    START,
+    WRITE,
+    Counted,
+    Result,
+    Row,
+    Run,
+    changes,
+    ratios,
+    read_document,
+)
 
 # A scan takes this much of a point in memory: x, y, z, intensity and label.
 _POINT_BYTES: Final = 24

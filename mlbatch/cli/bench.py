@@ -46,9 +46,8 @@ def bench(
 ) -> None:
     """Measure conversions of standard recordings: CPU, time, memory, beside floors and peers."""
     from mlbatch.bench.measure import BenchError
-    from mlbatch.bench.results import document
+    from mlbatch.bench.results import document, lines
     from mlbatch.bench.runner import bench as measure
-    from mlbatch.bench.table import lines
 
     result = measure(
         _settings(seconds, repeat, case or [], engine, peer_python or [], keep, against)
@@ -103,7 +102,7 @@ def _settings(
 
 def _engines(wanted: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Engines to measure, and what is to be said about others."""
-    from mlbatch.bench.machine import version
+    from mlbatch.bench.measure import version
 
     if wanted != "all":
         return (wanted,), ()

@@ -41,7 +41,7 @@ def test_cpu_memory_and_time_are_those_of_the_process(tmp_path: Path) -> None:
 def test_the_measuring_process_stays_small() -> None:
     """Its pages count as memory of what it starts."""
     loaded = run_python(
-        "import sys\nimport mlbatch.cli.bench as bench\nimport mlbatch.bench.table\n"
+        "import sys\nimport mlbatch.cli.bench as bench\nimport mlbatch.bench.results\n"
         "bench._settings(1.0, 1, [], 'all', [], None, None)\n"
         "print([name for name in ('numpy', 'mcap', 'yaml') if name in sys.modules])"
     )

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from mlbatch.bench.cases import RECORDINGS
 from mlbatch.bench.measure import BenchError
 from mlbatch.bench.peers import PEERS, installed, run_peer
-from mlbatch.bench.recordings import RECORDINGS, make
+from mlbatch.bench.recordings import make
 from mlbatch.bench.results import Counted
 
 VLP16, DUAL = RECORDINGS["three-vlp16"], RECORDINGS["dual-4"]

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import pytest
 
-from mlbatch.bench.ratios import (
+from mlbatch.bench.results import (
     COPY,
     CPU,
     DRY_RUN,
+    FLOOR,
     LIBRARY,
     MEMORY,
     OWN_CPU,
+    PEER,
     START,
     WALL,
     WRITE,
     WRITING,
+    Counted,
+    Row,
     changes,
     ratios,
 )
-from mlbatch.bench.results import FLOOR, PEER, Counted, Row
 from tests.bench.made import row, run
 
 WRITTEN = Counted(1_000_000, 800_000, 100, 10.0, 4_000_000, 20_000_000)

@@ -14,9 +14,9 @@ from pathlib import Path
 import dpkt
 import pytest
 
-from mlbatch.bench import captures, recordings
-from mlbatch.bench.cases import CASES, disk_bytes
-from mlbatch.bench.recordings import CAPTURE, KINDS, RECORDINGS, RIG, make
+from mlbatch.bench import cases, recordings
+from mlbatch.bench.cases import CAPTURE, CASES, KINDS, RECORDINGS, RIG, disk_bytes
+from mlbatch.bench.recordings import make
 from tests.builders.run import command
 
 SECONDS = 1.0
@@ -182,7 +182,7 @@ def test_fragments_hold_the_same_scans(folder: Path, tmp_path: Path) -> None:
 def test_pieces_of_time_do_not_show(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(captures, "_PIECE_NS", 70_000_000)
+    monkeypatch.setattr(recordings, "_PIECE_NS", 70_000_000)
     make(RECORDINGS["mixed"], SECONDS, tmp_path)
     assert (tmp_path / CAPTURE).read_bytes() == (folder / "mixed" / CAPTURE).read_bytes()
 
@@ -202,12 +202,13 @@ def test_a_kept_recording_is_used_as_long_as_it_would_be_made_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = RECORDINGS["three-vlp16"]
-    assert not recordings.is_made(tmp_path)
+    assert not cases.is_made(tmp_path)
     make(recording, 0.2, tmp_path)
-    assert recordings.is_made(tmp_path)
-    monkeypatch.setattr(recordings, "digest", lambda: "of other makers")
-    assert not recordings.is_made(tmp_path)
+    assert cases.is_made(tmp_path)
+    monkeypatch.setattr(cases, "digest", lambda: "of other makers")
+    assert not cases.is_made(tmp_path)
+    monkeypatch.undo()
     make(recording, 0.2, tmp_path)
-    assert recordings.is_made(tmp_path)
+    assert cases.is_made(tmp_path)
     (tmp_path / CAPTURE).unlink()
-    assert not recordings.is_made(tmp_path)
+    assert not cases.is_made(tmp_path)

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.bench.measure import BenchError
-from mlbatch.bench.ratios import CPU
-from mlbatch.bench.results import Changed, Ratio, document, read_document
+from mlbatch.bench.results import CPU, Changed, Ratio, document, read_document
 from tests.bench.made import STAGES, result, row, run
 
 KEYS = ["schema", "date", "machine", "seconds", "repeat"]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mlbatch.bench.ratios import CPU, MEMORY
-from mlbatch.bench.results import Changed, Counted, Ratio
-from mlbatch.bench.table import aligned, lines
+from mlbatch.bench.results import CPU, MEMORY, Changed, Counted, Ratio, aligned, lines
 from tests.bench.made import STAGES, result, row, run
 
 
