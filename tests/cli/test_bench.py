@@ -1,4 +1,4 @@
-"""`mlbatch bench` as a user types it."""
+"""The command `mlbatch bench`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench import runner
-from mlbatch.bench.cases import CASES, Case, Conversion
-from mlbatch.bench.results import Counted, Run
+from mlbatch.bench.cases import Case, Conversion
 from mlbatch.cli import bench as options
 from tests.builders.run import command
 
@@ -19,9 +17,9 @@ SHORT = ("bench", "--seconds", "1", "--repeat", "1", "--case", "three-vlp16", "-
 
 
 def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
-    told = command(*SHORT, "--json", "--keep", tmp_path)
-    assert (told.code, told.err) == (0, "")
-    found = json.loads(told.out)
+    done = command(*SHORT, "--json", "--keep", tmp_path)
+    assert (done.code, done.err) == (0, "")
+    found = json.loads(done.out)
     rows = {row["program"]: row for row in found["rows"]}
     assert list(rows) == ["numpy", "python with numpy", "memory copy"]
     ours, copied = rows["numpy"], rows["memory copy"]
@@ -36,22 +34,22 @@ def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
     assert {"cpu", "cores", "memory_mb", "python", "numpy", "mlbatch"} <= set(found["machine"])
     assert any("velodyne-decoder was not measured" in note for note in found["notes"])
     earlier = tmp_path / "earlier.json"
-    earlier.write_text(told.out, encoding="utf-8")
+    earlier.write_text(done.out, encoding="utf-8")
     before_ns = capture.stat().st_mtime_ns
-    told = command(*SHORT, "--keep", tmp_path, "--against", earlier)
-    assert (told.code, told.err) == (0, "")
-    assert "before" in told.out
-    # The recording was used again, and nothing else stays.
+    done = command(*SHORT, "--keep", tmp_path, "--against", earlier)
+    assert (done.code, done.err) == (0, "")
+    assert "before" in done.out
+    # The recording was used again, and nothing else is left.
     assert capture.stat().st_mtime_ns == before_ns
     assert sorted(path.name for path in tmp_path.iterdir()) == ["earlier.json", "three-vlp16-1s"]
 
 
-def test_an_output_is_measured_and_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outputs_are_measured_and_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case("small", ("three-vlp16",), "mcap", ("plain write", "mcap library"))
     monkeypatch.setattr("mlbatch.bench.cases.CASES", (case,))
-    told = command("bench", "--seconds", "1", "--repeat", "2", "--json", "--keep", tmp_path)
-    assert told.code == 0
-    found = json.loads(told.out)
+    done = command("bench", "--seconds", "1", "--repeat", "2", "--json", "--keep", tmp_path)
+    assert done.code == 0
+    found = json.loads(done.out)
     rows = {row["program"]: row for row in found["rows"]}
     assert list(rows) == ["dry run", "mcap", "plain write", "mcap library"]
     assert rows["mcap"]["written_bytes"] == rows["plain write"]["written_bytes"]
@@ -60,84 +58,62 @@ def test_an_output_is_measured_and_deleted(tmp_path: Path, monkeypatch: pytest.M
     assert [path.name for path in tmp_path.iterdir()] == ["three-vlp16-1s"]
 
 
-def test_a_conversion_that_fails_is_told_at_the_end(
+def test_a_failed_conversion_is_reported_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = Conversion("wrong", "three-vlp16", options=("--rate", "0.01"))
     case = Case("small", ("three-vlp16",), "", (), (Conversion("right", "three-vlp16"), wrong))
     monkeypatch.setattr("mlbatch.bench.cases.CASES", (case,))
-    told = command("bench", "--seconds", "1", "--repeat", "1", "--keep", tmp_path)
-    assert told.code == 1
-    assert "small  right" in told.out
-    assert "note: small: wrong: wanted exit code 0, got 2: mlbatch: error: --rate" in told.out
-    assert told.err.startswith("mlbatch: error: 1 conversion(s) failed, small: wrong first")
+    done = command("bench", "--seconds", "1", "--repeat", "1", "--keep", tmp_path)
+    assert done.code == 1
+    assert "small  right" in done.out
+    assert "note: small: wrong: expected exit code 0, found 2: mlbatch: error: --rate" in done.out
+    assert done.err.startswith("mlbatch: error: 1 conversion(s) failed, small: wrong first")
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
-        (("--seconds", "0.5"), 2, "--seconds: wanted 1 to 3600, got 0.5"),
-        (("--seconds", "nan"), 2, "--seconds: wanted 1 to 3600, got nan"),
-        (("--repeat", "0"), 2, "--repeat: wanted 1 to 1000, got 0"),
+        (("--seconds", "0.5"), 2, "--seconds: expected 1 to 3600, found 0.5"),
+        (("--seconds", "nan"), 2, "--seconds: expected 1 to 3600, found nan"),
+        (("--repeat", "0"), 2, "--repeat: expected 1 to 1000, found 0"),
         (
             ("--engine", "abacus"),
             2,
-            "--engine: wanted one of all, numpy, numba, auto, got 'abacus'",
+            "--engine: expected one of all, numpy, numba, auto, found 'abacus'",
         ),
-        (("--case", "none"), 2, "--case: wanted one of dual-4, "),
-        (("--against", "/no/file"), 1, "/no/file: wanted an earlier result"),
-        (("--peer-python", "/no/python"), 1, "--peer-python: wanted a program, got /no/python"),
-        (("--keep", "/dev/null"), 1, "/dev/null: wanted a folder to write to, got File exists"),
+        (("--case", "none"), 2, "--case: expected one of dual-4, "),
+        (("--against", "/no/file"), 1, "/no/file: expected an earlier result"),
+        (("--peer-python", "/no/python"), 1, "--peer-python: expected a program, found /no/python"),
+        (("--keep", "/dev/null"), 1, "/dev/null: expected a folder to write to, found File exists"),
     ],
 )
-def test_mistakes(words: tuple[str, ...], code: int, said: str) -> None:
-    told = command("bench", *words)
-    assert told.code == code
-    assert told.err.startswith(f"mlbatch: error: {said}")
-    assert told.err.count("\n") == 1
+def test_mistakes(words: tuple[str, ...], code: int, message: str) -> None:
+    done = command("bench", *words)
+    assert done.code == code
+    assert done.err.startswith(f"mlbatch: error: {message}")
+    assert done.err.count("\n") == 1
 
 
-def test_too_small_a_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(2, 1, 5_000_000))
-    told = command("bench", "--case", "pandar64", "--seconds", "10", "--keep", tmp_path)
-    assert told.code == 1
+    done = command("bench", "--case", "pandar64", "--seconds", "10", "--keep", tmp_path)
+    assert done.code == 1
     # 3000 packets of 1198 bytes and 58 around them, in 10 s.
-    assert "wanted about 37 MB of free disk, got 5 MB; choose another with --keep" in told.err
+    assert "expected about 37 MB of free disk, found 5 MB; choose another with --keep" in done.err
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_compiler_numpy_is_measured_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_only_numpy_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "COMPILER", "no-such-distribution")
-    engines, notes = options._engines("all")
+    engines, notes = options.engines_to_measure("all")
     assert engines == ("numpy",)
     assert notes == ("engine numba was not measured: pip install mlbatch[fast]",)
 
 
-def test_programs_run_in_turn_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
-
-    def noted(session: runner.Session, conversion: Conversion) -> Run:
-        order.append(conversion.name)
-        return Run(1.0, 1.0, 1.0, 1.0, Counted(slots=1))
-
-    monkeypatch.setattr(runner.Session, "_convert", noted)
-    pair = (Conversion("a", "three-vlp16"), Conversion("b", "three-vlp16"))
-    settings = runner.Settings(
-        *((Case("small", ("three-vlp16",), "", (), pair),), ("numpy",), 1.0, 3), keep=tmp_path
-    )
-    assert [row.program for row in runner.bench(settings).rows] == ["a", "b"]
-    # After runs that are not measured, in which all is compiled.
-    assert order[2:] == ["a", "b", "b", "a", "a", "b"]
-    assert sorted(order[:2]) == ["a", "b"]
-
-
-def test_case_names_are_all_different() -> None:
-    assert len({case.name for case in CASES}) == len(CASES)
-
-
 def test_a_case_that_is_named_twice_is_measured_once() -> None:
-    """Else its rows would be compared with each other."""
+    """Otherwise its rows would be compared with each other."""
     names = ["pandar64", "mixed", "pandar64"]
-    settings = options._settings(1.0, 1, names, "numpy", [], None, None)
+    settings = options.settings_from(1.0, 1, names, "numpy", [], None, None)
     assert [case.name for case in settings.cases] == ["pandar64", "mixed"]
