@@ -3,8 +3,8 @@
     python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine numba
 
 Packets are pushed one by one, as from a driver on the vehicle, through the classes of a conversion:
-`Feeder.feed`, `Batcher.push`, `Decoder.scan`. Garbage collection is on. CPU time of the thread is
-the cost of the work; wall time includes other load of the machine.
+`Ingest.columns`, `Batcher.push`, `DecodeWorker.decode`. Garbage collection is on. CPU time of the
+thread is the cost of the work; wall time includes other load of the machine.
 """
 
 from __future__ import annotations
@@ -21,13 +21,11 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.decode.decoder import Decoder, Due, Label
 from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import Wishes
 from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.decode_pool import DecodePool
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.session import boxes_of, run_info, source_of
-from mlbatch.readers import merge
 from mlbatch.types import PacketBatch
 from mlbatch.units import NS_PER_US
 
@@ -57,39 +55,21 @@ class Driver:
 
     def __init__(self, job: Job) -> None:
         self.run = Conversion(job)
-        self._decoder: Decoder | None = None
+        # Created when the first window closes, as in a conversion.
+        self._pool: DecodePool | None = None
 
     def push(self, batch: PacketBatch) -> int:
         """Push a batch, decode the windows it completes; returns the number of scans."""
         batcher = self.run.batcher
-        places = [batcher.oldest_place(number) for number in range(len(self.run.feeds))]
-        fed = self.run.feeder.feed(batch, places)
+        oldest = [batcher.oldest_place(sensor.index) for sensor in self.run.sensors]
+        ingested = self.run.session.ingest.columns(batch, oldest)
         scans = 0
-        for window in batcher.push(fed.arrivals, batch.host_ns):
-            label = Label(
-                window.index,
-                window.slice,
-                window.start_ns,
-                window.end_ns,
-                window.complete,
-                window.ready_host_ns,
-            )
-            due = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
-            self.decoder.scan(due, label)
-            scans += 1
+        for window in batcher.push(ingested.arrivals, batch.host_ns):
+            self._pool = self._pool or self.run.pool
+            for task in self._pool.tasks(window, iter(())):
+                self._pool.workers[0].decode(task)
+                scans += 1
         return scans
-
-    @property
-    def decoder(self) -> Decoder:
-        """Created when the first window closes, as in a conversion."""
-        if self._decoder is None:
-            run, job = self.run, self.run.job
-            info = run_info(run.setup, job, run.grid, "utc")
-            members = zip(run.setup.sensors, run.feeds, info.sensors, strict=True)
-            sources = [source_of(one, feed, sensor.ring_base, job) for one, feed, sensor in members]
-            boxes_m = boxes_of(run.setup, job)
-            self._decoder = Decoder(info, sources, boxes_m, job.extras, engine=run.engine)
-        return self._decoder
 
 
 def one_by_one(batches: Iterator[PacketBatch]) -> Iterator[PacketBatch]:
@@ -103,7 +83,7 @@ def measure(job: Job, warm: int, packets: int) -> PushTimes:
     """Push packets one by one; time `packets` of them, after the first `warm`."""
     driver = Driver(job)
     times = PushTimes()
-    for number, batch in enumerate(one_by_one(merge(driver.run.recordings))):
+    for number, batch in enumerate(one_by_one(driver.run.session.packets())):
         if number == warm + packets:
             break
         wall_ns = time.perf_counter_ns()
