@@ -38,7 +38,7 @@ def compare(
 ) -> None:
     """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
     from mlbatch.cli import options
-    from mlbatch.cli.options import columns
+    from mlbatch.cli.tables import table_lines
     from mlbatch.compare.compare import Settings, compare
     from mlbatch.discovery.discover import Wishes
     from mlbatch.pipeline.job import Job
@@ -57,7 +57,7 @@ def compare(
         typer.echo(json.dumps(found.as_json(), indent=1))
         return
     typer.echo(found.title())
-    for line in columns(found.rows()):
+    for line in table_lines(found.rows()):
         typer.echo(line)
 
 

@@ -147,7 +147,7 @@ class NewestSweeps:
     Begins when every sensor has a sweep.
     """
 
-    name = "latest"
+    name = "latest sweeps"
 
     def __init__(self, sensors: int) -> None:
         self._newest: list[Sweep | None] = [None] * sensors

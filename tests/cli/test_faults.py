@@ -105,7 +105,7 @@ def test_the_seed_chooses_the_packets(shell: Shell) -> None:
     [
         ("--fault drop:lft:5%", "did you mean left?"),
         ("--fault drop:left", "--fault: expected drop:SENSOR:VALUE, found 'drop:left'"),
-        ("--fault-seed -1", "--fault-seed: wanted a whole number from 0, got -1; correct it"),
+        ("--fault-seed -1", "--fault-seed: expected a whole number from 0, found -1; correct it"),
     ],
 )
 def test_mistakes(shell: Shell, arguments: str, message: str) -> None:
@@ -121,5 +121,5 @@ def test_many_late_columns_give_a_warning(shell: Shell) -> None:
     late, decoded = left["columns"]["dropped"]["late"], left["columns"]["decoded"]
     assert late > decoded / 2
     (warning,) = [one for one in report["warnings"] if one["code"] == "late"]
-    assert warning["message"].startswith(f"left: {late} of {decoded} columns came too late")
+    assert warning["message"].startswith(f"left: {late} of {decoded} columns")
     assert "late" not in right["columns"]["dropped"]

@@ -18,7 +18,7 @@ from tests.builders.phases import CASES, slug, write_case
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "compare.md"
-POLICIES = ("latest", "approximate time", "timeout collate", WINDOWS)
+POLICIES = ("latest sweeps", "approximate time", "timeout collate", WINDOWS)
 IN_PHASE, BY_37, BY_63, DOUBLE, DRIFTING, SILENT = CASES
 # 511 / 512 of 100 ms, rounded down to ns as the encoder does.
 SWEEP_MS = 99.804687
