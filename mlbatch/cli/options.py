@@ -18,7 +18,7 @@ from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S, parse_rate
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import Fault
+    from mlbatch.faults import Fault
 
 # Every job needs memory for a few scans.
 MAX_JOBS = 64
@@ -149,7 +149,7 @@ def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
     if not texts:
         return ()
     # Not loaded for runs without faults.
-    from mlbatch.faults.replay import parse_fault
+    from mlbatch.faults import parse_fault
 
     return tuple(parse_fault(text) for text in texts)
 

@@ -21,7 +21,7 @@ from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import PacketBatch
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
 
 SYNCHRONISED = "synchronised"
 # Warning codes by kind of clock step.

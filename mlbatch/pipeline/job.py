@@ -17,7 +17,7 @@ from mlbatch.types import EXTRAS
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import Fault
+    from mlbatch.faults import Fault
 
 DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S

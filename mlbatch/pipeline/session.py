@@ -27,7 +27,7 @@ from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTab
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
 
 # A note for the user, no warning: how the times of decoded clouds were read.
 CLOUDS = "clouds"
@@ -96,7 +96,7 @@ class Session:
         if not job.faults:
             return None
         # Not loaded for runs without faults.
-        from mlbatch.faults.replay import FaultReplay
+        from mlbatch.faults import FaultReplay
 
         replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in self.sensors])
         replay.begin_ns = self.begin_ns if job.fault_begin_ns is None else job.fault_begin_ns

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mlbatch.discovery.discover import Wishes
-from mlbatch.faults.replay import Fault, parse_fault
+from mlbatch.faults import Fault, parse_fault
 from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job

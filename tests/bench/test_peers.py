@@ -1,4 +1,4 @@
-"""Peers: found in environments, measured through their scripts; here by packages that pretend."""
+"""Peers: found in environments and measured; here with stub packages."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from mlbatch.bench.cases import RECORDINGS
 from mlbatch.bench.measure import BenchError
 from mlbatch.bench.peers import PEERS, installed, run_peer
-from mlbatch.bench.recordings import RECORDINGS, make
-from mlbatch.bench.results import Counted
+from mlbatch.bench.recordings import make
+from mlbatch.bench.results import Workload
 
 VLP16, DUAL = RECORDINGS["three-vlp16"], RECORDINGS["dual-4"]
 BY_NAME = {peer.name: peer for peer in PEERS}
-# Gives a turn of five points after ten packets, and one of two points at the end.
+# Gives a sweep of five points after ten packets, and one of two points at the end.
 DECODER = """
 class Model:
     VLP16 = "VLP-16"
@@ -31,7 +32,7 @@ class StreamDecoder:
     def finish(self):
         return (0.0, [0] * 2)
 """
-# Two frames of three by four pixels for each sensor, but one that is missing.
+# Two frames of three by four pixels per sensor, of which one is missing.
 SDK = """
 import numpy as np
 from ouster.sdk import core
@@ -81,8 +82,8 @@ def package(place: Path, name: str, version: str, **modules: str) -> None:
 
 
 @pytest.fixture
-def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in; processes find both peers."""
+def stubbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, with both stub packages in the search path."""
     place = tmp_path / "packages"
     place.mkdir()
     package(place, "velodyne-decoder", "3.1.0", velodyne_decoder=DECODER)
@@ -92,27 +93,27 @@ def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_versions_of_what_is_there(pretended: Path) -> None:
-    found = installed(sys.executable, pretended)
+def test_versions_of_installed_peers(stubbed: Path) -> None:
+    found = installed(sys.executable, stubbed)
     assert found == {"ouster-sdk": "1.0.1", "velodyne-decoder": "3.1.0"}
 
 
-def test_nothing_may_be_there(tmp_path: Path) -> None:
+def test_an_environment_without_peers(tmp_path: Path) -> None:
     assert installed(sys.executable, tmp_path) == {}
 
 
 @pytest.mark.parametrize(
-    ("python", "said"),
+    ("python", "message"),
     [
-        ("/no/python", "wanted a program, got /no/python: No such file"),
-        ("/bin/true", "wanted a Python interpreter, got another program"),
-        ("/bin/false", "wanted exit code 0, got 1"),
+        ("/no/python", "expected a program, found /no/python: No such file"),
+        ("/bin/true", "expected a Python interpreter, found another program"),
+        ("/bin/false", "expected exit code 0, found 1"),
     ],
 )
-def test_what_is_no_python(tmp_path: Path, python: str, said: str) -> None:
+def test_other_programs_are_refused(tmp_path: Path, python: str, message: str) -> None:
     with pytest.raises(BenchError, match="--peer-python") as caught:
         installed(python, tmp_path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_peers_fit_sensors_and_outputs() -> None:
@@ -125,26 +126,26 @@ def test_peers_fit_sensors_and_outputs() -> None:
     assert fitting("mixed", "") == fitting("pandar64", "") == fitting("dual-4", "mcap") == []
 
 
-def test_velodyne_decoder_gets_the_packets_of_each_sensor(pretended: Path) -> None:
-    make(VLP16, 0.1, pretended)
-    run = run_peer(BY_NAME["velodyne-decoder"], sys.executable, VLP16, pretended, 0.1, pretended)
-    size = (pretended / "capture.pcap").stat().st_size
+def test_velodyne_decoder_reads_the_packets_of_each_sensor(stubbed: Path) -> None:
+    make(VLP16, 0.1, stubbed)
+    run = run_peer(BY_NAME["velodyne-decoder"], sys.executable, VLP16, stubbed, 0.1, stubbed)
+    size = (stubbed / "capture.pcap").stat().st_size
     packets = (size - 24) // (1206 + 58)
-    # Three sensors with two turns each.
-    assert run.counted == Counted(packets * 384, 21, 6, 0.1, size, 0)
+    # Three sensors with two sweeps each.
+    assert run.workload == Workload(packets * 384, 21, 6, 0.1, size, 0)
     assert 0 < run.own_cpu_s < run.cpu_s
 
 
 @pytest.mark.parametrize("name", ["ouster-sdk", "ouster-sdk lean"])
-def test_ouster_sdk_gets_metadata_and_mounting(pretended: Path, name: str) -> None:
-    make(DUAL, 0.1, pretended)
-    run = run_peer(BY_NAME[name], sys.executable, DUAL, pretended, 0.1, pretended)
-    size = (pretended / "capture.pcap").stat().st_size
-    assert run.counted == Counted(3 * 12, 3 * 2, 2, 0.1, size, 0)
+def test_ouster_sdk_gets_metadata_and_extrinsics(stubbed: Path, name: str) -> None:
+    make(DUAL, 0.1, stubbed)
+    run = run_peer(BY_NAME[name], sys.executable, DUAL, stubbed, 0.1, stubbed)
+    size = (stubbed / "capture.pcap").stat().st_size
+    assert run.workload == Workload(3 * 12, 3 * 2, 2, 0.1, size, 0)
 
 
-def test_ouster_cli_leaves_nothing(pretended: Path) -> None:
-    make(DUAL, 0.1, pretended)
-    run = run_peer(BY_NAME["ouster-cli"], sys.executable, DUAL, pretended, 0.1, pretended)
-    assert (run.counted.points, run.counted.written_bytes) == (12, 33)
-    assert not list(pretended.glob("*.ply"))
+def test_ouster_cli_leaves_no_output(stubbed: Path) -> None:
+    make(DUAL, 0.1, stubbed)
+    run = run_peer(BY_NAME["ouster-cli"], sys.executable, DUAL, stubbed, 0.1, stubbed)
+    assert (run.workload.points, run.workload.written_bytes) == (12, 33)
+    assert not list(stubbed.glob("*.ply"))

@@ -1,4 +1,4 @@
-"""Faults on the command line: what a hiccup of a lidar does to a whole conversion."""
+"""`mlbatch convert --fault`: what a fault does to a whole conversion."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def test_without_faults_the_report_has_none(shell: Shell) -> None:
     assert "faults" not in _report(shell)
 
 
-def test_what_is_dropped_is_lost(shell: Shell) -> None:
+def test_dropped_packets_are_counted_as_lost(shell: Shell) -> None:
     report = _report(shell, "drop:left:10%")
     (fault,) = report["faults"]
     assert fault["fault"] == "drop:left:10%"
     left, right = _packets(report)
     lost = LEFT - left["read"]
     assert lost + IMU - report["sensors"][0]["imu_packets"] == fault["packets"]
-    # At the very ends nobody can tell that something is missing.
+    # Loss at the very begin and end is not detectable.
     assert lost - 2 <= left["lost"] <= lost > 10
     assert (right["read"], right["lost"]) == (RIGHT, 0)
 
 
-def test_copies_are_duplicates_and_change_nothing(shell: Shell) -> None:
+def test_copies_are_rejected_as_duplicates(shell: Shell) -> None:
     plain, report = _report(shell), _report(shell, "dup:*:20%")
     (fault,) = report["faults"]
     copies = sum(one["imu_packets"] - IMU for one in report["sensors"])
@@ -56,7 +56,7 @@ def test_copies_are_duplicates_and_change_nothing(shell: Shell) -> None:
     assert report["warnings"] == []
 
 
-def test_delay_and_order_change_no_scan(shell: Shell) -> None:
+def test_delay_and_reordering_change_no_scan(shell: Shell) -> None:
     plain = _report(shell)
     for faults in (
         ["delay:left:60ms"],
@@ -69,15 +69,15 @@ def test_delay_and_order_change_no_scan(shell: Shell) -> None:
             assert (one["columns"], one["points"]) == (other["columns"], other["points"])
 
 
-def test_a_silent_sensor_leaves_the_other_alone(shell: Shell) -> None:
+def test_a_dropout_does_not_affect_the_other_sensor(shell: Shell) -> None:
     plain, report = _report(shell), _report(shell, "stall:left:0.2s-0.4s")
     assert report["sensors"][1]["columns"] == plain["sensors"][1]["columns"]
     left = report["sensors"][0]
     silent = left["packets"]["lost"] + IMU - left["imu_packets"]
-    assert silent == report["faults"][0]["packets"] == 84  # 0.2 s of 320 and 100 packets a second
+    assert silent == report["faults"][0]["packets"] == 84  # 0.2 s of 320 and 100 packets per second
 
 
-def test_a_clock_that_jumps_is_told_and_split(shell: Shell, tmp_path: Path) -> None:
+def test_a_clock_step_is_an_error_or_splits(shell: Shell, tmp_path: Path) -> None:
     jump = "--fault jump:*:37s@0.4s"
     outcome = shell(f"convert {RECORDING} --dry-run {jump}")
     assert outcome.code == 1
@@ -101,25 +101,25 @@ def test_the_seed_chooses_the_packets(shell: Shell) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         ("--fault drop:lft:5%", "did you mean left?"),
-        ("--fault drop:left", "--fault: wanted drop:SENSOR:VALUE, got 'drop:left'"),
-        ("--fault-seed -1", "--fault-seed: wanted a whole number from 0, got -1; correct it"),
+        ("--fault drop:left", "--fault: expected drop:SENSOR:VALUE, found 'drop:left'"),
+        ("--fault-seed -1", "--fault-seed: expected a whole number from 0, found -1; correct it"),
     ],
 )
-def test_mistakes(shell: Shell, arguments: str, words: str) -> None:
+def test_mistakes(shell: Shell, arguments: str, message: str) -> None:
     outcome = shell(f"convert {RECORDING} --dry-run {arguments}")
     assert outcome.code == 2
-    assert words in outcome.err
+    assert message in outcome.err
     assert outcome.err.count("\n") == 1
 
 
-def test_many_late_columns_are_warned_of(shell: Shell) -> None:
+def test_many_late_columns_give_a_warning(shell: Shell) -> None:
     report = _report(shell, "delay:left:300ms", more="--max-wait 0.1")
     left, right = report["sensors"]
     late, decoded = left["columns"]["dropped"]["late"], left["columns"]["decoded"]
     assert late > decoded / 2
     (warning,) = [one for one in report["warnings"] if one["code"] == "late"]
-    assert warning["message"].startswith(f"left: {late} of {decoded} columns came too late")
+    assert warning["message"].startswith(f"left: {late} of {decoded} columns")
     assert "late" not in right["columns"]["dropped"]

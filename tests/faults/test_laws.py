@@ -1,4 +1,4 @@
-"""Laws of fault replay: as plain loops would do it, in every grouping, and nothing is lost."""
+"""Laws of fault replay: equal to plain loops, for every grouping; every packet is counted."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array
-from mlbatch.faults.replay import Fault, FaultReplay, parse_fault
+from mlbatch.faults import Fault, FaultReplay, parse_fault
 from mlbatch.types import PacketBatch
 
 MS, S = 10**6, 10**9
 BEGIN_NS = 1_700_000_000 * S
 NAMES = ["left", "right", "top"]
-# Of the reference: its shares are compared with the same 53 bits.
+# Constants of SplitMix64.
 WORD, GOLDEN = 2**64 - 1, 0x9E3779B97F4A7C15
 
 
 @dataclass(frozen=True)
 class One:
-    """A packet; sensor -1: of none."""
+    """A packet; sensor -1: none."""
 
     host_ns: int
     sensor: int
@@ -34,7 +34,7 @@ class One:
 
 
 def packets(rng: random.Random, count: int) -> list[One]:
-    """A session of three sensors and others; the recorder's clock sometimes steps back."""
+    """Packets of three sensors and of none; the clock of the capture host sometimes steps back."""
     at, found = BEGIN_NS, []
     for number in range(count):
         at += rng.choice([0, 0, 1, 1, 2, 5, -3, 40]) * MS
@@ -45,7 +45,7 @@ def packets(rng: random.Random, count: int) -> list[One]:
 
 
 def batches(session: Sequence[One], sizes: Sequence[int]) -> Iterator[PacketBatch]:
-    """The session in batches, all in one buffer that is reused, not in the order of arrival."""
+    """The session in batches; all share one buffer, in reverse order."""
     data = np.zeros(sum(len(one.payload) for one in session) + 1, np.uint8)
     at = 0
     for count in sizes:
@@ -62,7 +62,7 @@ def batches(session: Sequence[One], sizes: Sequence[int]) -> Iterator[PacketBatc
 
 
 def owner(batch: PacketBatch) -> I64Array:
-    """Streams are numbered as sensors here."""
+    """Streams have the indices of sensors here."""
     return batch.stream
 
 
@@ -75,7 +75,7 @@ def grouped(rng: random.Random, total: int) -> list[int]:
 
 
 def replayed(replay: FaultReplay, session: Sequence[One], sizes: Sequence[int]) -> list[One]:
-    """What comes out."""
+    """The session with faults."""
     given = []
     for batch in replay.batches(batches(session, sizes), owner):
         for start, size, stream, host_ns in zip(
@@ -96,10 +96,10 @@ def of(session: Sequence[One], sensor: int) -> list[One]:
 
 @dataclass
 class Moving:
-    """A packet of the reference; lane: sensor and size; key: what it is sorted by."""
+    """A packet of the reference; group: sensor and size; key: sort key."""
 
     one: One
-    lane: tuple[int, int]
+    group: tuple[int, int]
     number: int
     key: list[int]
 
@@ -112,7 +112,7 @@ def mixed(state: int) -> int:
 
 
 def drawn(seed: int, fault: int, packet: Moving) -> int:
-    """The number that decides on a packet."""
+    """The number that a fault draws for a packet."""
     state = 0
     for word in (seed, fault, zlib.crc32(NAMES[packet.one.sensor].encode())):
         state = mixed((state ^ word) + GOLDEN & WORD)
@@ -120,11 +120,11 @@ def drawn(seed: int, fault: int, packet: Moving) -> int:
 
 
 def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> list[One]:
-    """The session with faults, one packet after the other."""
+    """The session with faults, packet by packet."""
     begin_ns = next((one.host_ns for one in session if one.sensor >= 0), 0)
 
     def hits(kind: str, packet: Moving) -> list[int]:
-        """Faults of a kind that touch a packet."""
+        """Faults of a kind that affect a packet."""
         return [
             number
             for number, fault in enumerate(faults)
@@ -139,9 +139,9 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
     left, newest = [], 0
     for place, one in enumerate(session):
         newest = max(newest, one.host_ns)
-        lane = one.sensor, len(one.payload)
-        packet = Moving(one, lane, numbers[lane], [newest, place])
-        numbers[lane] += 1
+        group = one.sensor, len(one.payload)
+        packet = Moving(one, group, numbers[group], [newest, place])
+        numbers[group] += 1
         if any(hits(kind, packet) for kind in ("drop", "stall", "late", "early")):
             continue
         for fault in hits("truncate", packet):
@@ -158,8 +158,8 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
                 payload[bit // 8] ^= 1 << bit % 8
                 packet.one = replace(packet.one, payload=bytes(payload))
         left.append(packet)
-    for lane in {packet.lane for packet in left}:
-        own = [packet for packet in left if packet.lane == lane]
+    for group in {packet.group for packet in left}:
+        own = [packet for packet in left if packet.group == group]
         moved = [bool(hits("reorder", packet)) for packet in own]
         at = 0
         while at < len(own):
@@ -184,7 +184,7 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
 
 # -- laws -----------------------------------------------------------------------------------------
 
-# A session of many packets is more than hypothesis draws well: it draws the seed and the length.
+# hypothesis draws seed and length: many packets are too much to draw.
 RANDOM = st.integers(0, 2**32 - 1).map(random.Random)
 LENGTHS = st.integers(1, 120)
 SHARED = ["drop", "truncate", "bitflip", "reorder", "dup"]
@@ -211,8 +211,8 @@ def drawn_faults(rng: random.Random, session: Sequence[One]) -> list[Fault]:
 
 @settings(max_examples=150)
 @given(RANDOM, LENGTHS)
-def test_faults_are_those_of_the_plain_loops(rng: random.Random, length: int) -> None:
-    """In every grouping; and the counts too do not depend on it."""
+def test_faults_equal_the_plain_loops(rng: random.Random, length: int) -> None:
+    """For every grouping, with equal counts."""
     session = packets(rng, length)
     faults, seed = drawn_faults(rng, session), rng.choice([0, 1, 2**64 - 1])
     expected = reference(faults, seed, session)
@@ -227,7 +227,7 @@ def test_faults_are_those_of_the_plain_loops(rng: random.Random, length: int) ->
 @settings(max_examples=60)
 @given(RANDOM, LENGTHS)
 def test_the_ledgers_balance(rng: random.Random, length: int) -> None:
-    """Read = given + removed - repeated, and the last is what came out."""
+    """Read = given + removed - repeated."""
     session = packets(rng, length)
     replay = FaultReplay(drawn_faults(rng, session), 7, NAMES)
     given_packets = replayed(replay, session, grouped(rng, len(session)))
@@ -237,7 +237,7 @@ def test_the_ledgers_balance(rng: random.Random, length: int) -> None:
         assert ledger.read == ledger.given + ledger.removed - ledger.repeated
     removed = [c.packets for c, f in zip(replay.counts, replay.faults, strict=True) if _removes(f)]
     assert sum(removed) == sum(ledger.removed for ledger in replay.ledgers)
-    # What belongs to no sensor passes, in its order.
+    # Packets of no sensor keep their order.
     assert of(given_packets, -1) == of(session, -1)
 
 
@@ -247,15 +247,14 @@ def _removes(fault: Fault) -> bool:
 
 @settings(max_examples=40)
 @given(RANDOM)
-def test_without_faults_all_stays(rng: random.Random) -> None:
+def test_without_faults_nothing_changes(rng: random.Random) -> None:
     session = packets(rng, 60)
     assert replayed(FaultReplay([], 3, NAMES), session, grouped(rng, 60)) == session
 
 
 @settings(max_examples=40)
 @given(RANDOM, st.integers(1, 200))
-def test_a_delay_of_all_changes_arrivals_only(rng: random.Random, delay_ms: int) -> None:
-    """Packets of no sensor apart."""
+def test_a_delay_of_all_changes_receive_times_only(rng: random.Random, delay_ms: int) -> None:
     session = [one for one in packets(rng, 60) if one.sensor >= 0]
     replay = FaultReplay([parse_fault(f"delay:*:{delay_ms}ms")], 0, NAMES)
     later = [replace(one, host_ns=one.host_ns + delay_ms * MS) for one in session]
@@ -263,7 +262,7 @@ def test_a_delay_of_all_changes_arrivals_only(rng: random.Random, delay_ms: int)
 
 
 def steady(count: int, sensors: int = 1) -> list[One]:
-    """Sensors that send a packet each millisecond."""
+    """Sensors with a packet per millisecond."""
     return [
         One(BEGIN_NS + number * MS, sensor, number.to_bytes(8, "big"))
         for number in range(count)
@@ -273,8 +272,8 @@ def steady(count: int, sensors: int = 1) -> list[One]:
 
 @pytest.mark.parametrize("kind", SHARED)
 @pytest.mark.parametrize("percent", [1, 5, 50])
-def test_shares_are_met(kind: str, percent: int) -> None:
-    """Within five standard deviations of the binomial law, for each of three sensors."""
+def test_shares(kind: str, percent: int) -> None:
+    """Within five standard deviations of the binomial distribution, over three sensors."""
     count, share = 20_000, percent / 100
     replay = FaultReplay([parse_fault(f"{kind}:*:{percent}%")], 0, NAMES)
     total = sum(len(batch) for batch in replay.batches(batches_of(steady(count, 3)), owner))
@@ -286,12 +285,12 @@ def test_shares_are_met(kind: str, percent: int) -> None:
 
 
 def batches_of(session: Sequence[One]) -> Iterator[PacketBatch]:
-    """All in one."""
+    """All in one batch."""
     return batches(session, [len(session)])
 
 
 def test_drops_of_sensors_and_seeds_are_independent() -> None:
-    """Two draws of a half agree on a half of the packets, within five standard deviations."""
+    """Two draws of one half agree on half of the packets, within five standard deviations."""
     count = 4000
     session = steady(count, 2)
     lost = []
@@ -305,29 +304,29 @@ def test_drops_of_sensors_and_seeds_are_independent() -> None:
         assert abs(count - len(lost[one] ^ lost[other]) - count / 2) < 5 * (count / 4) ** 0.5
 
 
-def test_a_sensor_has_its_faults_whoever_else_there_is() -> None:
+def test_faults_of_a_sensor_do_not_depend_on_other_sensors() -> None:
     session = steady(300)
     faults = [parse_fault("drop:left:20%")]
     alone = replayed(FaultReplay(faults, 0, ["left"]), session, [300])
     second = [replace(one, sensor=1) for one in session]
-    beside = replayed(FaultReplay(faults, 0, ["top", "left"]), second, [300])
-    assert [one.payload for one in alone] == [one.payload for one in beside]
+    together = replayed(FaultReplay(faults, 0, ["top", "left"]), second, [300])
+    assert [one.payload for one in alone] == [one.payload for one in together]
 
 
-def test_other_packets_of_a_sensor_do_not_matter() -> None:
-    """Some containers hold the packets of its IMU too, or hold them elsewhere in the order."""
+def test_packets_of_other_sizes_do_not_matter() -> None:
+    """Some containers have IMU packets, or have them at other positions."""
     session = steady(300)
     others = [replace(one, payload=one.payload + b"IMU") for one in session[::7]]
     mixed_in = sorted([*session, *others], key=lambda one: (one.host_ns, -len(one.payload)))
     faults = [parse_fault(f"{kind}:left:20%") for kind in SHARED]
     alone = replayed(FaultReplay(faults, 0, NAMES), session, [300])
     for order in (mixed_in, [*session, *others]):
-        beside = replayed(FaultReplay(faults, 0, NAMES), order, [len(order)])
-        assert Counter(alone) <= Counter(beside)
+        together = replayed(FaultReplay(faults, 0, NAMES), order, [len(order)])
+        assert Counter(alone) <= Counter(together)
 
 
-def test_a_delay_holds_no_more_than_its_worth() -> None:
-    """Of a thousand packets, sent each millisecond, 25 wait."""
+def test_a_delay_holds_the_packets_of_its_length() -> None:
+    """25 of 1000 packets wait, one per millisecond."""
     replay = FaultReplay([parse_fault("delay:left:25ms")], 0, NAMES)
     most, read, given_packets = 0, 0, 0
     source = batches(steady(1000), [10] * 100)
@@ -340,13 +339,13 @@ def test_a_delay_holds_no_more_than_its_worth() -> None:
 
 @settings(max_examples=40)
 @given(st.integers(-(10**5), 10**5).filter(bool), st.integers(-(10**12), 10**12).filter(bool))
-def test_clocks_with_drift_and_jumps_are_as_reckoned(milli_ppm: int, step_ns: int) -> None:
-    """Against whole numbers of any size; shifts are rounded to the nanosecond."""
+def test_drift_and_clock_steps_equal_exact_arithmetic(milli_ppm: int, step_ns: int) -> None:
+    """Shifts are rounded to the nanosecond."""
     specs = [f"drift:left:{milli_ppm / 1000}ppm", f"jump:left:{step_ns}ns@100s"]
     replay = FaultReplay([parse_fault(spec) for spec in specs], 0, NAMES)
     replay.begin_ns = BEGIN_NS
     since_ns = [0, 1, 99 * S, 100 * S - 1, 100 * S, 86_400 * S]
     shift = replay.shift_ns(0, BEGIN_NS + np.array(since_ns))
-    for since, got in zip(since_ns, shift.tolist(), strict=True):
-        wanted = since * milli_ppm / 10**9 + (step_ns if since >= 100 * S else 0)
-        assert abs(got - wanted) <= 1
+    for since, found in zip(since_ns, shift.tolist(), strict=True):
+        expected = since * milli_ppm / 10**9 + (step_ns if since >= 100 * S else 0)
+        assert abs(found - expected) <= 1

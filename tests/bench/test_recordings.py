@@ -1,4 +1,4 @@
-"""Recordings of the benchmark, as dpkt and hand-read bytes see them, and as a conversion does."""
+"""Recordings of the benchmark, read by dpkt, by hand-computed offsets, and by a conversion."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from pathlib import Path
 import dpkt
 import pytest
 
-from mlbatch.bench import captures, recordings
-from mlbatch.bench.cases import CASES, disk_bytes
-from mlbatch.bench.recordings import CAPTURE, KINDS, RECORDINGS, RIG, make
+from mlbatch.bench import recordings
+from mlbatch.bench.cases import CAPTURE, RECORDINGS, RIG
+from mlbatch.bench.recordings import make
 from tests.builders.run import command
 
 SECONDS = 1.0
 EPOCH_S = 1_700_000_000
-# 640 packets of 1/64 turn a second; the second sensor's rotor is 37.1 ms behind: 23.7 packets less.
+# 640 packets per second, 64 per revolution; the second sensor's rotor is 37.1 ms late: 23.7 packets
+# less.
 OUSTER_PACKETS = {"192.168.7.11": 640, "192.168.7.12": 616}
 A_IP, B_IP = OUSTER_PACKETS
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a second of each recording in a folder of its own."""
+    """One second of each recording, each in its own folder."""
     place = tmp_path_factory.mktemp("recordings")
     for name, recording in RECORDINGS.items():
         (place / name).mkdir()
@@ -51,12 +52,12 @@ def datagrams(path: Path) -> Iterator[tuple[float, str, bytes]]:
 
 @pytest.mark.parametrize(("name", "size"), [("dual-4", 8448), ("dual-12", 24832)])
 def test_two_ousters(folder: Path, name: str, size: int) -> None:
-    """facts/ouster.md: header 32, 16 columns of 12 bytes and 128 pixels, footer 32."""
+    """docs/sources/ouster.md: header 32, 16 columns of 12 bytes and 128 pixels, footer 32."""
     sent = Counter((source, len(data)) for _, source, data in datagrams(folder / name))
     assert sent == Counter({(source, size): count for source, count in OUSTER_PACKETS.items()})
 
 
-def test_columns_of_an_ouster_follow_each_other(folder: Path) -> None:
+def test_ouster_columns_are_consecutive(folder: Path) -> None:
     stamps_ns: list[int] = []
     for number, (host_s, _, data) in enumerate(
         one for one in datagrams(folder / "dual-4") if one[1] == B_IP
@@ -68,13 +69,13 @@ def test_columns_of_an_ouster_follow_each_other(folder: Path) -> None:
             stamp_ns, mid, status = struct.unpack_from("<QHH", data, 32 + column * 524)
             assert (mid, status) == (number % 64 * 16 + column, 1)
             stamps_ns.append(stamp_ns)
-        # Under 2 ms of a packet and 0.3 ms on the way.
+        # Less than 2 ms in a packet, and 0.3 ms of transport.
         assert 0 < host_s - stamps_ns[-1] / 1e9 < 0.002
     assert stamps_ns[0] == EPOCH_S * 10**9 + 37_100_000
     assert {b - a for a, b in pairwise(stamps_ns)} == {97656, 97657}
 
 
-def test_pixels_of_both_profiles_hold_the_same_ranges(folder: Path) -> None:
+def test_both_profiles_have_the_same_ranges(folder: Path) -> None:
     low = next(datagrams(folder / "dual-4"))[2]
     full = next(datagrams(folder / "dual-12"))[2]
     near = 0
@@ -100,7 +101,7 @@ def test_fragments_join_to_the_plain_packets(folder: Path) -> None:
         data = joined.setdefault((source, ip_id), bytearray(8456))
         data[offset : offset + len(frame) - 34] = frame[34:]
         counts[source, ip_id] += 1
-    # 8456 bytes in pieces of 1480.
+    # 8456 bytes in fragments of 1480.
     assert set(counts.values()) == {6}
     for _, frame in records(folder / "dual-4"):
         source, ip_id = frame[26:30], int.from_bytes(frame[18:20], "big")
@@ -109,15 +110,15 @@ def test_fragments_join_to_the_plain_packets(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_records_are_in_order_and_about_as_large_as_told(folder: Path, name: str) -> None:
+def test_records_are_in_order_and_of_about_the_given_size(folder: Path, name: str) -> None:
     times = [stamp for stamp, _ in records(folder / name)]
     assert all(later >= earlier for earlier, later in pairwise(times))
     size = (folder / name / CAPTURE).stat().st_size
-    assert size == pytest.approx(RECORDINGS[name].bytes_a_second * SECONDS, rel=0.05)
+    assert size == pytest.approx(RECORDINGS[name].bytes_per_s * SECONDS, rel=0.05)
 
 
-def test_a_velodyne_turns_with_its_clock(folder: Path) -> None:
-    """facts/velodyne.md: 1206 bytes, 12 blocks of 100, then us past the hour and two bytes."""
+def test_velodyne_azimuths_follow_the_clock(folder: Path) -> None:
+    """docs/sources/velodyne.md: 12 blocks of 100 bytes, then us past the hour and two bytes."""
     packets = [one for one in datagrams(folder / "three-vlp16") if one[1] == "192.168.7.21"]
     assert len(packets) == 753
     for number, (_, _, data) in enumerate(packets):
@@ -131,8 +132,8 @@ def test_a_velodyne_turns_with_its_clock(folder: Path) -> None:
             assert cdeg == int((begin_ns + block * 110_592) * 36_000 / 1e8) % 36_000
 
 
-def test_a_hesai_tells_its_date(folder: Path) -> None:
-    """facts/hesai.md section 3: the tail of a Pandar64 begins at byte 1172."""
+def test_hesai_packets_contain_the_date(folder: Path) -> None:
+    """docs/sources/hesai.md section 3: the tail of a Pandar64 begins at byte 1172."""
     _, _, data = next(datagrams(folder / "pandar64"))
     assert len(data) == 1198
     assert data[:8] == bytes.fromhex("eeff400600040000")
@@ -144,29 +145,29 @@ def test_a_hesai_tells_its_date(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_a_conversion_takes_every_packet(folder: Path, tmp_path: Path, name: str) -> None:
+def test_a_conversion_accepts_every_packet(folder: Path, tmp_path: Path, name: str) -> None:
     place = folder / name
     report = tmp_path / "report.json"
     done = command(
         *("convert", place / CAPTURE, "--rig", place / RIG, "--dry-run", "--report", report)
     )
     assert (done.code, done.err) == (0, "")
-    told = json.loads(report.read_text(encoding="utf-8"))
-    assert not told["warnings"]
-    assert not told["unassigned"]
-    assert [sensor["name"] for sensor in told["sensors"]] == [
+    report_document = json.loads(report.read_text(encoding="utf-8"))
+    assert not report_document["warnings"]
+    assert not report_document["unassigned"]
+    assert [sensor["name"] for sensor in report_document["sensors"]] == [
         sensor.name for sensor in RECORDINGS[name].sensors
     ]
-    for sensor in told["sensors"]:
+    for sensor in report_document["sensors"]:
         assert sensor["packets"]["read"] == sensor["packets"]["accepted"] > 0
         slots = sensor["points"]["slots"]
         assert 0.7 < sensor["points"]["written"] / slots < 0.9
-    # Of ten windows the first, and that of the last stamp, are not whole; nor is one at a phase.
-    slots = sum(sensor["points"]["slots"] for sensor in told["sensors"])
-    assert 0.75 < slots / (RECORDINGS[name].slots_a_second * SECONDS) < 0.95
+    # Of ten windows the first, the last, and one at a phase are incomplete.
+    slots = sum(sensor["points"]["slots"] for sensor in report_document["sensors"])
+    assert 0.75 < slots / (RECORDINGS[name].slots_per_s * SECONDS) < 0.95
 
 
-def test_fragments_hold_the_same_scans(folder: Path, tmp_path: Path) -> None:
+def test_fragments_give_the_same_scans(folder: Path, tmp_path: Path) -> None:
     found = []
     for name in ("dual-4", "dual-4-fragments"):
         output = tmp_path / name
@@ -179,35 +180,9 @@ def test_fragments_hold_the_same_scans(folder: Path, tmp_path: Path) -> None:
     assert found[0]
 
 
-def test_pieces_of_time_do_not_show(
+def test_the_chunk_length_does_not_matter(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(captures, "_PIECE_NS", 70_000_000)
+    monkeypatch.setattr(recordings, "CHUNK_NS", 70_000_000)
     make(RECORDINGS["mixed"], SECONDS, tmp_path)
     assert (tmp_path / CAPTURE).read_bytes() == (folder / "mixed" / CAPTURE).read_bytes()
-
-
-def test_the_disk_that_cases_need() -> None:
-    by_name = {case.name: case for case in CASES}
-    low = 2 * 640 * (8448 + 58)
-    assert RECORDINGS["dual-4"].bytes_a_second == low
-    # The recording, plain and in fragments, but no output.
-    assert disk_bytes([by_name["dual-4"]], 2.0) == 4 * low
-    # The recording once, and all its slots at 48 bytes.
-    assert disk_bytes([by_name["dual-4-mcap"]], 1.0) == low + 2 * 10_240 * 128 * 48
-    assert set(KINDS) == {sensor.kind for one in RECORDINGS.values() for sensor in one.sensors}
-
-
-def test_a_kept_recording_is_used_as_long_as_it_would_be_made_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = RECORDINGS["three-vlp16"]
-    assert not recordings.is_made(tmp_path)
-    make(recording, 0.2, tmp_path)
-    assert recordings.is_made(tmp_path)
-    monkeypatch.setattr(recordings, "digest", lambda: "of other makers")
-    assert not recordings.is_made(tmp_path)
-    make(recording, 0.2, tmp_path)
-    assert recordings.is_made(tmp_path)
-    (tmp_path / CAPTURE).unlink()
-    assert not recordings.is_made(tmp_path)
