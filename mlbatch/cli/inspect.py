@@ -28,7 +28,7 @@ def inspect(
     ] = None,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
-    from mlbatch.cli.options import table_lines
+    from mlbatch.cli.tables import table_lines
     from mlbatch.discovery.inspect import survey
 
     found = survey(tuple(recordings), tuple(metadata or ()), whole=whole)

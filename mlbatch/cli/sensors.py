@@ -31,7 +31,7 @@ def sensors(
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
         return
-    from mlbatch.cli.options import table_lines
+    from mlbatch.cli.tables import table_lines
 
     cells = [[_cell(row[key]) for key in HEAD] for row in rows]
     for line in table_lines([list(HEAD), *cells]):

@@ -37,8 +37,6 @@ FOREIGN = re.compile(r"typer\.echo|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']")
 OUTSIDE = re.compile(
     r"\b(?:STYLE|CONTRACT|ARCHITECTURE|REDESIGN)\.md|\bfacts/\w+\.md|\.\./shared/\w+\.md"
 )
-    r"\b(?:STYLE|CONTRACT|ARCHITECTURE|REDESIGN)\.md|\bfacts/\w+\.md|\.\./shared/\w+\.md"
-)
 CITED = re.compile(r"docs/((?:\w+/)?[\w-]+)\.md(?:,? sections? (\d+))?")
 
 
