@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Arrival, Delivery, Intake, JumpGuard
+from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Arrival, Intake, JumpGuard
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.errors import ClockJump
@@ -152,13 +152,13 @@ class Batcher:
 
     # -- steps --------------------------------------------------------------------------------
 
-    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Delivery | None]:
+    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Accepted | None]:
         """What the sensors' doors let in; ClockJump where clocks jump.
 
         Clocks that jump together are cut at the first packet of any of them, also of one whose
         next packet is not here yet: else it would depend on the batch where a recording is cut.
         """
-        accepted: list[Delivery | None] = []
+        accepted: list[Accepted | None] = []
         jumps: list[ClockJump] = []
         for number, (track, arrival) in enumerate(zip(self._tracks, arrivals, strict=True)):
             delivery = None
@@ -177,7 +177,7 @@ class Batcher:
             raise ClockJump(str(first), min([first.host_ns, *near_ns]))
         return accepted
 
-    def _check_clocks(self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array]) -> None:
+    def _check_clocks(self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array]) -> None:
         """As soon as two sensors have a packet, their stamps must be comparable."""
         firsts = []
         for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
@@ -197,7 +197,7 @@ class Batcher:
             )
 
     def _advance(
-        self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array], host_ns: I64Array
+        self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array], host_ns: I64Array
     ) -> Progress:
         """Newest stamps and the watermark before and after each delivery; evaluates eq. (1)."""
         newest = np.full((len(self._tracks), len(host_ns) + 1), NEVER)
@@ -413,7 +413,7 @@ class Progress:
     host_ns: I64Array
 
 
-def ranked(accepted: Sequence[Delivery | None]) -> tuple[list[I64Array], I64Array]:
+def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Array]:
     """Of each sensor, the number of each of its packets among all; positions of these, in order."""
     events = [_NONE if delivery is None else delivery.packets.position for delivery in accepted]
     delivering = [number for number, event in enumerate(events) if len(event)]

@@ -56,7 +56,7 @@ class Arrival:
 
 
 @dataclass(slots=True)
-class Delivery:
+class Accepted:
     """Accepted packets of one sensor on the common clock, in order of delivery.
 
     newest_ns: (A,) int64, largest valid stamp of each, NEVER where none is valid.
@@ -100,7 +100,7 @@ class Intake:
         self._recent: list[I64Array] = []
         self._largest_key = -1
 
-    def accept(self, arrival: Arrival) -> Delivery:
+    def accept(self, arrival: Arrival) -> Accepted:
         """Let in the packets of a batch, as far as they are good."""
         fresh = self._distinct(arrival.key)
         if fresh is not None:
@@ -118,7 +118,7 @@ class Intake:
             stamp, known = arrival.heads.stamp_ns, high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
             high = np.where(known, arrival.host_ns, NEVER)
-        return Delivery(arrival, high)
+        return Accepted(arrival, high)
 
     def _is_calm(self, lowest: int, highest: int) -> bool:
         """Whether stamps between these limits are sane, and no packet of them can be a step."""
@@ -311,7 +311,7 @@ class JumpGuard:
         self._newest_ns = NEVER
         self._host_ns = 0
 
-    def check(self, delivery: Delivery) -> None:
+    def check(self, delivery: Accepted) -> None:
         """Look at the next packets, in order of delivery."""
         if not self._has_clock:
             return

@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.clocks.compare import with_host_steps
 from mlbatch.clocks.timescale import DELAY, HOST
-from mlbatch.clocks.watch import LIMIT_NS, ClockFinding, ClockWatch, Stretch, steady, stretch_of
+from mlbatch.clocks.watch import LIMIT_NS, ClockEstimate, ClockWatch, Segment, segment_of, steady
 from mlbatch.errors import ClockError
 from mlbatch.units import NS_PER_MS
 
@@ -27,9 +27,9 @@ _FAR = 2**62
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A stretch of a map: offsets to add at stamps (k,), ns; beyond them the rate goes on.
+    """A segment of a map: offsets to add at stamps (k,), ns; beyond them the rate goes on.
 
-    least_ns, most_ns: no aligned stamp lies outside, so that stretches keep their order.
+    least_ns, most_ns: no aligned stamp lies outside, so that segments keep their order.
     """
 
     stamp_ns: I64Array
@@ -59,7 +59,7 @@ class _Piece:
 class ClockMap:
     """Maps a sensor's stamps onto another clock; larger stamps never become smaller ones.
 
-    knots: of all stretches; residual_p50_ns, residual_max_ns: how far the fastest packets lie from
+    knots: of all segments; residual_p50_ns, residual_max_ns: how far the fastest packets lie from
     the map; to: `host` or `first`.
     """
 
@@ -67,7 +67,7 @@ class ClockMap:
     knots: int
     residual_p50_ns: int
     residual_max_ns: int
-    stretches: tuple[Stretch, ...]
+    segments: tuple[Segment, ...]
     _pieces: tuple[_Piece, ...]
 
     def apply(self, stamp_ns: I64Array, host_ns: I64Array | None = None) -> I64Array:
@@ -83,14 +83,14 @@ class ClockMap:
             return np.where(sane, self.apply(good_ns, host_ns), stamp_ns)
         if len(self._pieces) == 1:
             return self._pieces[0].apply(stamp_ns)
-        which = stretch_of(self.stretches, stamp_ns, host_ns)
+        which = segment_of(self.segments, stamp_ns, host_ns)
         aligned = np.empty_like(stamp_ns)
         for number, piece in enumerate(self._pieces):
             mine = which == number
             aligned[mine] = piece.apply(stamp_ns[mine])
         return aligned
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """One line for the report."""
         target = "the recorder's clock" if self.to == TO_HOST else "the first sensor's clock"
         return (
@@ -105,7 +105,7 @@ def fit(watches: Sequence[ClockWatch], to: str = TO_HOST) -> tuple[ClockMap | No
 
     to: `host` or `first`; ClockError if the first sensor's clock cannot be a target.
     """
-    found = [(str(at), watch.finding()) for at, watch in enumerate(watches)]
+    found = [(str(at), watch.estimate()) for at, watch in enumerate(watches)]
     seen = with_host_steps([(name, one) for name, one in found if one is not None])
     findings = dict(seen)
     target = _target(findings.get("0")) if to == TO_FIRST else ()
@@ -121,7 +121,7 @@ def fit(watches: Sequence[ClockWatch], to: str = TO_HOST) -> tuple[ClockMap | No
     return tuple(maps)
 
 
-def _target(finding: ClockFinding | None) -> tuple[Stretch, ...]:
+def _target(finding: ClockEstimate | None) -> tuple[Segment, ...]:
     """The first sensor's clock, by a recorder's clock that never stepped."""
     if finding is None:
         raise ClockError(
@@ -136,15 +136,15 @@ def _target(finding: ClockFinding | None) -> tuple[Stretch, ...]:
     return steady(finding, _TAKEN_OUT)
 
 
-def _itself(finding: ClockFinding) -> ClockMap:
+def _itself(finding: ClockEstimate) -> ClockMap:
     """The map of the target: nothing changes."""
     nothing = np.zeros(1, np.int64)
     return ClockMap(
-        TO_FIRST, 0, 0, 0, finding.stretches[:1], (_Piece(nothing, nothing, 0.0, -_FAR, _FAR),)
+        TO_FIRST, 0, 0, 0, finding.segments[:1], (_Piece(nothing, nothing, 0.0, -_FAR, _FAR),)
     )
 
 
-def _map(finding: ClockFinding, to: str, target: Sequence[Stretch]) -> ClockMap:
+def _map(finding: ClockEstimate, to: str, target: Sequence[Segment]) -> ClockMap:
     pieces: list[_Piece] = []
     least_ns = -_FAR
     for one in steady(finding, _TAKEN_OUT):
@@ -152,23 +152,23 @@ def _map(finding: ClockFinding, to: str, target: Sequence[Stretch]) -> ClockMap:
         least_ns = int(piece.apply(np.array([one.last_stamp_ns], np.int64))[0])
         pieces.append(replace(piece, most_ns=least_ns))
     pieces[-1] = replace(pieces[-1], most_ns=_FAR)
-    residual_ns = np.concatenate([one.line.residual_ns for one in finding.stretches])
+    residual_ns = np.concatenate([one.line.residual_ns for one in finding.segments])
     return ClockMap(
         to,
         sum(len(piece.stamp_ns) for piece in pieces),
         round(float(np.quantile(residual_ns, 0.5, method="inverted_cdf"))),
         round(float(residual_ns.max())),
-        finding.stretches,
+        finding.segments,
         tuple(pieces),
     )
 
 
-def _piece(one: Stretch, target: Sequence[Stretch], least_ns: int) -> _Piece:
-    """The map of one stretch; target: empty for the recorder's clock."""
+def _piece(one: Segment, target: Sequence[Segment], least_ns: int) -> _Piece:
+    """The map of one segment; target: empty for the recorder's clock."""
     at_ns = one.line.host_ns
     rate = 0.0
     if target:
-        at_ns = np.union1d(at_ns, np.concatenate([stretch.line.host_ns for stretch in target]))
+        at_ns = np.union1d(at_ns, np.concatenate([segment.line.host_ns for segment in target]))
         near = (at_ns >= one.first_host_ns) & (at_ns <= one.last_host_ns)
         at_ns = at_ns[near | np.isin(at_ns, one.line.host_ns)]
         rate = target[-1].line.rate
@@ -181,10 +181,10 @@ def _piece(one: Stretch, target: Sequence[Stretch], least_ns: int) -> _Piece:
     return _Piece(stamp_ns[kept], offset_ns, rate, least_ns, _FAR)
 
 
-def _offsets(target: Sequence[Stretch], at_ns: I64Array) -> I64Array:
+def _offsets(target: Sequence[Segment], at_ns: I64Array) -> I64Array:
     """How far the target's clock is ahead of the recorder's."""
     offset_ns = np.zeros(len(at_ns), np.int64)
-    for number, stretch in enumerate(target):
-        mine = at_ns >= stretch.first_host_ns if number else np.ones(len(at_ns), bool)
-        offset_ns[mine] = stretch.line.at(at_ns[mine])
+    for number, segment in enumerate(target):
+        mine = at_ns >= segment.first_host_ns if number else np.ones(len(at_ns), bool)
+        offset_ns[mine] = segment.line.at(at_ns[mine])
     return offset_ns

@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch.arrays import I64Array
 from mlbatch.clocks.timescale import DELAY, EPOCHS, GPS, HOST, TAI, UTC, in_seconds, whole_ns
-from mlbatch.clocks.watch import ClockFinding, Jump, Stretch, steady
+from mlbatch.clocks.watch import ClockEstimate, Jump, Segment, steady
 from mlbatch.errors import ClockError
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -27,7 +27,7 @@ RATE_SLACK_PPM = 1.0
 # Steps of the recorder's clock are seen at the same time and of the same size by all sensors.
 _TOGETHER_NS, _SAME_NS, _SAME_SHARE = NS_PER_S, NS_PER_MS, 0.02
 _FREE_PPM = 100.0
-Named = tuple[str, ClockFinding]
+Named = tuple[str, ClockEstimate]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Pair:
         """The clocks were never farther apart than this."""
         return max(abs(self.low_ns), abs(self.high_ns)) + self.uncertainty_ns
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """One line for people."""
         middle = (self.low_ns + self.high_ns) // 2
         text = f"{self.one} and {self.two}: {self.verdict}: {self.why}; {self.two} is "
@@ -99,7 +99,7 @@ class Comparison:
     verdict: str
     bound_ns: int | None
     reference: str
-    findings: tuple[Named, ...]
+    estimates: tuple[Named, ...]
     pairs: tuple[Pair, ...]
     corrections: tuple[Correction, ...]
 
@@ -107,11 +107,11 @@ class Comparison:
         """Pairs that were farther apart than `limit_ns`, whatever the verdict."""
         return tuple(pair for pair in self.pairs if _least(pair) > limit_ns)
 
-    def in_words(self) -> list[str]:
+    def describe(self) -> list[str]:
         """Lines for people: the verdict (of two or more sensors), each sensor, each pair."""
         lines = [f"clocks: {self.verdict}{self._bound()}"] if self.pairs else []
-        lines += [f"{name}: {finding.in_words()}" for name, finding in self.findings]
-        lines += [pair.in_words() for pair in self.pairs]
+        lines += [f"{name}: {finding.describe()}" for name, finding in self.estimates]
+        lines += [pair.describe() for pair in self.pairs]
         return lines
 
     def _bound(self) -> str:
@@ -187,10 +187,10 @@ def with_host_steps(findings: Sequence[Named]) -> tuple[Named, ...]:
     return tuple(named)
 
 
-def _kind(jump: Jump, others: Sequence[ClockFinding]) -> str:
+def _kind(jump: Jump, others: Sequence[ClockEstimate]) -> str:
     shared = [jump]
     for other in others:
-        seen = [one for one in other.stretches if _covers(one, jump.host_ns)]
+        seen = [one for one in other.segments if _covers(one, jump.host_ns)]
         same = [one for one in other.jumps if _is_same(one, jump)]
         if not same and (len(seen) or other.jumps):
             return DELAY if jump.kind == HOST else jump.kind
@@ -205,9 +205,9 @@ def _open(shared: Sequence[Jump]) -> bool:
     return all(not one.side for one in shared)
 
 
-def _covers(stretch: Stretch, host_ns: int) -> bool:
+def _covers(segment: Segment, host_ns: int) -> bool:
     inside_ns = _TOGETHER_NS
-    return stretch.first_host_ns + inside_ns < host_ns < stretch.last_host_ns - inside_ns
+    return segment.first_host_ns + inside_ns < host_ns < segment.last_host_ns - inside_ns
 
 
 def _is_same(one: Jump, two: Jump) -> bool:
@@ -262,7 +262,7 @@ def _epoch(one: str, two: str) -> str:
     return two if one == UTC and two in (TAI, GPS) else ""
 
 
-def _apart_ppm(one: ClockFinding, two: ClockFinding) -> float:
+def _apart_ppm(one: ClockEstimate, two: ClockEstimate) -> float:
     """How much faster one clock runs than the other, where that is sure; else 0."""
     if one.drift_ppm is None or two.drift_ppm is None:
         return 0.0
@@ -271,7 +271,7 @@ def _apart_ppm(one: ClockFinding, two: ClockFinding) -> float:
     return apart if apart > error + RATE_SLACK_PPM else 0.0
 
 
-def _range(one: Sequence[Stretch], two: Sequence[Stretch]) -> tuple[int, int, int]:
+def _range(one: Sequence[Segment], two: Sequence[Segment]) -> tuple[int, int, int]:
     """Least and largest difference of two clocks, and the time between them if never both seen."""
     low, high = [], []
     for first in one:
@@ -291,11 +291,11 @@ def _range(one: Sequence[Stretch], two: Sequence[Stretch]) -> tuple[int, int, in
     return int(difference.min()), int(difference.max()), end - begin
 
 
-def _before(one: Sequence[Stretch], two: Sequence[Stretch]) -> bool:
+def _before(one: Sequence[Segment], two: Sequence[Segment]) -> bool:
     return one[-1].last_host_ns < two[0].first_host_ns
 
 
-def _difference(first: Stretch, second: Stretch, begin: int, end: int) -> I64Array:
+def _difference(first: Segment, second: Segment, begin: int, end: int) -> I64Array:
     """How far the second clock is ahead at all knots of both within a time, and at its ends."""
     knots = np.concatenate([first.line.host_ns, second.line.host_ns])
     inside = knots[(knots > begin) & (knots < end)]

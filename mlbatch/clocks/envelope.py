@@ -34,13 +34,13 @@ _MAD_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class BinRange:
     """Rows `begin` to `end` of a track: a clock that runs on without a step.
 
     first, last: (stamp, arrival) of its first and last packet, ns.
     """
 
-    track: Track
+    table: BinTable
     begin: int
     end: int
     first: tuple[int, int]
@@ -49,9 +49,9 @@ class Part:
     @property
     def packets(self) -> int:
         """Packets in it; roughly, where it begins or ends within a bin."""
-        whole = self.end == len(self.track.rows)
-        over = len(self.track.rows) * self.track.per_bin - self.track.packets if whole else 0
-        return max((self.end - self.begin) * self.track.per_bin - over, 1)
+        whole = self.end == len(self.table.rows)
+        over = len(self.table.rows) * self.table.per_bin - self.table.packets if whole else 0
+        return max((self.end - self.begin) * self.table.per_bin - over, 1)
 
     @property
     def span_ns(self) -> int:
@@ -60,14 +60,14 @@ class Part:
 
     def points(self) -> tuple[I64Array, I64Array, I64Array]:
         """Arrival, and stamp minus arrival, of the fastest packet of each bin, ns; and its row."""
-        rows = self.track.rows[self.begin : self.end, TOP]
+        rows = self.table.rows[self.begin : self.end, TOP]
         offset_ns = rows[:, 0] - rows[:, 1]
         kept = np.flatnonzero(~_lonely(offset_ns))
         return rows[kept, 1], offset_ns[kept], self.begin + kept
 
     def samples(self) -> tuple[I64Array, I64Array]:
         """The same of the first packet of each bin: how packets usually arrive."""
-        rows = self.track.rows[self.begin : self.end, FIRST]
+        rows = self.table.rows[self.begin : self.end, FIRST]
         return rows[:, 1], rows[:, 0] - rows[:, 1]
 
 
@@ -98,7 +98,7 @@ class Line:
         return first + np.rint(y).astype(np.int64)
 
 
-def groups(host_ns: I64Array, offset_ns: I64Array, part: Part, most: int) -> I64Array:
+def groups(host_ns: I64Array, offset_ns: I64Array, part: BinRange, most: int) -> I64Array:
     """Index of the top point of each group of neighbouring points, in order; see GROUP_NS."""
     count = len(host_ns)
     wanted = min(part.span_ns // GROUP_NS, part.packets // GROUP_PACKETS, most, count)
@@ -112,7 +112,7 @@ def groups(host_ns: I64Array, offset_ns: I64Array, part: Part, most: int) -> I64
     return at[np.diff(np.searchsorted(starts, at, side="right"), prepend=0) > 0]
 
 
-def envelope(part: Part) -> Line:
+def envelope(part: BinRange) -> Line:
     """The envelope of a part."""
     host_ns, offset_ns, _ = part.points()
     x = (host_ns - host_ns[0]).astype(np.float64)
@@ -212,8 +212,8 @@ _WIDTH = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """What is known of a stretch of packets: rows (bins, 16), in order of arrival.
+class BinTable:
+    """What is known of a segment of packets: rows (bins, 16), in order of arrival.
 
     per_bin: packets of a bin, the last one may hold fewer; last: (stamp, arrival) of the last
     packet.
@@ -230,8 +230,8 @@ class Track:
         return int(self.rows[0, 2]), int(self.rows[0, 3])
 
 
-class Bins:
-    """The packets of one stretch of a clock."""
+class PacketBins:
+    """The packets of one segment of a clock."""
 
     def __init__(self) -> None:
         self.packets = 0
@@ -270,11 +270,11 @@ class Bins:
         self.packets += count
         self._last = int(stamp_ns[-1]), int(host_ns[-1])
 
-    def track(self) -> Track | None:
+    def table(self) -> BinTable | None:
         """All that is kept; None without a packet."""
         if self._last is None:
             return None
-        return Track(self._rows.copy(), self._per_bin, self.packets, self._last)
+        return BinTable(self._rows.copy(), self._per_bin, self.packets, self._last)
 
 
 @dataclass(frozen=True, slots=True)

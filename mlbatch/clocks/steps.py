@@ -17,9 +17,9 @@ from mlbatch.clocks.envelope import (
     FALL,
     MOST_GROUPS,
     RISE,
+    BinRange,
+    BinTable,
     Line,
-    Part,
-    Track,
     envelope,
     groups,
 )
@@ -52,17 +52,17 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class ClockTrack:
     """A clock from its first packet to its last: parts, their envelopes, the steps between them."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[BinRange, ...]
     lines: tuple[Line, ...]
     steps: tuple[Step, ...]
 
 
-def course_of(tracks: Sequence[Track]) -> Course:
+def track_of(tracks: Sequence[BinTable]) -> ClockTrack:
     """What a clock did: steps that come to nothing are pauses of the recorder, and left out."""
-    parts, lines, steps = list[Part](), list[Line](), list[Step]()
+    parts, lines, steps = list[BinRange](), list[Line](), list[Step]()
     for part in (part for track in tracks for part in _split(track)):
         line = envelope(part)
         if parts:
@@ -74,24 +74,24 @@ def course_of(tracks: Sequence[Track]) -> Course:
             steps.append(step)
         parts.append(part)
         lines.append(line)
-    return Course(tuple(parts), tuple(lines), tuple(steps))
+    return ClockTrack(tuple(parts), tuple(lines), tuple(steps))
 
 
-def _joined(one: Part, two: Part) -> Part:
+def _joined(one: BinRange, two: BinRange) -> BinRange:
     """Two parts as one."""
-    if one.track is two.track:
-        return Part(one.track, one.begin, two.end, one.first, two.last)
+    if one.table is two.table:
+        return BinRange(one.table, one.begin, two.end, one.first, two.last)
     rows = np.concatenate(
-        [one.track.rows[one.begin : one.end], two.track.rows[two.begin : two.end]]
+        [one.table.rows[one.begin : one.end], two.table.rows[two.begin : two.end]]
     )
     packets = one.packets + two.packets
-    track = Track(rows, max(-(-packets // len(rows)), 1), packets, two.last)
-    return Part(track, 0, len(rows), one.first, two.last)
+    table = BinTable(rows, max(-(-packets // len(rows)), 1), packets, two.last)
+    return BinRange(table, 0, len(rows), one.first, two.last)
 
 
-def _split(track: Track) -> list[Part]:
-    """A track, cut at the steps of its envelope."""
-    whole = Part(track, 0, len(track.rows), track.first, track.last)
+def _split(table: BinTable) -> list[BinRange]:
+    """A table, cut at the steps of its envelope."""
+    whole = BinRange(table, 0, len(table.rows), table.first, table.last)
     host_ns, offset_ns, row = whole.points()
     tops = groups(host_ns, offset_ns, whole, MOST_GROUPS)
     rate = _usual_rate(host_ns[tops], offset_ns[tops])
@@ -100,17 +100,17 @@ def _split(track: Track) -> list[Part]:
         return [whole]
     usual_ns = median(np.abs(np.diff(level)))
     size = _gaps(level)
-    tops_of_rows = track.rows[:, 0] - track.rows[:, 1] - offset_ns[0]
-    levels = _level(track.rows[:, 1], tops_of_rows, host_ns[0], rate)
-    parts: list[Part] = []
+    tops_of_rows = table.rows[:, 0] - table.rows[:, 1] - offset_ns[0]
+    levels = _level(table.rows[:, 1], tops_of_rows, host_ns[0], rate)
+    parts: list[BinRange] = []
     begin, first = 0, whole.first
     for at in np.flatnonzero(np.abs(size) > max(SMALLEST_NS, _SCALES * usual_ns)).tolist():
         near = slice(row[tops[max(at - 2, 0)]], row[tops[min(at + 1, len(tops) - 1)]] + 1)
-        cut = _cut(track, near, levels, float(level[at - 1]), float(size[at]))
-        if cut is not None and cut.end > begin and cut.start < len(track.rows):
-            parts.append(Part(track, begin, cut.end, first, cut.before))
+        cut = _cut(table, near, levels, float(level[at - 1]), float(size[at]))
+        if cut is not None and cut.end > begin and cut.start < len(table.rows):
+            parts.append(BinRange(table, begin, cut.end, first, cut.before))
             begin, first = cut.start, cut.after
-    return [*parts, Part(track, begin, len(track.rows), first, whole.last)]
+    return [*parts, BinRange(table, begin, len(table.rows), first, whole.last)]
 
 
 def _usual_rate(host_ns: I64Array, offset_ns: I64Array) -> float:
@@ -146,7 +146,7 @@ def _gaps(level: F64Array) -> F64Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Cut:
+class StepLocation:
     """End of the rows before a step, start of those after it, the packets around it."""
 
     end: int
@@ -155,7 +155,9 @@ class _Cut:
     after: tuple[int, int]
 
 
-def _cut(track: Track, near: slice, level: F64Array, old: float, size: float) -> _Cut | None:
+def _cut(
+    table: BinTable, near: slice, level: F64Array, old: float, size: float
+) -> StepLocation | None:
     """Where a step lies in the rows `near`; level: of all rows; old: before it; None: no step."""
     over = np.flatnonzero(level[near] > old + size / 2)
     if not len(over):
@@ -170,14 +172,14 @@ def _cut(track: Track, near: slice, level: F64Array, old: float, size: float) ->
     low, high = (float(side.max() - old) / size for side in sides)
     if low > _SHARE or high < 1 - _SHARE:
         return None
-    pairs = track.rows[[at], RISE] if size > 0 else _falls(track.rows[at : at + 2])
+    pairs = table.rows[[at], RISE] if size > 0 else _falls(table.rows[at : at + 2])
     heights = (pairs[:, 2] - pairs[:, 0]) - (pairs[:, 3] - pairs[:, 1])
     best = int(np.argmin(np.abs(heights - size)))
     before, after = pairs[best, :2].tolist(), pairs[best, 2:].tolist()
     # Of a fall, the first half of the pairs is of the last row before it, or in that row.
     end = at if size > 0 or best < len(pairs) // 2 else at + 1
     # A row of one packet lies on one side; one of many may hold packets of both.
-    return _Cut(end, end + (track.per_bin > 1), tuple(before), tuple(after))
+    return StepLocation(end, end + (table.per_bin > 1), tuple(before), tuple(after))
 
 
 def _falls(rows: I64Array) -> I64Array:
@@ -185,7 +187,7 @@ def _falls(rows: I64Array) -> I64Array:
     return np.stack([rows[:, FALL], rows[:, BACK]], axis=1).reshape(-1, 4)
 
 
-def _step(one: Part, line: Line, two: Part, next_line: Line) -> Step:
+def _step(one: BinRange, line: Line, two: BinRange, next_line: Line) -> Step:
     """The step between two parts."""
     before, after = one.last, two.first
     stamps_ns, hosts_ns = after[0] - before[0], after[1] - before[1]

@@ -1,7 +1,7 @@
 """The clock doctor: what a sensor's clock counts, how far it is off, how fast it drifts, its jumps.
 
 A `ClockWatch` is fed with the stamps of one sensor's packets and their arrivals, and tells a
-`ClockFinding`; `clock_compare.compare` holds those of several sensors against each other (the page
+`ClockEstimate`; `clock_compare.compare` holds those of several sensors against each other (the page
 docs/clocks.md says how it decides, and what it cannot know).
 """
 
@@ -15,8 +15,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.clocks.envelope import Bins, Line
-from mlbatch.clocks.steps import Course, Step, course_of
+from mlbatch.clocks.envelope import Line, PacketBins
+from mlbatch.clocks.steps import ClockTrack, Step, track_of
 from mlbatch.clocks.timescale import (
     DELAY,
     EPOCHS,
@@ -31,12 +31,12 @@ from mlbatch.clocks.timescale import (
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 __all__ = [
-    "ClockFinding",
+    "ClockEstimate",
     "ClockWatch",
     "Jump",
-    "Stretch",
+    "Segment",
+    "segment_of",
     "steady",
-    "stretch_of",
     "whole_ns",
 ]
 
@@ -44,7 +44,7 @@ __all__ = [
 HARD_NS = NS_PER_S
 LIMIT_NS = 2**31 * NS_PER_S
 # A clock that steps more often tells no time.
-MOST_STRETCHES = 64
+MAX_SEGMENTS = 64
 # Packets are looked at so many at a time: one by one they would cost a hundred times as much.
 _AT_ONCE = 4096
 # What also the fastest packet may have taken from its stamp to the recorder.
@@ -73,7 +73,7 @@ class Jump:
     kind: str
     side: str
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """For people."""
         before_s, after_s = self.stamp_before_ns / NS_PER_S, self.stamp_after_ns / NS_PER_S
         if self.kind == HOST:
@@ -89,7 +89,7 @@ class Jump:
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class Segment:
     """A clock between two jumps: first and last stamp and arrival, ns; domain; its envelope."""
 
     first_stamp_ns: int
@@ -102,10 +102,10 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockFinding:
+class ClockEstimate:
     """What is known of a sensor's clock; see docs/clocks.md.
 
-    domain: utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest stretch;
+    domain: utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest segment;
     offset_ns: stamp minus arrival of the fastest packets, in the middle of it (`at_host_ns`), and
     its uncertainty; drift_ppm: rate of the sensor's clock against the recorder's, None if too
     short to tell; resolution_ns: what all steps of stamps are multiples of (0: no step);
@@ -125,7 +125,7 @@ class ClockFinding:
     resolution_ns: int
     jitter_p50_ns: int
     jitter_p99_ns: int
-    stretches: tuple[Stretch, ...]
+    segments: tuple[Segment, ...]
     unsteady: bool
     mode: str = ""
 
@@ -134,7 +134,7 @@ class ClockFinding:
         """Jumps of the sensor's own clock."""
         return tuple(jump for jump in self.jumps if jump.kind not in (HOST, DELAY))
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """One line for people."""
         text = f"clock: {IN_WORDS[self.domain]}, {in_seconds(self.offset_ns)} to the recorder"
         text += f" (+-{self.uncertainty_ns / NS_PER_MS:.3f} ms)"
@@ -145,7 +145,7 @@ class ClockFinding:
         if self.drift_ppm is not None:
             text += f", drift {self.drift_ppm:+.2f} +-{self.drift_uncertainty_ppm:.2f} ppm"
         for jump in self.jumps:
-            text += f"; {jump.in_words()}"
+            text += f"; {jump.describe()}"
         return text + ("; it jumps again and again" if self.unsteady else "")
 
 
@@ -160,11 +160,11 @@ class ClockWatch:
         self.damaged = 0
         self._period_ns = period_ns
         self._mode = mode
-        self._bins: list[Bins] = []
+        self._bins: list[PacketBins] = []
         self._last: int | None = None
         self._pending: Pending | None = None
         self._unsteady = False
-        self._told: ClockFinding | None = None
+        self._told: ClockEstimate | None = None
         self._queue: list[tuple[I64Array, I64Array]] = []
         self._queued = 0
 
@@ -213,27 +213,27 @@ class ClockWatch:
                 self.damaged += 1
             return
         if not goes_on:
-            if len(self._bins) == MOST_STRETCHES:
+            if len(self._bins) == MAX_SEGMENTS:
                 self._unsteady = True
                 return
-            self._bins.append(Bins())
+            self._bins.append(PacketBins())
         self._bins[-1].add(stamp_ns, host_ns)
         self._last = last
 
-    def finding(self) -> ClockFinding | None:
+    def estimate(self) -> ClockEstimate | None:
         """What is known so far; None before the first packet."""
         if self._told is None:
             self._told = self._found()
         return self._told
 
-    def _found(self) -> ClockFinding | None:
-        course = self.course()
+    def _found(self) -> ClockEstimate | None:
+        course = self.track()
         if course is None:
             return None
         longest = max(range(len(course.parts)), key=lambda at: course.parts[at].packets)
         part, line = course.parts[longest], course.lines[longest]
         at_ns = part.first[1] + part.span_ns // 2
-        stretches = tuple(
+        segments = tuple(
             _stretch(course, number, self._period_ns) for number in range(len(course.parts))
         )
         jumps = tuple(_jump(step, self._period_ns) for step in course.steps)
@@ -244,10 +244,10 @@ class ClockWatch:
         drift = _drift(course)
         scatter_ns = round(3 * line.scatter_ns) + quantum * (quantum <= NS_PER_MS)
         burst_ns = BURST_NS * BURST_NS // max(part.span_ns, BURST_NS)
-        return ClockFinding(
+        return ClockEstimate(
             packets=sum(one.packets for one in self._bins) + (not self._bins),
             damaged=self.damaged + (self._pending is not None and bool(self._bins)),
-            domain=_domain(stretches, jumps, longest),
+            domain=_domain(segments, jumps, longest),
             offset_ns=int(line.at(np.array([at_ns], np.int64))[0]),
             uncertainty_ns=SHORTEST_WAY_NS + scatter_ns + burst_ns,
             at_host_ns=at_ns,
@@ -257,26 +257,26 @@ class ClockWatch:
             resolution_ns=quantum,
             jitter_p50_ns=p50,
             jitter_p99_ns=p99,
-            stretches=stretches,
+            segments=segments,
             unsteady=self._unsteady,
             mode=self._mode,
         )
 
-    def course(self) -> Course | None:
+    def track(self) -> ClockTrack | None:
         """Parts, envelopes and steps; None before the first packet."""
         self._look()
-        tracks = [track for track in (one.track() for one in self._bins) if track is not None]
+        tracks = [track for track in (one.table() for one in self._bins) if track is not None]
         if not tracks and self._pending is not None:
-            alone = Bins()
+            alone = PacketBins()
             alone.add(*(np.array([value], np.int64) for value in self._pending))
-            tracks = [track for track in (alone.track(),) if track is not None]
-        return course_of(tracks) if tracks else None
+            tracks = [track for track in (alone.table(),) if track is not None]
+        return track_of(tracks) if tracks else None
 
 
-def steady(finding: ClockFinding, kinds: Collection[str] = (HOST,)) -> tuple[Stretch, ...]:
-    """The stretches by a recorder's clock that never stepped; kinds: jumps taken for its steps."""
-    moved_ns, stretches = 0, [finding.stretches[0]]
-    for jump, one in zip(finding.jumps, finding.stretches[1:], strict=True):
+def steady(finding: ClockEstimate, kinds: Collection[str] = (HOST,)) -> tuple[Segment, ...]:
+    """The segments by a recorder's clock that never stepped; kinds: jumps taken for its steps."""
+    moved_ns, segments = 0, [finding.segments[0]]
+    for jump, one in zip(finding.jumps, finding.segments[1:], strict=True):
         if jump.kind in kinds:
             moved_ns -= jump.size_ns
         line = replace(
@@ -285,21 +285,21 @@ def steady(finding: ClockFinding, kinds: Collection[str] = (HOST,)) -> tuple[Str
             offset_ns=one.line.offset_ns + moved_ns,
         )
         first_ns, last_ns = one.first_host_ns - moved_ns, one.last_host_ns - moved_ns
-        stretches.append(replace(one, first_host_ns=first_ns, last_host_ns=last_ns, line=line))
-    return tuple(stretches)
+        segments.append(replace(one, first_host_ns=first_ns, last_host_ns=last_ns, line=line))
+    return tuple(segments)
 
 
-def stretch_of(
-    stretches: Sequence[Stretch], stamp_ns: I64Array, host_ns: I64Array | None = None
+def segment_of(
+    segments: Sequence[Segment], stamp_ns: I64Array, host_ns: I64Array | None = None
 ) -> I64Array:
-    """Which stretch stamps belong to, from 0; where stretches share stamps, their arrival tells."""
-    if len(stretches) == 1:
+    """Which segment stamps belong to, from 0; where segments share stamps, their arrival tells."""
+    if len(segments) == 1:
         return np.zeros(stamp_ns.shape, np.int64)
     away = np.stack(
         [
             _outside(stamp_ns, one.first_stamp_ns, one.last_stamp_ns)
             + (0 if host_ns is None else _outside(host_ns, one.first_host_ns, one.last_host_ns))
-            for one in stretches
+            for one in segments
         ]
     )
     nearest: I64Array = away.argmin(axis=0)
@@ -311,10 +311,10 @@ def _outside(value: I64Array, low: int, high: int) -> I64Array:
     return away
 
 
-def _stretch(course: Course, number: int, period_ns: int) -> Stretch:
+def _stretch(course: ClockTrack, number: int, period_ns: int) -> Segment:
     part, line = course.parts[number], course.lines[number]
     offset_ns = int(line.offset_ns[len(line.offset_ns) // 2])
-    return Stretch(
+    return Segment(
         part.first[0],
         part.last[0],
         part.first[1],
@@ -325,12 +325,12 @@ def _stretch(course: Course, number: int, period_ns: int) -> Stretch:
     )
 
 
-def _domain(stretches: Sequence[Stretch], jumps: Sequence[Jump], longest: int) -> str:
-    """Of the longest stretch; a recorder's clock that was set may tell it before or after only."""
-    named = [one.domain for one in stretches if one.domain in EPOCHS]
-    if stretches[longest].domain == UNKNOWN and named and all(one.kind == HOST for one in jumps):
+def _domain(segments: Sequence[Segment], jumps: Sequence[Jump], longest: int) -> str:
+    """Of the longest segment; a recorder's clock that was set may tell it before or after only."""
+    named = [one.domain for one in segments if one.domain in EPOCHS]
+    if segments[longest].domain == UNKNOWN and named and all(one.kind == HOST for one in jumps):
         return named[0]
-    return stretches[longest].domain
+    return segments[longest].domain
 
 
 def _jump(step: Step, period_ns: int) -> Jump:
@@ -340,7 +340,7 @@ def _jump(step: Step, period_ns: int) -> Jump:
     return Jump(step.after[1], before, after, step.size_ns, kind, step.side)
 
 
-def _jitter(course: Course) -> tuple[int, int]:
+def _jitter(course: ClockTrack) -> tuple[int, int]:
     """Median and 99th percentile of how far packets lie below the envelope, ns."""
     late = []
     for part, line in zip(course.parts, course.lines, strict=True):
@@ -350,8 +350,8 @@ def _jitter(course: Course) -> tuple[int, int]:
     return int(p50), int(p99)
 
 
-def _drift(course: Course) -> tuple[float, float] | None:
-    """Rate over all stretches, longer ones counting more; and its error."""
+def _drift(course: ClockTrack) -> tuple[float, float] | None:
+    """Rate over all segments, longer ones counting more; and its error."""
     known = [
         (float(part.span_ns) ** 3, line)
         for part, line in zip(course.parts, course.lines, strict=True)

@@ -210,13 +210,13 @@ def _clock(run: Conversion, number: int) -> ClockReport:
     if finding is None:
         return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
     if run.clocks.maps and (found := run.clocks.maps[number]) is not None:
-        notes += (found.in_words(),)
+        notes += (found.describe(),)
     return ClockReport(
         source,
         epoch,
         offset_to_host_ms=offset_ns / NS_PER_MS,
         drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
-        notes=(*notes, finding.in_words()),
+        notes=(*notes, finding.describe()),
     )
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, JumpGuard, extremes
 from mlbatch.clocks.compare import Comparison, compare
-from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.discovery.discover import Note, Setup
 from mlbatch.discovery.extrinsics import Mounted
 from mlbatch.discovery.sampler import Found
@@ -83,10 +83,10 @@ class Timekeeper:
                     watch.add(newest_ns[measured], arrival.host_ns[measured])
         self.maps = fit(watches, to)
 
-    def findings(self) -> list[tuple[str, ClockFinding]]:
+    def findings(self) -> list[tuple[str, ClockEstimate]]:
         """What is known of the clock of each sensor that gave stamps of its own."""
         pairs = zip(self.sensors, self._watches, strict=True)
-        found = ((sensor.name, watch.finding()) for sensor, watch in pairs)
+        found = ((sensor.name, watch.estimate()) for sensor, watch in pairs)
         return [(name, finding) for name, finding in found if finding is not None]
 
     def comparison(self) -> Comparison | None:
@@ -100,12 +100,12 @@ class Timekeeper:
         if comparison is None:
             return []
         notes = []
-        for name, finding in comparison.findings:
+        for name, finding in comparison.estimates:
             for jump in finding.jumps:
-                text = f"{name}: {jump.in_words()}"
+                text = f"{name}: {jump.describe()}"
                 notes.append(Note(_WARNINGS.get(jump.kind, "clock_jump"), name, text))
         notes += [
-            Note("clocks", "", pair.in_words())
+            Note("clocks", "", pair.describe())
             for pair in comparison.pairs
             if pair.verdict != SYNCHRONISED
         ]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Arrival, Delivery, Intake
+from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Accepted, Arrival, Intake
 from mlbatch.errors import ClockError
 from mlbatch.types import Heads
 
@@ -33,7 +33,7 @@ def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps]
     )
 
 
-def _stamps_ms(delivery: Delivery) -> list[list[float]]:
+def _stamps_ms(delivery: Accepted) -> list[list[float]]:
     rows: list[list[float]] = (delivery.packets.heads.stamp_ns / MS).tolist()
     return rows
 

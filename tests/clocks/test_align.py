@@ -85,7 +85,7 @@ def test_drift_that_comes_and_goes() -> None:
     assert np.abs(error_ns(one)).max() < 150 * NS_PER_US
     made = fitted(one)
     assert made.knots == 119
-    assert "119 knot(s)" in made.in_words()
+    assert "119 knot(s)" in made.describe()
 
 
 def test_stamps_are_mapped_exactly() -> None:
@@ -163,7 +163,7 @@ def test_onto_the_first_sensor() -> None:
     aligned_ns = two.apply(second.stamp_ns, second.host_ns)
     assert (np.diff(aligned_ns) >= 0).all()
     assert np.abs(aligned_ns - target.read(second.true_ns)).max() < 100 * NS_PER_US
-    assert two.in_words().startswith("aligned to the first sensor's clock: ")
+    assert two.describe().startswith("aligned to the first sensor's clock: ")
 
 
 def test_a_sensor_that_is_longer_there_than_the_first() -> None:

@@ -49,7 +49,7 @@ def compared(
         )
         watch = ClockWatch(period_ns=HOUR_NS if clock.past_hour else 0)
         watch.add(one.stamp_ns, one.host_ns)
-        finding = watch.finding()
+        finding = watch.estimate()
         assert finding is not None
         findings.append((NAMES[number], finding))
     return compare(findings)
@@ -64,7 +64,7 @@ def test_synchronised_sensors() -> None:
     assert [(pair.one, pair.two) for pair in comparison.pairs] == [
         *(("a", "b"), ("a", "c"), ("b", "c"))
     ]
-    assert comparison.in_words()[0].startswith("clocks: synchronised within 4.0")
+    assert comparison.describe()[0].startswith("clocks: synchronised within 4.0")
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_whole_differences_are_named(clocks: tuple[Clock, Clock], text: str, who
     assert correction.rig_text() == text
     (pair,) = comparison.pairs
     assert pair.whole.startswith(whole)
-    assert f"b: correctable: {whole}" in comparison.in_words()[-1]
+    assert f"b: correctable: {whole}" in comparison.describe()[-1]
     assert comparison.bound_ns is not None
     assert comparison.bound_ns < 5 * NS_PER_MS
 
@@ -134,12 +134,12 @@ def test_clocks_that_jump_are_unsynchronised() -> None:
 def test_one_sensor_has_nothing_to_be_compared_with() -> None:
     comparison = compared(UPTIME)
     assert (comparison.verdict, comparison.pairs, comparison.bound_ns) == (SYNCHRONISED, (), 0)
-    assert len(comparison.in_words()) == 1
-    assert compare([]).in_words() == []
+    assert len(comparison.describe()) == 1
+    assert compare([]).describe() == []
 
 
 def _host_steps(comparison: Comparison) -> list[Jump]:
-    return [jump for jump in comparison.findings[0][1].jumps if jump.kind == "host"]
+    return [jump for jump in comparison.estimates[0][1].jumps if jump.kind == "host"]
 
 
 @pytest.mark.parametrize("by_ms", [-1500, -40, 40, 1500])
@@ -169,14 +169,14 @@ def test_packets_of_one_sensor_that_take_longer_are_no_step_of_the_recorder() ->
     for name, host_ns in (("a", one.host_ns), ("b", delayed_ns)):
         watch = ClockWatch()
         watch.add(one.stamp_ns, host_ns)
-        finding = watch.finding()
+        finding = watch.estimate()
         assert finding is not None
         findings.append((name, finding))
     comparison = compare(findings)
     assert _host_steps(comparison) == []
-    (jump,) = comparison.findings[1][1].jumps
+    (jump,) = comparison.estimates[1][1].jumps
     assert jump.kind == "delay"
-    assert jump.in_words().startswith("packets took 60.000 ms longer from 1714566911.0")
+    assert jump.describe().startswith("packets took 60.000 ms longer from 1714566911.0")
     assert comparison.verdict == UNSYNCHRONISED
     assert comparison.pairs[0].why == "their difference changes by +60.000 ms"
 

@@ -13,7 +13,7 @@ import pytest
 
 from mlbatch.clocks.align import ClockMap, fit
 from mlbatch.clocks.compare import CORRECTABLE, SYNCHRONISED, Comparison, compare
-from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from tests.builders.clocks import (
     BEGIN_NS,
     GPS_1980_NS,
@@ -42,7 +42,7 @@ class Sensor:
     domain: str
     heard: Heard
     watch: ClockWatch
-    finding: ClockFinding
+    finding: ClockEstimate
     map: ClockMap
 
 
@@ -140,7 +140,7 @@ def _simulate(seed: int) -> Simulated:
         sensors.append((clock, domain))
         watches.append(watch)
         heards.append(heard)
-    findings = [watch.finding() for watch in watches]
+    findings = [watch.estimate() for watch in watches]
     maps = fit(watches)
     known = [finding for finding in findings if finding is not None]
     comparison = compare([(f"s{at}", finding) for at, finding in enumerate(known)])
@@ -168,9 +168,9 @@ def _sensors(recordings: list[Simulated]) -> list[tuple[Simulated, Sensor]]:
 
 
 def test_the_domain_is_right(recordings: list[Simulated]) -> None:
-    """Of the longest stretch; a jump of 37 s makes TAI of UTC, so there another one may be told."""
+    """Of the longest segment; a jump of 37 s makes TAI of UTC, so there another one may be told."""
     told = [
-        sensor.domain in {stretch.domain for stretch in sensor.finding.stretches}
+        sensor.domain in {segment.domain for segment in sensor.finding.segments}
         if sensor.clock.steps
         else sensor.domain == sensor.finding.domain
         for _, sensor in _sensors(recordings)
@@ -232,7 +232,7 @@ def test_corrections_bring_clocks_together(recordings: list[Simulated]) -> None:
         comparison = one.comparison
         if comparison.verdict != CORRECTABLE:
             continue
-        names = [name for name, _ in comparison.findings]
+        names = [name for name, _ in comparison.estimates]
         by_name = dict(zip(names, one.sensors, strict=True))
         reference = by_name[comparison.reference]
         for correction in comparison.corrections:
@@ -253,7 +253,7 @@ def test_jumps_are_found_and_told_from_steps_of_the_recorder(recordings: list[Si
     wrong = 0
     steps = 0
     for one in recordings:
-        for (_, finding), sensor in zip(one.comparison.findings, one.sensors, strict=True):
+        for (_, finding), sensor in zip(one.comparison.estimates, one.sensors, strict=True):
             truth = sorted(by_ns for _, by_ns in (*sensor.clock.steps, *_seen(one.host)))
             sizes = sorted(jump.size_ns for jump in finding.jumps)
             assert len(sizes) == len(truth)

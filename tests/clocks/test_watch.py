@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.clocks.watch import ClockFinding, ClockWatch, stretch_of
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch, segment_of
 from tests.builders.clocks import (
     BEGIN_NS,
     GPS_1980_NS,
@@ -49,10 +49,10 @@ def heard(
     )
 
 
-def found(one: Heard, period_ns: int = 0) -> ClockFinding:
+def found(one: Heard, period_ns: int = 0) -> ClockEstimate:
     watch = ClockWatch(period_ns=period_ns)
     watch.add(one.stamp_ns, one.host_ns)
-    finding = watch.finding()
+    finding = watch.estimate()
     assert finding is not None
     return finding
 
@@ -68,7 +68,7 @@ def test_an_exact_clock() -> None:
     # One packet each 5 ms.
     assert finding.resolution_ns == 5 * NS_PER_MS
     assert (finding.jitter_p50_ns, finding.jitter_p99_ns) == (0, 0)
-    assert finding.in_words() == (
+    assert finding.describe() == (
         "clock: UTC, -0.100 ms to the recorder (+-1.020 ms), drift +0.00 +-0.00 ppm"
     )
 
@@ -104,8 +104,8 @@ def test_a_counter_past_the_hour() -> None:
 
 
 def test_local_time_is_named() -> None:
-    assert "about 8 whole hour(s): a time zone" in found(heard(Clock(8 * HOUR_NS))).in_words()
-    assert "about 37 s" not in found(heard(Clock(36 * NS_PER_S))).in_words()
+    assert "about 8 whole hour(s): a time zone" in found(heard(Clock(8 * HOUR_NS))).describe()
+    assert "about 37 s" not in found(heard(Clock(36 * NS_PER_S))).describe()
 
 
 def test_the_recorder_before_2017_had_another_tai() -> None:
@@ -144,7 +144,7 @@ def test_one_packet() -> None:
 
 
 def test_nothing_was_heard() -> None:
-    assert ClockWatch().finding() is None
+    assert ClockWatch().estimate() is None
 
 
 def test_resolution() -> None:
@@ -166,7 +166,7 @@ def test_ptp_lock_gained() -> None:
     """From power-on to TAI after 5 s: both are told, and where it happened."""
     by_ns = TAI_NS - UPTIME.offset_ns
     finding = found(heard(replace(UPTIME, steps=((5, by_ns),))))
-    assert [one.domain for one in finding.stretches] == ["uptime", "tai"]
+    assert [one.domain for one in finding.segments] == ["uptime", "tai"]
     assert finding.domain == "tai"
     (jump,) = finding.jumps
     assert (jump.kind, jump.size_ns) == ("forward", by_ns)
@@ -174,7 +174,7 @@ def test_ptp_lock_gained() -> None:
     assert jump.stamp_before_ns == 1004_995 * NS_PER_MS
     assert jump.stamp_after_ns == BEGIN_NS + 5 * NS_PER_S + TAI_NS
     assert jump.host_ns == BEGIN_NS + 5 * NS_PER_S + 100 * NS_PER_US
-    assert "forward by +1714565933.000000 s: from 1004.995000 s to" in finding.in_words()
+    assert "forward by +1714565933.000000 s: from 1004.995000 s to" in finding.describe()
 
 
 @pytest.mark.parametrize("by_ms", [37_000, -37_000, 1500, -1500, 250, -250, 5, -5, 2, -2])
@@ -213,7 +213,7 @@ def test_steps_of_the_recorder_in_words() -> None:
     finding = found(heard(host=Clock(steps=((10, -40 * NS_PER_MS),))))
     # 1714566896 s, 10 s later, 0.1 ms on the way, set back by 40 ms.
     words = "; the recorder's clock stepped by -40.000 ms at 1714566905.960 s"
-    assert finding.in_words().endswith(words)
+    assert finding.describe().endswith(words)
 
 
 def test_silence_is_no_jump() -> None:
@@ -253,8 +253,8 @@ def test_a_clock_that_jumps_without_end() -> None:
     stamp_ns = BEGIN_NS + at * NS_PER_MS + at // 10 % 2 * 100 * NS_PER_S
     finding = found(Heard(at, stamp_ns, BEGIN_NS + at * NS_PER_MS))
     assert finding.unsteady
-    assert len(finding.stretches) == 64
-    assert "again and again" in finding.in_words()
+    assert len(finding.segments) == 64
+    assert "again and again" in finding.describe()
 
 
 # -- laws -----------------------------------------------------------------------------------------
@@ -278,12 +278,12 @@ def test_pieces_do_not_matter(case: str, size: int) -> None:
     watch = ClockWatch()
     for at in range(0, len(stamp_ns), size):
         watch.add(stamp_ns[at : at + size], one.host_ns[at : at + size])
-    pieces = watch.finding()
+    pieces = watch.estimate()
     assert pieces is not None
     assert _plain(pieces) == _plain(whole)
 
 
-def _plain(finding: ClockFinding) -> str:
+def _plain(finding: ClockEstimate) -> str:
     """A finding with all its digits."""
     with np.printoptions(floatmode="unique", threshold=10**6):
         return repr(finding)
@@ -294,8 +294,8 @@ def test_asking_changes_nothing() -> None:
     watch = ClockWatch()
     for at in range(0, len(one.stamp_ns), 100):
         watch.add(one.stamp_ns[at : at + 100], one.host_ns[at : at + 100])
-        watch.finding()
-    finding = watch.finding()
+        watch.estimate()
+    finding = watch.estimate()
     assert finding is not None
     assert _plain(finding) == _plain(found(one))
 
@@ -309,15 +309,15 @@ def test_memory_does_not_grow_with_the_recording() -> None:
         watch.add(true_ns, true_ns + 70 * NS_PER_US)
         sizes.append(_rows(watch))
     assert max(sizes) <= 4096
-    finding = watch.finding()
+    finding = watch.estimate()
     assert finding is not None
     assert (finding.packets, finding.offset_ns) == (1_800_000, -70 * NS_PER_US)
 
 
 def _rows(watch: ClockWatch) -> int:
-    course = watch.course()
-    assert course is not None
-    return sum(len(part.track.rows) for part in course.parts)
+    track = watch.track()
+    assert track is not None
+    return sum(len(part.table.rows) for part in track.parts)
 
 
 def test_which_stretch_a_packet_is_of() -> None:
@@ -325,10 +325,10 @@ def test_which_stretch_a_packet_is_of() -> None:
     one = heard(Clock(steps=((10, -5 * NS_PER_S),)))
     finding = found(one)
     truth = (one.true_ns - BEGIN_NS >= 10 * NS_PER_S).astype(np.int64)
-    np.testing.assert_array_equal(stretch_of(finding.stretches, one.stamp_ns, one.host_ns), truth)
+    np.testing.assert_array_equal(segment_of(finding.segments, one.stamp_ns, one.host_ns), truth)
     early = heard(Clock(steps=((10, 5 * NS_PER_S),)))
-    alone = stretch_of(found(early).stretches, early.stamp_ns)
+    alone = segment_of(found(early).segments, early.stamp_ns)
     np.testing.assert_array_equal(alone, truth)
     columns = np.repeat(early.stamp_ns[:, None], 3, axis=1)
-    both = stretch_of(found(early).stretches, columns, early.host_ns[:, None])
+    both = segment_of(found(early).segments, columns, early.host_ns[:, None])
     np.testing.assert_array_equal(both, np.repeat(truth[:, None], 3, axis=1))

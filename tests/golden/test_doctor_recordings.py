@@ -15,7 +15,7 @@ import pytest
 
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.clocks.compare import SYNCHRONISED, UNSYNCHRONISED, compare
-from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.discovery.match import match
 from mlbatch.discovery.probe import calibrations_for, look
 from mlbatch.discovery.sampler import split_by_kind
@@ -100,7 +100,7 @@ PAIRS = (
 )
 
 
-def findings(path: Path, period_ns: int = 0) -> dict[str, ClockFinding]:
+def findings(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
     """Clocks of the sensors of a recording, found as the program finds them."""
     if path.is_dir():
         (path,) = path.glob("*.db3")
@@ -122,7 +122,7 @@ def findings(path: Path, period_ns: int = 0) -> dict[str, ClockFinding]:
                 _, newest_ns = extremes(lidar.heads(packets[good], host_ns))
                 known = newest_ns > NEVER
                 watches[sensor.name].add(newest_ns[known], host_ns[known])
-    found = {name: watch.finding() for name, watch in watches.items()}
+    found = {name: watch.estimate() for name, watch in watches.items()}
     return {name: finding for name, finding in found.items() if finding is not None}
 
 
@@ -152,7 +152,7 @@ def test_two_sensors_that_count_from_power_on(path: str, uptimes_s: tuple[int, i
     found = findings(RECORDINGS / path)
     assert [finding.domain for finding in found.values()] == ["uptime", "uptime"]
     if uptimes_s is not None:
-        told_s = sorted(one.stretches[0].first_stamp_ns / NS_PER_S for one in found.values())
+        told_s = sorted(one.segments[0].first_stamp_ns / NS_PER_S for one in found.values())
         assert told_s == pytest.approx(uptimes_s, abs=0.5)
     comparison = compare(list(found.items()))
     assert comparison.verdict == UNSYNCHRONISED
@@ -165,4 +165,4 @@ def test_sensors_of_the_fixtures_are_synchronised(name: str) -> None:
     """Their SOURCE.md: UTC for all, packets on the way for about a millisecond."""
     comparison = compare(list(findings(FIXTURES / name, HOUR_NS * ("four" in name)).items()))
     assert comparison.verdict == SYNCHRONISED
-    assert {finding.domain for _, finding in comparison.findings} == {"utc"}
+    assert {finding.domain for _, finding in comparison.estimates} == {"utc"}
