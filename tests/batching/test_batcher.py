@@ -48,13 +48,13 @@ def _stamps(feed: Sequence[FeedPacket], outcome: Outcome, index: int) -> list[tu
     ]
 
 
-# -- where windows lie ----------------------------------------------------------------------------
+# -- bounds of windows ----------------------------------------------------------------------------
 
 
 def test_the_first_window_begins_after_the_first_stamp() -> None:
     outcome = _outcome(every(0, 20, 350), TEN_HZ)
     assert outcome.t_init_ns == 100 * MS
-    # 20 and 70 lie in the head, 320 in the tail.
+    # 20 and 70 are in the head, 320 in the tail.
     assert spans(outcome) == [(0, 100 * MS, 200 * MS), (1, 200 * MS, 300 * MS)]
     assert outcome.dropped == [{"head": 2, "tail": 1}]
     assert (outcome.decoded, outcome.written) == ([7], [4])
@@ -69,12 +69,12 @@ def test_a_first_stamp_on_the_grid_waits_one_more_period() -> None:
 def test_the_sensor_that_starts_last_sets_the_first_window() -> None:
     outcome = _outcome(by_host(every(0, 20, 750) + every(1, 330, 750)), TWO)
     assert outcome.t_init_ns == 400 * MS
-    # 20 to 270 lie before the head, 320 and 370 in it.
+    # 20 to 270 are before the head, 320 and 370 in it.
     assert outcome.dropped[0] == {"before_start": 6, "head": 2, "tail": 1}
     assert [window.complete for window in outcome.windows] == [True] * 3
 
 
-def test_head_and_tail_are_written_on_wish() -> None:
+def test_head_and_tail_are_written_with_keep_partial() -> None:
     outcome = _outcome(every(0, 20, 350), replace(TEN_HZ, keep_partial=True))
     assert [(w.index, w.complete, len(w.columns)) for w in outcome.windows] == [
         *[(-1, False, 2), (0, True, 2), (1, True, 2)],
@@ -109,7 +109,7 @@ def test_slices_are_published_one_by_one() -> None:
 # -- order ----------------------------------------------------------------------------------------
 
 
-def test_columns_lie_by_stamp_then_sensor_then_arrival() -> None:
+def test_columns_are_sorted_by_stamp_sensor_delivery() -> None:
     feed = [
         *[packet(0, 50), packet(1, 50), packet(1, 120, 130), packet(0, 110, 130)],
         *[packet(0, 130, 140), packet(1, 250), packet(0, 250), packet(0, 350), packet(1, 350)],
@@ -148,7 +148,7 @@ def test_a_column_is_late_once_its_own_sensor_passed_its_window(ahead: float, la
     assert _stamps(feed, outcome, 0) == [(0, 120), (0, 190)][: 2 - late]
 
 
-def test_other_sensors_make_nobody_late() -> None:
+def test_other_sensors_make_no_column_late() -> None:
     feed = [packet(0, 50), packet(1, 50), packet(0, 400), packet(1, 150), packet(1, 400)]
     outcome = _outcome(feed, TWO)
     assert "late" not in outcome.dropped[1]
@@ -164,7 +164,7 @@ def test_a_column_out_of_order_is_sorted_into_its_place() -> None:
 # -- stalls ---------------------------------------------------------------------------------------
 
 
-def test_a_silent_sensor_is_not_waited_for_longer_than_said() -> None:
+def test_a_silent_sensor_is_stalled_after_the_timeout() -> None:
     feed = by_host(every(0, 50, 800) + every(1, 60, 260))
     outcome = _outcome(feed, replace(TWO, max_wait_ns=200 * MS))
     # Sensor 1 ends at 210; at 450 it is 240 behind, and all to 400 comes out.
@@ -188,7 +188,7 @@ def test_without_a_limit_all_wait() -> None:
     assert _stamps(feed, outcome, 2) == [(0, 300), (1, 310), (0, 350)]
 
 
-# -- what is left out -----------------------------------------------------------------------------
+# -- dropped columns, empty windows ---------------------------------------------------------------
 
 
 def test_empty_windows_are_counted_and_never_written() -> None:
@@ -225,7 +225,7 @@ def test_nothing_at_all() -> None:
     assert (outcome.t_init_ns, outcome.windows, outcome.empty) == (None, [], 0)
 
 
-# -- clocks and places, which the face of the reference does not show -----------------------------
+# -- beyond the interface of the reference --------------------------------------------------------
 
 
 def _arrival(position: int, stamp_ms: float, host_ms: float, place: int) -> Arrival:
@@ -255,9 +255,9 @@ def test_clocks_must_be_comparable(apart_ms: float, comparable: bool) -> None:
     with pytest.raises(ClockError) as err:
         list(batcher.push(arrivals, host_ns))
     assert str(err.value) == (
-        "clocks of the sensors cannot be compared: stamp minus arrival is -3.000 s for right and "
-        "-4.000 s for left, 1.000 s apart; wanted at most 1 s; use --align-clocks or --clock host, "
-        "or give clock.offset_s or clock.epoch in the rig"
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "1.000 s: stamp minus receive time is -3.000 s for right and -4.000 s for left; use "
+        "--align-clocks or --clock host, or give clock.offset_s or clock.epoch in the rig"
     )
 
 

@@ -17,7 +17,7 @@ from mlbatch.errors import ClockJump
 from mlbatch.types import Heads
 from tests.builders.hand import MS
 
-# A sensor's number, the arrival of a packet and its only stamp.
+# Sensor, receive time and only stamp of a packet.
 Feed = Sequence[tuple[int, int, int]]
 EPOCH = 100_000
 

@@ -1,4 +1,4 @@
-"""Clocks of sensors and recorders, simulated: stamps and arrivals whose truth is known."""
+"""Clocks of sensors and recorders, simulated: stamps and receive times whose truth is known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Clock:
 
     wander: (ppm, period s) of a drift that comes and goes, with the temperature; quantum_ns: its
     stamps are multiples of that; wrap_ns: it counts on from 0 there, 0: never; past_hour: its
-    stamps leave out the hour, which the decoder takes from the first arrival.
+    stamps leave out the hour, which the decoder takes from the first receive time.
     """
 
     offset_ns: int = 0
@@ -57,10 +57,10 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """From a sensor to the recorder: shortest delay, mean of the exponential rest, bursts.
+    """From a sensor to the capture host: shortest delay, mean of the exponential rest, bursts.
 
     bursts_hz: how often a queue holds everything back for up to `burst_ms`; lost: share of packets;
-    pauses: (after s, for s) while the recorder stands still.
+    pauses: (after s, for s) while the capture host stands still.
     """
 
     least_us: float = 60.0
@@ -73,7 +73,7 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Packets of one sensor in order of arrival: true times, stamps, arrivals; ns, (P,)."""
+    """Packets of one sensor in order of receive time: true, stamp and receive times; ns, (P,)."""
 
     true_ns: I64Array
     stamp_ns: I64Array
@@ -95,7 +95,7 @@ def hear(
     begin_s: float = 0.0,
     silent: tuple[tuple[float, float], ...] = (),
 ) -> Heard:
-    """A sensor that sends at a steady rate, and what a recorder hears of it.
+    """A sensor that sends at a steady rate, and what a capture host hears of it.
 
     silent: (from s, to s) in which it sends nothing.
     """
@@ -136,7 +136,7 @@ def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
 
 
 def _hours_from_arrival(past_hour_ns: I64Array, host_ns: I64Array) -> I64Array:
-    """Stamps whose hour is guessed once, from the first arrival, and kept."""
+    """Stamps whose hour is guessed once, from the first receive time, and kept."""
     first_ns = int(past_hour_ns[0]) - int(host_ns[0])
     offset_ns = (first_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     near_ns = host_ns + offset_ns

@@ -1,6 +1,6 @@
 """Feeds of packets as rigs produce them, and worse: for the laws of batching.
 
-One maker draws everything from a `random.Random`: seeded it is fast (`random_feed`), and driven by
+One vendor draws everything from a `random.Random`: seeded it is fast (`random_feed`), and driven by
 hypothesis it shrinks (`feeds`). Column rates are low, so that a few packets cross many windows.
 """
 
@@ -71,7 +71,7 @@ def groups(rng: random.Random, total: int) -> list[int]:
 
 
 def make_feed(rng: random.Random, *, quiet: bool = False) -> Case:
-    """Draw a scene, the packets of each sensor, and their order of arrival."""
+    """Draw a scene, the packets of each sensor, and their order of receive time."""
     scene = _scene(rng, quiet)
     arrivals: list[tuple[int, int, FeedPacket]] = []
     for sensor in range(scene.settings.sensors):

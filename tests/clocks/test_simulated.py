@@ -1,7 +1,7 @@
-"""The clock doctor and the fit on 600 simulated recordings whose truth is known.
+"""Clock estimates and maps of 600 simulated recordings whose truth is known.
 
-Each has one to three sensors; what their clocks count, how they drift and jump, how packets travel
-and what the recorder's clock does are drawn with a fixed seed.
+Each has one to three sensors; domains, drift, jumps, transport delays and the capture host's clock
+are drawn with a fixed seed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """A simulated recording; host: the recorder's clock."""
+    """A simulated recording; host: the capture host's clock."""
 
     seconds: float
     host: Clock
@@ -57,7 +57,7 @@ class Simulated:
 
     @property
     def is_long(self) -> bool:
-        """Whether drift must be told."""
+        """True if there must be a drift."""
         return self.seconds >= MINUTE_S
 
     def error_ns(self, sensor: Sensor) -> int:
@@ -86,7 +86,7 @@ def _clock(rng: np.random.Generator, domain: str) -> Clock:
         "wrong_year": -int(rng.integers(200, 4000)) * DAY_NS + int(rng.integers(DAY_NS)),
         "unknown": int(rng.integers(100, 10_000)) * NS_PER_S + small_ns,
     }
-    # Clocks that follow a source drift with it: what is left is the recorder's own drift.
+    # Clocks that follow a source drift with it: what is left is the capture host's own drift.
     follows = domain in ("utc", "tai", "gps")
     return Clock(
         offsets_ns[domain],
@@ -100,7 +100,7 @@ DOMAINS = ("utc", "utc", "tai", "gps", "uptime", "uptime", "top_of_hour", "wrong
 
 
 def _jumps(rng: np.random.Generator, clock: Clock, domain: str, seconds: float) -> Clock:
-    """One clock in eight steps once, well before the recorder's."""
+    """One clock in eight steps once, well before the capture host's."""
     if seconds < 10 or rng.random() > 0.125 or domain == "top_of_hour":
         return clock
     after_s = float(rng.uniform(0.25, 0.45) * seconds)
@@ -168,15 +168,15 @@ def _sensors(recordings: list[Simulated]) -> list[tuple[Simulated, Sensor]]:
 
 
 def test_the_domain_is_right(recordings: list[Simulated]) -> None:
-    """Of the longest segment; a jump of 37 s makes TAI of UTC, so there another one may be told."""
-    told = [
+    """Of the longest segment; with a jump of 37 s (from UTC to TAI), that of any segment."""
+    right = [
         sensor.domain in {segment.domain for segment in sensor.finding.segments}
         if sensor.clock.steps
         else sensor.domain == sensor.finding.domain
         for _, sensor in _sensors(recordings)
     ]
-    assert len(told) > 1000
-    assert np.mean(told) >= 0.99
+    assert len(right) > 1000
+    assert np.mean(right) >= 0.99
 
 
 def test_offsets_are_exact_to_the_second_and_within_a_millisecond(
@@ -207,7 +207,7 @@ def test_drift_is_within_one_ppm(recordings: list[Simulated]) -> None:
 
 
 def test_never_synchronised_beyond_the_bound(recordings: list[Simulated]) -> None:
-    """And clocks that are synchronised are told so."""
+    """And clocks within the bound are."""
     verdicts: dict[tuple[bool, bool, str], int] = {}
     for one in recordings:
         comparison = one.comparison
@@ -248,8 +248,8 @@ def test_corrections_bring_clocks_together(recordings: list[Simulated]) -> None:
     assert checked > 400
 
 
-def test_jumps_are_found_and_told_from_steps_of_the_recorder(recordings: list[Simulated]) -> None:
-    """Where a packet was lost right at a step, only the other sensors tell whose step it was."""
+def test_jumps_are_found_and_separated_from_host_steps(recordings: list[Simulated]) -> None:
+    """Where a packet was lost right at a step, only the other sensors show whose step it was."""
     wrong = 0
     steps = 0
     for one in recordings:
@@ -269,12 +269,12 @@ def test_jumps_are_found_and_told_from_steps_of_the_recorder(recordings: list[Si
 
 
 def _seen(host: Clock) -> list[tuple[float, int]]:
-    """Steps of the recorder's clock as those of the sensors' clocks against it."""
+    """Steps of the capture host's clock as those of the sensors' clocks against it."""
     return [(after_s, -by_ns) for after_s, by_ns in host.steps]
 
 
 def test_aligned_stamps_are_right_within_half_a_millisecond(recordings: list[Simulated]) -> None:
-    """By the recorder's clock as it was at first: its steps are not in the stamps."""
+    """By the capture host's clock as it was at first: its steps are not in the stamps."""
     errors_ns = []
     for one, sensor in _sensors(recordings):
         heard = sensor.heard

@@ -1,4 +1,4 @@
-"""What stamps count, by their value and by the recorder's clock (facts/ouster.md, section 7)."""
+"""Timescales of stamps (docs/sources/ouster.md, section 7); leap seconds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NOON_NS = 1_777_896_000 * NS_PER_S
         (-37.0, "unknown"),
     ],
 )
-def test_a_date_is_judged_by_the_recorder(ahead_s: float, name: str) -> None:
+def test_a_date_is_compared_with_the_capture_host(ahead_s: float, name: str) -> None:
     assert timescale(NOON_NS + round(ahead_s * NS_PER_S), NOON_NS) == name
 
 

@@ -1,4 +1,4 @@
-"""What each fault must lead to: a table of declarations, by CONTRACT.md and docs/faults.md.
+"""Expected result of each fault: a table of declarations, by docs/faults.md.
 
 A declaration names the fault as a user writes it ({v}: the victim), what it leaves of the packets
 before the batching sees them, and which counts must stand in the report. `touched` is the number of
@@ -19,7 +19,7 @@ Change = Callable[[Session, int], Session]
 # What a sensor's `packets` must say: from its packets sent, and those touched.
 Counts = Mapping[str, Callable[[int, int], tuple[int, int]]]
 
-# The recorder runs so long; things happen at times that lie well inside windows.
+# Length of the capture; events are at times well inside windows.
 LENGTH_NS = 500 * NS_PER_MS
 NOON_NS = 1_700_000_000 * NS_PER_S // HOUR_NS * HOUR_NS + 1000 * NS_PER_S
 HALF_NS = 250 * NS_PER_MS
@@ -30,8 +30,8 @@ SHORT_WAIT = ("--max-wait", "0.1")
 class Kind:
     """A row of the table; only one of `change`, `pieces`, `subset`, or none for identity.
 
-    fault: "" none; send: the session of some makers; change: what is left for the batching (the
-    session, first arrival); subset: chance decides which packets are gone, any of them may be;
+    fault: "" none; send: the session of some vendors; change: what is left for the batching (the
+    session, first receive time); subset: chance decides which packets are gone, any of them may be;
     pieces: outputs of `--on-jump split`, each a session; error: what the run says without it;
     counts: of the victim's packets, lowest and highest; wait_ns: of `words`.
     """
@@ -72,7 +72,7 @@ def wrapping(maker: str) -> Sent:
 
 
 def restarting(maker: str) -> Sent:
-    """Up for 100 s at first; then all counts and clocks begin anew, and the recorder goes on."""
+    """Up for 100 s at first; then all counts and clocks begin anew, but not the capture host's."""
     row = MAKERS[maker]
     up_ns = 100 * NS_PER_S
     before = row.send(Spell(up_ns + row.begin_ns, HALF_NS - 20 * NS_PER_MS, 5000))
@@ -85,7 +85,7 @@ def _victim(session: Session, change: Callable[[Sent], Sent]) -> Session:
 
 
 def silent(from_ns: int, until_ns: int) -> Change:
-    """The victim's packets of a time after the first arrival are lost."""
+    """The victim's packets of an interval after the first receive time are lost."""
 
     def change(session: Session, begin_ns: int) -> Session:
         def remaining(sent: Sent) -> Sent:
@@ -105,7 +105,7 @@ def shifted(by_ns: int) -> Change:
 
 
 def drifting(ppm: int) -> Change:
-    """The victim's clock gains from the first arrival on."""
+    """The victim's clock gains from the first receive time on."""
 
     def change(session: Session, begin_ns: int) -> Session:
         def gaining(sent: Sent) -> Sent:
@@ -120,7 +120,7 @@ def drifting(ppm: int) -> Change:
 
 
 def cut_at(at_ns: int, by_ns: int) -> Callable[[Session, int], tuple[Session, ...]]:
-    """Two stretches, by arrival; in the second all clocks are off."""
+    """Two pieces, by receive time; in the second all clocks are off."""
 
     def pieces(session: Session, begin_ns: int) -> tuple[Session, ...]:
         first, second = [], []
@@ -165,7 +165,7 @@ def _with(sent: int, touched: int) -> tuple[int, int]:
 
 
 def _between_others(sent: int, touched: int) -> tuple[int, int]:
-    """Nobody can tell what is missing at the very ends."""
+    """Loss at the ends cannot be known."""
     return touched - 3, touched
 
 
@@ -249,12 +249,12 @@ KINDS: Mapping[str, Kind] = {
     "jump forward": Kind(
         "jump:*:37s@0.25s",
         pieces=cut_at(HALF_NS, 37 * NS_PER_S),
-        error=("clock jump within the recording", "went forward", "--on-jump split"),
+        error=("clock jump within the recording", "a step forward", "--on-jump split"),
     ),
     "jump back": Kind(
         "jump:*:-20s@0.25s",
         pieces=cut_at(HALF_NS, -20 * NS_PER_S),
-        error=("clock reset within the recording", "went back", "--on-jump split"),
+        error=("clock reset within the recording", "a step back", "--on-jump split"),
     ),
     "wrap": Kind(
         "reorder:{v}:10%",
@@ -264,7 +264,7 @@ KINDS: Mapping[str, Kind] = {
     "restart": Kind(
         pieces=restarted,
         session=restarting,
-        error=("clock reset within the recording", "went back", "--on-jump split"),
+        error=("clock reset within the recording", "a step back", "--on-jump split"),
     ),
     "bit flips": Kind(
         "bitflip:{v}:2%",

@@ -1,7 +1,7 @@
 """Sessions of the matrix in every container, with the rig that names their lidars.
 
-Messages: facts/messages.md section 1; the bag for ROS 2 holds scans of HESAI and Velodyne, many
-packets a message, all others a message a packet.
+Messages: docs/sources/messages.md section 1; the bag for ROS 2 has scans of HESAI and Velodyne, of
+many packets a message, all others a message a packet.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from tests.builders.sessions_of_bags import write_mcap
 from tests.golden.maker_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.lidars import MAKERS, Sent
 
-# Scans hold what came in so many ns: less than the slack of the shortest wait of the matrix.
+# Scan messages contain the packets of so many ns, less than the shortest wait of the matrix.
 SCAN_NS = 20_000_000
 Session = Sequence[Sent]
 
 
 def packets_of(sent: Sent) -> tuple[tuple[int, bytes], ...]:
-    """(arrival, payload)."""
+    """(receive time, payload)."""
     return tuple(zip(sent.host_ns.tolist(), sent.payloads, strict=True))
 
 
@@ -42,7 +42,7 @@ def _frames(session: Session) -> list[tuple[int, bytes]]:
         for maker in [MAKERS[sent.maker]]
         for host_ns, payload in packets_of(sent)
     ]
-    # By arrival; what came at the same time stays in the order of the lidars.
+    # By receive time, then in the order of the lidars.
     return sorted(records, key=lambda record: record[0])
 
 
@@ -117,7 +117,7 @@ CAPTURES = ("pcap", "pcapng")
 
 
 def names(session: Session) -> list[str]:
-    """Of the sensors, in the order of the rig: its makers."""
+    """Names of the sensors in the order of the rig: their vendors."""
     return [sent.maker for sent in session]
 
 
@@ -143,6 +143,6 @@ def rig_text(session: Session, container: str, clocks: Mapping[str, str] | None 
 
 
 def span_ns(session: Session) -> tuple[int, int]:
-    """First and last arrival."""
+    """First and last receive time."""
     hosts = np.concatenate([sent.host_ns for sent in session])
     return int(hosts.min()), int(hosts.max())

@@ -1,7 +1,7 @@
-"""CONTRACT.md section 1 for packets that arrive in the order of their stamps, in a few array steps.
+"""Expected scans of packets received in the order of their stamps (docs/batching.md), by arrays.
 
-Only for sessions in which no column is late: what faults do to packets is done to them before. The
-grid is that of 20 Hz, whose lines are whole ns.
+Only for sessions in which no column is late; faults are applied to packets before. The grid is that
+of 20 Hz, whose bounds are whole ns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PERIOD_NS = 50 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A scan that must be there: its columns (n,) in order, and how many points they hold."""
+    """An expected scan: its columns (n,) in order, and the number of their points."""
 
     start_ns: int
     complete: bool
@@ -30,7 +30,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """What must come of a session; dropped: columns of each sensor by reason."""
+    """Expected result of a session; dropped: columns of each sensor by reason."""
 
     t_init_ns: int
     windows: Mapping[int, Window]

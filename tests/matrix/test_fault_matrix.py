@@ -1,7 +1,7 @@
-"""Every fault in rigs of one to four makers, in every container: the declared result, and proof.
+"""Every fault in rigs of one to four vendors, in every container: the declared result, and checks.
 
-The rows of the table stand in `cells.py`, the law of windows in `law.py`. Every maker is once the
-victim of every fault, since the rigs of one to four lidars begin with another maker each.
+The rows of the table are in `cells.py`, the law of windows in `law.py`. Every vendor is once the
+victim of every fault, since the rigs of one to four lidars begin with another vendor each.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Cell:
 
     @property
     def begin_ns(self) -> int:
-        """Arrival of the first packet."""
+        """Receive time of the first packet."""
         return span_ns(self.session)[0]
 
     def prepare(self, session: Session, clock: str = "") -> None:
@@ -95,7 +95,7 @@ class Cell:
         )
 
 
-# -- what holds for every output ------------------------------------------------------------------
+# -- checks of every output -----------------------------------------------------------------------
 
 
 def report_of(folder: Path) -> Report:
@@ -104,7 +104,7 @@ def report_of(folder: Path) -> Report:
 
 
 def check_proof(folder: Path) -> Report:
-    """`verify` finds nothing, ledgers balance, and no scan holds what is older than its period."""
+    """`verify` finds nothing, ledgers balance, and no scan has a column before its period."""
     verdict = verify(folder)
     assert verdict.violations == ()
     assert verdict.scans
@@ -170,7 +170,7 @@ def check_counts(cell: Cell, report: Report) -> None:
 
 
 def prints(folder: Path) -> Print:
-    """All that identity covers (CONTRACT.md section 1), and all ledgers."""
+    """Everything that must be identical, and all ledgers."""
     report = report_of(folder)
     files = tuple((path.name, sha256(path.read_bytes()).digest()) for path in scan_files(folder))
     table = csv_without_arrival((folder / "scans.csv").read_text(encoding="utf-8"))
@@ -274,7 +274,7 @@ def check_refused(cell: Cell, words: Sequence[str], *, faulty: bool = True) -> N
 
 
 def check_remedied(cell: Cell, send: Callable[[str], Sent], clock: str) -> None:
-    """A sensor that really is off: refused, until its rig tells by how much."""
+    """A sensor whose clock is off: refused, until its rig has the offset."""
     session = (*cell.session[:-1], send(cell.victim))
     cell.prepare(session)
     if cell.size > 1:

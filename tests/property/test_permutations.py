@@ -1,9 +1,9 @@
-"""The result depends on stamps alone: whole conversions over 1000 random arrivals, and delays.
+"""The result depends on stamps alone: whole conversions over 1000 random receive times, and delays.
 
-CONTRACT.md section 1, Laws: scans, scans.csv without `ready_host_ns` and all ledgers are the same
+docs/batching.md: scans, scans.csv without `ready_host_ns` and all ledgers are the same
 for every interleaving between sensors in which none lags by more than `--max-wait` in stamps.
-Thousands of other feeds cross the batching alone in `test_batching.py`; here packets of five makers
-go all the way, their arrivals drawn anew each time and cut into batches anywhere.
+`test_batching.py` tests the batching alone with thousands of other feeds; here packets of five
+vendors are converted, with random receive times and batches.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.matrix.lidars import MAKERS, NS_PER_MS, Sent, Spell, write_metadata
 
 BLOCKS, PERMUTATIONS_A_BLOCK = range(20), 50
 LENGTH_NS = 80 * NS_PER_MS
-# Shorter than the session, so that an arrival could break the law.
+# Shorter than the session, so that receive times could break the law.
 WAIT_NS = 40 * NS_PER_MS
 RATE = Fraction(50)
 LIVOX_IP, LIVOX_PORT = "10.0.0.5", 57000
@@ -141,7 +141,7 @@ def livox_sent() -> Sent:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """Lidars of five makers at the same time."""
+    """Lidars of five vendors at the same time."""
     folder = tmp_path_factory.mktemp("permutations")
     write_metadata(folder)
     four = [row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS)) for row in MAKERS.values()]
@@ -187,7 +187,7 @@ def permutation(session: Session, rng: random.Random) -> list[int]:
         tries = rng.sample(left, len(left))
         if current in left and rng.random() < stays:
             tries.insert(0, current)
-        # The slowest may always go on, so that one is found.
+        # The slowest may always continue, so that one is found.
         current = next(one for one in tries if _may_go_on(session, places, newest, one))
         order.append(places[current])
         newest[current] = max(newest[current], session.high_ns[places[current]])

@@ -22,7 +22,7 @@ HOUR_MS = 3_600_000
 def test_gap_of_an_hour_is_counted_and_not_visited() -> None:
     feed = [*every(0, 50, 400), *every(0, 1000 * HOUR_MS, 1000 * HOUR_MS + 400)]
     outcome = reference_scans(feed, TEN_HZ)
-    # Windows 1 to 3 and four from 36 000 000 on, numbered from time 0, hold columns; the oracle
+    # Windows 1 to 3 and four from 36 000 000 on, numbered from time 0, have columns; the oracle
     # would take minutes to visit those between.
     assert outcome.empty == 36_000_000 - 4
 
@@ -122,7 +122,7 @@ def test_start_and_end_choose_windows_by_their_start() -> None:
 
 def test_empty_windows_are_counted_within_start_and_end() -> None:
     feed = [*every(0, 50, 200), *every(0, 900, 1200)]
-    # [200, 900) holds nothing: 7 windows, of which 3 begin in [450, 750).
+    # [200, 900) is empty: 7 windows, of which 3 begin in [450, 750).
     limits = replace(TEN_HZ, start_ns=450 * MS, end_ns=750 * MS)
     assert reference_scans(feed, TEN_HZ).empty == 7
     assert reference_scans(feed, limits).empty == 3
