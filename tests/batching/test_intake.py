@@ -33,8 +33,8 @@ def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps]
     )
 
 
-def _stamps_ms(delivery: Accepted) -> list[list[float]]:
-    rows: list[list[float]] = (delivery.packets.heads.stamp_ns / MS).tolist()
+def _stamps_ms(accepted: Accepted) -> list[list[float]]:
+    rows: list[list[float]] = (accepted.packets.heads.stamp_ns / MS).tolist()
     return rows
 
 
@@ -45,9 +45,9 @@ def _alone(*stamps_ms: float, first_key: int = 0) -> Arrival:
 
 def test_good_packets_pass_untouched() -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival([10, 20], [30, 40]))
-    assert _stamps_ms(delivery) == [[10, 20], [30, 40]]
-    assert delivery.newest_ns.tolist() == [20 * MS, 40 * MS]
+    accepted = intake.accept(_arrival([10, 20], [30, 40]))
+    assert _stamps_ms(accepted) == [[10, 20], [30, 40]]
+    assert accepted.newest_ns.tolist() == [20 * MS, 40 * MS]
     assert intake.rejected == {}
 
 
@@ -105,8 +105,8 @@ def test_numbers_repeat_after_a_while(between: int, rejected: int) -> None:
 )
 def test_impossible_stamps(stamps: Stamps, good: bool) -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival(stamps))
-    assert len(delivery.packets.key) == good
+    accepted = intake.accept(_arrival(stamps))
+    assert len(accepted.packets.key) == good
     assert intake.rejected == ({} if good else {"bad_stamp": 1})
 
 
@@ -121,17 +121,17 @@ def test_a_wild_stamp_that_the_next_packet_does_not_confirm_is_rejected() -> Non
 @pytest.mark.parametrize(("step_ms", "held"), [(1000, False), (1000.000001, True)])
 def test_a_step_of_one_second_needs_no_confirmation(step_ms: float, held: bool) -> None:
     intake = Intake("left")
-    delivery = intake.accept(_alone(10, 10 + step_ms))
-    assert len(delivery.packets.key) == (1 if held else 2)
+    accepted = intake.accept(_alone(10, 10 + step_ms))
+    assert len(accepted.packets.key) == (1 if held else 2)
     assert (intake.held_place is not None) == held
 
 
 def test_a_gap_is_confirmed_by_the_next_packet() -> None:
     """Both are delivered with the packet that confirms."""
     intake = Intake("left")
-    delivery = intake.accept(_alone(10, 20, 5000, 5010, 5020))
-    assert _stamps_ms(delivery) == [[10], [20], [5000], [5010], [5020]]
-    assert delivery.packets.position.tolist() == [0, 1, 3, 3, 4]
+    accepted = intake.accept(_alone(10, 20, 5000, 5010, 5020))
+    assert _stamps_ms(accepted) == [[10], [20], [5000], [5010], [5020]]
+    assert accepted.packets.position.tolist() == [0, 1, 3, 3, 4]
     assert intake.rejected == {}
 
 
@@ -181,15 +181,15 @@ def test_invalid_columns_are_no_stamps() -> None:
     """The stamp of a masked column neither holds a packet nor counts as newest."""
     intake = Intake("left")
     arrival = _arrival([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
-    delivery = intake.accept(arrival)
-    assert delivery.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
+    accepted = intake.accept(arrival)
+    assert accepted.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
     assert intake.rejected == {}
 
 
 def test_a_packet_without_a_valid_column_is_accepted() -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival([10], [9e6], [20], valid=[[1], [0], [1]]))
-    assert delivery.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
+    accepted = intake.accept(_arrival([10], [9e6], [20], valid=[[1], [0], [1]]))
+    assert accepted.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
 
 
 # -- clocks ---------------------------------------------------------------------------------------
@@ -205,9 +205,9 @@ def test_the_host_clock_keeps_the_age_of_columns_within_their_packet() -> None:
     intake = Intake("left", host_clock=True)
     arrival = _arrival([10, 12], [20, 22])
     arrival.host_ns = np.array([1_000_000 * MS, 1_000_011 * MS])
-    delivery = intake.accept(arrival)
-    assert _stamps_ms(delivery) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
-    assert delivery.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
+    accepted = intake.accept(arrival)
+    assert _stamps_ms(accepted) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
+    assert accepted.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
 
 
 def test_loss_is_counted_of_accepted_packets_only() -> None:

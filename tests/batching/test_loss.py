@@ -99,7 +99,8 @@ def test_without_numbers_no_loss_is_known() -> None:
 def test_grouping_of_numbers_does_not_matter(steps: list[int], cuts: list[int], first: int) -> None:
     numbers = (first + np.cumsum(steps)) % WRAP
     parts = np.split(numbers, sorted(cut for cut in cuts if cut <= len(numbers)))
-    loss, whole = SequenceLoss(WRAP), SequenceLoss(WRAP)
+    loss = SequenceLoss(WRAP)
+    whole = SequenceLoss(WRAP)
     whole.add(numbers)
     for part in parts:
         loss.add(part)
@@ -164,18 +165,19 @@ class Sent:
 
 def sent(rotor: Rotor, packets: int) -> Sent:
     """The first packets of a lidar; each is received 0.3 ms after its last column."""
-    wanted = packets * rotor.columns
+    needed = packets * rotor.columns
     # No test has more than four fifths of a revolution dark.
-    number = np.arange(6 * wanted if rotor.dark else wanted)
+    number = np.arange(6 * needed if rotor.dark else needed)
     degrees = number * rotor.column_ns * (rotor.turns_per_s * 360e-9)
     lit = np.ones(len(number), bool)
     for begin, end in rotor.dark:
         lit &= (degrees - begin) % 360 >= (end - begin) % 360
-    number, degrees = number[lit][:wanted], degrees[lit][:wanted]
+    number = number[lit][:needed]
+    degrees = degrees[lit][:needed]
     shape = packets, rotor.columns
     time_ns = np.rint(number * rotor.column_ns).astype(np.int64).reshape(shape)
     stamp_ns = START_NS + time_ns - time_ns[:, :1] % 1000
-    words = rotor_words(np.rint(degrees * 100) / 36000, np.zeros(wanted)).reshape(shape)
+    words = rotor_words(np.rint(degrees * 100) / 36000, np.zeros(needed)).reshape(shape)
     return Sent(stamp_ns, words, stamp_ns[:, -1] + 300_000)
 
 
@@ -210,7 +212,8 @@ def bursts(packets: int, seed: int) -> BoolArray:
     return came
 
 
-FULL, DUAL = Rotor(), Rotor(columns=6)
+FULL = Rotor()
+DUAL = Rotor(columns=6)
 HALF = Rotor(dark=((90.0, 270.0),))
 ROTORS = {
     "whole turns": FULL,

@@ -110,15 +110,27 @@ def test_equal_stamps_are_sorted_by_sensor_then_delivery() -> None:
 
 def test_columns_are_sorted_by_stamp_sensor_delivery() -> None:
     feed = [
-        *[packet(0, 50), packet(1, 50), packet(1, 120, 130), packet(0, 110, 130)],
-        *[packet(0, 130, 140), packet(1, 250), packet(0, 250), packet(0, 350), packet(1, 350)],
+        packet(0, 50),
+        packet(1, 50),
+        packet(1, 120, 130),
+        packet(0, 110, 130),
+        packet(0, 130, 140),
+        packet(1, 250),
+        packet(0, 250),
+        packet(0, 350),
+        packet(1, 350),
     ]
     feed = [replace(one, stamps=one.stamps * (3 - len(one.stamps))) for one in feed]
     feed = [replace(one, valid=(True, one.stamps[0] != one.stamps[1])) for one in feed]
     outcome = batched(feed, TWO)
     # 130 of sensor 0 comes twice, in the order of its packets; that of sensor 1 comes after both.
     assert at_index(outcome, 0).columns == [
-        *[(0, 1, 0), (1, 1, 0), (0, 1, 1), (0, 2, 0), (1, 1, 1), (0, 2, 1)],
+        (0, 1, 0),
+        (1, 1, 0),
+        (0, 1, 1),
+        (0, 2, 0),
+        (1, 1, 1),
+        (0, 2, 1),
     ]
 
 

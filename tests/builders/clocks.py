@@ -14,7 +14,8 @@ NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # 2024-05-01 12:34:56 UTC; TAI - UTC was 37 s, GPS - UTC 18 s.
 BEGIN_NS = 1_714_566_896 * NS_PER_S
-TAI_NS, GPS_NS = 37 * NS_PER_S, 18 * NS_PER_S
+TAI_NS = 37 * NS_PER_S
+GPS_NS = 18 * NS_PER_S
 GPS_1980_NS = (18 - 315_964_800) * NS_PER_S
 
 
@@ -106,7 +107,8 @@ def hear(
     kept = rng.random(count) >= way.lost
     for from_s, to_s in silent:
         kept &= (since_s < from_s) | (since_s >= to_s)
-    true_ns, since_s = true_ns[kept], since_s[kept]
+    true_ns = true_ns[kept]
+    since_s = since_s[kept]
     arrival_ns = true_ns + np.rint(_way_ns(rng, way, since_s)).astype(np.int64)
     host_ns = host.read(np.maximum.accumulate(arrival_ns))
     stamp_ns = clock.read(true_ns)
@@ -118,7 +120,8 @@ def hear(
 def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
     """How long each packet takes; nothing overtakes, and what was held back comes at once."""
     delay_ns = way.least_us * NS_PER_US + rng.exponential(way.mean_us * NS_PER_US, len(since_s))
-    first_s, last_s = float(since_s[0]), float(since_s[-1])
+    first_s = float(since_s[0])
+    last_s = float(since_s[-1])
     number = rng.poisson(way.bursts_hz * (last_s - first_s))
     holds = [
         (float(begin), float(length))

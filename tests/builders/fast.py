@@ -23,9 +23,9 @@ class _Watched(Intake):
         self.accepted: list[int] = []
 
     def accept(self, arrival: Arrival) -> Accepted:
-        delivery = super().accept(arrival)
-        self.accepted += delivery.packets.place.tolist()
-        return delivery
+        accepted = super().accept(arrival)
+        self.accepted += accepted.packets.place.tolist()
+        return accepted
 
 
 def run_fast(feed: Sequence[FeedPacket], settings: Settings, group_sizes: Sequence[int]) -> Outcome:

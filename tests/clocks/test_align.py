@@ -101,7 +101,8 @@ def test_stamps_are_mapped_exactly() -> None:
 def test_stamps_between_and_beyond_those_seen_keep_their_order() -> None:
     rng = np.random.default_rng(0)
     one = heard(replace(UPTIME, drift_ppm=-45, steps=((20, 3 * NS_PER_S),)))
-    low, high = int(one.stamp_ns.min()), int(one.stamp_ns.max())
+    low = int(one.stamp_ns.min())
+    high = int(one.stamp_ns.max())
     stamp_ns = np.sort(rng.integers(low - 10 * NS_PER_S, high + 10 * NS_PER_S, 100_000))
     assert (np.diff(fitted(one).apply(stamp_ns)) >= 0).all()
 
@@ -154,8 +155,10 @@ def test_residuals() -> None:
 def test_onto_the_first_sensor() -> None:
     """Drift and steps of the capture host cancel; transport delays remain."""
     host = Clock(drift_ppm=18, steps=((22, 70 * NS_PER_MS), (41, -1200 * NS_PER_MS)))
-    target, other = Clock(TAI_NS, drift_ppm=3), replace(UPTIME, drift_ppm=-40)
-    first, second = heard(target, USUAL, host), heard(other, ETHERNET, host, seed=9)
+    target = Clock(TAI_NS, drift_ppm=3)
+    other = replace(UPTIME, drift_ppm=-40)
+    first = heard(target, USUAL, host)
+    second = heard(other, ETHERNET, host, seed=9)
     one, two = fit([watched(first), watched(second)], TO_FIRST)
     assert one is not None
     assert two is not None
@@ -167,7 +170,8 @@ def test_onto_the_first_sensor() -> None:
 
 
 def test_a_sensor_that_lasts_longer_than_the_first() -> None:
-    first, second = heard(UPTIME, EXACT, seconds=10), heard(Clock(drift_ppm=20), EXACT)
+    first = heard(UPTIME, EXACT, seconds=10)
+    second = heard(Clock(drift_ppm=20), EXACT)
     _, two = fit([watched(first), watched(second)], TO_FIRST)
     assert two is not None
     errors = two.apply(second.stamp_ns) - UPTIME.read(second.true_ns)

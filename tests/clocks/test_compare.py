@@ -36,7 +36,7 @@ def compared(
     begins_s: Sequence[float] = (0, 0, 0),
     rate_hz: float = 200,
 ) -> Comparison:
-    findings = []
+    estimates = []
     for number, clock in enumerate(clocks):
         one = hear(
             np.random.default_rng(number),
@@ -49,10 +49,10 @@ def compared(
         )
         watch = ClockWatch(period_ns=HOUR_NS if clock.past_hour else 0)
         watch.add(one.stamp_ns, one.host_ns)
-        finding = watch.estimate()
-        assert finding is not None
-        findings.append((NAMES[number], finding))
-    return compare(findings)
+        estimate = watch.estimate()
+        assert estimate is not None
+        estimates.append((NAMES[number], estimate))
+    return compare(estimates)
 
 
 def test_synchronised_sensors() -> None:
@@ -61,9 +61,8 @@ def test_synchronised_sensors() -> None:
     # 2 ms, and for both 1 ms of the way and 20 ms of a burst, 1500 times less.
     assert comparison.bound_ns == pytest.approx(4.03 * NS_PER_MS, rel=0.02)
     assert comparison.corrections == ()
-    assert [(pair.one, pair.two) for pair in comparison.pairs] == [
-        *(("a", "b"), ("a", "c"), ("b", "c"))
-    ]
+    pairs = [(pair.one, pair.two) for pair in comparison.pairs]
+    assert pairs == [("a", "b"), ("a", "c"), ("b", "c")]
     assert comparison.describe()[0].startswith("clocks: synchronised within 4.0")
 
 
@@ -165,14 +164,14 @@ def test_a_longer_transport_delay_of_one_sensor_is_no_host_step() -> None:
     late = replace(WAY, pauses=())
     one = hear(np.random.default_rng(1), TRUE, seconds=30, rate_hz=200, way=late)
     delayed_ns = one.host_ns + np.where(one.true_ns > BEGIN_NS + 15 * NS_PER_S, 60 * NS_PER_MS, 0)
-    findings = []
+    estimates = []
     for name, host_ns in (("a", one.host_ns), ("b", delayed_ns)):
         watch = ClockWatch()
         watch.add(one.stamp_ns, host_ns)
-        finding = watch.estimate()
-        assert finding is not None
-        findings.append((name, finding))
-    comparison = compare(findings)
+        estimate = watch.estimate()
+        assert estimate is not None
+        estimates.append((name, estimate))
+    comparison = compare(estimates)
     assert _host_steps(comparison) == []
     (jump,) = comparison.estimates[1][1].jumps
     assert jump.kind == "delay"

@@ -42,7 +42,7 @@ class Sensor:
     domain: str
     heard: Heard
     watch: ClockWatch
-    finding: ClockEstimate
+    estimate: ClockEstimate
     map: ClockMap
 
 
@@ -62,11 +62,12 @@ class Simulated:
 
     def error_ns(self, sensor: Sensor) -> int:
         """Offset found, minus the true one at that time (modulo the hour that was left out)."""
-        finding, heard = sensor.finding, sensor.heard
-        near = int(np.abs(heard.host_ns - finding.at_host_ns).argmin())
+        estimate = sensor.estimate
+        heard = sensor.heard
+        near = int(np.abs(heard.host_ns - estimate.at_host_ns).argmin())
         true_ns = heard.true_ns[near : near + 1]
         truth_ns = int((sensor.clock.error_ns(true_ns) - self.host.error_ns(true_ns))[0])
-        error_ns = finding.offset_ns - truth_ns
+        error_ns = estimate.offset_ns - truth_ns
         if sensor.clock.past_hour:
             error_ns = (error_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
         return error_ns
@@ -121,7 +122,9 @@ def _simulate(seed: int) -> Simulated:
     same = rng.random() < 0.3
     domain = str(rng.choice(DOMAINS))
     shared = _clock(rng, domain)
-    sensors, watches, heards = [], [], []
+    sensors = []
+    watches = []
+    heards = []
     for _ in range(number):
         clock = shared if same else _clock(rng, domain := str(rng.choice(DOMAINS)))
         clock = _jumps(rng, clock, domain, seconds)
@@ -140,16 +143,16 @@ def _simulate(seed: int) -> Simulated:
         sensors.append((clock, domain))
         watches.append(watch)
         heards.append(heard)
-    findings = [watch.estimate() for watch in watches]
+    estimates = [watch.estimate() for watch in watches]
     maps = fit(watches)
-    known = [finding for finding in findings if finding is not None]
-    comparison = compare([(f"s{at}", finding) for at, finding in enumerate(known)])
+    known = [estimate for estimate in estimates if estimate is not None]
+    comparison = compare([(f"s{at}", estimate) for at, estimate in enumerate(known)])
     return Simulated(
         seconds,
         host,
         tuple(
-            Sensor(*sensor, heard, watch, finding, one)
-            for sensor, heard, watch, finding, one in zip(
+            Sensor(*sensor, heard, watch, estimate, one)
+            for sensor, heard, watch, estimate, one in zip(
                 sensors, heards, watches, known, maps, strict=True
             )
             if one is not None
@@ -170,9 +173,9 @@ def _sensors(recordings: list[Simulated]) -> list[tuple[Simulated, Sensor]]:
 def test_the_domain_is_right(recordings: list[Simulated]) -> None:
     """Of the longest segment; with a jump of 37 s (from UTC to TAI), that of any segment."""
     right = [
-        sensor.domain in {segment.domain for segment in sensor.finding.segments}
+        sensor.domain in {segment.domain for segment in sensor.estimate.segments}
         if sensor.clock.steps
-        else sensor.domain == sensor.finding.domain
+        else sensor.domain == sensor.estimate.domain
         for _, sensor in _sensors(recordings)
     ]
     assert len(right) > 1000
@@ -185,23 +188,23 @@ def test_offsets_are_exact_to_the_second_and_within_a_millisecond(
     for one, sensor in _sensors(recordings):
         error_ns = abs(one.error_ns(sensor))
         assert error_ns < NS_PER_MS
-        assert error_ns < sensor.finding.uncertainty_ns
+        assert error_ns < sensor.estimate.uncertainty_ns
 
 
 def test_drift_is_within_one_ppm(recordings: list[Simulated]) -> None:
     pairs = [
-        (sensor.finding, sensor.clock.drift_ppm - one.host.drift_ppm)
+        (sensor.estimate, sensor.clock.drift_ppm - one.host.drift_ppm)
         for one, sensor in _sensors(recordings)
         if one.is_long
     ]
     assert len(pairs) > 400
     missed = 0
-    for finding, truth_ppm in pairs:
-        assert finding.drift_ppm is not None
-        assert finding.drift_uncertainty_ppm is not None
-        error_ppm = abs(finding.drift_ppm - truth_ppm)
+    for estimate, truth_ppm in pairs:
+        assert estimate.drift_ppm is not None
+        assert estimate.drift_uncertainty_ppm is not None
+        error_ppm = abs(estimate.drift_ppm - truth_ppm)
         assert error_ppm < 1
-        missed += error_ppm > finding.drift_uncertainty_ppm
+        missed += error_ppm > estimate.drift_uncertainty_ppm
     # The uncertainty is three standard errors.
     assert missed < 0.02 * len(pairs)
 
@@ -253,14 +256,14 @@ def test_jumps_are_found_and_separated_from_host_steps(recordings: list[Simulate
     wrong = 0
     steps = 0
     for one in recordings:
-        for (_, finding), sensor in zip(one.comparison.estimates, one.sensors, strict=True):
+        for (_, estimate), sensor in zip(one.comparison.estimates, one.sensors, strict=True):
             truth = sorted(by_ns for _, by_ns in (*sensor.clock.steps, *_seen(one.host)))
-            sizes = sorted(jump.size_ns for jump in finding.jumps)
+            sizes = sorted(jump.size_ns for jump in estimate.jumps)
             assert len(sizes) == len(truth)
             assert np.abs(np.subtract(sizes, truth)).max(initial=0) < NS_PER_MS // 4
             steps += len(truth)
-            wrong += len(finding.sensor_jumps) != len(sensor.clock.steps)
-            for jump in finding.jumps:
+            wrong += len(estimate.sensor_jumps) != len(sensor.clock.steps)
+            for jump in estimate.jumps:
                 since_s = (jump.host_ns - BEGIN_NS) / NS_PER_S
                 after_s = [after_s for after_s, _ in (*sensor.clock.steps, *one.host.steps)]
                 assert np.abs(np.subtract(after_s, since_s)).min() < 4

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.matrix.lidars import HOUR_NS, MAKERS, NS_PER_MS, NS_PER_S, Sent, Spell
+from tests.matrix.lidars import HOUR_NS, NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell
 
 Session = tuple[Sent, ...]
 Change = Callable[[Session, int], Session]
@@ -50,30 +50,30 @@ class Kind:
     warnings: tuple[str, ...] = ()
 
 
-def plain(maker: str) -> Sent:
+def plain(vendor: str) -> Sent:
     """Half a second around noon."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     return row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS))
 
 
-def ahead(maker: str) -> Sent:
+def ahead(vendor: str) -> Sent:
     """The same half second by a clock that counts TAI."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     ahead_ns = 37 * NS_PER_S
     return row.send(Spell(NOON_NS + row.begin_ns + ahead_ns, LENGTH_NS, ahead_ns=-ahead_ns))
 
 
-def wrapping(maker: str) -> Sent:
+def wrapping(vendor: str) -> Sent:
     """Half a second over the full hour, in which every count begins anew."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     return row.send(
         Spell(NOON_NS // HOUR_NS * HOUR_NS - HALF_NS + row.begin_ns, LENGTH_NS, row.wrap)
     )
 
 
-def restarting(maker: str) -> Sent:
+def restarting(vendor: str) -> Sent:
     """Up for 100 s at first; then all counts and clocks begin anew, but not the capture host's."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     up_ns = 100 * NS_PER_S
     before = row.send(Spell(up_ns + row.begin_ns, HALF_NS - 20 * NS_PER_MS, 5000))
     again = Spell(row.begin_ns + 20 * NS_PER_MS, HALF_NS, 0, up_ns + HALF_NS)
@@ -123,7 +123,8 @@ def cut_at(at_ns: int, by_ns: int) -> Callable[[Session, int], tuple[Session, ..
     """Two pieces, by receive time; in the second all clocks are off."""
 
     def pieces(session: Session, begin_ns: int) -> tuple[Session, ...]:
-        first, second = [], []
+        first = []
+        second = []
         for sent in session:
             late = sent.host_ns - begin_ns >= at_ns
             first.append(sent.where(np.flatnonzero(~late)))
@@ -136,7 +137,8 @@ def cut_at(at_ns: int, by_ns: int) -> Callable[[Session, int], tuple[Session, ..
 
 def restarted(session: Session, begin_ns: int) -> tuple[Session, ...]:
     """Before and after the stamps step back."""
-    first, second = [], []
+    first = []
+    second = []
     for sent in session:
         again = int(np.argmax(np.diff(sent.stamp_ns[:, 0]) < 0)) + 1
         first.append(sent.where(np.arange(again)))

@@ -54,7 +54,9 @@ def law(session: Sequence[Sent], max_wait_ns: int = NS_PER_S) -> Law:
     points = np.concatenate([sent.points.reshape(-1) for sent in session])
     sensor = np.repeat(np.arange(len(session)), [sent.stamp_ns.size for sent in session])
     order = np.lexsort((np.arange(len(sensor)), sensor, stamp_ns))
-    stamp_ns, sensor, points = stamp_ns[order], sensor[order], points[order]
+    stamp_ns = stamp_ns[order]
+    sensor = sensor[order]
+    points = points[order]
     index = stamp_ns // PERIOD_NS - k0
     tail = int(max(lasts)) // PERIOD_NS - k0
     reasons = {"before_start": index < -1, "head": index == -1, "tail": index == max(tail, 0)}

@@ -18,7 +18,9 @@ from tests.builders import hesai, robosense, velodyne
 from tests.builders.hesai_angles import angles_csv
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
-NS_PER_S, NS_PER_MS, NS_PER_US = 10**9, 10**6, 10**3
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
+NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # One reading in so many has a return.
 SPARSE = 16
@@ -35,7 +37,7 @@ class Sent:
     host_ns: (P,) receive time; stamp_ns: (P, C) of the columns; points: (P, C) their returns.
     """
 
-    maker: str
+    vendor: str
     payloads: tuple[bytes, ...]
     host_ns: I64Array
     stamp_ns: I64Array
@@ -85,7 +87,7 @@ def _readings(seed: int, *shape: int) -> tuple[I64Array, I64Array]:
 
 
 def _sent(
-    maker: str, spell: Spell, payloads: list[bytes], stamp_ns: I64Array, ranges: I64Array
+    vendor: str, spell: Spell, payloads: list[bytes], stamp_ns: I64Array, ranges: I64Array
 ) -> Sent:
     """A packet is received 0.3 ms after its last column."""
     shape = len(payloads), -1
@@ -93,7 +95,7 @@ def _sent(
     arrival = stamps[:, -1] + 300_000 + spell.ahead_ns
     host_ns = -(-arrival // ARRIVAL_STEP_NS) * ARRIVAL_STEP_NS
     points = np.count_nonzero(ranges.reshape(len(stamp_ns), -1), axis=1).reshape(shape)
-    return Sent(maker, tuple(payloads), host_ns, stamps, points)
+    return Sent(vendor, tuple(payloads), host_ns, stamps, points)
 
 
 def ouster(spell: Spell) -> Sent:
@@ -158,7 +160,7 @@ def robosense_helios16(spell: Spell) -> Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class Maker:
+class Vendor:
     """A lidar of the matrix.
 
     begin_ns: its first turn after the others'; wrap: its own count of packets at the begin of a
@@ -174,17 +176,17 @@ class Maker:
     wrap: int = 0
 
 
-MAKERS: Mapping[str, Maker] = {
-    "ouster": Maker(
+VENDORS: Mapping[str, Vendor] = {
+    "ouster": Vendor(
         *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
         *(0, 2**16 - 1),
     ),
-    "velodyne": Maker(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
-    "hesai": Maker(
+    "velodyne": Vendor(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
+    "hesai": Vendor(
         *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
         *(5_700_000, 2**32 - 100),
     ),
-    "robosense": Maker(
+    "robosense": Vendor(
         *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
         7_300_000,
     ),

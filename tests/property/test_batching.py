@@ -85,7 +85,8 @@ def test_order_between_sensors_does_not_matter(block: int) -> None:
     compared = 0
     for seed in range(block * SEEDS_A_BLOCK, (block + 1) * SEEDS_A_BLOCK):
         case = random_feed(seed)
-        options, rng = case[1], random.Random(seed)
+        options = case[1]
+        rng = random.Random(seed)
         if options.sensors == 1:
             continue
         expected = without_receive_times(by_reference(*case))

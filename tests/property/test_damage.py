@@ -54,7 +54,8 @@ LONGEST_S = 300
 BUFFERS = (9_000, 50_000)
 # Source IP in an Ethernet frame.
 SENDER = slice(26, 30)
-RIG, LIDARS = "rig.yaml", ("left.json", "right.json")
+RIG = "rig.yaml"
+LIDARS = ("left.json", "right.json")
 
 JOBS = (
     FIXTURE,
@@ -119,13 +120,16 @@ def outcome(job: Job, frames_given: int | None = None) -> Outcome:
 
 def check_ledgers(report: ReportInputs) -> None:
     """Ledgers balance (docs/report.md), and every datagram is counted."""
-    capture, unassigned = report.capture, sum(row.packets for row in report.unassigned)
+    capture = report.capture
+    unassigned = sum(row.packets for row in report.unassigned)
     assert capture.frames == capture.datagrams + sum(capture.skipped.values())
     ledgers = [sensor.ledger for sensor in report.sensors]
     own = sum(ledger.packets.read + ledger.imu_packets for ledger in ledgers)
     assert capture.datagrams == own + unassigned
     for ledger in ledgers:
-        packets, columns, points = ledger.packets, ledger.columns, ledger.points
+        packets = ledger.packets
+        columns = ledger.columns
+        points = ledger.points
         assert packets.read == packets.accepted + sum(packets.rejected.values())
         assert columns.decoded == columns.written + sum(columns.dropped.values())
         kept_out = points.no_return + points.range + points.box + points.repeated
@@ -141,7 +145,8 @@ def check_output(result: Result) -> None:
     assert result.memory is not None
     assert not result.memory.abandoned
     ledgers = [sensor.ledger for sensor in result.report.sensors]
-    columns, points = np.zeros(len(ledgers), np.int64), np.zeros(len(ledgers), np.int64)
+    columns = np.zeros(len(ledgers), np.int64)
+    points = np.zeros(len(ledgers), np.int64)
     for scan in result.scans:
         check_scan(scan)
         columns += np.bincount(scan.column_lidar_id, minlength=len(ledgers))
@@ -232,7 +237,8 @@ def test_damaged_columns(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["removed", "duplicated", "truncated"])
 def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
-    rng, sent = random.Random(f"exact {name}"), datagrams(LENGTH_NS)
+    rng = random.Random(f"exact {name}")
+    sent = datagrams(LENGTH_NS)
     parts = damaged(rng, [one.payload for one in sent], name)
     records = [
         replace(one, payload=payload).frame()
@@ -249,7 +255,8 @@ def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
             if (one.source, one.port) == (lidar.ip, 7502)
         ]
         whole = [sizes.count(size) for size, sizes in own]
-        packets, there = sensor.ledger.packets, np.flatnonzero(whole)
+        packets = sensor.ledger.packets
+        there = np.flatnonzero(whole)
         assert packets.read == sum(len(sizes) for _, sizes in own)
         assert packets.accepted == len(there)
         rejected = {
