@@ -85,7 +85,7 @@ def _lines(verdict: Verdict) -> list[str]:
         for check in verdict.checks
     ]
     lines = [f"{verdict.path}: {verdict.format}, {size}"]
-    lines += columns([("check", "judged", "outcome", "what stays open"), *rows])
+    lines += table_lines([("check", "judged", "outcome", "what stays open"), *rows])
     shown = verdict.violations[:SHOWN]
     lines += map(str, shown)
     if verdict.count > len(shown):

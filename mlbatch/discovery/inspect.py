@@ -124,7 +124,7 @@ class Survey:
 
     def clock_lines(self) -> list[str]:
         """What the clock doctor says, for people."""
-        return [] if self.clocks is None else self.clocks.in_words()
+        return [] if self.clocks is None else self.clocks.describe()
 
     def rig_text(self, folder: Path) -> str:
         """A rig file for these sensors; identity extrinsics are marked as to be measured."""
@@ -220,7 +220,7 @@ def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool 
         for sensor in found
         if sensor.lidar.calibration in files
     }
-    named = [(one.name, count.watch.finding()) for one, count in zip(found, counts, strict=True)]
+    named = [(one.name, count.watch.estimate()) for one, count in zip(found, counts, strict=True)]
     findings = [(name, finding) for name, finding in named if finding is not None]
     clocks = compare(findings) if findings else None
     return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes), clocks)
@@ -259,7 +259,7 @@ def _as_json(clocks: Comparison) -> dict[str, object]:
     return {
         "verdict": clocks.verdict,
         "bound_ms": None if clocks.bound_ns is None else clocks.bound_ns / NS_PER_MS,
-        "lines": clocks.in_words(),
+        "lines": clocks.describe(),
         "sensors": [
             {
                 "name": name,
@@ -272,7 +272,7 @@ def _as_json(clocks: Comparison) -> dict[str, object]:
                     for one in finding.jumps
                 ],
             }
-            for name, finding in clocks.findings
+            for name, finding in clocks.estimates
         ],
     }
 

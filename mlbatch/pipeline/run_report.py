@@ -228,13 +228,13 @@ def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
     if finding is None:
         return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
     if sensor.clock.map is not None:
-        notes += (sensor.clock.map.in_words(),)
+        notes += (sensor.clock.map.describe(),)
     return ClockReport(
         source,
         epoch,
         offset_to_host_ms=offset_ns / NS_PER_MS,
         drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
-        notes=(*notes, finding.in_words()),
+        notes=(*notes, finding.describe()),
     )
 
 

@@ -366,10 +366,10 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "incomparable clocks": (
         "apart/drive.pcap --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
-        "ouster_111 and -3600.004 s for ouster_222, 3600.000 s apart (1 whole hour(s): a time "
-        "zone, or the wrong hour); wanted at most 1 s; use --align-clocks or --clock host, or give "
-        "clock.offset_s or clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "3600.000 s (1 whole hour(s): a time zone, or the wrong hour): stamp minus receive time is "
+        "-0.004 s for ouster_111 and -3600.004 s for ouster_222; use --align-clocks or --clock "
+        "host, or give clock.offset_s or clock.epoch in the rig",
     ),
     "strict with a duplicate": (
         "twice/drive.pcap --strict",
@@ -434,10 +434,10 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
     "two uptime clocks": (
         f"{PAIR} --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -1718733565.192 s for "
-        "ouster_122239000672 and -1718728642.002 s for ouster_122247000785, 4923.190 s apart; "
-        "wanted at most 1 s; use --align-clocks or --clock host, or give clock.offset_s or "
-        "clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "4923.190 s: stamp minus receive time is -1718733565.192 s for ouster_122239000672 and "
+        "-1718728642.002 s for ouster_122247000785; use --align-clocks or --clock host, or give "
+        "clock.offset_s or clock.epoch in the rig",
     ),
     "one turn is never a whole window": (
         f"{ONE_UNIT}.pcap",

@@ -10,7 +10,7 @@ import pytest
 
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.run import command
-from tests.matrix.lidars import MAKERS, NS_PER_MS, NS_PER_S, Sent, Spell, write_metadata
+from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write_metadata
 
 BEGIN_NS = 1_700_000_000 * NS_PER_S
 LENGTH_NS = 1200 * NS_PER_MS
@@ -25,13 +25,13 @@ FILES = {"ouster": "front.json", "velodyne": "", "hesai": "unit.csv", "robosense
 
 
 def one(maker: str) -> Sent:
-    return MAKERS[maker].send(Spell(BEGIN_NS, LENGTH_NS))
+    return VENDORS[maker].send(Spell(BEGIN_NS, LENGTH_NS))
 
 
 def both(maker: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
     """Packets of two lidars by arrival, the second ahead in time, and its clock behind that."""
     spell = Spell(BEGIN_NS + ahead_ns + clock_ahead_ns, LENGTH_NS, ahead_ns=-clock_ahead_ns)
-    mixed = one(maker).then(MAKERS[maker].send(spell))
+    mixed = one(maker).then(VENDORS[maker].send(spell))
     return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
 
 
@@ -41,7 +41,7 @@ def converted(maker: str, sent: Sent, folder: Path) -> tuple[int, str]:
     frames = [
         (int(host_ns), frame)
         for host_ns, payload in zip(sent.host_ns, sent.payloads, strict=True)
-        for frame in udp_frame(payload, MAKERS[maker].ip, sport=9000, dport=MAKERS[maker].port)
+        for frame in udp_frame(payload, VENDORS[maker].ip, sport=9000, dport=VENDORS[maker].port)
     ]
     capture = write_pcap(folder / "drive.pcap", frames)
     files: list[str | Path] = ["--metadata", folder / FILES[maker]] if FILES[maker] else []
@@ -50,7 +50,7 @@ def converted(maker: str, sent: Sent, folder: Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", VENDORS)
 def test_two_lidars_in_turn_are_refused(maker: str, share: float, tmp_path: Path) -> None:
     # A third of a turn apart, so that the rotors differ as well.
     ahead_ns = 33 * NS_PER_MS // PACKET_NS[maker] * PACKET_NS[maker]
@@ -59,7 +59,7 @@ def test_two_lidars_in_turn_are_refused(maker: str, share: float, tmp_path: Path
     assert "several lidars share the address" in err
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", VENDORS)
 def test_two_clocks_are_refused(maker: str, tmp_path: Path) -> None:
     code, err = converted(maker, both(maker, 5 * NS_PER_MS, 700 * NS_PER_S), tmp_path)
     assert code == 1
@@ -95,7 +95,7 @@ ONE: Mapping[str, Callable[[Sent], Sent]] = {
 
 
 @pytest.mark.parametrize("change", ONE)
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", VENDORS)
 def test_one_lidar_is_not_refused(maker: str, change: str, tmp_path: Path) -> None:
     code, err = converted(maker, ONE[change](one(maker)), tmp_path)
     assert code == 0, err

@@ -15,7 +15,7 @@ import pytest
 
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.clocks.compare import SYNCHRONISED, UNSYNCHRONISED, compare
-from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.discovery.match import match
 from mlbatch.discovery.probe import calibrations_for, look
 from mlbatch.discovery.sampler import split_by_kind
@@ -100,7 +100,7 @@ PAIRS = (
 )
 
 
-def findings(path: Path, period_ns: int = 0) -> dict[str, ClockFinding]:
+def estimates(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
     """Clocks of the sensors of a recording, found as the program finds them."""
     if path.is_dir():
         (path,) = path.glob("*.db3")
@@ -122,37 +122,37 @@ def findings(path: Path, period_ns: int = 0) -> dict[str, ClockFinding]:
                 _, newest_ns = extremes(lidar.heads(packets[good], host_ns))
                 known = newest_ns > NEVER
                 watches[sensor.name].add(newest_ns[known], host_ns[known])
-    found = {name: watch.finding() for name, watch in watches.items()}
-    return {name: finding for name, finding in found.items() if finding is not None}
+    found = {name: watch.estimate() for name, watch in watches.items()}
+    return {name: estimate for name, estimate in found.items() if estimate is not None}
 
 
 @needs_recordings
 @pytest.mark.parametrize(("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value))
 def test_the_clock_of_a_recording(maker: str, case: Case) -> None:
     period_ns = HOUR_NS if maker == "velodyne" else 0
-    (finding,) = findings(RECORDINGS / maker / case.path, period_ns).values()
-    assert finding.domain == case.domain
-    assert (finding.packets, finding.damaged, finding.jumps) == (case.packets, 0, ())
+    (estimate,) = estimates(RECORDINGS / maker / case.path, period_ns).values()
+    assert estimate.domain == case.domain
+    assert (estimate.packets, estimate.damaged, estimate.jumps) == (case.packets, 0, ())
     if case.offset_s is not None:
-        assert finding.offset_ns / NS_PER_S == pytest.approx(case.offset_s, abs=case.within_s)
+        assert estimate.offset_ns / NS_PER_S == pytest.approx(case.offset_s, abs=case.within_s)
     # All are shorter than a second, which is too short for a rate.
-    assert finding.drift_ppm is None
+    assert estimate.drift_ppm is None
 
 
 @needs_recordings
 @pytest.mark.parametrize("path", EMPTY)
 def test_nothing_is_said_where_no_lidar_is(path: str) -> None:
-    assert findings(RECORDINGS / path) == {}
+    assert estimates(RECORDINGS / path) == {}
 
 
 @needs_recordings
 @pytest.mark.parametrize(("path", "uptimes_s"), PAIRS, ids=[path for path, _ in PAIRS])
 def test_two_sensors_that_count_from_power_on(path: str, uptimes_s: tuple[int, int] | None) -> None:
     """A packet each: apart by hours, which is sure; how far exactly is not."""
-    found = findings(RECORDINGS / path)
-    assert [finding.domain for finding in found.values()] == ["uptime", "uptime"]
+    found = estimates(RECORDINGS / path)
+    assert [estimate.domain for estimate in found.values()] == ["uptime", "uptime"]
     if uptimes_s is not None:
-        told_s = sorted(one.stretches[0].first_stamp_ns / NS_PER_S for one in found.values())
+        told_s = sorted(one.segments[0].first_stamp_ns / NS_PER_S for one in found.values())
         assert told_s == pytest.approx(uptimes_s, abs=0.5)
     comparison = compare(list(found.items()))
     assert comparison.verdict == UNSYNCHRONISED
@@ -163,6 +163,6 @@ def test_two_sensors_that_count_from_power_on(path: str, uptimes_s: tuple[int, i
 @pytest.mark.parametrize("name", ["two_lidars/two_lidars.pcap", "four_makers/four_makers.pcap"])
 def test_sensors_of_the_fixtures_are_synchronised(name: str) -> None:
     """Their SOURCE.md: UTC for all, packets on the way for about a millisecond."""
-    comparison = compare(list(findings(FIXTURES / name, HOUR_NS * ("four" in name)).items()))
+    comparison = compare(list(estimates(FIXTURES / name, HOUR_NS * ("four" in name)).items()))
     assert comparison.verdict == SYNCHRONISED
-    assert {finding.domain for _, finding in comparison.findings} == {"utc"}
+    assert {estimate.domain for _, estimate in comparison.estimates} == {"utc"}
