@@ -1,4 +1,4 @@
-"""Say in plain words what `make demo` has made: the last thing that it runs.
+"""Print a summary of what `make demo` made: its last step.
 
     python docs/demo.py demo
 
@@ -19,7 +19,7 @@ MCAP, SCANS, PICTURE = "two_lidars.mcap", "scans", "two_lidars.png"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The figures of a report that a newcomer wants to know."""
+    """Figures of a report for the summary."""
 
     names: tuple[str, ...]
     scans: int
@@ -29,13 +29,13 @@ class Outcome:
 
 
 def main() -> int:
-    """Read the report in the demo's folder and tell."""
-    parser = argparse.ArgumentParser(description="Say what the demo has made.")
-    parser.add_argument("folder", type=Path, help="where the demo wrote its files")
+    """Read the report in the demo folder; print the summary."""
+    parser = argparse.ArgumentParser(description="Summarise what the demo made.")
+    parser.add_argument("folder", type=Path, help="folder that the demo wrote to")
     folder: Path = parser.parse_args().folder
     try:
         text = (folder / SCANS / "report.json").read_text(encoding="utf-8")
-        print(told(read_outcome(text), folder))
+        print(describe(read_outcome(text), folder))
     except (OSError, ValueError, KeyError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
@@ -55,17 +55,17 @@ def read_outcome(text: str) -> Outcome:
     )
 
 
-def told(outcome: Outcome, folder: Path) -> str:
-    """A sentence about what there is, and one line for each thing to look at."""
+def describe(outcome: Outcome, folder: Path) -> str:
+    """Return one sentence on the result and one line a file."""
     lidars = f"{len(outcome.names)} lidars ({', '.join(outcome.names)})"
     period = f"{float(outcome.period_ms):g} ms"
     return f"""
-The packets of {lidars} have become {outcome.scans} scans with {outcome.points} points,
-exactly {outcome.rate_hz} a second; each holds what all lidars saw in the same {period}.
+Packets of {lidars} became {outcome.scans} scans with {outcome.points} points at exactly
+{outcome.rate_hz} Hz; each scan has all columns of all lidars from the same {period}.
 
-  {folder / PICTURE}   one of them as a picture: open it in any image viewer or browser
-  {folder / MCAP}  all of them for ROS 2, Foxglove and others (topic /points)
-  {folder / SCANS}/           all of them for numpy, a file each, with report.json and scans.csv"""
+  {folder / PICTURE}   picture of one scan, for any image viewer or browser
+  {folder / MCAP}  all scans for ROS 2, Foxglove and others (topic /points)
+  {folder / SCANS}/           all scans for numpy, one file each, with report.json and scans.csv"""
 
 
 if __name__ == "__main__":

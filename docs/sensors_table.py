@@ -1,6 +1,6 @@
-"""The table of sensors in the README, made from the models: `python docs/sensors_table.py`.
+"""Write the sensor table of the README from the models: `python docs/sensors_table.py`.
 
-Models that differ in nothing but their name share a row.
+Models that differ only in their name share a row.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from mlbatch.sensors import models
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 BEGIN, END = "<!-- sensors: python docs/sensors_table.py -->", "<!-- end of sensors -->"
-HEAD = ("maker", "models (channels)", "returns", "clock", "calibration", "verified")
+HEAD = ("vendor", "models (channels)", "returns", "clock", "calibration", "verified")
 
 
 def table() -> str:
-    """The rows, in the order of `mlbatch sensors`."""
+    """Return the rows, in the order of `mlbatch sensors`."""
     names: dict[tuple[str, ...], list[str]] = {}
     for model in models():
         names.setdefault(_shared(model), []).append(_name(model))
     rows = [HEAD, ("---",) * len(HEAD)]
-    rows += [(alike[0], ", ".join(found), *alike[1:]) for alike, found in names.items()]
+    rows += [(shared[0], ", ".join(found), *shared[1:]) for shared, found in names.items()]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def with_table(page: str) -> str:
-    """A page with the table of today between its marks."""
+    """Return the page with the current table between its marks."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
-        raise SystemExit(f"wanted the marks {BEGIN} and {END} in the page, got none; put them back")
+        raise SystemExit(f"expected the marks {BEGIN} and {END}, found none; restore them")
     return f"{before}{BEGIN}\n\n{table()}\n{END}{after}"
 
 
@@ -42,7 +42,7 @@ def _shared(model: SensorModel) -> tuple[str, ...]:
 
 
 def _name(model: SensorModel) -> str:
-    """Most names say how many channels a model has; the others are helped."""
+    """Return the model name, with its number of channels unless the name has it."""
     channels = str(model.channels)
     return (
         model.name if channels in re.findall(r"\d+", model.name) else f"{model.name} ({channels})"

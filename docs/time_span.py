@@ -2,8 +2,8 @@
 
     python docs/time_span.py > docs/time_span.svg
 
-Above, turns are joined as they are finished (the newest finished turn of each lidar); below,
-columns are batched on one grid of time, so that every scan spans one period.
+Top: frame-level fusion of the latest sweep of each lidar; bottom: columns batched on one time
+grid, so that every scan spans one period.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 PERIOD_MS = 100
-# When the rotors pass zero, after a line of the grid; 37 ms apart.
+# Rotors pass zero this long after a bound of the grid; 37 ms apart.
 PHASE_MS = {"left": 20, "right": 57}
 END_MS = 520
 ORIGIN_X, PX_PER_MS, LANE_HEIGHT, LANE_STEP = 70, 1.42, 20, 26
@@ -27,7 +27,7 @@ STYLE = """
   .inside { fill: #ffffff; text-anchor: middle; font-size: 12px; }
   .middle { text-anchor: middle; }
   .grid { stroke: #59636e; stroke-dasharray: 3 3; }
-  .turn { stroke: #ffffff; stroke-width: 2; }
+  .notch { stroke: #ffffff; stroke-width: 2; }
   .span { fill: none; stroke-width: 2; }
   .a { fill: #c2570c; } .span.a { fill: none; stroke: #c2570c; }
   .b { fill: #0b6bcb; } .span.b { fill: none; stroke: #0b6bcb; }
@@ -36,14 +36,14 @@ STYLE = """
     .card { fill: #0d1117; stroke: #3d444d; }
     text { fill: #f0f6fc; } .faint { fill: #9198a1; }
     .inside { fill: #ffffff; }
-    .grid { stroke: #9198a1; } .turn { stroke: #0d1117; }
+    .grid { stroke: #9198a1; } .notch { stroke: #0d1117; }
   }
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A stretch of one lidar's columns that goes into one scan; `number` picks the colour."""
+    """Columns of one lidar that go into one scan; `number` picks the colour."""
 
     start_ms: int
     end_ms: int
@@ -54,24 +54,24 @@ def main() -> None:
     """Print the picture."""
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">',
-        "<title>Time spans: turns joined as they finish, and scans on one grid of time</title>",
+        "<title>Time spans: fusion of latest sweeps, and scans on one time grid</title>",
         f"<style>{STYLE}</style>",
         f'<rect class="card" x="0.5" y="0.5" width="{WIDTH - 1}" height="{HEIGHT - 1}" rx="8"/>',
-        *joined_turns(18),
+        *fused_sweeps(18),
         *windows(206),
         "</svg>",
     ]
     print("\n".join(parts))
 
 
-def joined_turns(top: int) -> list[str]:
-    """Each set: a turn of `left`, and the newest turn of `right` finished by then."""
-    parts = [text(16, top + 16, "Turns joined as they finish", "title")]
+def fused_sweeps(top: int) -> list[str]:
+    """Each set: a sweep of `left`, and the latest sweep of `right` complete by then."""
+    parts = [text(16, top + 16, "Frame-level fusion: latest sweep of each lidar", "title")]
     lanes = {
         name: [Bar(start, start + PERIOD_MS, number) for number, start in enumerate(starts(name))]
         for name in PHASE_MS
     }
-    # The first turn of `left` has no finished partner in the picture.
+    # The first sweep of `left` has no complete partner in the picture.
     lanes["left"] = [
         Bar(bar.start_ms, bar.end_ms, None if bar.number == 0 else (bar.number or 0) - 1)
         for bar in lanes["left"]
@@ -84,20 +84,20 @@ def joined_turns(top: int) -> list[str]:
     ]
     for start, end, number in sets:
         parts += bracket(start, end, top + 94 + 22 * (number % 2), "ab"[number % 2])
-    note = "a set spans up to two turns, and columns of one instant land in different sets"
+    note = "a set spans up to two sweeps, and columns of one instant are in different sets"
     parts.append(text(ORIGIN_X, top + 148, note, "faint"))
     return parts
 
 
 def windows(top: int) -> list[str]:
-    """Each scan: all columns between two lines of the grid."""
+    """Each scan: all columns between two bounds of the grid."""
     cuts = range(0, END_MS + 1, PERIOD_MS)
     parts = [
         f'<line class="grid" x1="{x_of(cut):.1f}" x2="{x_of(cut):.1f}" '
         f'y1="{top + 26}" y2="{top + 112}"/>'
         for cut in cuts
     ]
-    parts.append(text(16, top + 16, "mlbatch: columns on one grid of time", "title"))
+    parts.append(text(16, top + 16, "mlbatch: columns on one time grid", "title"))
     lanes = {
         name: [
             Bar(max(cut, phase), min(cut + PERIOD_MS, END_MS), whole(cut, phase)) for cut in cuts
@@ -107,20 +107,20 @@ def windows(top: int) -> list[str]:
     parts += draw_lanes(lanes, top + 32)
     for name, y in zip(PHASE_MS, (top + 32, top + 32 + LANE_STEP), strict=True):
         parts += [
-            f'<line class="turn" x1="{x_of(at):.1f}" x2="{x_of(at):.1f}" y1="{y}" y2="{y + 6}"/>'
+            f'<line class="notch" x1="{x_of(at):.1f}" x2="{x_of(at):.1f}" y1="{y}" y2="{y + 6}"/>'
             for at in starts(name)[1:]
         ]
     for cut in cuts[1:-1]:
         number = cut // PERIOD_MS - 1
         parts += bracket(cut, cut + PERIOD_MS, top + 94, "ab"[number % 2], inset=2)
     parts += [text(x_of(cut), top + 128, f"{cut} ms", "faint middle") for cut in cuts]
-    note = "every scan spans one period; a notch marks where a rotor passes zero"
+    note = "every scan spans one period; notches: the rotor passes zero"
     parts.append(text(ORIGIN_X, top + 154, note, "faint"))
     return parts
 
 
 def starts(name: str) -> list[int]:
-    """When the turns of a lidar begin."""
+    """Start times of the sweeps of a lidar, ms."""
     return list(range(PHASE_MS[name], END_MS, PERIOD_MS))
 
 

@@ -1,4 +1,4 @@
-"""The Python face: the scans that `mlbatch convert` writes, one after the other in memory."""
+"""Python interface: the scans that `mlbatch convert` writes, one after another in memory."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def scans(
         ("engine", engine, ENGINES),
     ):
         if value not in known:
-            raise UsageError(f"{name}: wanted {' or '.join(known)}, got {value!r}; choose one")
+            raise UsageError(f"{name}: expected {' or '.join(known)}, found {value!r}; choose one")
     check_ranges_m("min_range", min_range, "max_range", max_range)
     job = Job(
         recordings=tuple(Path(path) for path in recordings),
@@ -66,7 +66,7 @@ def scans(
             host_clock=clock == "host",
             decode=dict(decode or {}),
         ),
-        # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
+        # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
         slices=check_slices("slices", slices),
         layout=layout,
@@ -83,7 +83,7 @@ def scans(
 
 
 def _owned(scan: Scan) -> Scan:
-    """The scan with arrays that the next one does not overwrite."""
+    """A scan with arrays of its own."""
     return replace(
         scan,
         xyz=np.array(scan.xyz, order="C"),

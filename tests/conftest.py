@@ -1,12 +1,17 @@
-"""What tests of the command line share."""
+"""What all tests share: one profile of hypothesis, and the command line in an empty folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.builders.sessions import Shell
+
+# No deadline: how long an example takes depends on how loaded the machine is.
+settings.register_profile("mlbatch", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("mlbatch")
 
 
 @pytest.fixture

@@ -179,9 +179,9 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
             if calls == end.at_call:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-    begin = resume.Course.begin
+    begin = resume.ResumeLog.begin
 
-    def begin_and_count(course: resume.Course) -> None:
+    def begin_and_count(course: resume.ResumeLog) -> None:
         nonlocal begun
         begun = True
         begin(course)
@@ -191,7 +191,7 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
         sys.setprofile(count)
         threading.setprofile(count)
         # What comes before, random times strike.
-        setattr(resume.Course, "begin", begin_and_count)  # noqa: B010 - no type allows it
+        setattr(resume.ResumeLog, "begin", begin_and_count)  # noqa: B010 - no type allows it
     code = 99
     try:
         mlbatch()

@@ -71,7 +71,6 @@ def _values(verdict: Verdict) -> dict[str, object]:
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    from mlbatch.cli.options import columns
 
     size = f"{verdict.scans} scans, {verdict.points} points"
     if verdict.columns is not None:

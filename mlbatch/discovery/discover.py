@@ -20,7 +20,8 @@ from mlbatch.discovery.probe import (
     read_given,
     with_clouds,
 )
-from mlbatch.discovery.sampler import Found, Kind, Router, Sampler
+from mlbatch.discovery.router import Router
+from mlbatch.discovery.sampler import Found, Kind, Sampler
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.frames.tree import some
 from mlbatch.lidar.interface import Calibration, ModelFile

@@ -20,11 +20,18 @@ from mlbatch.discovery.discover import describe, lacks_decoder, named, packet_ty
 from mlbatch.discovery.extrinsics import Mounted, in_words, mount
 from mlbatch.discovery.match import match, shared_by
 from mlbatch.discovery.probe import calibrations_for, first_seconds, look, with_clouds
-from mlbatch.discovery.sampler import Found, Kind, Role, Router, Sampler, split_by_kind
+from mlbatch.discovery.router import Role, Router
+from mlbatch.discovery.sampler import (
+    Found,
+    Kind,
+    Sampler,
+    clock_watch,
+    has_receive_times,
+    split_by_kind,
+)
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.interface import Lidar
-from mlbatch.pipeline.clock_monitor import is_untimed, watch_of
 from mlbatch.readers import merge, open_recording
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.types import Recording, StreamTable
@@ -238,7 +245,7 @@ def _count(
                 heads = sensor.lidar.heads(packets[good], hosts_ns)
                 count.loss.add(sensor.lidar.sequence(packets[good]), heads, hosts_ns)
                 _, newest_ns = extremes(heads)
-                if not is_untimed(untimed, sensor):
+                if has_receive_times(untimed, sensor):
                     count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
                 if count.first is None and heads.valid.any():
                     row, column = np.argwhere(heads.valid)[0]
@@ -274,7 +281,7 @@ def _counting(lidar: Lidar) -> _Count:
     """Nothing counted yet."""
     packet_ns = lidar.columns_per_packet * lidar.column_period_ns
     ring = RawRing(lidar.packet_size, lidar.records)
-    return _Count(ring, PacketLoss(lidar.sequence_modulus, packet_ns), watch_of(lidar))
+    return _Count(ring, PacketLoss(lidar.sequence_modulus, packet_ns), clock_watch(lidar))
 
 
 def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router) -> str:

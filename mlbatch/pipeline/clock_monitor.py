@@ -1,101 +1,96 @@
-"""The clocks of a run: what faults and maps do to stamps, and what watching them tells.
+"""Clocks of a run: maps on timestamps, watches of what is batched, warnings.
 
-Stamps pass here once, between the heads of packets and the batching: clock faults are added, then
-the maps of `--align-clocks`. What is batched is watched, so that the report can say how clocks ran.
+Timestamps are mapped once, between the column headers and the batching: injected clock faults are
+added, then the maps of `--align-clocks` applied. Batched timestamps are watched for the report.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, JumpGuard, extremes
 from mlbatch.clocks.compare import Comparison, compare
-from mlbatch.clocks.watch import ClockEstimate, ClockWatch
-from mlbatch.discovery.discover import Note, Setup
-from mlbatch.discovery.extrinsics import Mounted
-from mlbatch.discovery.sampler import Found
-from mlbatch.lidar.interface import Lidar
-from mlbatch.pipeline.ingest import Feeder
-from mlbatch.pipeline.session import feed_of
+from mlbatch.clocks.watch import ClockEstimate
+from mlbatch.discovery.discover import Note
+from mlbatch.discovery.router import Router
+from mlbatch.discovery.sampler import clock_watch
+from mlbatch.pipeline.ingest import Ingest
+from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import PacketBatch
 
 if TYPE_CHECKING:
-    from mlbatch.clocks.align import ClockMap
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
 
 SYNCHRONISED = "synchronised"
-# Codes of warnings by kind of jump.
+# Warning codes by kind of clock step.
 _WARNINGS = {"host": "host_step"}
 
 
-@dataclass(slots=True)
-class Timekeeper:
-    """What is known and done of the clocks of a session's sensors, by their numbers.
+class ClockMonitor:
+    """Maps and watches the clocks of the sensors of a run.
 
-    host_clocks: sensors whose stamps are arrivals, which nothing here changes; replay: None without
-    faults; untimed: numbers of streams as in StreamTable; maps: of `--align-clocks`, once they are
-    measured.
+    guards: for the batcher, one a sensor; they feed the watches and raise at clock steps.
     """
 
-    sensors: Sequence[Mounted]
-    host_clocks: Sequence[bool]
-    replay: FaultReplay | None
-    untimed: Collection[int]
-    maps: tuple[ClockMap | None, ...] = ()
-    guards: list[JumpGuard] = field(default_factory=list)
-    _watches: list[ClockWatch] = field(default_factory=list)
+    def __init__(self, sensors: Sequence[Sensor], replay: FaultReplay | None) -> None:
+        """replay: of injected faults, None without."""
+        self._sensors = sensors
+        self._replay = replay
+        self.guards = [
+            JumpGuard(
+                sensor.name,
+                # Delays cannot be measured where packets share the log time of a message.
+                sensor.clock.watch if sensor.clock.has_receive_times else None,
+                has_clock=not sensor.clock.by_host,
+            )
+            for sensor in sensors
+        ]
 
-    def __post_init__(self) -> None:
-        for sensor, by_host in zip(self.sensors, self.host_clocks, strict=True):
-            watch = watch_of(sensor.found.lidar)
-            self._watches.append(watch)
-            # Where packets share the log time of a message, their way cannot be told.
-            watched = None if is_untimed(self.untimed, sensor.found) else watch
-            self.guards.append(JumpGuard(sensor.name, watched, has_clock=not by_host))
-
-    def retime(self, number: int, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
-        """Stamps (P, C) of packets of a sensor as they are to be batched; host_ns: (P,)."""
-        if self.replay is not None:
-            stamp_ns = stamp_ns + self.replay.shift_ns(number, host_ns)[:, None]
-        found = self.maps[number] if self.maps else None
+    def map_stamps(self, sensor: Sensor, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
+        """Timestamps (P, C) of packets received at (P,) as they are to be batched."""
+        if self._replay is not None:
+            stamp_ns = stamp_ns + self._replay.shift_ns(sensor.index, host_ns)[:, None]
+        found = sensor.clock.map
         return stamp_ns if found is None else found.apply(stamp_ns, host_ns[:, None])
 
-    def align(self, batches: Iterator[PacketBatch], setup: Setup, to: str) -> None:
-        """Measure how the clocks run over a whole session, and map them from now on."""
+    def align(self, batches: Iterator[PacketBatch], router: Router, to: str) -> None:
+        """Measure the clocks over a whole session, and set the map of each sensor.
+
+        to: `host` or `first`, as in `--align-to`.
+        """
         from mlbatch.clocks.align import fit
 
-        watches = [watch_of(sensor.found.lidar) for sensor in self.sensors]
-        feeds = [feed_of(sensor) for sensor in self.sensors]
-        # Arrivals of sensors on the recorder's clock are needed as their own stamps, too.
-        feeder = Feeder(setup, feeds, self.host_clocks, self.retime)
-        if self.replay is not None:
-            batches = self.replay.batches(batches, feeder.owners)
+        # Rings and ledgers of their own: this pass reads everything once more.
+        sensors = [sensor.unread() for sensor in self._sensors]
+        watches = [clock_watch(sensor.lidar) for sensor in sensors]
+        ingest = Ingest(router, sensors, self.map_stamps)
+        if self._replay is not None:
+            batches = self._replay.batches(batches, ingest.owners)
+        nothing_kept = [None] * len(sensors)
         for batch in batches:
-            for arrival, watch in zip(
-                feeder.feed(batch, [None] * len(feeds)).arrivals, watches, strict=True
-            ):
+            arrivals = ingest.columns(batch, nothing_kept).arrivals
+            for arrival, watch in zip(arrivals, watches, strict=True):
                 if arrival is not None:
                     _, newest_ns = extremes(arrival.heads)
                     measured = newest_ns > NEVER
                     watch.add(newest_ns[measured], arrival.host_ns[measured])
-        self.maps = fit(watches, to)
+        for sensor, found in zip(self._sensors, fit(watches, to), strict=True):
+            sensor.clock.map = found
 
     def findings(self) -> list[tuple[str, ClockEstimate]]:
-        """What is known of the clock of each sensor that gave stamps of its own."""
-        pairs = zip(self.sensors, self._watches, strict=True)
-        found = ((sensor.name, watch.estimate()) for sensor, watch in pairs)
+        """Name and clock of each sensor that gave timestamps of its own."""
+        found = ((sensor.name, sensor.clock.watch.estimate()) for sensor in self._sensors)
         return [(name, finding) for name, finding in found if finding is not None]
 
     def comparison(self) -> Comparison | None:
-        """How the clocks agree; None where no sensor gave stamps of its own."""
+        """Agreement of the clocks; None if no sensor gave timestamps of its own."""
         findings = self.findings()
         return compare(findings) if findings else None
 
     def notes(self) -> list[Note]:
-        """Warnings: jumps of clocks, steps of the recorder's, clocks that do not run together."""
+        """Warnings: steps of sensor clocks and of the capture host's, clocks that differ."""
         comparison = self.comparison()
         if comparison is None:
             return []
@@ -110,13 +105,3 @@ class Timekeeper:
             if pair.verdict != SYNCHRONISED
         ]
         return notes
-
-
-def is_untimed(untimed: Collection[int], sensor: Found) -> bool:
-    """Whether a sensor's packets have no arrival times of their own."""
-    return any(stream in untimed for stream, _ in sensor.kinds)
-
-
-def watch_of(lidar: Lidar) -> ClockWatch:
-    """A watch for the clock of a sensor."""
-    return ClockWatch(period_ns=lidar.clock_period_ns, mode=lidar.timestamp_mode)

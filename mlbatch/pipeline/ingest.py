@@ -1,110 +1,96 @@
-"""From batches of packets to arrivals of sensors: routing, first checks, raw pixels into rings."""
+"""Packets of a batch to columns of sensors: routing, validity, raw packets into rings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Arrival
-from mlbatch.decode.packet_ring import RawRing
-from mlbatch.discovery.discover import Setup
-from mlbatch.discovery.sampler import Kind, Role, split_by_kind
-from mlbatch.lidar.interface import FAULTS, Lidar
-from mlbatch.report.ledger import SensorLedger
+from mlbatch.discovery.router import Role, Router
+from mlbatch.discovery.sampler import Kind, split_by_kind
+from mlbatch.lidar.interface import FAULTS
+from mlbatch.pipeline.sensor import Sensor
 from mlbatch.sensors import content_keys
 from mlbatch.types import ImuSamples, PacketBatch
 
-# Copies are looked for among so many IMU packets.
+# Duplicate IMU packets are detected among this many.
 RECENT_IMU = 64
-# Sensor, stamps (P, C) and arrivals (P,) of its packets: stamps as they are to be batched.
-Retime = Callable[[int, I64Array, I64Array], I64Array]
+# Maps timestamps (P, C) of packets of a sensor, received at (P,), to those that are batched.
+StampMap = Callable[[Sensor, I64Array, I64Array], I64Array]
 
 
 @dataclass(slots=True)
-class Feed:
-    """One sensor's way into the batching."""
-
-    lidar: Lidar
-    ring: RawRing
-    ledger: SensorLedger = field(default_factory=SensorLedger)
-
-
-@dataclass(slots=True)
-class Fed:
-    """What a batch brought: an arrival for each sensor (or None), and IMU samples."""
+class Ingested:
+    """Content of a batch: an arrival for each sensor (None: no packet of it), IMU samples."""
 
     arrivals: list[Arrival | None]
     imu: list[ImuSamples]
 
 
-class Feeder:
-    """Sorts packets to their sensors.
+class Ingest:
+    """Assigns packets to sensors and reads their column headers; pixels stay raw.
 
-    What belongs to none is counted in `unassigned`; `samples` has one of each kind, (1, size).
+    unassigned: packets of no sensor, by kind; samples: one packet of each such kind, (1, size).
     """
 
     def __init__(
-        self,
-        setup: Setup,
-        feeds: Sequence[Feed],
-        host_clocks: Sequence[bool],
-        retime: Retime | None = None,
+        self, router: Router, sensors: Sequence[Sensor], stamp_map: StampMap | None = None
     ) -> None:
-        """retime: what becomes of stamps before they are batched; None: nothing."""
+        """stamp_map: applied to timestamps before they are batched; None: unchanged."""
         self.unassigned: dict[Kind, int] = {}
         self.samples: dict[Kind, U8Array] = {}
-        self._router = setup.router
-        self._feeds = list(feeds)
-        self._host_clocks = list(host_clocks)
-        self._retime = retime
-        self._recent: list[I64Array] = [np.empty(0, np.int64) for _ in self._feeds]
+        self._router = router
+        self._sensors = list(sensors)
+        self._stamp_map = stamp_map
+        self._recent_imu: list[I64Array] = [np.empty(0, np.int64) for _ in self._sensors]
 
-    def feed(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Fed:
-        """Route a batch, copy lidar packets to their rings and read their heads."""
-        own: list[list[I64Array]] = [[] for _ in self._feeds]
-        fed = Fed([None] * len(self._feeds), [])
+    def columns(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Ingested:
+        """Route a batch, copy lidar packets to their rings and read their column headers.
+
+        oldest_places: first ring place that is still needed, of each sensor.
+        """
+        own: list[list[I64Array]] = [[] for _ in self._sensors]
+        ingested = Ingested([None] * len(self._sensors), [])
         owned = np.zeros(len(batch), bool)
         shared: list[tuple[Kind, I64Array]] = []
         for kind, index in split_by_kind(batch):
-            begin = int(batch.start[index[0]])
-            route = self._router.route(kind, batch.data[begin : begin + kind[1]])
+            route = self._router.route(kind, _payload(batch, int(index[0]), kind))
             if route.role is Role.LIDAR:
                 shared.append((kind, index))
                 for number in route.sensors:
                     own[number].append(index)
             elif route.role is Role.IMU:
-                fed.imu += self._imu(batch, index, route.sensors[0])
+                ingested.imu += self._imu(batch, index, self._sensors[route.sensors[0]])
             elif route.role is Role.BAD_SIZE:
-                packets = self._feeds[route.sensors[0]].ledger.packets
+                packets = self._sensors[route.sensors[0]].ledger.packets
                 packets.read += len(index)
                 packets.reject("bad_size", len(index))
             else:
                 self._unassign(kind, batch, index)
-        for number, parts in enumerate(own):
+        for sensor, parts, oldest_place in zip(self._sensors, own, oldest_places, strict=True):
             if parts:
                 index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
-                fed.arrivals[number] = self._arrive(
-                    number, batch, index, owned, oldest_places[number]
-                )
+                arrival = self._arrive(sensor, batch, index, owned, oldest_place)
+                ingested.arrivals[sensor.index] = arrival
         if not owned.all():
             for kind, index in shared:
                 self._unassign(kind, batch, index[~owned[index]])
-        return fed
+        return ingested
 
     def owners(self, batch: PacketBatch) -> I64Array:
-        """Number of the sensor that each packet is of, its IMU included; -1 of none."""
+        """Index of the sensor that sent each packet, IMU packets included; -1: no sensor."""
         owner = np.full(len(batch), -1, np.int64)
         for kind, index in split_by_kind(batch):
-            begin = int(batch.start[index[0]])
-            route = self._router.route(kind, batch.data[begin : begin + kind[1]])
+            route = self._router.route(kind, _payload(batch, int(index[0]), kind))
             if len(route.sensors) == 1:
                 owner[index] = route.sensors[0]
                 continue
             for number in route.sensors:
-                lidar, left = self._feeds[number].lidar, index[owner[index] < 0]
+                lidar = self._sensors[number].lidar
+                left = index[owner[index] < 0]
                 packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
                 owner[left[lidar.owns(packets)]] = number
         return owner
@@ -114,20 +100,20 @@ class Feeder:
             return
         self.unassigned[kind] = self.unassigned.get(kind, 0) + len(index)
         if kind not in self.samples:
-            begin = int(batch.start[index[0]])
-            self.samples[kind] = batch.data[begin : begin + kind[1]][None].copy()
+            self.samples[kind] = _payload(batch, int(index[0]), kind)[None].copy()
 
     def _arrive(
         self,
-        number: int,
+        sensor: Sensor,
         batch: PacketBatch,
         index: I64Array,
         owned: BoolArray,
         oldest_place: int | None,
     ) -> Arrival:
-        feed = self._feeds[number]
-        lidar, counts = feed.lidar, feed.ledger.packets
-        packets, place = feed.ring.store(batch.data, batch.start[index], oldest_place)
+        """Copy packets that may be of a sensor to its ring; give those that are, and are valid."""
+        lidar = sensor.lidar
+        counts = sensor.ledger.packets
+        packets, place = sensor.ring.store(batch.data, batch.start[index], oldest_place)
         good = lidar.owns(packets) & ~owned[index]
         counts.read += int(np.count_nonzero(good))
         owned[index] |= good
@@ -137,11 +123,13 @@ class Feeder:
                 counts.reject(FAULTS[fault], count)
             good &= faults == 0
         if not good.all():
-            packets, place, index = packets[good], place[good], index[good]
+            packets = packets[good]
+            place = place[good]
+            index = index[good]
         host_ns = batch.host_ns[index]
         heads = lidar.heads(packets, host_ns)
-        if self._retime is not None:
-            heads.stamp_ns = self._retime(number, heads.stamp_ns, host_ns)
+        if self._stamp_map is not None:
+            heads.stamp_ns = self._stamp_map(sensor, heads.stamp_ns, host_ns)
         return Arrival(
             position=index,
             host_ns=host_ns,
@@ -150,35 +138,43 @@ class Feeder:
             place=place,
         )
 
-    def _fresh(self, number: int, key: I64Array) -> BoolArray:
-        """Which IMU packets (n,) of a sensor are no copies of recent ones, by their content."""
-        keys = np.concatenate([self._recent[number], key])
-        _, first = np.unique(keys, return_index=True)
-        fresh = np.zeros(len(keys), np.bool_)
-        fresh[first] = True
-        self._recent[number] = keys[-RECENT_IMU:]
-        return fresh[len(keys) - len(key) :]
-
-    def _imu(self, batch: PacketBatch, index: I64Array, number: int) -> list[ImuSamples]:
-        feed = self._feeds[number]
-        feed.ledger.imu_packets += len(index)
+    def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:
+        """Samples of IMU packets; duplicates are counted and left out."""
+        ledger = sensor.ledger
+        ledger.imu_packets += len(index)
         payloads = batch.data[batch.start[index, None] + np.arange(int(batch.size[index[0]]))]
-        fresh = self._fresh(number, content_keys(payloads))
+        fresh = self._fresh_imu(sensor, content_keys(payloads))
         if not fresh.all():
-            again = len(feed.lidar.imu(payloads[~fresh], number).stamp_ns)
-            feed.ledger.imu_samples.decoded += again
-            feed.ledger.imu_samples.drop("duplicate", again)
-            payloads, index = payloads[fresh], index[fresh]
-        if not self._host_clocks[number] and self._retime is None:
-            return [feed.lidar.imu(payloads, number)]
+            again = len(sensor.lidar.imu(payloads[~fresh], sensor.index).stamp_ns)
+            ledger.imu_samples.decoded += again
+            ledger.imu_samples.drop("duplicate", again)
+            payloads = payloads[fresh]
+            index = index[fresh]
+        if not sensor.clock.by_host and self._stamp_map is None:
+            return [sensor.lidar.imu(payloads, sensor.index)]
         samples = []
         for host_ns, payload in zip(batch.host_ns[index].tolist(), payloads, strict=True):
-            sample = feed.lidar.imu(payload[None], number)
-            if not self._host_clocks[number] and self._retime is not None:
+            sample = sensor.lidar.imu(payload[None], sensor.index)
+            if not sensor.clock.by_host and self._stamp_map is not None:
                 stamps_ns = sample.stamp_ns[None]
-                sample.stamp_ns = self._retime(number, stamps_ns, np.array([host_ns]))[0]
+                sample.stamp_ns = self._stamp_map(sensor, stamps_ns, np.array([host_ns]))[0]
             elif len(sample.stamp_ns):
-                # Ages first: damaged stamps may be too large to be added to an arrival.
+                # Subtract first: damaged timestamps may overflow if added to a receive time.
                 sample.stamp_ns = sample.stamp_ns - sample.stamp_ns[-1:] + host_ns
             samples.append(sample)
         return samples
+
+    def _fresh_imu(self, sensor: Sensor, key: I64Array) -> BoolArray:
+        """Mask (n,) of the IMU packets whose content differs from that of recent ones."""
+        keys = np.concatenate([self._recent_imu[sensor.index], key])
+        _, first = np.unique(keys, return_index=True)
+        fresh = np.zeros(len(keys), np.bool_)
+        fresh[first] = True
+        self._recent_imu[sensor.index] = keys[-RECENT_IMU:]
+        return fresh[len(keys) - len(key) :]
+
+
+def _payload(batch: PacketBatch, number: int, kind: Kind) -> U8Array:
+    """Payload of one packet of a kind."""
+    begin = int(batch.start[number])
+    return batch.data[begin : begin + kind[1]]

@@ -1,4 +1,9 @@
-"""IMU samples on their way past the batching: kept until the scan of their time is out."""
+"""IMU samples and recorded messages: not batched, written with the scan of their time.
+
+Recorded Imu messages are written only if scans are on an epoch clock within 1 s of theirs, at their
+own timestamps; messages of other topics byte for byte at their log time. IMU samples of lidars keep
+the clock of their lidar.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +18,92 @@ import numpy as np
 from mlbatch.arrays import BoolArray
 from mlbatch.batching.intake import STAMP_LIMIT_NS
 from mlbatch.errors import UsageError
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.sensor import Sensor
 from mlbatch.report.ledger import DecodedCounts
-from mlbatch.types import ImuSamples, Message, Recording, Topic
+from mlbatch.types import IMU, MESSAGE_ENCODINGS, ImuSamples, Message, Recording, Topic
 from mlbatch.units import NS_PER_S
+
+IMU_TYPE = "sensor_msgs/Imu"
+PASS_REASONS = ("no_place", "bad_stamp", "outside_time", "other_clock")
+# Never forward a recorded /tf_static: the writers publish their own.
+OWN_TOPIC = "/tf_static"
+NEAR_NS = NS_PER_S
+# Two words of the timestamp in a message's header, by encoding (docs/sources/messages.md, section
+# 1): after 4 bytes of CDR encapsulation, or after the sequence number of ROS 1.
+_STAMP = {"cdr": struct.Struct("<4xiI"), "ros1": struct.Struct("<4xII")}
+
+# Lower and upper end of --start/--end, ns; None: no limit.
+TimeLimits = tuple[int | None, int | None]
+
+
+class Passthrough:
+    """What a run forwards beside its scans: IMU samples of lidars, messages of bags."""
+
+    def __init__(self, sensors: Sequence[Sensor], job: Job) -> None:
+        self.imu = ImuQueue(
+            [sensor.ledger.imu_samples for sensor in sensors],
+            [sensor.clock.imu_offset_ns for sensor in sensors],
+            has_place=IMU in job.extras,
+        )
+        self.messages = MessageQueue(
+            job.passed, MESSAGE_ENCODINGS & job.extras, job.segment.begin_ns
+        )
+
+    def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
+        """Raise UsageError for a pattern that matches no topic of the recordings."""
+        self.messages.refuse_unknown(recordings)
+
+    def subscribe(self, recordings: Iterable[Recording]) -> None:
+        """Ask the recordings for the messages to forward."""
+        self.messages.subscribe(recordings)
+
+    def add(
+        self, imu: Iterable[ImuSamples], messages: Iterable[Message], limits_ns: TimeLimits
+    ) -> None:
+        """Add IMU samples and messages of a batch; what is before `--start` is dropped at once."""
+        for samples in imu:
+            self.imu.add(samples)
+        self.messages.add(messages)
+        low_ns, _ = limits_ns
+        if low_ns is not None:
+            # Otherwise all of it would wait for the first scan.
+            self.imu.drop_before(low_ns)
+            self.messages.drop_before(low_ns)
+
+    def drain_until(
+        self, end_ns: int | None, limits_ns: TimeLimits, clock_offset_ns: int | None
+    ) -> list[ImuSamples | Message]:
+        """IMU samples, then messages, before `end_ns` (None: all) and inside the limits.
+
+        clock_offset_ns: scan clock minus receive time; None where scans are on no epoch clock.
+        """
+        return [
+            *self.imu.drain_until(end_ns, limits_ns),
+            *self.messages.drain_until(end_ns, limits_ns, clock_offset_ns),
+        ]
 
 
 class ImuQueue:
-    """Samples of all sensors, counted in `counts`; nothing is kept for an output without a place.
+    """IMU samples of all lidars.
 
-    offsets_ns: added to the stamps of each sensor, as to those of its columns.
+    counts: counters of each sensor; offsets_ns: added to the timestamps of each sensor; has_place:
+    False if the output has no place for samples; then none is kept.
     """
 
     def __init__(
-        self, counts: Sequence[DecodedCounts], offsets_ns: Sequence[int], *, wanted: bool
+        self, counts: Sequence[DecodedCounts], offsets_ns: Sequence[int], *, has_place: bool
     ) -> None:
         self._counts = list(counts)
         self._offsets_ns = list(offsets_ns)
-        self._wanted = wanted
+        self._has_place = has_place
         self._waiting: list[ImuSamples] = []
 
     def add(self, samples: ImuSamples) -> None:
-        """Take in samples of one sensor."""
+        """Add samples of one sensor."""
         counts = self._counts[samples.sensor]
         counts.decoded += len(samples.stamp_ns)
-        if not self._wanted:
+        if not self._has_place:
             counts.drop("no_place", len(samples.stamp_ns))
             return
         samples.stamp_ns = samples.stamp_ns + self._offsets_ns[samples.sensor]
@@ -46,28 +113,27 @@ class ImuQueue:
             self._waiting.append(samples)
 
     def drop_before(self, low_ns: int) -> None:
-        """Drop what lies before the first limit, so that it need not wait for a scan."""
+        """Drop samples before the first limit."""
         kept = [self._kept(one, one.stamp_ns >= low_ns, "outside_time") for one in self._waiting]
         self._waiting = [samples for samples in kept if len(samples.stamp_ns)]
 
-    def take(
-        self, until_ns: int | None, limits_ns: tuple[int | None, int | None]
-    ) -> list[ImuSamples]:
-        """Samples before `until_ns` (None: all) and inside the limits, by stamp."""
-        low, high = limits_ns
-        taken, later = [], []
+    def drain_until(self, end_ns: int | None, limits_ns: TimeLimits) -> list[ImuSamples]:
+        """Samples before `end_ns` (None: all) and inside the limits, by timestamp."""
+        low_ns, high_ns = limits_ns
+        taken = []
+        later = []
         for number in sorted({samples.sensor for samples in self._waiting}):
             samples = _in_order([one for one in self._waiting if one.sensor == number])
-            upto = len(samples.stamp_ns)
-            if until_ns is not None:
-                upto = int(np.searchsorted(samples.stamp_ns, until_ns))
-                later.append(_part(samples, slice(upto, None)))
-            samples = _part(samples, slice(0, upto))
-            inside = np.ones(upto, bool)
-            if low is not None:
-                inside &= samples.stamp_ns >= low
-            if high is not None:
-                inside &= samples.stamp_ns < high
+            count = len(samples.stamp_ns)
+            if end_ns is not None:
+                count = int(np.searchsorted(samples.stamp_ns, end_ns))
+                later.append(_part(samples, slice(count, None)))
+            samples = _part(samples, slice(0, count))
+            inside = np.ones(count, bool)
+            if low_ns is not None:
+                inside &= samples.stamp_ns >= low_ns
+            if high_ns is not None:
+                inside &= samples.stamp_ns < high_ns
             samples = self._kept(samples, inside, "outside_time")
             if len(samples.stamp_ns):
                 self._counts[number].written += len(samples.stamp_ns)
@@ -83,7 +149,7 @@ class ImuQueue:
 
 
 def _in_order(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of one sensor as one, by stamp: packets may have overtaken each other."""
+    """Samples of one sensor as one, by timestamp: packets may be reordered."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     order = np.argsort(stamp_ns, kind="stable")
     return ImuSamples(
@@ -103,23 +169,8 @@ def _part(samples: ImuSamples, which: BoolArray | slice) -> ImuSamples:
     )
 
 
-# Messages of a recording that go to the output as they are: IMU topics, and those of `--pass`.
-#
-# CONTRACT.md section 3: recorded Imu topics only if scans are on an epoch clock within 1 s of
-# them, all at their own stamps; other topics byte for byte at their log time.
-
-IMU_TYPE = "sensor_msgs/Imu"
-PASS_REASONS = ("no_place", "bad_stamp", "outside_time", "other_clock")
-# Ours says where the sensors are; a second one could contradict it.
-OWN_TOPIC = "/tf_static"
-NEAR_NS = NS_PER_S
-# Where the stamp of a message's header begins, and its two words, by encoding (facts/messages.md
-# section 1): CDR has 4 bytes of its own before it, ROS 1 a sequence number.
-_STAMP = {"cdr": struct.Struct("<4xiI"), "ros1": struct.Struct("<4xII")}
-
-
 @dataclass(slots=True)
-class PassCounts:
+class MessageCounts:
     """Messages of one topic: read = written + sum(dropped); reasons as in PASS_REASONS."""
 
     read: int = 0
@@ -132,7 +183,7 @@ class PassCounts:
 
 
 def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]:
-    """Names of topics to hand over: all Imu topics, and those that a pattern names."""
+    """Names of the topics to forward: all Imu topics, and those that match a pattern."""
     return frozenset(
         topic.name
         for topic in topics
@@ -140,55 +191,56 @@ def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]
     ) - {OWN_TOPIC}
 
 
-class PassQueue:
-    """Holds messages until the scan of their time is out; `counts` by topic."""
+class MessageQueue:
+    """Recorded messages until the scan of their time is written; `counts` by topic."""
 
     def __init__(
         self, patterns: Sequence[str], encodings: frozenset[str], begin_ns: int | None = None
     ) -> None:
-        """encodings: those that the output has a place for; begin_ns: arrival where a part begins.
+        """encodings: those that the output can store; begin_ns: start of a segment (receive time).
 
-        Of what came before the part only latched messages are taken, as by a late subscriber.
+        Of what was received before the segment only latched messages are taken, as by a subscriber
+        that joins late.
         """
-        self.counts: dict[str, PassCounts] = {}
+        self.counts: dict[str, MessageCounts] = {}
         self._patterns = list(patterns)
         self._encodings = encodings
         self._begin_ns = begin_ns
-        # A heap by stamp, then arrival: recordings hold messages in any order.
+        # A heap by timestamp, then file order: recordings hold messages in any order.
         self._waiting: list[tuple[int, int, Message]] = []
-        self._arrived = 0
+        self._added = 0
 
     @property
     def waiting(self) -> int:
-        """Messages whose time has not come."""
+        """Number of messages in the queue."""
         return len(self._waiting)
 
     @property
-    def has_room(self) -> bool:
-        """Whether the output takes messages at all."""
+    def has_place(self) -> bool:
+        """True if the output can store messages at all."""
         return bool(self._encodings)
 
-    def keep(self, recordings: Iterable[Recording]) -> None:
-        """Have recordings hand over what is selected."""
+    def subscribe(self, recordings: Iterable[Recording]) -> None:
+        """Ask the recordings for the selected topics."""
         for recording in recordings:
             recording.keep = selected(recording.topics, self._patterns)
 
     def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
-        """Refuse a pattern that no topic of the recordings matches."""
+        """Raise UsageError for a pattern that matches no topic of the recordings."""
         names = [topic.name for recording in recordings for topic in recording.topics]
         for pattern in self._patterns:
             if not any(fnmatchcase(name, pattern) for name in names):
                 raise UsageError(
-                    f"--pass {pattern}: wanted a topic of the recording, got none that matches; "
-                    "see `mlbatch inspect`"
+                    f"--pass {pattern}: expected a topic of the recording, found none that "
+                    "matches; see `mlbatch inspect`"
                 )
 
     def add(self, messages: Iterable[Message]) -> None:
-        """Take in messages, in file order."""
+        """Add messages, in file order."""
         for message in messages:
-            if self._is_of_earlier_part(message):
+            if self._is_of_earlier_segment(message):
                 continue
-            counts = self.counts.setdefault(message.topic.name, PassCounts())
+            counts = self.counts.setdefault(message.topic.name, MessageCounts())
             counts.read += 1
             if message.topic.encoding not in self._encodings:
                 counts.drop("no_place")
@@ -200,37 +252,39 @@ class PassQueue:
                     counts.drop("bad_stamp")
                     continue
                 stamp_ns = own_ns
-            heapq.heappush(self._waiting, (stamp_ns, self._arrived, message))
-            self._arrived += 1
+            heapq.heappush(self._waiting, (stamp_ns, self._added, message))
+            self._added += 1
 
-    def _is_of_earlier_part(self, message: Message) -> bool:
-        """Whether a message that came to teach belongs to the output of an earlier part."""
+    def _is_of_earlier_segment(self, message: Message) -> bool:
+        """True for a message read for its metadata that is output of an earlier segment."""
         begin_ns = self._begin_ns
         return begin_ns is not None and message.host_ns < begin_ns and not message.topic.latched
 
     def drop_before(self, low_ns: int) -> None:
-        """Drop what lies before the first limit, so that it need not wait for a scan."""
+        """Drop messages before the first limit."""
         while self._waiting and self._waiting[0][0] < low_ns:
             _, _, message = heapq.heappop(self._waiting)
             self.counts[message.topic.name].drop("outside_time")
 
-    def take(
-        self, until_ns: int | None, limits_ns: tuple[int | None, int | None], offset_ns: int | None
+    def drain_until(
+        self, end_ns: int | None, limits_ns: TimeLimits, clock_offset_ns: int | None
     ) -> list[Message]:
-        """Messages before `until_ns` (None: all), at the times they are written at.
+        """Messages before `end_ns` (None: all), at the times they are written at.
 
-        offset_ns: scan clock minus arrival, None where scans are not on an epoch clock.
+        clock_offset_ns: scan clock minus receive time, None where scans are on no epoch clock.
         """
-        low, high = limits_ns
-        if low is not None:
-            self.drop_before(low if until_ns is None else min(low, until_ns))
+        low_ns, high_ns = limits_ns
+        if low_ns is not None:
+            self.drop_before(low_ns if end_ns is None else min(low_ns, end_ns))
         taken = []
-        while self._waiting and (until_ns is None or self._waiting[0][0] < until_ns):
+        while self._waiting and (end_ns is None or self._waiting[0][0] < end_ns):
             stamp_ns, _, message = heapq.heappop(self._waiting)
             counts = self.counts[message.topic.name]
-            if high is not None and stamp_ns >= high:
+            if high_ns is not None and stamp_ns >= high_ns:
                 counts.drop("outside_time")
-            elif message.topic.type == IMU_TYPE and not _is_near(stamp_ns, message, offset_ns):
+            elif message.topic.type == IMU_TYPE and not _is_near(
+                stamp_ns, message, clock_offset_ns
+            ):
                 counts.drop("other_clock")
             else:
                 counts.written += 1
@@ -239,7 +293,7 @@ class PassQueue:
 
 
 def header_stamp_ns(message: Message) -> int | None:
-    """Stamp of a message that begins with a Header, ns; None if it has none that makes sense."""
+    """Timestamp of a message that begins with a Header, ns; None if it is not a plausible one."""
     words = _STAMP.get(message.topic.encoding)
     if words is None or len(message.data) < words.size:
         return None
@@ -249,6 +303,8 @@ def header_stamp_ns(message: Message) -> int | None:
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
-def _is_near(stamp_ns: int, message: Message, offset_ns: int | None) -> bool:
-    """Whether an IMU's clock is that of the scans, both seen from the recorder's."""
-    return offset_ns is not None and abs(stamp_ns - message.host_ns - offset_ns) <= NEAR_NS
+def _is_near(stamp_ns: int, message: Message, clock_offset_ns: int | None) -> bool:
+    """True if an IMU's clock is that of the scans, both relative to the capture host's."""
+    if clock_offset_ns is None:
+        return False
+    return abs(stamp_ns - message.host_ns - clock_offset_ns) <= NEAR_NS

@@ -1,7 +1,7 @@
-"""A conversion with its writer: every scan is written, or nothing under a final name.
+"""A conversion with its output: every scan is written, or nothing under a final name.
 
 One thread reads, batches and decodes, another writes. With `--jobs N` one thread reads and batches,
-and N of them decode and write, each a scan.
+and N decode and write, a scan each.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.errors import NoScanError, RecordingError
-from mlbatch.pipeline import accounts
-from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline import run_report
+from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
+from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import Course
-from mlbatch.pipeline.scan_task import Bench, Decoded, LeftOut, Task
-from mlbatch.pipeline.workers import Steps, Workers, in_one_go
-from mlbatch.report.report import ReportInputs, imbalances, report_text
-from mlbatch.types import ImuSamples, Message, RunInfo, Summary
+from mlbatch.pipeline.resume import ResumeLog
+from mlbatch.pipeline.scan_task import ScanTask, forward
+from mlbatch.pipeline.workers import OrderedWorkers, run_inline
+from mlbatch.report.report import RunReport, imbalances, report_text
+from mlbatch.types import RunInfo, Summary
 from mlbatch.writers import ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
-# Given what the report is made of, and the complete output before it gets its final name.
-Last = Callable[[ReportInputs, Path], None]
-# Scans that one thread decodes ahead of the one that writes.
+# Called with the content of the report and the complete output, before that gets its final name.
+Last = Callable[[RunReport, Path], None]
+# Decode-ahead depth (scans) of the one thread that decodes.
 _AHEAD = 2
-# Tasks that several threads find waiting, when they are done with theirs.
+# Tasks that wait for several threads.
 _WAITING = 2
 
 
@@ -36,27 +36,27 @@ def convert(
     job: Job,
     open_writer: OpenWriter | None,
     progress: Progress | None = None,
-    course: Course | None = None,
+    resume_log: ResumeLog | None = None,
     last: Last | None = None,
-) -> tuple[Conversion, ReportInputs]:
-    """Run a job; open_writer None is a dry run. Gives the run and what its report is made of.
+) -> tuple[Conversion, RunReport]:
+    """Run a job; returns the run and the content of its report.
 
-    course: of the output, so that an interrupted run can be resumed.
+    open_writer: None in a dry run; resume_log: of the output, so that the run can be resumed.
     """
-    # One more than wait to be written: the one that is being decoded.
-    waits = job.jobs == 1 and open_writer is not None
-    run = Conversion(job, buffers=_AHEAD + 1 if waits else 1)
-    if course is not None:
-        course.join(run)
-    output = _Output(run, open_writer, course)
+    # One scan more than are waiting to be written: the one that is being decoded.
+    decodes_ahead = job.jobs == 1 and open_writer is not None
+    run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1)
+    if resume_log is not None:
+        resume_log.join(run)
+    output = _Output(run, open_writer, resume_log)
     try:
         output.make(progress)
         run.close()
-        if course is not None:
-            course.complete()
+        if resume_log is not None:
+            resume_log.complete()
         inputs = _finish(run, output.writer, last)
-        if course is not None:
-            course.remove()
+        if resume_log is not None:
+            resume_log.remove()
         output.writer = None
     except NoScanError:
         output.discard()
@@ -64,158 +64,97 @@ def convert(
     finally:
         if output.writer is not None:
             output.writer.abandon()
-        if course is not None:
-            course.settle()
+        if resume_log is not None:
+            resume_log.sync()
     return run, inputs
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """A scan on its way into the output; task None: what passes by where there is no scan.
-
-    is_kept: a continued output holds it; before: what comes before it; decoded: None where that is
-    still to be done.
-    """
-
-    task: Task | None
-    is_kept: bool
-    before: list[ImuSamples | Message]
-    decoded: Decoded | None
-
-
 class _Output:
-    """The output under construction; `writer` is None as long as it is not begun, or never."""
+    """The output under construction; `writer` is None before the first scan, and in a dry run."""
 
     def __init__(
-        self, run: Conversion, open_writer: OpenWriter | None, course: Course | None
+        self, run: Conversion, open_writer: OpenWriter | None, resume_log: ResumeLog | None
     ) -> None:
         self.writer: ScanWriter | None = None
         self._run = run
         self._open_writer = open_writer
-        self._course = course
-        self._jobs = run.job.jobs
-        self._idle: list[Bench] = []
+        self._resume_log = resume_log
+        self._idle: list[DecodeWorker] = []
         self._is_begun = False
         self._scans = 0
 
     def make(self, progress: Progress | None) -> None:
         """Decode and write all scans."""
-        run, alone = self._run, self._jobs == 1
-        ahead = _AHEAD if alone else self._jobs + _WAITING
+        run = self._run
+        jobs = run.job.jobs
+        ahead = _AHEAD if jobs == 1 else jobs + _WAITING
         with (
             contextlib.closing(run.tasks(progress)) as tasks,
-            Workers(self._steps, self._jobs, ahead) as workers,
+            OrderedWorkers[ScanTask](jobs, ahead) as workers,
         ):
             for item in tasks:
-                task = None if isinstance(item, LeftOut) else item
-                before = run.take_passing(item.end_ns)
-                if task is None and not before:
+                scan_task = self._scan_task(item)
+                if scan_task is None:
                     continue
-                self._begin()
-                piece = self._piece(task, before)
-                if alone and self._open_writer is None:
-                    # There is nothing to write that another thread could do meanwhile.
-                    in_one_go(self._steps(piece))
+                if jobs == 1:
+                    scan_task.decode_with(run.pool.workers[0])
+                if jobs == 1 and self._open_writer is None:
+                    # Nothing to write that another thread could do meanwhile.
+                    run_inline(scan_task)
                 else:
-                    workers.put(piece)
+                    workers.put(scan_task)
             workers.finish()
 
-    def _piece(self, task: Task | None, before: list[ImuSamples | Message]) -> _Piece:
-        if task is None:
-            return _Piece(None, False, before, None)
-        is_kept = self._course is not None and self._scans < self._course.done
-        self._scans += 1
-        decoded = None
-        if self._jobs == 1:
-            began_s = time.perf_counter()
-            decoded = self._run.benches[0].decode(task)
-            self._run.stages.decode_s += time.perf_counter() - began_s
-        return _Piece(task, is_kept, before, decoded)
-
-    def discard(self) -> None:
-        """Remove the output: without a scan there is nothing to go on from."""
-        if self.writer is not None:
-            self.writer.abandon()
-            self.writer = None
-        if self._course is not None:
-            self._course.discard()
+    def _scan_task(self, item: DecodeTask | SkippedWindow) -> ScanTask | None:
+        """The task of a scan with the messages before it; None if there is nothing to write."""
+        task = None if isinstance(item, SkippedWindow) else item
+        before = self._run.passed_through(item.end_ns)
+        if task is None and not before:
+            return None
+        self._begin()
+        is_kept = False
+        if task is not None:
+            is_kept = self._resume_log is not None and self._scans < self._resume_log.done
+            self._scans += 1
+        return ScanTask(
+            self._run,
+            task,
+            before,
+            self.writer,
+            self._idle,
+            self._resume_log,
+            is_kept=is_kept,
+        )
 
     def _begin(self) -> None:
-        """Open the output, now that it is known what its scans say of themselves; once."""
+        """Open the output, once the headers of its scans are known."""
         if self._is_begun:
             return
         self._is_begun = True
-        self._idle.extend(self._run.benches)
+        self._idle.extend(self._run.pool.workers)
         if self._open_writer is not None and self._run.info is not None:
-            if self._course is not None:
-                # Before anything of the output is touched: another run may have begun it meanwhile.
-                self._course.begin()
+            if self._resume_log is not None:
+                # Locks the output before anything of it is touched: another run may have begun it.
+                self._resume_log.begin()
             self.writer = self._open_writer(self._run.info)
 
-    def _steps(self, piece: _Piece) -> Steps:
-        """What a thread does for a scan, or for what passes by without one; see `Workers`."""
-        bench, decoded, began_s = None, piece.decoded, time.perf_counter()
-        if piece.task is not None and decoded is None:
-            bench = self._idle.pop()
-            decoded = bench.decode(piece.task)
-        decode_s = time.perf_counter() - began_s
-        watch, writing = _Watch(), self._writing(piece, decoded)
-        watch.do(writing)
-        yield
-        if decoded is not None:
-            self._run.account(decoded.scan)
-        for item in piece.before:
-            _hand_over(item, self.writer)
-        watch.do(writing)
-        yield
-        watch.do(writing)
-        yield
-        watch.do(writing)
-        if decoded is not None and self._course is not None and self.writer is not None:
-            self._course.note(decoded.fates, self.writer)
-        self._run.stages.write_s += watch.spent_s
-        if bench is not None:
-            self._run.stages.decode_s += decode_s
-            self._idle.append(bench)
-
-    def _writing(self, piece: _Piece, decoded: Decoded | None) -> Steps:
-        if self.writer is None:
-            return iter(())
-        if piece.task is None or decoded is None:
-            return self.writer.flush()
-        write = self.writer.pass_over if piece.is_kept else self.writer.write
-        return write(decoded.scan, piece.task.only)
+    def discard(self) -> None:
+        """Remove the output: without a scan there is nothing to resume."""
+        if self.writer is not None:
+            self.writer.abandon()
+            self.writer = None
+        if self._resume_log is not None:
+            self._resume_log.discard()
 
 
-@dataclass(slots=True)
-class _Watch:
-    """Measures the time that parts of a task take, without the waiting between them."""
-
-    spent_s: float = 0.0
-
-    def do(self, steps: Steps) -> None:
-        """Do the next part."""
-        began_s = time.perf_counter()
-        next(steps, None)
-        self.spent_s += time.perf_counter() - began_s
-
-
-def _hand_over(item: ImuSamples | Message, writer: ScanWriter | None) -> None:
-    if writer is None:
-        return
-    if isinstance(item, Message):
-        writer.write_message(item)
-    else:
-        writer.write_imu(item)
-
-
-def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> ReportInputs:
-    """Hand over what is left, close the ledgers and complete the output."""
+def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> RunReport:
+    """Write the last messages, check the ledgers and complete the output."""
     began_s = time.perf_counter()
-    for item in run.take_passing(None):
-        _hand_over(item, writer)
-    run.tell_of_passed()
-    inputs = accounts.report_inputs(run)
+    for item in run.passed_through(None):
+        forward(item, writer)
+    for note in run_report.message_notes(run):
+        run.warn(note)
+    inputs = run_report.run_report(run)
     broken = imbalances(inputs)
     if broken:
         raise RecordingError(f"the ledger does not balance, please report: {broken[0]}")
@@ -227,7 +166,7 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Re
     def complete(partial: Path) -> None:
         nonlocal inputs
         run.stages.write_s += time.perf_counter() - began_s
-        inputs = accounts.report_inputs(run)
+        inputs = run_report.run_report(run)
         if last is not None:
             last(inputs, partial)
 

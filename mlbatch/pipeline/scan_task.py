@@ -1,150 +1,107 @@
-"""Windows to scans, by one thread or several: what is due, and who decodes it."""
+"""A scan from its raw columns into the output, in four stages."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field, fields, replace
+import time
+from collections.abc import Callable, Sequence
 
-import numpy as np
-
-from mlbatch.batching.windows import Window
-from mlbatch.decode.decoder import Decoder, Due, Label, Source
-from mlbatch.report.ledger import PointCounts
-from mlbatch.types import Scan
-
-# What became of the slots of every sensor in a scan, in the order of `ledger.POINT_FATES`.
-Fates = Sequence[Sequence[int]]
-NewDecoder = Callable[[Sequence[Source], int | None], Decoder]
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
+from mlbatch.pipeline.resume import ResumeLog
+from mlbatch.types import ImuSamples, Message
+from mlbatch.writers import ScanJob, ScanWriter
 
 
-@dataclass(slots=True)
-class Task:
-    """Columns of a scan to be decoded.
+class ScanTask:
+    """The stages of one scan; see `workers.StagedTask`."""
 
-    only: with `--split` the sensor that they are of; fates: as `Decoder.scan` takes them.
-    """
+    def __init__(
+        self,
+        run: Conversion,
+        task: DecodeTask | None,
+        before: Sequence[ImuSamples | Message],
+        writer: ScanWriter | None,
+        idle: list[DecodeWorker],
+        resume_log: ResumeLog | None,
+        *,
+        is_kept: bool,
+    ) -> None:
+        """task: None where messages are to be written without a scan; before: what to write first.
 
-    due: Due
-    label: Label
-    only: int | None
-    fates: Fates | None
-    is_decoded: bool = False
+        writer: None in a dry run; idle: decode workers, of which one is taken while in use;
+        is_kept: a resumed output already contains the scan.
+        """
+        self._run = run
+        self._task = task
+        self._before = before
+        self._writer = writer
+        self._idle = idle
+        self._resume_log = resume_log
+        self._is_kept = is_kept
+        self._worker: DecodeWorker | None = None
+        self._decoded: Decoded | None = None
+        self._decode_s = 0.0
+        self._write_s = 0.0
+        self._job = ScanJob()
 
-    @property
-    def end_ns(self) -> int:
-        """End of the window."""
-        return self.label.end_ns
-
-    def oldest_place(self, sensor: int) -> int | None:
-        """First ring place of a sensor whose pixels are still needed."""
-        if self.is_decoded:
-            return None
-        if self.only is None:
-            place = self.due.place[self.due.sensor == sensor]
-        else:
-            place = self.due.place[: len(self.due) if self.only == sensor else 0]
-        return int(place.min()) if len(place) else None
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A window that gives no scan, though it holds columns; what passes by goes on."""
-
-    end_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """A scan, and what became of the slots of every sensor in it."""
-
-    scan: Scan
-    fates: list[list[int]]
-
-
-class Bench:
-    """The decoders of one thread, with scratch that no other thread uses."""
-
-    def __init__(self, sources: Sequence[Source], split: bool, new: NewDecoder) -> None:
-        """split: a decoder for each sensor, as tasks then are of one sensor."""
-        self._sensors = len(sources)
-        if split:
-            for source in sources:
-                source.ring_base = 0
-            self._decoders = [new([source], number) for number, source in enumerate(sources)]
-        else:
-            self._decoders = [new(sources, None)]
-
-    def decode(self, task: Task) -> Decoded:
-        """The scan of a task; its arrays live as long as the decoder says."""
-        decoder = self._decoders[task.only or 0]
-        before = [one.fates for one in decoder.counts]
-        scan = decoder.scan(task.due, task.label, task.fates)
-        task.is_decoded = True
-        after = [one.fates for one in decoder.counts]
-        own = [
-            [late - early for late, early in zip(now, was, strict=True)]
-            for now, was in zip(after, before, strict=True)
-        ]
-        if task.only is not None:
-            nothing = [[0] * len(own[0])] * self._sensors
-            own = [*nothing[: task.only], *own, *nothing[task.only + 1 :]]
-        return Decoded(scan, own)
-
-    @property
-    def points(self) -> list[PointCounts]:
-        """What became of the pixels of each sensor here."""
-        return [counts for decoder in self._decoders for counts in decoder.counts]
-
-
-@dataclass(slots=True)
-class Benches:
-    """The benches of a run, and the tasks whose raw packets they still need."""
-
-    benches: list[Bench] = field(default_factory=list)
-    _open: list[Task] = field(default_factory=list)
-
-    def points(self, number: int) -> PointCounts:
-        """What became of the pixels of a sensor, whoever decoded them."""
-        total = PointCounts()
-        for bench in self.benches:
-            counts = bench.points[number]
-            for part in fields(PointCounts):
-                setattr(total, part.name, getattr(total, part.name) + getattr(counts, part.name))
-        return total
-
-    def open(self, window: Window, split: bool, fates: Iterator[Fates]) -> Iterator[Task]:
-        """What is to be decoded of a window: one scan, or one of each sensor in it."""
-        label = Label(
-            window.index,
-            window.slice,
-            window.start_ns,
-            window.end_ns,
-            window.complete,
-            window.ready_host_ns,
-        )
-        due = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
-        if not split:
-            yield self._task(due, label, None, fates)
+    def decode_with(self, worker: DecodeWorker) -> None:
+        """Decode in this thread, so that only writing is left for others."""
+        if self._task is None:
             return
-        for number in np.unique(window.sensor).tolist():
-            own = window.sensor == number
-            alone = np.zeros(int(np.count_nonzero(own)), np.int64)
-            part = Due(due.stamp_ns[own], alone, due.place[own], due.encoder[own])
-            yield self._task(part, label, number, fates)
+        began_s = time.perf_counter()
+        self._decoded = worker.decode(self._task)
+        self._decode_s += time.perf_counter() - began_s
 
-    def _task(self, due: Due, label: Label, only: int | None, fates: Iterator[Fates]) -> Task:
-        task = Task(due, label, only, next(fates, None))
-        self._open.append(task)
-        return task
+    def decode(self) -> None:
+        """Raw columns to points, points to the bytes of the output. Any thread."""
+        if self._decoded is None and self._task is not None:
+            self._worker = self._idle.pop()
+            self.decode_with(self._worker)
+        self._job = self._writer_job()
+        self._timed(self._job.pack)
 
-    def oldest_place(self, sensor: int, waiting: int | None) -> int | None:
-        """First ring place of a sensor that is needed, `waiting` being that of the batching."""
-        self._open = [task for task in self._open if not task.is_decoded]
-        places = [task.oldest_place(sensor) for task in self._open]
-        return min((at for at in (*places, waiting) if at is not None), default=None)
+    def append(self) -> None:
+        """Count the scan, write what precedes it, take its place in the output. In order."""
+        if self._decoded is not None:
+            self._run.account(self._decoded.scan)
+        for item in self._before:
+            forward(item, self._writer)
+        self._timed(self._job.append)
+
+    def compress(self) -> None:
+        """Compress what is complete. Any thread."""
+        self._timed(self._job.compress)
+
+    def commit(self) -> None:
+        """Write what is complete; note it for `--resume`. In order."""
+        self._timed(self._job.commit)
+        if self._decoded is not None and self._resume_log is not None and self._writer is not None:
+            self._resume_log.note(self._decoded.outcomes, self._writer)
+        self._run.stages.write_s += self._write_s
+        self._run.stages.decode_s += self._decode_s
+        if self._worker is not None:
+            # Only now, since its arrays were read until here.
+            self._idle.append(self._worker)
+
+    def _writer_job(self) -> ScanJob:
+        if self._writer is None:
+            return ScanJob()
+        if self._task is None or self._decoded is None:
+            return self._writer.flush()
+        write = self._writer.skip if self._is_kept else self._writer.write
+        return write(self._decoded.scan, self._task.only)
+
+    def _timed(self, stage: Callable[[], None]) -> None:
+        began_s = time.perf_counter()
+        stage()
+        self._write_s += time.perf_counter() - began_s
 
 
-def with_own_lidars(sources: Sequence[Source]) -> list[Source]:
-    """The same sources for another thread: lidars have scratch of their own, rings are shared."""
-    return [replace(source, lidar=deepcopy(source.lidar)) for source in sources]
+def forward(item: ImuSamples | Message, writer: ScanWriter | None) -> None:
+    """Write IMU samples or a message, if there is a writer."""
+    if writer is None:
+        return
+    if isinstance(item, Message):
+        writer.write_message(item)
+    else:
+        writer.write_imu(item)

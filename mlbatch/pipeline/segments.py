@@ -1,4 +1,4 @@
-"""A part of a session by arrival: what `--on-jump split` converts on its own."""
+"""Segments of a session by receive time: `--on-jump split` converts each on its own."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """Arrivals in [begin_ns, end_ns); None: no limit."""
+class TimeSegment:
+    """Receive times in [begin_ns, end_ns); None: no limit."""
 
     begin_ns: int | None = None
     end_ns: int | None = None
@@ -23,14 +23,14 @@ class Part:
 
 @dataclass(slots=True)
 class ClippedRecording:
-    """The packets and messages of a recording that arrived within a part; `Recording`.
+    """The packets and messages of a recording that were received within a segment.
 
-    What lies outside is left out of the counts, too: it belongs to another part. Messages from
-    before the part come only if they teach of sensors, since metadata stand at the start.
+    Others are not counted either: they belong to another segment. Messages from before the segment
+    are given only if they are metadata of sensors, which are recorded once, at the start.
     """
 
     inner: Recording
-    part: Part
+    segment: TimeSegment
     topics: tuple[Topic, ...] = ()
     keep: frozenset[str] = frozenset()
     notes: list[str] = field(default_factory=list)
@@ -46,7 +46,7 @@ class ClippedRecording:
         self._follow()
 
     def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
-        """Yield the packets of the part, in file order; may be called again (counts restart).
+        """Yield the packets of the segment, in file order; may be called again (counts restart).
 
         until_ns: stop once this much time (ns) has passed since the first packet's arrival.
         """
@@ -72,7 +72,7 @@ class ClippedRecording:
             self._follow()
 
     def _inside(self, batch: PacketBatch) -> BoolArray:
-        low, high = self.part.begin_ns, self.part.end_ns
+        low, high = self.segment.begin_ns, self.segment.end_ns
         inside = np.ones(len(batch), np.bool_)
         if low is not None:
             inside &= batch.host_ns >= low
@@ -84,18 +84,18 @@ class ClippedRecording:
         return tuple(message for message in batch.messages if self._is_due(message))
 
     def _is_due(self, message: Message) -> bool:
-        low, high = self.part.begin_ns, self.part.end_ns
+        low, high = self.segment.begin_ns, self.segment.end_ns
         if high is not None and message.host_ns >= high:
             return False
         return low is None or message.host_ns >= low or teaches(message.topic)
 
     def _leave_out(self, count: int) -> None:
-        """Take packets out of the inner counts: what clouds become is counted there as well."""
+        """Remove packets from the inner counts, where packets made of clouds are counted, too."""
         self.inner.counts.frames -= count
         self.inner.counts.datagrams -= count
 
     def _follow(self) -> None:
-        """Take over what the inner recording says of itself."""
+        """Copy the attributes of the inner recording that change while it is read."""
         inner = self.inner
         self.topics, self.notes, self.counts = inner.topics, inner.notes, inner.counts
         self.position_bytes = inner.position_bytes

@@ -1,98 +1,218 @@
-"""The stages of a run, made from what was found and what is wanted."""
+"""A session: its recordings opened, its sensors found and ready to be read."""
 
 from __future__ import annotations
 
+import contextlib
+import math
+from collections.abc import Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import Intake
-from mlbatch.decode.decoder import Source
-from mlbatch.decode.packet_ring import RawRing
-from mlbatch.discovery.discover import Setup
+from mlbatch.decode.kernels import choose_engine
+from mlbatch.discovery.discover import Note, Setup, absent, discover, untimed
 from mlbatch.discovery.extrinsics import Mounted
-from mlbatch.pipeline.ingest import Feed
+from mlbatch.discovery.probe import is_without_packets
+from mlbatch.discovery.sampler import clock_watch, has_receive_times
+from mlbatch.errors import RecordingError
+from mlbatch.pipeline.clock_monitor import ClockMonitor
+from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
-from mlbatch.types import RunInfo, SensorInfo
-from mlbatch.units import rate_text
+from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
+from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
+from mlbatch.readers import merge, open_recording, use_engine
+from mlbatch.rig.rig import Rig, RigSensor
+from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
+from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
+
+# A note for the user, no warning: how the times of decoded clouds were read.
+CLOUDS = "clouds"
 
 
-def feed_of(sensor: Mounted) -> Feed:
-    """A sensor's ring and ledger."""
-    lidar = sensor.found.lidar
-    return Feed(lidar, RawRing(lidar.packet_size, lidar.records))
+class Session:
+    """The recordings of a job and the sensors found in them.
 
+    engine: `numpy` or `numba`; setup: result of discovery; sensors: in the order of `lidar_id`;
+    replay: of injected faults, or None; delivered: packets given by `packets` so far; notes:
+    warnings so far.
+    """
 
-def intake_of(sensor: Mounted, *, host_clock: bool) -> Intake:
-    """The door of a sensor, with what the rig says of its clock."""
-    lidar = sensor.found.lidar
-    return Intake(
-        sensor.name,
-        host_clock=host_clock,
-        offset_ns=sensor.offset_ns,
-        modulus=lidar.sequence_modulus,
-        packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
-    )
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.delivered = 0
+        self.notes: list[Note] = []
+        self._received_ns: tuple[int, int] | None = None
+        streams = StreamTable()
+        opened = [open_recording(path, streams) for path in job.recordings]
+        self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
+        use_engine(opened, self.engine)
+        if job.segment != TimeSegment():
+            opened = [ClippedRecording(recording, job.segment) for recording in opened]
+        self.setup: Setup = discover(opened, streams, job.wishes)
+        self.recordings: Sequence[Recording] = self.setup.recordings
+        self.sensors: list[Sensor] = []
+        for found in self.setup.sensors:
+            self.sensors.append(self._sensor(found))
+        self.refuse_untimed()
+        self.replay = self._replay()
+        self.clocks = ClockMonitor(self.sensors, self.replay)
+        if job.align_clocks_to:
+            self.clocks.align(merge(self.recordings), self.setup.router, job.align_clocks_to)
+        maps_stamps = bool(job.faults or job.align_clocks_to)
+        self.ingest = Ingest(
+            self.setup.router, self.sensors, self.clocks.map_stamps if maps_stamps else None
+        )
 
+    def _sensor(self, found: Mounted) -> Sensor:
+        """The next sensor, with an empty ring and ledger."""
+        job, rig, lidar = self.job, found.rig, found.found.lidar
+        sampler = self.setup.sampler
+        ring_base = 0
+        if self.sensors:
+            last = self.sensors[-1]
+            ring_base = last.ring_base + max(last.lidar.channels, int(last.lidar.channel.max()) + 1)
+        return Sensor(
+            index=len(self.sensors),
+            detected=found,
+            clock=SensorClock(
+                by_host=job.wishes.host_clock or (rig is not None and rig.clock == "host"),
+                offset_ns=found.offset_ns,
+                has_receive_times=has_receive_times(sampler.table.untimed, found.found),
+                watch=clock_watch(lidar),
+            ),
+            limits=limits(job, rig),
+            ring_base=ring_base,
+            columns_per_s=sampler.columns_per_s(found.found),
+            ring=new_ring(lidar),
+        )
 
-def source_of(sensor: Mounted, feed: Feed, ring_base: int, job: Job) -> Source:
-    """What the decoder has to know of a sensor."""
-    rig = sensor.rig
-    low = [job.min_range_m, 0.0 if rig is None else rig.min_range_m or 0.0]
-    high = [job.max_range_m, float("inf") if rig is None else rig.max_range_m or float("inf")]
-    return Source(
-        feed.lidar,
-        feed.ring,
-        sensor.body_from_sensor,
-        ring_base,
-        max(low),
-        min(high),
-        job.keep_repeated,
-    )
+    def _replay(self) -> FaultReplay | None:
+        """Replay of the job's faults, None without."""
+        job = self.job
+        if not job.faults:
+            return None
+        # Not loaded for runs without faults.
+        from mlbatch.faults import FaultReplay
 
+        replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in self.sensors])
+        replay.begin_ns = self.begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
+        return replay
 
-def replay_of(setup: Setup, job: Job, begin_ns: int | None) -> FaultReplay | None:
-    """The replay of the faults wanted; begin_ns: arrival of the first packet, where it is known."""
-    if not job.faults:
-        return None
-    # Not loaded for runs without faults.
-    from mlbatch.faults.replay import FaultReplay
+    # -- reading ------------------------------------------------------------------------------
 
-    replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in setup.sensors])
-    # Not the first packet that is read: bags hold many in a message, of each sensor in turn.
-    replay.begin_ns = begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
-    return replay
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield all packets in receive order, with injected faults."""
+        # Also after an error, files are closed here, by the thread that opened them.
+        with contextlib.closing(merge(self.recordings, is_without_packets)) as merged:
+            batches: Iterator[PacketBatch] = merged
+            if self.replay is not None:
+                batches = self.replay.batches(batches, self.ingest.owners)
+            for batch in batches:
+                self._count(batch)
+                yield batch
 
+    def _count(self, batch: PacketBatch) -> None:
+        if not len(batch):
+            return
+        self.delivered += len(batch)
+        first_ns = int(batch.host_ns[0]) if self._received_ns is None else self._received_ns[0]
+        self._received_ns = first_ns, int(batch.host_ns[-1])
 
-def boxes_of(setup: Setup, job: Job) -> F64Array:
-    """Boxes to leave out, of rig and job: (k, 6), m, body frame."""
-    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
-    if setup.rig is None:
-        return boxes_m
-    return np.concatenate([setup.rig.exclude_boxes_m, boxes_m])
+    @property
+    def begin_ns(self) -> int | None:
+        """Receive time of the first packet of any sensor, among those sampled by discovery.
 
+        Not of the first packet read: bags hold many in a message, sensor by sensor.
+        """
+        spans = self.setup.sampler.span_ns
+        kinds = [kind for sensor in self.setup.sensors for kind in sensor.found.kinds]
+        return min((spans[kind][0] for kind in kinds if kind in spans), default=None)
 
-def run_info(setup: Setup, job: Job, grid: Grid, scale: str) -> RunInfo:
-    """What is the same for all scans; scale: their timescale."""
-    sensors, ring_base = [], 0
-    for sensor in setup.sensors:
-        lidar = sensor.found.lidar
-        sensors.append(
+    @property
+    def last_host_ns(self) -> int:
+        """Receive time of the newest packet; 0 before the first."""
+        return 0 if self._received_ns is None else self._received_ns[1]
+
+    @property
+    def recorded_s(self) -> float:
+        """Time between the first and the last packet read, by the capture host."""
+        if self._received_ns is None:
+            return 0.0
+        return (self._received_ns[1] - self._received_ns[0]) / NS_PER_S
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all recordings."""
+        return sum(recording.size_bytes for recording in self.recordings)
+
+    @property
+    def position_bytes(self) -> int:
+        """Bytes read so far."""
+        return sum(recording.position_bytes for recording in self.recordings)
+
+    # -- what scans are made with -------------------------------------------------------------
+
+    @property
+    def boxes_m(self) -> F64Array:
+        """Excluded boxes of rig and job: (k, 6), m, body frame."""
+        return excluded_boxes_m(self.job, self.setup.rig)
+
+    def run_info(self, rate_hz: str, timescale: str) -> RunInfo:
+        """What is the same for all scans; rate_hz: exact rate as text."""
+        job = self.job
+        sensors = tuple(
             SensorInfo(
                 sensor.name,
-                lidar.model,
-                lidar.channels,
-                lidar.returns,
-                0 if job.split else ring_base,
+                sensor.lidar.model,
+                sensor.lidar.channels,
+                sensor.lidar.returns,
+                0 if job.split else sensor.ring_base,
                 sensor.body_from_sensor,
             )
+            for sensor in self.sensors
         )
-        ring_base += max(lidar.channels, int(lidar.channel.max()) + 1)
-    return RunInfo(
-        tuple(sensors), setup.frame_id, rate_text(grid.rate), scale, job.slices, job.layout
+        return RunInfo(sensors, self.setup.frame_id, rate_hz, timescale, job.slices, job.layout)
+
+    # -- checks and warnings ------------------------------------------------------------------
+
+    def refuse_untimed(self) -> None:
+        """Raise UsageError where receive times are needed and packets have none of their own."""
+        aligned = bool(self.job.align_clocks_to)
+        option = "--align-clocks" if aligned else "--clock host"
+        for sensor in self.sensors:
+            error = untimed(self.setup.sampler.table, sensor.detected.found, option)
+            if error is not None and (aligned or sensor.clock.by_host):
+                raise error
+
+    def refuse_absent(self) -> None:
+        """Raise RigError if a sensor that the rig requires sent no packet."""
+        for sensor in self.sensors:
+            if sensor.is_required and not sensor.ledger.packets.read:
+                raise absent(sensor.detected, self.job.wishes.rig)
+
+    def warn(self, note: Note) -> None:
+        """Add a warning; RecordingError with `--strict`."""
+        if self.job.strict and note.code != CLOUDS:
+            raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
+        self.notes.append(note)
+
+
+def limits(job: Job, rig: RigSensor | None) -> Limits:
+    """The narrower of the job's and the rig's ranges for a sensor."""
+    min_range_m = 0.0 if rig is None else rig.min_range_m or 0.0
+    max_range_m = math.inf if rig is None else rig.max_range_m or math.inf
+    return Limits(
+        max(job.min_range_m, min_range_m), min(job.max_range_m, max_range_m), job.keep_repeated
     )
+
+
+def excluded_boxes_m(job: Job, rig: Rig | None) -> F64Array:
+    """Excluded boxes of rig and job: (k, 6), m, body frame."""
+    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
+    if rig is None:
+        return boxes_m
+    return np.concatenate([rig.exclude_boxes_m, boxes_m])

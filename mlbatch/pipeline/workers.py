@@ -1,50 +1,69 @@
-"""Threads that share one sequence of tasks; what of a task depends on order is done in order.
+"""Threads that share a sequence of tasks; ordered stages run in the order of the tasks.
 
-Threads, and not processes: arrays stay where they are, nothing is read twice, and what takes time
-(numpy, checksums, compression, writing) lets other threads run meanwhile.
+Threads, not processes: arrays are shared, nothing is read twice, and the expensive parts (numpy,
+checksums, compression, writing) release the interpreter lock.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from types import TracebackType
-from typing import Generic, TypeAlias, TypeVar
-
-Task = TypeVar("Task")
-# What is done for a task, with a `yield` after each of its parts but the last. The first and third
-# are done at any time, the second and fourth in turn: after the same part of all earlier tasks.
-Steps: TypeAlias = Iterator[None]
-# Parts in turn.
-_TURNS = 2
+from typing import Generic, Protocol, TypeVar
 
 
-def in_one_go(steps: Steps) -> None:
-    """Do all that there is to do for a task, alone."""
-    for _ in steps:
-        pass
+class StagedTask(Protocol):
+    """A task in four stages, each run once, in this order."""
+
+    def decode(self) -> None:
+        """Any thread, at any time."""
+        ...
+
+    def append(self) -> None:
+        """In order: after this stage of all earlier tasks."""
+        ...
+
+    def compress(self) -> None:
+        """Any thread, at any time."""
+        ...
+
+    def commit(self) -> None:
+        """In order: after this stage of all earlier tasks."""
+        ...
+
+
+Task = TypeVar("Task", bound=StagedTask)
+# Ordered stages of a task.
+_ORDERED = 2
+
+
+def run_inline(task: StagedTask) -> None:
+    """Run all stages of a task in this thread."""
+    task.decode()
+    task.append()
+    task.compress()
+    task.commit()
 
 
 class _Stopped(Exception):
     """An earlier task failed."""
 
 
-class Workers(Generic[Task]):
-    """Runs the steps of tasks; what fails first, in the order of tasks, fails here.
+class OrderedWorkers(Generic[Task]):
+    """Runs tasks in threads; the first error, in the order of the tasks, is raised here.
 
-    Then no later task has done its last part, nor its second if that or an earlier one failed.
+    After an error no later task commits, nor appends if the error occurred before its append.
     """
 
-    def __init__(self, steps: Callable[[Task], Steps], threads: int, ahead: int) -> None:
-        """ahead: how many tasks may be unfinished when `put` returns."""
-        self._steps = steps
+    def __init__(self, threads: int, ahead: int) -> None:
+        """ahead: number of tasks that may be unfinished when `put` returns."""
         self._ahead = ahead
         self._waiting: deque[tuple[int, Task]] = deque()
         self._given = 0
-        # Tasks that are past each part in turn.
-        self._past = [0] * _TURNS
+        # Tasks that have done each ordered stage.
+        self._past = [0] * _ORDERED
         self._error: BaseException | None = None
         self._is_closed = False
         self._changed = threading.Condition()
@@ -57,21 +76,21 @@ class Workers(Generic[Task]):
             thread.start()
 
     def put(self, task: Task) -> None:
-        """Append a task; waits while too many are unfinished, raises what failed in one."""
+        """Append a task; waits while too many are unfinished; raises the error of one."""
         with self._changed:
             self._waiting.append((self._given, task))
             self._given += 1
             self._changed.notify_all()
             self._wait(lambda: self._given - self._past[-1] <= self._ahead)
-        self._refuse()
+        self._raise_error()
 
     def finish(self) -> None:
-        """Wait for the end of all tasks; raises what failed in one."""
+        """Wait until all tasks are done; raises the error of one."""
         with self._changed:
             self._wait(lambda: self._given == self._past[-1])
-        self._refuse()
+        self._raise_error()
 
-    def __enter__(self) -> Workers[Task]:
+    def __enter__(self) -> OrderedWorkers[Task]:
         return self
 
     def __exit__(
@@ -80,7 +99,7 @@ class Workers(Generic[Task]):
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        """End all threads, also after an error; what failed in an earlier task is raised first."""
+        """End all threads, also after an error; the error of an earlier task is raised first."""
         try:
             with self._changed:
                 self._wait(lambda: self._given == self._past[-1])
@@ -92,22 +111,25 @@ class Workers(Generic[Task]):
         for thread in self._threads:
             thread.join()
         if error is not self._error:
-            self._refuse()
+            self._raise_error()
 
-    def _refuse(self) -> None:
+    def _raise_error(self) -> None:
         if self._error is not None:
             raise self._error
 
     def _wait(self, is_due: Callable[[], bool]) -> None:
-        """Wait, with the lock held, for something to be true or to have failed."""
+        """Wait, with the lock held, for a condition or an error."""
         self._changed.wait_for(lambda: self._error is not None or is_due())
 
     def _run(self) -> None:
-        """One thread."""
+        """Body of a thread."""
         while (found := self._next()) is not None:
             number, task = found
             try:
-                self._work(number, self._steps(task))
+                task.decode()
+                self._in_order(0, number, task.append)
+                task.compress()
+                self._in_order(1, number, task.commit)
             except _Stopped:
                 return
             except BaseException as error:
@@ -121,24 +143,22 @@ class Workers(Generic[Task]):
                 return None
             return self._waiting.popleft()
 
-    def _work(self, number: int, steps: Steps) -> None:
-        for turn in range(_TURNS):
-            next(steps)
-            with self._changed:
-                self._wait(partial(self._is_turn, turn, number))
-                if self._error is not None:
-                    raise _Stopped
-            next(steps, None)
-            with self._changed:
-                self._past[turn] += 1
-                self._changed.notify_all()
+    def _in_order(self, ordered: int, number: int, stage: Callable[[], None]) -> None:
+        """Run an ordered stage of a task once all earlier tasks have done theirs."""
+        with self._changed:
+            self._wait(partial(self._is_next, ordered, number))
+            if self._error is not None:
+                raise _Stopped
+        stage()
+        with self._changed:
+            self._past[ordered] += 1
+            self._changed.notify_all()
 
-    def _is_turn(self, turn: int, number: int) -> bool:
-        """Whether all earlier tasks are past this part."""
-        return self._past[turn] == number
+    def _is_next(self, ordered: int, number: int) -> bool:
+        return self._past[ordered] == number
 
     def _fail(self, number: int, error: BaseException) -> None:
-        """Stop all, once earlier tasks are through: one of them may fail as well."""
+        """Stop all, once earlier tasks are done: one of them may fail as well."""
         with self._changed:
             self._wait(lambda: self._past[-1] == number)
             if self._error is None:

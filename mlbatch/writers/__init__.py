@@ -1,15 +1,12 @@
-"""Outputs: one module a format, found by name; rules of CONTRACT.md, section 2."""
+"""Outputs: formats found by their place in `writers/formats/`, and atomic files."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from mlbatch.errors import UsageError
-from mlbatch.writers._atomic import (
+from mlbatch.writers.atomic import (
     REPORT_JSON,
     SCANS_CSV,
     check_free_space,
@@ -24,7 +21,15 @@ from mlbatch.writers._atomic import (
     side_path,
     write_text,
 )
-from mlbatch.writers._options import Safe, ScanWriter, WriterModule, WriterOptions
+from mlbatch.writers.base import (
+    NO_COMPRESSION,
+    Checkpoint,
+    ScanJob,
+    ScanWriter,
+    WriterModule,
+    WriterOptions,
+)
+from mlbatch.writers.formats import format_module, format_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,8 +37,9 @@ if TYPE_CHECKING:
     from mlbatch.types import RunInfo
 
 __all__ = [
+    "Checkpoint",
     "ReportPaths",
-    "Safe",
+    "ScanJob",
     "ScanWriter",
     "WriterOptions",
     "check_compression",
@@ -45,7 +51,7 @@ __all__ = [
     "discard_old",
     "export_errors",
     "extras",
-    "formats",
+    "format_names",
     "is_report",
     "is_taken",
     "old_path",
@@ -57,7 +63,7 @@ __all__ = [
 ]
 
 DEFAULT_FORMAT = "npz"
-# Announced in the contract; named here so that asking for one gets a straight answer.
+# Formats that are announced, so that errors can say that this version has none of them.
 LATER_FORMATS = ("pcd", "las", "kitti")
 LATER_SUFFIXES = {
     ".pcd": "pcd",
@@ -67,71 +73,85 @@ LATER_SUFFIXES = {
 }
 
 
-@lru_cache(maxsize=1)
-def formats() -> tuple[str, ...]:
-    """Names of all formats, sorted; no plug-in is imported."""
-    found = pkgutil.iter_modules(__path__)
-    return tuple(sorted(module.name for module in found if not module.name.startswith("_")))
-
-
 def plugin(name: str) -> WriterModule:
-    """The module that writes the format called `name`."""
-    if name not in formats():
+    """Return the module of a format, UsageError for an unknown one."""
+    if name not in format_names():
         later = " (not in this version)" if name in LATER_FORMATS else ""
         raise UsageError(
-            f"--format: wanted one of {', '.join(formats())}, got {name!r}{later}; choose one"
+            f"--format: expected one of {', '.join(format_names())}, found {name!r}{later}; "
+            "choose one"
         )
-    return cast(WriterModule, importlib.import_module(f"{__name__}.{name}"))
+    return format_module(name)
 
 
 def choose_format(target: Path, asked: str | None) -> str:
-    """Format of the output `target`; `asked` is the value of `--format`, None if not given."""
+    """Return the format of the output `target`; asked: value of `--format`, None if not given."""
     suffix = target.suffix.lower()
     _refuse_file_name(target, suffix)
-    found = _of_suffix(suffix)
+    found = _format_of_suffix(suffix)
     if asked is None:
         return found or DEFAULT_FORMAT
     if found is not None and plugin(asked).SUFFIX is None:
         raise UsageError(
-            f"-o {target}: wanted a folder for --format {asked}, got the name of a {found} file; "
-            f"leave out {suffix} or the option"
+            f"-o {target}: expected a folder for --format {asked}, found the name of a {found} "
+            f"file; leave out {suffix} or the option"
         )
     if found is not None and found != asked:
         raise UsageError(
-            f"-o {target}: wanted the name of a {plugin(asked).SUFFIX} file for --format {asked}, "
-            f"got that of a {found} file; change {suffix} or leave out the option"
+            f"-o {target}: expected the name of a {plugin(asked).SUFFIX} file for --format "
+            f"{asked}, found that of a {found} file; change {suffix} or leave out the option"
         )
     return plugin(asked).FORMAT
 
 
-def _of_suffix(suffix: str) -> str | None:
-    """The format whose files bear a suffix."""
+def _format_of_suffix(suffix: str) -> str | None:
+    """Return the format with this file suffix."""
     if not suffix:
         return None
-    # Importing them all takes long: the one that is likely comes first.
-    likely = sorted(formats(), key=lambda name: name != suffix.removeprefix("."))
+    # Importing all formats is slow: the likely one comes first.
+    likely = sorted(format_names(), key=lambda name: name != suffix.removeprefix("."))
     suffixes = ((plugin(name).SUFFIX, name) for name in likely)
     return next((name for own, name in suffixes if own == suffix), None)
 
 
+def _refuse_file_name(target: Path, suffix: str) -> None:
+    """Refuse names of files for outputs that are folders or not in this version."""
+    name = suffix.removeprefix(".")
+    if name in format_names() and plugin(name).SUFFIX is None:
+        raise UsageError(
+            f"-o {target}: expected a folder, since {name} output is one file per scan, found a "
+            f"file name; give -o {target.with_suffix('')} --format {name}"
+        )
+    if suffix == ".db3":
+        raise UsageError(
+            f"-o {target}: expected a folder, since rosbag2 output is a folder with an MCAP file, "
+            f"found a file name; give -o {target.with_suffix('')} --format rosbag2"
+        )
+    if suffix in LATER_SUFFIXES:
+        raise UsageError(
+            f"-o {target}: expected a .mcap file, a .bag file or a folder, found {suffix} "
+            f"({LATER_SUFFIXES[suffix]}, not in this version); choose another output"
+        )
+
+
 def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
-    """Start the output `target` in the format called `name`."""
+    """Start the output `target` in a format."""
     check_compression(name, options)
     return plugin(name).open_writer(target, info, options)
 
 
 @dataclass(frozen=True, slots=True)
 class ReportPaths:
-    """Where the report and the table of scans of an output lie."""
+    """Paths of the report and the table of scans of an output."""
 
     report: Path
     scans_csv: Path
 
 
 def report_paths(target: Path, name: str) -> ReportPaths:
-    """Inside an output folder, beside an output file.
+    """Return the paths inside an output folder, or next to an output file.
 
-    A writer's `finish` has the report written and writes scans.csv, before the output is named.
+    A writer's `finish` has the report written, then scans.csv, before it moves the output.
     """
     if plugin(name).SUFFIX is None:
         return ReportPaths(target / REPORT_JSON, target / SCANS_CSV)
@@ -139,49 +159,31 @@ def report_paths(target: Path, name: str) -> ReportPaths:
 
 
 def extras(name: str, options: WriterOptions) -> frozenset[str]:
-    """Those of `types.EXTRAS` that an output in the format called `name` holds."""
+    """Return the optional contents of an output, see `WriterModule.extras`."""
     return plugin(name).extras(options)
 
 
 def check_compression(name: str, options: WriterOptions) -> None:
-    """Refuse a compression that is none, or that the format called `name` has no place for."""
-    # Imported here, since it knows the types that need numpy.
-    from mlbatch.writers._compression import compression_of, refuse_compression
+    """Refuse an unknown compression, or any for a format without."""
+    text = options.compression
+    if text == NO_COMPRESSION:
+        return
+    # Imported here: it loads numpy and the MCAP library.
+    from mlbatch.writers.mcap_container import compression_of
 
-    if plugin(name).COMPRESSES:
-        compression_of(options.compression)
-    else:
-        refuse_compression(options.compression, name)
+    compression_of(text)
+    if not plugin(name).COMPRESSES:
+        raise UsageError(
+            f"--compression: expected {NO_COMPRESSION} for {name}, found {text!r}; leave it out, "
+            "or write a .mcap or rosbag2 output"
+        )
 
 
 def check_target(name: str, target: Path, options: WriterOptions, layout: str) -> None:
-    """Refuse at the start what could not be written at the end.
-
-    The surest way to know that an output can be opened is to open it; what that made is removed.
-    """
-    # Imported here, since the types need numpy and naming formats must not.
+    """Refuse an output that could not be written; opens it and removes what that created."""
+    # Imported here: it loads numpy.
     from mlbatch.types import RunInfo
 
     info = RunInfo((), "", "10", "unknown", layout=layout)
     open_writer(name, target, info, replace(options, split=False)).abandon()
     discard(target)
-
-
-def _refuse_file_name(target: Path, suffix: str) -> None:
-    """Refuse names of single files for outputs that are not single files."""
-    name = suffix.removeprefix(".")
-    if name in formats() and plugin(name).SUFFIX is None:
-        raise UsageError(
-            f"-o {target}: wanted a folder, since {name} output is a file a scan, got a file "
-            f"name; give -o {target.with_suffix('')} --format {name}"
-        )
-    if suffix == ".db3":
-        raise UsageError(
-            f"-o {target}: wanted a folder, since rosbag2 output is a folder with an MCAP file, "
-            f"got a file name; give -o {target.with_suffix('')} --format rosbag2"
-        )
-    if suffix in LATER_SUFFIXES:
-        raise UsageError(
-            f"-o {target}: wanted a .mcap file, a .bag file or a folder, got {suffix} "
-            f"({LATER_SUFFIXES[suffix]}, not in this version); choose another output"
-        )

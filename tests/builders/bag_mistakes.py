@@ -163,29 +163,29 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "existing folder": (
         "drive.mcap -o old --format rosbag2",
         1,
-        "old: wanted a new output, got an existing one; choose another or --overwrite",
+        "old: expected a new output, found an existing one; choose another or --overwrite",
     ),
     "existing bag": (
         "drive.mcap -o old.bag",
         1,
-        "old.bag: wanted a new output, got an existing one; choose another or --overwrite",
+        "old.bag: expected a new output, found an existing one; choose another or --overwrite",
     ),
     "db3 output": (
         "drive.mcap -o scans.db3",
         2,
-        "-o scans.db3: wanted a folder, since rosbag2 output is a folder with an MCAP file, "
-        "got a file name; give -o scans --format rosbag2",
+        "-o scans.db3: expected a folder, since rosbag2 output is a folder with an MCAP file, "
+        "found a file name; give -o scans --format rosbag2",
     ),
     "mcap name for a ROS 1 bag": (
         "drive.mcap -o scans.mcap --format rosbag1",
         2,
-        "-o scans.mcap: wanted the name of a .bag file for --format rosbag1, got that of a "
+        "-o scans.mcap: expected the name of a .bag file for --format rosbag1, found that of a "
         "mcap file; change .mcap or leave out the option",
     ),
     "bag name for npz": (
         "drive.mcap -o scans.bag --format npz",
         2,
-        "-o scans.bag: wanted a folder for --format npz, got the name of a rosbag1 file; "
+        "-o scans.bag: expected a folder for --format npz, found the name of a rosbag1 file; "
         "leave out .bag or the option",
     ),
     "no extrinsics": (

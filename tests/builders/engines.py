@@ -14,11 +14,11 @@ import pytest
 from mlbatch.decode import numba_engine
 from mlbatch.decode.decoder import Decoder, Due, Label
 from mlbatch.decode.kernels import is_installed
-from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.scan_task import LeftOut
-from mlbatch.pipeline.session import boxes_of, run_info, source_of
+from mlbatch.pipeline.session import excluded_boxes_m, limits
 from mlbatch.types import EXTRAS, Scan
+from mlbatch.units import rate_text
 
 needs_numba = pytest.mark.skipif(
     not is_installed(), reason="numba is not installed: pip install mlbatch[fast]"
@@ -85,18 +85,24 @@ def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
     run = Conversion(job)
     pairs: list[Pair] = []
     for task in run.tasks():
-        if isinstance(task, LeftOut):
+        if isinstance(task, SkippedWindow):
             continue
         pairs = pairs or [Pair(*(_decoder(run, one, name) for name in ENGINES)) for one in wanted]
         for pair in pairs:
-            pair.check(task.due, task.label)
+            pair.check(task.columns, task.label)
         task.is_decoded = True
     return pairs
 
 
 def _decoder(run: Conversion, wanted: Job, engine: str) -> Decoder:
     assert run.info is not None
-    info = run_info(run.setup, wanted, run.grid, run.info.timescale)
-    sensors = zip(run.setup.sensors, run.feeds, info.sensors, strict=True)
-    sources = [source_of(sensor, feed, one.ring_base, wanted) for sensor, feed, one in sensors]
-    return Decoder(info, sources, boxes_of(run.setup, wanted), wanted.extras, engine=engine)
+    session = run.session
+    info = session.run_info(rate_text(run.grid.rate), run.info.timescale)
+    sensors = [replace(one, limits=limits(wanted, one.rig)) for one in run.sensors]
+    return Decoder(
+        replace(info, layout=wanted.layout),
+        [sensor.source() for sensor in sensors],
+        excluded_boxes_m(wanted, session.setup.rig),
+        wanted.extras,
+        engine=engine,
+    )

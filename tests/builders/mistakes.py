@@ -55,48 +55,48 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "file name for a folder": (
         f"{FIX} -o out.npz",
         2,
-        "-o out.npz: wanted a folder, since npz output is a file a scan, got a file name; "
+        "-o out.npz: expected a folder, since npz output is one file per scan, found a file name; "
         "give -o out --format npz",
     ),
     "later suffix": (
         f"{FIX} -o out.las",
         2,
-        "-o out.las: wanted a .mcap file, a .bag file or a folder, got .las (las, not in this "
+        "-o out.las: expected a .mcap file, a .bag file or a folder, found .las (las, not in this "
         "version); choose another output",
     ),
     "later format": (
         f"{FIX} --format las",
         2,
-        "--format: wanted one of mcap, npz, ply, rosbag1, rosbag2, got 'las' (not in this "
+        "--format: expected one of mcap, npz, ply, rosbag1, rosbag2, found 'las' (not in this "
         "version); choose one",
     ),
     "folder format for a file": (
         f"{FIX} -o out.mcap --format ply",
         2,
-        "-o out.mcap: wanted a folder for --format ply, got the name of a mcap file; "
+        "-o out.mcap: expected a folder for --format ply, found the name of a mcap file; "
         "leave out .mcap or the option",
     ),
     "existing output": (
         f"{FIX} -o old",
         1,
-        "old: wanted a new output, got an existing one; choose another or --overwrite",
+        "old: expected a new output, found an existing one; choose another or --overwrite",
     ),
     "strangers in the output": (
         f"{FIX} -o old --overwrite",
         1,
-        "old: wanted a folder that only holds scans to overwrite, got diary.txt in it as well; "
+        "old: expected a folder with nothing but scans to overwrite, found diary.txt in it; "
         "choose another output",
     ),
     "output folder missing": (
         f"{FIX} -o none/out",
         1,
-        "none/out: wanted an output in an existing folder, got none, which is none; create it "
+        "none/out: expected an output in an existing folder, found no folder none; create it "
         "(mkdir -p) or choose another",
     ),
     "no name of an output": (
         f"{FIX} -o .",
         1,
-        ".: wanted the name of a new output, got a folder; add a name",
+        ".: expected the name of a new output, found a folder; add a name",
     ),
     "output over a rig": (
         "fix/two_lidars.pcap --rig fix/rig.yaml -o fix/rig.yaml --format mcap --overwrite",
@@ -241,13 +241,13 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "organized ply": (
         f"{FIX} --format ply --layout organized",
         2,
-        "--layout organized: PLY has no organized form; use npz or mcap",
+        "--layout organized: expected dense for ply, found organized; write npz or mcap",
     ),
     "point layout": (
         f"{FIX} -o out.mcap --point-layout loam",
         2,
-        "--point-layout: wanted one of standard, velodyne, ouster, hesai, autoware, kiss-icp, "
-        "minimal, got 'loam'; choose one",
+        "--point-layout: expected one of standard, velodyne, ouster, hesai, autoware, kiss-icp, "
+        "minimal, found 'loam'; choose one",
     ),
     "engine": (
         f"{FIX} --engine cuda",
@@ -262,13 +262,13 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "level of compression": (
         f"{FIX} -o x.mcap --compression zstd:23",
         2,
-        "--compression: wanted none, lz4, zstd or zstd:1 to zstd:22, got 'zstd:23'; choose one",
+        "--compression: expected none, lz4, zstd or zstd:1 to zstd:22, found 'zstd:23'; choose one",
     ),
     "compression of files of scans": (
         f"{FIX} --compression lz4",
         2,
-        "--compression: wanted none for npz, got 'lz4'; leave it out, or write a .mcap or rosbag2 "
-        "output",
+        "--compression: expected none for npz, found 'lz4'; leave it out, or write a .mcap or "
+        "rosbag2 output",
     ),
     "decoder option": (
         f"{FIX} --decode crc=no",

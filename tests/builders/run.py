@@ -22,10 +22,9 @@ from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
-from mlbatch.pipeline.workers import Steps
 from mlbatch.readers import open_recording
 from mlbatch.readers._capture import CaptureRecording
-from mlbatch.report.report import ReportInputs
+from mlbatch.report.report import RunReport
 from mlbatch.types import (
     EXTRAS,
     IMU,
@@ -37,7 +36,7 @@ from mlbatch.types import (
     StreamTable,
     Summary,
 )
-from mlbatch.writers import Safe, ScanWriter, WriterOptions, extras, open_writer
+from mlbatch.writers import Checkpoint, ScanJob, ScanWriter, WriterOptions, extras, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT / ".." / "shared" / "recordings"
@@ -89,22 +88,25 @@ class Memory:
     summary: Summary | None = None
     abandoned: bool = False
 
-    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
+    def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Keep a scan."""
-        yield
+        return _Keep(self, scan, sensor)
+
+    def keep(self, scan: Scan, sensor: int | None) -> None:
+        """Copy a scan, in order."""
         self.scans.append((deepcopy(scan), sensor))
 
-    def pass_over(self, scan: Scan, sensor: int | None = None) -> Steps:
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Nothing: what is in memory is never continued."""
-        yield
+        return ScanJob()
 
-    def flush(self) -> Steps:
+    def flush(self) -> ScanJob:
         """Nothing: all is kept at once."""
-        return iter(())
+        return ScanJob()
 
-    def safe(self) -> Safe:
+    def checkpoint(self) -> Checkpoint:
         """Nothing: see above."""
-        return Safe(0)
+        return Checkpoint(0)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Keep IMU samples."""
@@ -125,12 +127,22 @@ class Memory:
         self.abandoned = True
 
 
+@dataclass(slots=True)
+class _Keep(ScanJob):
+    memory: Memory
+    scan: Scan
+    sensor: int | None
+
+    def append(self) -> None:
+        self.memory.keep(self.scan, self.sensor)
+
+
 @dataclass(frozen=True, slots=True)
 class Result:
     """A conversion that ended well; `memory` is None where the output went to a file."""
 
     run: Conversion
-    report: ReportInputs
+    report: RunReport
     memory: Memory | None = None
 
     @property

@@ -12,9 +12,8 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.discovery.discover import Wishes
-from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.scan_task import LeftOut
 from mlbatch.types import MESSAGE_ENCODINGS
 from tests.builders.bags import Body, Recorded
 from tests.builders.sessions import NS_PER_MS, Shell, Unit, twin
@@ -91,9 +90,9 @@ def test_what_passes_by_can_be_taken_at_every_window(tmp_path: Path) -> None:
     run = Conversion(job)
     waiting = []
     for item in run.tasks():
-        assert isinstance(item, LeftOut)
-        run.take_passing(item.end_ns)
-        waiting.append(run.passed.waiting)
+        assert isinstance(item, SkippedWindow)
+        run.passed_through(item.end_ns)
+        waiting.append(run.passthrough.messages.waiting)
     assert len(waiting) > TURNS - 3
     assert all(a - b == TURN_NS // EVERY_NS for a, b in itertools.pairwise(waiting[1:]))
 
@@ -121,9 +120,9 @@ def test_a_recording_of_messages_alone_is_read_along_with_the_packets(tmp_path: 
     run = Conversion(Job(tuple(paths), wishes, passed=("/note",), extras=MESSAGE_ENCODINGS))
     most = taken = 0
     for item in run.tasks():
-        most = max(most, run.passed.waiting)
-        taken += len(run.take_passing(item.end_ns))
-    assert taken + len(run.take_passing(None)) == NOTES
+        most = max(most, run.passthrough.messages.waiting)
+        taken += len(run.passed_through(item.end_ns))
+    assert taken + len(run.passed_through(None)) == NOTES
     assert most < NOTES * 2 // 3
 
 

@@ -21,8 +21,8 @@ from mlbatch.report import ledger
 from mlbatch.report.report import build_report
 from mlbatch.rig.rig import read_rig
 from mlbatch.sensors import models
-from mlbatch.writers import formats
-from mlbatch.writers._layouts import CLOUD_LAYOUTS, PLY_LAYOUT
+from mlbatch.writers import format_names
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.contract.test_help import OPTIONS
 from tests.contract.tree import PACKAGE, ROOT, run_mlbatch, run_python
 
@@ -151,7 +151,7 @@ def test_layouts_are_described(name: str) -> None:
 
 def test_formats_are_described() -> None:
     titles = re.findall(r"^## (\w+)", _page("formats.md"), re.MULTILINE)
-    assert {title.lower() for title in titles} >= set(formats())
+    assert {title.lower() for title in titles} >= set(format_names())
 
 
 def test_every_container_is_named() -> None:

@@ -172,7 +172,7 @@ def points_kinds() -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(size=st.sampled_from(SIZES), count=st.integers(0, 9), seed=st.integers(0, 2**32))
 def test_random_bytes_are_nobodys(plugin: Plugin, size: int, count: int, seed: int) -> None:
     sample = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
@@ -180,7 +180,7 @@ def test_random_bytes_are_nobodys(plugin: Plugin, size: int, count: int, seed: i
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(content=st.binary(max_size=400) | st.text(max_size=400).map(str.encode))
 def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) -> None:
     refusal = "some.file: "

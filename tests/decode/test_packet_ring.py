@@ -67,7 +67,7 @@ steps = st.lists(
 
 
 @given(steps, st.sampled_from([(50, 7, 12, 3), (36, 0, 12, 3), (33, 32, 1, 1), (64, 8, 24, 2)]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_needed_records_survive_growth_and_wrap(
     plan: list[tuple[int, int, int]], sizes: tuple[int, int, int, int]
 ) -> None:

@@ -21,7 +21,7 @@ FOLDER = Path("build") / "fuzz"
 _PART = 2000
 _TOLD = 50_000
 # What Python cannot interrupt (a search in C) ends the process with the place where it hung.
-_HANG_S = 60
+_HANG_S = 300
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,6 +61,7 @@ def test_a_campaign_tells_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None
         threading.Event().wait()
 
     monkeypatch.setattr(harness, "LONGEST_S", 0.2)
+    monkeypatch.setattr(harness, "WAITING_S", 2.0)
     wanted = (
         *((crash, "BrokenLaw: of thermodynamics"), (swell, "MemoryError")),
         *((turn, "TooLate"), (wait, "TooLate")),

@@ -19,13 +19,13 @@ import pytest
 
 from mlbatch.decode.decoder import Decoder
 from mlbatch.errors import ExportError, PacketError
-from mlbatch.writers import _gathered
-from mlbatch.writers._chunk import Chunk
+from mlbatch.writers import output_file
+from mlbatch.writers.mcap_container import Chunk
 from tests.builders.run import command
 from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, TWO, Case, contents, write_recordings
 
-_HANGS_AFTER_S = 240
+_HANGS_AFTER_S = 300
 _TURNS = 14
 _SESSION = "session/drive.pcap"
 _MORE = {
@@ -117,7 +117,7 @@ class Nth:
 # What fails in a stage, and what is said of it.
 STAGES: dict[str, tuple[BaseException, str]] = {
     "decode": (PacketError("spoilt"), "spoilt"),
-    "seal": (MemoryError(), "out of memory"),
+    "compress": (MemoryError(), "out of memory"),
     "write": (OSError(28, "No space left on device"), "No space left on device"),
 }
 
@@ -131,15 +131,15 @@ def test_an_error_of_any_stage_ends_the_run(
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
     error, wanted = STAGES[stage]
     nth = Nth(number, error)
-    scan, seal, write_all = Decoder.scan, Chunk.seal, _gathered.write_all
+    scan, compress, write_all = Decoder.scan, Chunk.compress, output_file.write_all
 
     def failing_scan(*given: object) -> object:
         nth.call()
         return scan(*given)  # type: ignore[arg-type]
 
-    def failing_seal(*given: object) -> None:
+    def failing_compress(*given: object) -> None:
         nth.call()
-        seal(*given)  # type: ignore[arg-type]
+        compress(*given)  # type: ignore[arg-type]
 
     def failing_write(*given: object) -> None:
         nth.call()
@@ -147,10 +147,10 @@ def test_an_error_of_any_stage_ends_the_run(
 
     if stage == "decode":
         monkeypatch.setattr(Decoder, "scan", failing_scan)
-    elif stage == "seal":
-        monkeypatch.setattr(Chunk, "seal", failing_seal)
+    elif stage == "compress":
+        monkeypatch.setattr(Chunk, "compress", failing_compress)
     else:
-        monkeypatch.setattr(_gathered, "write_all", failing_write)
+        monkeypatch.setattr(output_file, "write_all", failing_write)
     told = command(*_words("mcap", "--jobs", str(jobs)))
     assert told.code == 1
     assert told.err.count("\n") == 1
@@ -182,13 +182,13 @@ def test_the_earliest_scan_that_fails_is_told(
 SLOW = """
 import sys, time
 from mlbatch import cli, resume
-from mlbatch.writers import npz
+from mlbatch.writers.formats import npz
 resume.INTERVAL_S = 0.0
-save = npz.NpzSaver.save
+encode = npz.NpzEncoder.encode
 def slow(*given):
-    save(*given)
     time.sleep(0.2)
-npz.NpzSaver.save = slow
+    return encode(*given)
+npz.NpzEncoder.encode = slow
 cli.main()
 """
 
@@ -213,7 +213,7 @@ def test_an_interrupt_ends_the_run_and_it_goes_on(
             assert process.poll() is None
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     assert said.endswith(
         "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "

@@ -81,7 +81,7 @@ def test_a_file_that_may_not_grow_is_continued(
     refused = _run("-c", LIMITED, str(limit_bytes), *words, cwd=place)
     assert refused.returncode == 1
     assert re.search(
-        r"partial: wanted to write it, got 'File too large'; raise the limit of file sizes or "
+        r"partial: expected to write it, found 'File too large'; raise the limit of file sizes or "
         r"choose another disk; then --resume goes on after the \d+ scans that are safe\n$",
         refused.stderr,
     )

@@ -16,8 +16,7 @@ from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.run import convert
-from mlbatch.pipeline.workers import Steps
-from mlbatch.report.report import ReportInputs
+from mlbatch.report.report import RunReport
 from mlbatch.types import RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
@@ -121,7 +120,7 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
 
 
 def test_a_dry_run_reports_the_same() -> None:
-    def sums(report: ReportInputs) -> list[object]:
+    def sums(report: RunReport) -> list[object]:
         return [report.scans, report.t_init_ns, *(sensor.ledger for sensor in report.sensors)]
 
     job = replace(FIXTURE, extras=frozenset())
@@ -135,7 +134,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
         folder = tmp_path / str(turns)
         one = Unit(turns=turns)
         run, _ = convert(_job(write_session(folder, one, twin(one, 222)), identity=True), None)
-        sizes.append([feed.ring.nbytes for feed in run.feeds])
+        sizes.append([sensor.ring.nbytes for sensor in run.sensors])
     assert sizes[0] == sizes[1]
 
 
@@ -145,13 +144,10 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
 class _FullDisk(Memory):
     """Fails at the second scan."""
 
-    def write(self, scan: Scan, sensor: int | None = None) -> Steps:
-        steps = super().write(scan, sensor)
-        next(steps)
-        yield
+    def keep(self, scan: Scan, sensor: int | None) -> None:
         if self.scans:
             raise ExportError("no space left")
-        yield from steps
+        super().keep(scan, sensor)
 
 
 def test_a_writer_is_abandoned_when_the_run_fails() -> None:

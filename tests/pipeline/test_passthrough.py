@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.pipeline.passthrough import ImuQueue, PassQueue
+from mlbatch.pipeline.passthrough import ImuQueue, MessageQueue
 from mlbatch.report.ledger import DecodedCounts
 from mlbatch.types import ImuSamples, Message, Topic
 
@@ -23,11 +23,11 @@ def test_what_is_taken_by_and_by_is_all_in_the_order_of_times(
     arrivals: list[tuple[int, Topic]], ends: list[int], low: int, limit_comes_first: bool
 ) -> None:
     messages = [Message(topic, at, bytes([number])) for number, (at, topic) in enumerate(arrivals)]
-    queue = PassQueue([], frozenset({"cdr"}))
+    queue = MessageQueue([], frozenset({"cdr"}))
     queue.add(messages)
     if limit_comes_first:
         queue.drop_before(low)
-    taken = [queue.take(end, (low, None), None) for end in (*sorted(ends), None)]
+    taken = [queue.drain_until(end, (low, None), None) for end in (*sorted(ends), None)]
     for end, part in zip(sorted(ends), taken, strict=False):
         assert all(message.host_ns < end for message in part)
     # Of equal times the topics by name, and messages of one topic as they came.
@@ -44,17 +44,17 @@ def test_what_is_taken_by_and_by_is_all_in_the_order_of_times(
 
 
 def test_what_lies_before_the_first_limit_does_not_wait() -> None:
-    queue = PassQueue([], frozenset({"cdr"}))
+    queue = MessageQueue([], frozenset({"cdr"}))
     queue.add([Message(TOPICS[0], at, b"") for at in range(10)])
     queue.drop_before(7)
     assert queue.waiting == 3
     assert queue.counts["/b"].dropped == {"outside_time": 7}
     counts = DecodedCounts()
-    samples = ImuQueue([counts], [100], wanted=True)
+    samples = ImuQueue([counts], [100], has_place=True)
     zeros = np.zeros((10, 3))
     samples.add(ImuSamples(0, np.arange(10), zeros, zeros))
     samples.drop_before(107)
     assert counts.dropped == {"outside_time": 7}
-    (left,) = samples.take(None, (107, None))
+    (left,) = samples.drain_until(None, (107, None))
     assert left.stamp_ns.tolist() == [107, 108, 109]
     assert counts.written == 3

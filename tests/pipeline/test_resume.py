@@ -18,7 +18,8 @@ from mlbatch.pipeline import resume
 from mlbatch.pipeline import resume as _resume_state
 from mlbatch.readers import _source
 from mlbatch.types import Scan
-from mlbatch.writers import npz
+from mlbatch.writers.formats import npz
+from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
 from tests.resume_storm import contents
 
@@ -41,16 +42,16 @@ def shell(
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
     """Have the writing of a scan fail, once."""
-    save, calls = npz.NpzSaver.save, 0
+    encode, calls = npz.NpzEncoder.encode, 0
 
-    def failing(saver: npz.NpzSaver, file: object, found: Scan) -> None:
+    def failing(encoder: npz.NpzEncoder, found: Scan) -> list[Bytes]:
         nonlocal calls
         calls += 1
         if calls == scan + 1:
             raise error
-        save(saver, file, found)  # type: ignore[arg-type]
+        return encode(encoder, found)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", failing)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", failing)
 
 
 def _interrupt(shell: Shell, words: str = f"{CAPTURE} -o out") -> None:
@@ -74,13 +75,13 @@ def test_it_goes_on_after_the_scans_that_are_safe(
     _interrupt(shell)
     first = Path("out.partial/000000.npz").stat().st_mtime_ns
     saved = []
-    save = npz.NpzSaver.save
+    encode = npz.NpzEncoder.encode
 
-    def counting(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
+    def counting(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
         saved.append(scan.index)
-        save(saver, file, scan)  # type: ignore[arg-type]
+        return encode(encoder, scan)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", counting)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", counting)
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 0
     assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
@@ -100,14 +101,14 @@ def test_an_interrupt_tells_of_it(shell: Shell, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_request_to_end_is_an_interrupt(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGTERM)
-    save = npz.NpzSaver.save
+    encode = npz.NpzEncoder.encode
 
-    def ending(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
-        save(saver, file, scan)  # type: ignore[arg-type]
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
         if scan.index == 1:
             signal.raise_signal(signal.SIGTERM)
+        return encode(encoder, scan)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", ending)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 130
     assert signal.getsignal(signal.SIGTERM) is before
     assert '"synced":true' in STATE.read_text().splitlines()[-1]
@@ -189,8 +190,8 @@ def test_a_lost_scan_is_refused(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        "mlbatch: error: out.partial/000001.npz: wanted a scan of the interrupted run to go on "
-        "after it, got none; leave out --resume to begin anew"
+        "mlbatch: error: out.partial/000001.npz: expected a scan of the interrupted run, "
+        "found no file; leave out --resume to start over"
     )
 
 
@@ -198,7 +199,7 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=30))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.Course, "complete", _refuse)
+        patch.setattr(resume.ResumeLog, "complete", _refuse)
         assert shell(f"convert {capture} -o out.mcap").code == 1
     partial = Path("out.mcap.partial")
     kept = json.loads(Path("out.mcap.partial.state").read_text().splitlines()[-2])["kept_bytes"]
@@ -206,12 +207,12 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"convert {capture} -o out.mcap --resume")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1] == (
-        f"mlbatch: error: out.mcap.partial: wanted {kept} bytes of the interrupted run to go on "
-        f"after them, got {kept - 1}; leave out --resume to begin anew"
+        f"mlbatch: error: out.mcap.partial: expected {kept} bytes of the interrupted run, "
+        f"found {kept - 1}; leave out --resume to start over"
     )
 
 
-def _refuse(course: resume.Course) -> None:
+def _refuse(course: resume.ResumeLog) -> None:
     raise ExportError("stopped")
 
 
@@ -258,7 +259,7 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
 
     monkeypatch.setattr(run, "check_target", refuse)
     outcome = shell(f"convert {CAPTURE} -o out")
-    assert (outcome.code, "got an existing one" in outcome.err) == (1, True)
+    assert (outcome.code, "found an existing one" in outcome.err) == (1, True)
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
@@ -314,7 +315,7 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: out.partial/000004.npz: wanted to write it, got 'No space left on "
+        "mlbatch: error: out.partial/000004.npz: expected to write it, found 'No space left on "
         "device'; free space on this disk or choose another output; then --resume goes on after "
         "the 4 scans that are safe\n"
     )
@@ -361,7 +362,7 @@ def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
     _interrupt(shell, f"{CAPTURE} -o out --overwrite")
     refused = shell(f"convert {CAPTURE} -o out --resume")
     assert refused.code == 1
-    assert "wanted a new output, got an existing one" in refused.err
+    assert "expected a new output, found an existing one" in refused.err
     assert shell(f"convert {CAPTURE} -o out --resume --overwrite").code == 0
     assert contents(Path()) == whole
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import pytest
 
-from mlbatch.pipeline.workers import Workers, in_one_go
+from mlbatch.pipeline.workers import OrderedWorkers, run_inline
 
 PARTS = 4
 
@@ -23,32 +23,50 @@ class Work:
         self._pauses_s = random.Random(seed)
         self._lock = threading.Lock()
 
-    def steps(self, task: int) -> Iterator[None]:
-        for part in range(PARTS):
-            time.sleep(self._pauses_s.random() * 1e-3)
-            if (task, part) in self._fails:
-                raise OSError(f"task {task}")
-            with self._lock:
-                self.done.append((task, part))
-            if part < PARTS - 1:
-                yield
+    def do(self, task: int, part: int) -> None:
+        """Do a part of a task, or fail in it."""
+        time.sleep(self._pauses_s.random() * 1e-3)
+        if (task, part) in self._fails:
+            raise OSError(f"task {task}")
+        with self._lock:
+            self.done.append((task, part))
 
     def of(self, part: int) -> list[int]:
         """Tasks whose part was done, in this order."""
         return [task for task, own in self.done if own == part]
 
 
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A task whose stages are parts 0 to 3 of a work."""
+
+    work: Work
+    number: int
+
+    def decode(self) -> None:
+        self.work.do(self.number, 0)
+
+    def append(self) -> None:
+        self.work.do(self.number, 1)
+
+    def compress(self) -> None:
+        self.work.do(self.number, 2)
+
+    def commit(self) -> None:
+        self.work.do(self.number, 3)
+
+
 def run(work: Work, tasks: int, threads: int, ahead: int) -> None:
-    with Workers(work.steps, threads, ahead) as workers:
+    with OrderedWorkers[Task](threads, ahead) as workers:
         for task in range(tasks):
-            workers.put(task)
+            workers.put(Task(work, task))
         workers.finish()
 
 
 def give(work: Work, tasks: int, then: Exception) -> None:
-    with Workers(work.steps, 2, 4) as workers:
+    with OrderedWorkers[Task](2, 4) as workers:
         for task in range(tasks):
-            workers.put(task)
+            workers.put(Task(work, task))
         raise then
 
 
@@ -66,9 +84,9 @@ def test_parts_in_turn_are_done_in_the_order_of_tasks(threads: int, seed: int) -
 @pytest.mark.parametrize("ahead", [0, 1, 4])
 def test_no_more_tasks_are_unfinished_than_allowed(ahead: int) -> None:
     work = Work()
-    with Workers(work.steps, 3, ahead) as workers:
+    with OrderedWorkers[Task](3, ahead) as workers:
         for task in range(30):
-            workers.put(task)
+            workers.put(Task(work, task))
             assert task + 1 - len(work.of(3)) <= ahead
 
 
@@ -118,5 +136,5 @@ def test_no_thread_is_left() -> None:
 
 def test_alone_all_parts_are_done_at_once() -> None:
     work = Work()
-    in_one_go(work.steps(5))
+    run_inline(Task(work, 5))
     assert work.done == [(5, part) for part in range(PARTS)]

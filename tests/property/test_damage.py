@@ -19,7 +19,7 @@ import pytest
 from mlbatch.discovery.discover import Wishes
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
-from mlbatch.report.report import ReportInputs, build_report
+from mlbatch.report.report import RunReport, build_report
 from mlbatch.types import Scan
 from tests.builders.captures import pcap_bytes
 from tests.builders.damage import (
@@ -118,7 +118,7 @@ def outcome(job: Job, frames_given: int | None = None) -> Outcome:
     return json.dumps(ledgers), prints(result)
 
 
-def check_ledgers(report: ReportInputs) -> None:
+def check_ledgers(report: RunReport) -> None:
     """Ledgers balance (docs/report.md), and every datagram is counted."""
     capture = report.capture
     unassigned = sum(row.packets for row in report.unassigned)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mlbatch.discovery.discover import Wishes
-from mlbatch.faults.replay import Fault, parse_fault
+from mlbatch.faults import Fault, parse_fault
 from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
@@ -124,7 +124,7 @@ def printed(job: Job) -> Print:
     assert len(scans) > LENGTH_NS * RATE / 10**9 - 1
     assert run.table is not None
     table = csv_without_arrival(run.table.text())
-    ledgers = [repr(feed.ledger) for feed in run.feeds]
+    ledgers = [repr(sensor.ledger) for sensor in run.sensors]
     return scans, table, ledgers, repr(run.info)
 
 

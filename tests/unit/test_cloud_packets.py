@@ -108,7 +108,7 @@ def test_memory_is_bounded_where_later_clouds_share_no_times() -> None:
         pack(points, Layout(0, 256), 22 * 10_000)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 40)), min_size=1, max_size=120),
     st.booleans(),

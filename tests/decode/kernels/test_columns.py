@@ -76,8 +76,8 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
     found = []
     for make, words in OTHERS:
         job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
-        (sensor,) = Conversion(job).setup.sensors
-        found.append(sensor.found.lidar)
+        (sensor,) = Conversion(job).sensors
+        found.append(sensor.lidar)
     return found
 
 
@@ -181,13 +181,13 @@ def check(lidars: list[Lidar], case: Case) -> None:
 
 
 @given(cases, st.sampled_from(NAMES), st.sampled_from((16, 32, 64, 128)))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_any_pixels_of_any_profile(case: Case, profile: str, beams: int) -> None:
     check([ouster(profile, beams)], case)
 
 
 @given(case=cases, chosen=st.lists(st.integers(0, len(OTHERS) + 1), min_size=1, max_size=4))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_any_pixels_of_any_rig(case: Case, chosen: list[int], others: list[Lidar]) -> None:
     # Two that are decoded together, as their pixels are alike.
     alike = [ouster("RNG15_RFL8_NIR8", 32, 1), ouster("RNG15_RFL8_NIR8", 32, 2)]

@@ -312,7 +312,7 @@ def test_many_messages_give_what_they_give_one_by_one() -> None:
     assert list(zip(*(column.tolist() for column in columns), strict=True)) == expected
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(sorted(PACKET_TYPES)), st.sampled_from(["cdr", "ros1"]), st.data())
 def test_lengths_that_lie_never_read_beyond_the_message(
     name: str, encoding: str, draw: st.DataObject

@@ -213,7 +213,7 @@ def feed(seed: int) -> Records:
     return records
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(
     seed=st.integers(0, 2**32),
     buffer_bytes=st.sampled_from([100, 1000, 2000, 5000, 20_000, 100_000]),

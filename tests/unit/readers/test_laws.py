@@ -86,7 +86,7 @@ def read_or_refusal(recording: CaptureRecording) -> list[Seen] | str:
         return str(err)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(seed=st.integers(0, 2**32), buffer_bytes=BUFFERS)
 def test_any_buffer_gives_the_same_packets_and_counts(seed: int, buffer_bytes: int) -> None:
     with TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def test_any_buffer_gives_the_same_packets_and_counts(seed: int, buffer_bytes: i
         assert small.streams.streams == whole.streams.streams
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @example(seed=128280, buffer_bytes=64)
 @given(seed=st.integers(0, 2**32), buffer_bytes=BUFFERS)
 def test_damaged_files_balance_whatever_the_buffer(seed: int, buffer_bytes: int) -> None:

@@ -127,7 +127,7 @@ def test_no_recordings_and_empty_recordings() -> None:
     assert merged([[], [1], []]) == [(1, 0)]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     session=st.lists(st.lists(st.integers(0, 30), max_size=20), max_size=4),
     seed=st.integers(0, 1000),

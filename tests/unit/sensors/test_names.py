@@ -146,14 +146,14 @@ SIZES = [34, 42, 51, 80, 99, 512, 568, 678, 786, 812, 861, 918, 978, 1072, 1080,
 SIZES += [1206, 1210, 1212, 1248, 1256, 1262, 1268, 1278, 1318, 1362, 1380, 1388]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
 def test_random_bytes_are_nobodys(size: int, seed: int, count: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
     assert named(noise) is None
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(min_size=1, max_size=1500), st.integers(1, 3))
 def test_any_bytes_give_a_name_or_none(payload: bytes, count: int) -> None:
     assert "\n" not in (named(rows([payload] * count)) or "")

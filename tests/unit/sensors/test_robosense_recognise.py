@@ -118,7 +118,7 @@ def test_a_damaged_packet_does_not_hide_a_stream() -> None:
 SIZES = [51, 812, 1200, 1210, 1248, 1268, 1342, 1404, 1448]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
 def test_random_bytes_are_nobodys(size: int, seed: int, count: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)

@@ -1,0 +1,158 @@
+"""Windows to scans, by one thread or several: what is to be decoded, and by whom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from mlbatch.batching.windows import Window
+from mlbatch.decode.decoder import Decoder, Due, Label, Source
+from mlbatch.report.ledger import PointCounts
+from mlbatch.types import Scan
+
+# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_FATES`.
+Outcomes: TypeAlias = Sequence[Sequence[int]]
+# Gives a decoder of these sensors; with `--split` of one sensor, whose index is the second.
+NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
+
+
+@dataclass(slots=True)
+class DecodeTask:
+    """Columns of one scan, to be decoded.
+
+    only: with `--split` the index of their sensor; outcomes: as in `Decoder.scan`.
+    """
+
+    columns: Due
+    label: Label
+    only: int | None
+    outcomes: Outcomes | None
+    is_decoded: bool = False
+
+    @property
+    def end_ns(self) -> int:
+        """End of the window."""
+        return self.label.end_ns
+
+    def oldest_place(self, sensor: int) -> int | None:
+        """First ring place of a sensor whose pixels are still needed."""
+        if self.is_decoded:
+            return None
+        if self.only is None:
+            place = self.columns.place[self.columns.sensor == sensor]
+        else:
+            place = self.columns.place[: len(self.columns) if self.only == sensor else 0]
+        return int(place.min()) if len(place) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A scan, and its slots by outcome, one list a sensor."""
+
+    scan: Scan
+    outcomes: list[list[int]]
+
+
+class DecodeWorker:
+    """The decoders of one thread, with scratch memory of their own."""
+
+    def __init__(self, sources: Sequence[Source], split: bool, new: NewDecoder) -> None:
+        """split: one decoder a sensor, since each task then is of one sensor."""
+        self._sensors = len(sources)
+        if split:
+            for source in sources:
+                source.ring_base = 0
+            self._decoders = [new([source], number) for number, source in enumerate(sources)]
+        else:
+            self._decoders = [new(sources, None)]
+
+    def decode(self, task: DecodeTask) -> Decoded:
+        """Decode a task; the arrays are valid as long as the decoder's buffers last."""
+        decoder = self._decoders[task.only or 0]
+        before = [counts.fates for counts in decoder.counts]
+        scan = decoder.scan(task.columns, task.label, task.outcomes)
+        task.is_decoded = True
+        after = [counts.fates for counts in decoder.counts]
+        outcomes = [
+            [late - early for late, early in zip(now, was, strict=True)]
+            for now, was in zip(after, before, strict=True)
+        ]
+        if task.only is not None:
+            nothing = [[0] * len(outcomes[0])] * self._sensors
+            outcomes = [*nothing[: task.only], *outcomes, *nothing[task.only + 1 :]]
+        return Decoded(scan, outcomes)
+
+    @property
+    def points(self) -> list[PointCounts]:
+        """Point counters of each sensor."""
+        return [counts for decoder in self._decoders for counts in decoder.counts]
+
+
+class DecodePool:
+    """The decode workers of a run, and the tasks whose raw packets are still needed."""
+
+    def __init__(
+        self, sources: Sequence[Source], new: NewDecoder, *, workers: int, split: bool
+    ) -> None:
+        """workers: one a thread; each has lidars of its own if there are several.
+
+        Lidars have scratch memory, and the feeding thread reads column headers with them.
+        """
+        self._split = split
+        self._open: list[DecodeTask] = []
+        self.workers = [
+            DecodeWorker(_with_own_lidars(sources) if workers > 1 else sources, split, new)
+            for _ in range(workers)
+        ]
+
+    def tasks(self, window: Window, earlier: Iterator[Outcomes]) -> Iterator[DecodeTask]:
+        """Yield the tasks of a window: one, or with `--split` one for each sensor in it.
+
+        earlier: outcomes of the scans that a resumed output already contains.
+        """
+        label = Label(
+            window.index,
+            window.slice,
+            window.start_ns,
+            window.end_ns,
+            window.complete,
+            window.ready_host_ns,
+        )
+        columns = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
+        if not self._split:
+            yield self._task(columns, label, None, earlier)
+            return
+        for number in np.unique(window.sensor).tolist():
+            own = window.sensor == number
+            first = np.zeros(int(np.count_nonzero(own)), np.int64)
+            part = Due(columns.stamp_ns[own], first, columns.place[own], columns.encoder[own])
+            yield self._task(part, label, number, earlier)
+
+    def _task(
+        self, columns: Due, label: Label, only: int | None, earlier: Iterator[Outcomes]
+    ) -> DecodeTask:
+        task = DecodeTask(columns, label, only, next(earlier, None))
+        self._open.append(task)
+        return task
+
+    def oldest_place(self, sensor: int) -> int | None:
+        """First ring place of a sensor that a task still needs; None: none."""
+        self._open = [task for task in self._open if not task.is_decoded]
+        places = [task.oldest_place(sensor) for task in self._open]
+        return min((place for place in places if place is not None), default=None)
+
+    def points(self, sensor: int) -> PointCounts:
+        """Point counters of a sensor, over all workers."""
+        total = PointCounts()
+        for worker in self.workers:
+            total.add(worker.points[sensor].fates)
+        return total
+
+
+def _with_own_lidars(sources: Sequence[Source]) -> list[Source]:
+    """The same sources with copies of their lidars; rings are shared."""
+    return [replace(source, lidar=deepcopy(source.lidar)) for source in sources]

@@ -1,0 +1,135 @@
+"""A sensor of a run: one object from its packets to its accounting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from mlbatch.arrays import F64Array
+from mlbatch.batching.intake import Intake
+from mlbatch.clocks.timescale import timescale
+from mlbatch.clocks.watch import ClockWatch
+from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.projector import Source
+from mlbatch.discovery.extrinsics import Mounted
+from mlbatch.lidar.interface import Lidar
+from mlbatch.report.ledger import SensorLedger
+from mlbatch.rig.rig import RigSensor
+
+if TYPE_CHECKING:
+    from mlbatch.clocks.align import ClockMap
+
+
+@dataclass(slots=True)
+class SensorClock:
+    """How the timestamps of a sensor become timestamps of the common clock.
+
+    by_host: receive times replace the sensor's timestamps; offset_ns: the rig's correction, added
+    to the sensor's timestamps; has_receive_times: False where packets share the log time of a
+    message; watch: measures timestamp minus receive time; map: of `--align-clocks`, once fitted.
+    """
+
+    by_host: bool
+    offset_ns: int
+    has_receive_times: bool
+    watch: ClockWatch
+    map: ClockMap | None = None
+
+    @property
+    def source(self) -> str:
+        """`host` or `sensor`, as in the report."""
+        return "host" if self.by_host else "sensor"
+
+    @property
+    def imu_offset_ns(self) -> int:
+        """Correction of IMU timestamps; receive times need none."""
+        return 0 if self.by_host else self.offset_ns
+
+    def timescale(self, stamp_ns: int, host_ns: int) -> str:
+        """Timescale of the timestamps as they are batched; host_ns: receive time of stamp_ns."""
+        return timescale(host_ns if self.by_host else stamp_ns, host_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Which points of a sensor are written; ranges in m."""
+
+    min_range_m: float
+    max_range_m: float
+    keep_repeated: bool
+
+
+@dataclass(slots=True)
+class Sensor:
+    """A lidar of this run: how it is read, where it sits, its clock, its packets and counters.
+
+    index: `lidar_id` in outputs; detected: what discovery knows of it; ring_base: first ring
+    number of its channels; columns_per_s: nominal rate, None if unknown; ring: raw packets until
+    their window closes.
+    """
+
+    index: int
+    detected: Mounted
+    clock: SensorClock
+    limits: Limits
+    ring_base: int
+    columns_per_s: float | None
+    ring: RawRing
+    ledger: SensorLedger = field(default_factory=SensorLedger)
+
+    @property
+    def name(self) -> str:
+        """Name in all outputs."""
+        return self.detected.name
+
+    @property
+    def lidar(self) -> Lidar:
+        """Decoder of its packets."""
+        return self.detected.found.lidar
+
+    @property
+    def body_from_sensor(self) -> F64Array:
+        """Extrinsics, (4, 4) float64, m."""
+        return self.detected.body_from_sensor
+
+    @property
+    def rig(self) -> RigSensor | None:
+        """Entry in the rig file, None without a rig."""
+        return self.detected.rig
+
+    @property
+    def is_required(self) -> bool:
+        """True if the rig requires at least one packet of it."""
+        return self.rig is not None and not self.rig.optional
+
+    def intake(self) -> Intake:
+        """A new intake of the batcher for this sensor."""
+        lidar = self.lidar
+        return Intake(
+            self.name,
+            host_clock=self.clock.by_host,
+            offset_ns=self.clock.offset_ns,
+            modulus=lidar.sequence_modulus,
+            packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
+        )
+
+    def source(self) -> Source:
+        """What decoding needs of this sensor."""
+        return Source(
+            self.lidar,
+            self.ring,
+            self.body_from_sensor,
+            self.ring_base,
+            self.limits.min_range_m,
+            self.limits.max_range_m,
+            self.limits.keep_repeated,
+        )
+
+    def unread(self) -> Sensor:
+        """The same sensor with an empty ring and ledger, for a pass of its own."""
+        return replace(self, ring=new_ring(self.lidar), ledger=SensorLedger())
+
+
+def new_ring(lidar: Lidar) -> RawRing:
+    """An empty ring for the packets of a lidar."""
+    return RawRing(lidar.packet_size, lidar.records)

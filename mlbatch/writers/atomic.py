@@ -1,0 +1,225 @@
+"""Atomic outputs: complete under the final name, or not there at all.
+
+An output is written to `<OUTPUT>.partial` and renamed at the end. A killed run leaves its
+`.partial`; the next run to the same output continues it (`--resume`) or replaces it. This covers
+killed processes. It does not cover a power failure right after a run: nothing is synced to disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mlbatch.errors import ExportError
+from mlbatch.writers.formats import format_module, format_names
+
+PARTIAL_SUFFIX = ".partial"
+SCANS_CSV = "scans.csv"
+REPORT_JSON = "report.json"
+# Files that a run writes into a folder. A folder with any other file is never replaced.
+_SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(\w+)")
+# The same for a ROS 2 bag. Recorders write such files as well: a scans.csv marks our own.
+_OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
+# A report may have any name (`--report`); it is recognised by its first bytes, in any version.
+_REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
+_HEAD_BYTES = 64
+_ADVICE = {
+    errno.ENOSPC: "free space on this disk or choose another output",
+    errno.EDQUOT: "free space in your quota or choose another output",
+    errno.EFBIG: "raise the limit of file sizes or choose another disk",
+    errno.EACCES: "choose an output where you may write",
+    errno.EPERM: "choose an output where you may write",
+    errno.EROFS: "choose an output on a disk that is not read-only",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+_BYTES_PER_MB = 1_000_000
+
+
+@contextlib.contextmanager
+def export_errors(path: Path) -> Iterator[None]:
+    """Convert an OSError while `path` is written to an ExportError of one line."""
+    try:
+        yield
+    except OSError as err:
+        advice = _ADVICE.get(err.errno or 0, "check the disk and the name of the output")
+        reason = err.strerror or str(err)
+        raise ExportError(f"{path}: expected to write it, found {reason!r}; {advice}") from err
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """A file or folder under construction."""
+
+    target: Path  # final path
+    partial: Path  # path until `publish`
+    overwrite: bool  # whether an earlier output at `target` may be replaced
+
+    def publish(self) -> None:
+        """Move the finished output to its final path, replacing an earlier output."""
+        with export_errors(self.target):
+            old = old_path(self.target)
+            if not os.path.lexists(self.target):
+                self.partial.rename(self.target)
+                # Left by a run that was killed between the two renames of a folder.
+                _remove(old)
+                return
+            _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
+            if self.target.is_dir():
+                self._replace_folder()
+            else:
+                os.replace(self.partial, self.target)
+
+    def _replace_folder(self) -> None:
+        """Swap folders: a folder cannot be renamed onto one that is not empty."""
+        old = old_path(self.target)
+        _remove(old)
+        self.target.rename(old)
+        try:
+            self.partial.rename(self.target)
+        except OSError:
+            old.rename(self.target)
+            raise
+        shutil.rmtree(old)
+
+
+def is_taken(name: str) -> bool:
+    """Return whether a run may write a file of this name into an output folder."""
+    return _is_own_file(name) or bool(_OWN_BAG_FILE.fullmatch(name))
+
+
+def _is_own_file(name: str) -> bool:
+    scan = _SCAN_FILE.fullmatch(name)
+    if scan is None:
+        return name in (SCANS_CSV, REPORT_JSON)
+    return scan[3] in format_names() and format_module(scan[3]).SUFFIX is None
+
+
+def is_report(path: Path) -> bool:
+    """Return whether a file is the report of a run."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _REPORT.match(file.read(_HEAD_BYTES)) is not None
+
+
+def check_name(target: Path) -> None:
+    """Refuse a path that cannot be created: not a name, or without a parent folder."""
+    if target.name in ("", ".", ".."):
+        raise ExportError(
+            f"{target}: expected the name of a new output, found a folder; add a name"
+        )
+    if not target.parent.is_dir():
+        raise ExportError(
+            f"{target}: expected an output in an existing folder, found no folder {target.parent}; "
+            "create it (mkdir -p) or choose another"
+        )
+
+
+def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
+    """Check that `target` can be written; create a new `.partial` unless `keep`."""
+    check_name(target)
+    if os.path.lexists(target):
+        _check_replaceable(target, overwrite, folder)
+    partial = partial_path(target)
+    if keep:
+        return Output(target, partial, overwrite)
+    with export_errors(partial):
+        _remove(partial)
+        if folder:
+            partial.mkdir()
+        else:
+            partial.touch()
+    return Output(target, partial, overwrite)
+
+
+def discard(target: Path) -> None:
+    """Remove the `.partial` of an output."""
+    partial = partial_path(target)
+    with export_errors(partial):
+        _remove(partial)
+
+
+def partial_path(target: Path) -> Path:
+    """Return the path of an output under construction."""
+    return target.with_name(target.name + PARTIAL_SUFFIX)
+
+
+def old_path(target: Path) -> Path:
+    """Return the path of an older output folder while the new one is moved into place."""
+    return target.with_name(f"{target.name}.old{PARTIAL_SUFFIX}")
+
+
+def discard_old(target: Path) -> None:
+    """Remove the replaced folder of a run that was killed right after its output was complete."""
+    with export_errors(target):
+        _remove(old_path(target))
+
+
+def side_path(target: Path, name: str) -> Path:
+    """Return the path of the report or scan table of an output that is a file."""
+    return target.with_name(f"{target.name}.{name}")
+
+
+def check_free_space(target: Path, needed_bytes: int) -> None:
+    """Refuse an output if its disk has less free space than `needed_bytes`."""
+    with export_errors(target):
+        free_bytes = shutil.disk_usage(target.parent).free
+    if free_bytes < needed_bytes:
+        raise ExportError(
+            f"{target}: expected about {needed_bytes // _BYTES_PER_MB} MB of free disk, found "
+            f"{free_bytes // _BYTES_PER_MB} MB; free space or choose another output"
+        )
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a small file atomically, replacing an older one."""
+    partial = partial_path(path)
+    with export_errors(path):
+        partial.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(partial, path)
+
+
+def _check_replaceable(target: Path, overwrite: bool, folder: bool) -> None:
+    """Refuse to replace what exists at `target` unless allowed and written by a run."""
+    if not overwrite:
+        raise ExportError(
+            f"{target}: expected a new output, found an existing one; choose another or --overwrite"
+        )
+    expected = "folder" if folder else "file"
+    if not (target.is_dir() if folder else target.is_file()):
+        raise ExportError(
+            f"{target}: expected a {expected} to overwrite, found none; choose another"
+        )
+    with export_errors(target):
+        stranger = next(_strangers(target, deep=True), None) if folder else None
+    if stranger is not None:
+        raise ExportError(
+            f"{target}: expected a folder with nothing but scans to overwrite, found "
+            f"{stranger.name} in it; choose another output"
+        )
+
+
+def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
+    """Yield entries of a folder that no run wrote; deep: enter folders of single sensors."""
+    has_scans = (folder / SCANS_CSV).is_file()
+    for entry in folder.iterdir():
+        if has_scans and _OWN_BAG_FILE.fullmatch(entry.name):
+            continue
+        if deep and entry.is_dir() and not entry.is_symlink():
+            yield from _strangers(entry, deep=False)
+        elif not (_is_own_file(entry.name) or is_report(entry)):
+            yield entry
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or folder if it exists."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,126 @@
+"""The interface of writers: what a format module offers, and what it is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+
+DEFAULT_POINT_LAYOUT = "standard"
+NO_COMPRESSION = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class WriterOptions:
+    """Options of an output."""
+
+    point_layout: str = DEFAULT_POINT_LAYOUT  # preset of PointCloud2 fields
+    overwrite: bool = False  # replace an existing output at the end
+    split: bool = False  # one output stream per sensor instead of merged scans
+    # Bytes to keep of the file in an existing `.partial` (0 where each scan is a file); None: start
+    # a new `.partial`.
+    kept_bytes: int | None = None
+    compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """Written data that survive a kill of the process: the first `scans`, and their bytes."""
+
+    scans: int
+    kept_bytes: int = 0  # length of the part of the output file with these scans
+
+
+class ScanJob:
+    """The work of a writer for one scan, in four stages; a stage without work does nothing.
+
+    The caller runs all four in this order, each once. `pack` and `compress` run in any thread, at
+    the same time as stages of other jobs. `append` and `commit` run in the order of the scans,
+    each after the same stage of all earlier jobs.
+    """
+
+    def pack(self) -> None:
+        """Convert the points to the bytes of a message or file. Any thread."""
+
+    def append(self) -> None:
+        """Assign the position in the output: sequence number, chunk. In order."""
+
+    def compress(self) -> None:
+        """Compress what is complete, compute its checksums. Any thread."""
+
+    def commit(self) -> None:
+        """Write what is complete. In order."""
+
+
+class ScanWriter(Protocol):
+    """Writer of one run; there is no file at the final path before `finish`.
+
+    Stages of jobs may run in several threads, see `ScanJob`. IMU samples and messages are written
+    right before an `append`, `checkpoint` is called right after a `commit`, both in that order;
+    other jobs may be in other stages then. `finish` is called when all jobs are done.
+    """
+
+    def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that writes a scan; its arrays must stay valid until the last stage.
+
+        sensor: index of the only sensor in the scan with `--split`, None for a merged scan.
+        """
+        ...
+
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job for a scan that the kept part of a `.partial` contains.
+
+        Only the number of its points is used, not their values.
+        """
+        ...
+
+    def flush(self) -> ScanJob:
+        """Return the job that writes complete chunks of messages where no scan follows them."""
+        ...
+
+    def checkpoint(self) -> Checkpoint:
+        """Return what a resumed run need not write again; hands it to the system first."""
+        ...
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Write IMU samples; formats without IMU ignore the call."""
+        ...
+
+    def write_message(self, message: Message) -> None:
+        """Forward a recorded message unchanged; formats without messages ignore the call."""
+        ...
+
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
+        """Complete the output and move it to its final path.
+
+        last: called with the path of the complete output, just before the move.
+        """
+        ...
+
+    def abandon(self) -> None:
+        """Close all files after an error; the `.partial` stays."""
+        ...
+
+
+class WriterModule(Protocol):
+    """A format: a module in `writers/formats/`, called by the name of the format."""
+
+    FORMAT: str  # name of the module
+    SUFFIX: str | None  # of the output file; None: the output is a folder
+    COMPRESSES: bool  # whether `--compression` applies
+
+    def extras(self, options: WriterOptions) -> frozenset[str]:
+        """Return the optional contents that the output includes.
+
+        A subset of `types.EXTRAS`, `types.IMU` and `types.MESSAGE_ENCODINGS`.
+        """
+        ...
+
+    def open_writer(self, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+        """Start the output `target`; nothing is created at that path before `finish`."""
+        ...

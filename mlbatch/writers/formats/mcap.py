@@ -1,0 +1,34 @@
+"""One MCAP file with PointCloud2, Imu and /tf_static of ROS 2 (docs/sources/outputs.md).
+
+Recorded messages are forwarded unchanged, also those of ROS 1: MCAP can contain both.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mlbatch.types import RunInfo
+from mlbatch.writers._wire import Cdr
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
+
+FORMAT = "mcap"
+SUFFIX: str | None = ".mcap"
+COMPRESSES = True
+
+
+def extras(options: WriterOptions) -> frozenset[str]:
+    """Return the inputs of the point layout, IMU samples and messages."""
+    return extras_of(options, "cdr", "ros1")
+
+
+def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start an MCAP file."""
+
+    def open_file(path: Path, kept_bytes: int | None) -> MessageFile:
+        # Imported here, so that naming the format does not load the library.
+        from mlbatch.writers.mcap_container import McapContainer
+
+        return McapContainer(path, kept_bytes, options.compression)
+
+    return MessageWriter(target, info, options, Cdr, open_file)

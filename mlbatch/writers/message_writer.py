@@ -1,0 +1,415 @@
+"""Outputs of ROS messages: topics, message order, /tf_static, IMU samples, PointCloud2 assembly.
+
+The fields of the messages: docs/sources/messages.md and docs/sources/outputs.md. A format gives a
+`MessageFile`, the container to which the messages are written, and a `Wire`, their encoding.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+import numpy as np
+
+from mlbatch.arrays import F64Array
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.writers._ros2_types import FIELD_CODES
+from mlbatch.writers._wire import Wire
+from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
+from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions
+from mlbatch.writers.output_file import borrow
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_of
+
+# Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
+WAITING_SAMPLES = 65536
+WAITING_BYTES = 16 << 20
+_TF_STATIC = "/tf_static"
+
+# sensor_msgs/Imu: -1 in the covariance means no orientation; a covariance of zeros is unknown.
+_NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
+_UNKNOWN_COVARIANCE = (0.0,) * 9
+
+
+class PendingChunk(Protocol):
+    """Messages of a file that are complete and not written yet."""
+
+    def compress(self) -> None:
+        """Compress the messages and compute checksums. Any thread."""
+        ...
+
+    def write(self) -> None:
+        """Write the chunk; in the order of `take_chunks`."""
+        ...
+
+
+class MessageFile(Protocol):
+    """A container of messages under construction; it collects messages to chunks."""
+
+    @property
+    def complete_chunks(self) -> int:
+        """Number of complete chunks, written or not: the next message is added to this chunk."""
+        ...
+
+    def written(self) -> tuple[int, int]:
+        """Return the number of chunks that the system has, and the bytes up to their end."""
+        ...
+
+    def take_chunks(self) -> Sequence[PendingChunk]:
+        """Return the chunks completed since the last call; none if they are written at once."""
+        ...
+
+    def send(
+        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+    ) -> None:
+        """Append a message of type `kind`, package/Type; the first one creates the topic."""
+        ...
+
+    def forward(self, message: Message) -> None:
+        """Append a recorded message unchanged; ExportError if the file cannot contain it."""
+        ...
+
+    def finish(self, summary: Summary, grid: dict[str, str]) -> None:
+        """Add metadata where the container has a place for them, complete and close the file."""
+        ...
+
+    def abandon(self) -> None:
+        """Close the incomplete file."""
+        ...
+
+
+NewWire: TypeAlias = Callable[[], Wire]
+# Path, and the bytes to keep of an existing file, None: create a new one.
+OpenFile: TypeAlias = Callable[[Path, int | None], MessageFile]
+
+
+def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
+    """Return the inputs of the point layout, IMU samples, and messages in `encodings`."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    return frozenset({IMU, *encodings}) | (frozenset() if layout is None else layout.extras)
+
+
+def _layout_of(options: WriterOptions) -> Layout:
+    """Return the point layout of the options."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    if layout is None:
+        raise UsageError(
+            f"--point-layout: expected one of {', '.join(CLOUD_LAYOUTS)}, found "
+            f"{options.point_layout!r}; choose one"
+        )
+    return layout
+
+
+class MessageWriter:
+    """Writes a run as messages; those before the first scan wait, since /tf_static is first."""
+
+    def __init__(
+        self,
+        target: Path,
+        info: RunInfo,
+        options: WriterOptions,
+        wire: NewWire,
+        opener: OpenFile,
+        *,
+        folder: bool = False,
+    ) -> None:
+        """opener: opens the file at the path of the partial output; folder: in that folder."""
+        # Before anything is created, as it may be refused.
+        self._layout = _layout_of(options)
+        keep = options.kept_bytes is not None
+        self._output = prepare(target, options.overwrite, folder, keep)
+        self._info = info
+        self._wire = wire
+        self.idle: list[CloudMessage] = []  # buffers that no job uses
+        self._waiting: list[ImuSamples | Message] = []
+        self._waiting_samples = 0
+        self._waiting_bytes = 0
+        self._begun = False
+        # For each scan that is not in a written chunk: the number of its chunk.
+        self._chunk_of_scan: deque[int] = deque()
+        self._written_scans = 0
+        self._topics: dict[int | None, str] = {None: "/points"}
+        if options.split:
+            for number, sensor in enumerate(info.sensors):
+                self._topics[number] = f"/{sensor.name}/points"
+        imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
+        self._own = frozenset({_TF_STATIC, *self._topics.values(), *imu})
+        with export_errors(self._output.partial):
+            self._file = opener(self._output.partial, options.kept_bytes)
+
+    def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
+        return _CloudJob(self, scan, sensor, is_kept=False)
+
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that sends a message as long as the scan: the kept file contains it."""
+        return _CloudJob(self, scan, sensor, is_kept=True)
+
+    def flush(self) -> ScanJob:
+        """Return the job that writes complete chunks."""
+        return _ChunkJob(self._file, self._output.partial)
+
+    def checkpoint(self) -> Checkpoint:
+        """Return the scans in written chunks."""
+        chunks, kept_bytes = self._file.written()
+        while self._chunk_of_scan and self._chunk_of_scan[0] < chunks:
+            self._chunk_of_scan.popleft()
+            self._written_scans += 1
+        return Checkpoint(self._written_scans, kept_bytes)
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Write IMU samples at their own timestamps."""
+        self._send_or_wait(samples)
+
+    def write_message(self, message: Message) -> None:
+        """Forward a recorded message at its log time."""
+        topic = message.topic.name
+        if topic in self._own:
+            raise ExportError(
+                f"{self._output.target}: expected recorded topics other than those of the scans, "
+                f"found {topic}; do not pass it, or rename the sensor in the rig"
+            )
+        self._send_or_wait(message)
+
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
+        """Add metadata, close the file and move it to its final path."""
+        output = self._output
+        with export_errors(output.partial):
+            self._begin(summary.t_init_ns)
+            self._file.finish(summary, self._grid(summary))
+        if last is not None:
+            last(output.partial)
+        # Only after all that may fail: until now the table of an older output is in place.
+        inside = output.partial.is_dir()
+        table = output.partial / SCANS_CSV if inside else side_path(output.target, SCANS_CSV)
+        write_text(table, summary.scans_csv)
+        output.publish()
+
+    def abandon(self) -> None:
+        """Close the file; it has no index and stays under `.partial`."""
+        self._file.abandon()
+
+    # -- for the stages of jobs ---------------------------------------------------------------
+
+    def pack_scan(self, scan: Scan, is_kept: bool) -> tuple[CloudMessage, memoryview]:
+        """Return the message of a scan and the buffer that contains it. Any thread.
+
+        is_kept: only the length of the message is used.
+        """
+        dense = scan.info.layout != "organized"
+        cloud = borrow(self.idle, self._new_cloud)
+        if is_kept:
+            shape = (scan.points,) if dense else scan.time_ns.T.shape
+            return cloud, cloud.blank(shape, scan.start_ns)
+        return cloud, cloud.assemble(points_of(scan), scan.start_ns, dense)
+
+    def send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
+        """Add the message of a scan to its chunk. In order."""
+        with export_errors(self._output.partial):
+            self._begin(scan.start_ns)
+            self._chunk_of_scan.append(self._file.complete_chunks)
+            topic = self._topics[sensor]
+            self._file.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+
+    # -- messages -----------------------------------------------------------------------------
+
+    def _new_cloud(self) -> CloudMessage:
+        return CloudMessage(self._layout, self._info.frame_id, self._wire)
+
+    def _send_or_wait(self, item: ImuSamples | Message) -> None:
+        with export_errors(self._output.partial):
+            if self._begun:
+                self._send(item)
+                return
+            self._waiting.append(item)
+            if isinstance(item, Message):
+                self._waiting_bytes += len(item.data)
+            else:
+                self._waiting_samples += len(item.stamp_ns)
+            if self._waiting_samples >= WAITING_SAMPLES or self._waiting_bytes >= WAITING_BYTES:
+                self._begin(None)
+
+    def _begin(self, start_ns: int | None) -> None:
+        """Write /tf_static at the earliest known timestamp, then what waited; once."""
+        if self._begun:
+            return
+        self._begun = True
+        stamps = [] if start_ns is None else [start_ns]
+        for item in self._waiting:
+            if isinstance(item, Message):
+                stamps.append(item.host_ns)
+            else:
+                stamps += item.stamp_ns.tolist()
+        stamp_ns = min(stamps, default=0)
+        transforms = static_transforms(self._info, stamp_ns, self._wire)
+        self._file.send(_TF_STATIC, "tf2_msgs/TFMessage", stamp_ns, transforms, latched=True)
+        for item in self._waiting:
+            self._send(item)
+        self._waiting.clear()
+
+    def _send(self, item: ImuSamples | Message) -> None:
+        if isinstance(item, Message):
+            self._file.forward(item)
+            return
+        name = self._info.sensors[item.sensor].name
+        for row in range(len(item.stamp_ns)):
+            message = imu_message(item, row, f"{name}_imu", self._wire)
+            self._file.send(f"/{name}/imu", "sensor_msgs/Imu", int(item.stamp_ns[row]), message)
+
+    def _grid(self, summary: Summary) -> dict[str, str]:
+        info = self._info
+        return {
+            "rate_hz": info.rate_hz,
+            "t_init_ns": "" if summary.t_init_ns is None else str(summary.t_init_ns),
+            "slices": str(info.slices),
+            "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
+            "timescale": info.timescale,
+            "frame_id": info.frame_id,
+        }
+
+
+class _ChunkJob(ScanJob):
+    """Writes the chunks that are complete at its `append`."""
+
+    def __init__(self, file: MessageFile, partial: Path) -> None:
+        self._file = file
+        self._partial = partial
+        self._chunks: Sequence[PendingChunk] = ()
+
+    def append(self) -> None:
+        with export_errors(self._partial):
+            self._chunks = self._file.take_chunks()
+
+    def compress(self) -> None:
+        for chunk in self._chunks:
+            chunk.compress()
+
+    def commit(self) -> None:
+        with export_errors(self._partial):
+            for chunk in self._chunks:
+                chunk.write()
+
+
+class _CloudJob(ScanJob):
+    """Writes one scan, and the chunks that are complete with it."""
+
+    def __init__(
+        self, writer: MessageWriter, scan: Scan, sensor: int | None, is_kept: bool
+    ) -> None:
+        self._writer = writer
+        self._scan = scan
+        self._sensor = sensor
+        self._is_kept = is_kept
+        self._chunks = writer.flush()
+
+    def pack(self) -> None:
+        self._cloud, self._message = self._writer.pack_scan(self._scan, self._is_kept)
+
+    def append(self) -> None:
+        self._writer.send_scan(self._scan, self._sensor, self._message)
+        self._chunks.append()
+
+    def compress(self) -> None:
+        self._chunks.compress()
+
+    def commit(self) -> None:
+        self._chunks.commit()
+        self._writer.idle.append(self._cloud)
+
+
+class CloudMessage:
+    """Assembles sensor_msgs/PointCloud2 in one buffer that is reused for every scan."""
+
+    def __init__(self, layout: Layout, frame_id: str, wire: NewWire) -> None:
+        self._layout = layout
+        self._frame_id = frame_id
+        self._wire = wire
+        self._dtype = layout.dtype
+        self._buffer = np.empty(0, dtype=np.uint8)
+
+    def assemble(self, points: Points, stamp_ns: int, dense: bool) -> memoryview:
+        """Return the message; it is valid until the next call."""
+        head = self._head(points.time_ns.shape, stamp_ns)
+        start = len(head)
+        end = start + points.time_ns.size * self._layout.step
+        self._fit(end + 1)
+        self._buffer[:start] = np.frombuffer(head, dtype=np.uint8)
+        records = self._buffer[start:end].view(self._dtype)
+        self._layout.pack(points, records.reshape(points.time_ns.shape))
+        self._buffer[end] = dense
+        return self._buffer[: end + 1].data
+
+    def blank(self, shape: tuple[int, ...], stamp_ns: int) -> memoryview:
+        """Return bytes as long as the message of a cloud of this shape, with any content."""
+        total = len(self._head(shape, stamp_ns)) + math.prod(shape) * self._layout.step + 1
+        self._fit(total)
+        return self._buffer[:total].data
+
+    def _fit(self, total: int) -> None:
+        if len(self._buffer) < total:
+            # Zeros: padding between fields is never written.
+            self._buffer = np.zeros(total * 5 // 4, dtype=np.uint8)
+
+    def _head(self, shape: tuple[int, ...], stamp_ns: int) -> bytearray:
+        """Return the message up to its points; shape: (width,) or (height, width)."""
+        step = self._layout.step
+        height, width = shape if len(shape) == 2 else (1, shape[0])
+        message = self._wire()
+        message.header(stamp_ns, self._frame_id)
+        message.put("I", height, width, len(self._layout.fields))
+        for field in self._layout.fields:
+            message.text(field.name)
+            message.put("I", field.offset)
+            message.put("B", FIELD_CODES[field.dtype])
+            message.put("I", 1)
+        message.put("B", 0)
+        message.put("I", step, step * width, step * width * height)
+        return message.data
+
+
+def imu_message(samples: ImuSamples, row: int, frame_id: str, wire: NewWire) -> bytes:
+    """Return the sensor_msgs/Imu of one of the samples."""
+    message = wire()
+    message.header(int(samples.stamp_ns[row]), frame_id)
+    message.put("d", *_NO_ORIENTATION)
+    message.put("d", *samples.angular_velocity[row].tolist(), *_UNKNOWN_COVARIANCE)
+    message.put("d", *samples.acceleration[row].tolist(), *_UNKNOWN_COVARIANCE)
+    return bytes(message.data)
+
+
+def static_transforms(info: RunInfo, stamp_ns: int, wire: NewWire) -> bytes:
+    """Return the tf2_msgs/TFMessage with the pose of every sensor in the body frame."""
+    message = wire()
+    message.put("I", len(info.sensors))
+    for sensor in info.sensors:
+        pose = sensor.body_from_sensor
+        message.header(stamp_ns, info.frame_id)
+        message.text(sensor.name)
+        message.put("d", *pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
+    return bytes(message.data)
+
+
+def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3).
+
+    K = 4 q q^T is linear in the rotation; its row with the largest diagonal is q up to a factor
+    and far from 0 (S. W. Shepperd, "Quaternion from rotation matrix", 1978).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    product = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )
+    row = product[int(np.argmax(np.diagonal(product)))]
+    x, y, z, w = (row / np.sqrt((row * row).sum())).tolist()
+    # Adding 0.0 turns -0.0 into 0.0, so that equal poses give equal bytes.
+    sign = -1.0 if w < 0 else 1.0
+    return sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0

@@ -1,0 +1,97 @@
+"""What may be replaced, and errors of the disk; laws of every format are in test_formats.py."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from mlbatch.errors import ExportError
+from mlbatch.writers import WriterOptions, check_free_space, open_writer, write_text
+from mlbatch.writers.atomic import prepare
+from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
+
+
+def test_a_full_disk_names_a_remedy(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
+    os.symlink("/dev/full", tmp_path / "out.partial" / "000000.npz")
+    with pytest.raises(ExportError, match=r"found 'No space left on device'; free space"):
+        run_job(writer.write(dense_scan()))
+
+
+@pytest.mark.parametrize("stranger", ["notes.txt", "left/photo.jpg", ".git/config"])
+def test_a_folder_with_other_files_is_never_replaced(stranger: str, tmp_path: Path) -> None:
+    (tmp_path / "out" / stranger).parent.mkdir(parents=True)
+    (tmp_path / "out" / stranger).write_text("mine")
+    with pytest.raises(ExportError, match=Path(stranger).name):
+        prepare(tmp_path / "out", overwrite=True, folder=True)
+    assert (tmp_path / "out" / stranger).read_text() == "mine"
+
+
+def test_a_recorded_bag_is_never_replaced(tmp_path: Path) -> None:
+    """Its files have the names of an output, but there is no scans.csv."""
+    (tmp_path / "drive").mkdir()
+    for name in ("drive_0.mcap", "metadata.yaml"):
+        (tmp_path / "drive" / name).write_text("mine")
+    with pytest.raises(ExportError, match=r"drive_0\.mcap|metadata\.yaml"):
+        prepare(tmp_path / "drive", overwrite=True, folder=True)
+    assert len(list((tmp_path / "drive").iterdir())) == 2
+
+
+def test_files_and_folders_do_not_replace_each_other(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(ExportError, match="expected a file to overwrite"):
+        prepare(tmp_path / "folder", overwrite=True, folder=False)
+    with pytest.raises(ExportError, match="expected a folder to overwrite"):
+        prepare(tmp_path / "file", overwrite=True, folder=True)
+    if Path("/dev/null").exists():
+        with pytest.raises(ExportError, match="expected a file to overwrite"):
+            prepare(Path("/dev/null"), overwrite=True, folder=False)
+
+
+def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
+    writer = open_writer("mcap", tmp_path / "out.mcap", run_info(), WriterOptions())
+    (tmp_path / "out.mcap").write_text("other run")
+    with pytest.raises(ExportError, match="existing"):
+        writer.finish(SUMMARY)
+    assert (tmp_path / "out.mcap").read_text() == "other run"
+
+
+@pytest.mark.parametrize("target", ["missing/out", "file/out"])
+def test_a_missing_parent_folder_is_named(target: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ExportError, match="mkdir -p"):
+        prepare(tmp_path / target, overwrite=False, folder=True)
+
+
+@pytest.mark.parametrize("target", ["..", "/", "."])
+def test_folders_are_no_names(target: str) -> None:
+    with pytest.raises(ExportError, match="add a name"):
+        prepare(Path(target), overwrite=True, folder=True)
+
+
+def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    if os.access(locked, os.W_OK):
+        pytest.skip("this user may write everywhere")
+    with pytest.raises(ExportError, match="choose an output where you may write"):
+        prepare(locked / "out", overwrite=False, folder=True)
+
+
+def test_too_little_free_disk_is_refused(tmp_path: Path) -> None:
+    check_free_space(tmp_path / "out", 1)
+    with pytest.raises(ExportError, match="expected about 1000000000000 MB of free disk"):
+        check_free_space(tmp_path / "out", 10**18)
+
+
+def test_texts_replace_older_ones_whole(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    write_text(path, "long text\n")
+    write_text(path, "µ\n")
+    assert path.read_bytes() == b"\xc2\xb5\n"
+    assert len(list(tmp_path.iterdir())) == 1

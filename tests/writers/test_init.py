@@ -1,0 +1,116 @@
+"""Which format an output gets, what is refused, and where the side files are."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mlbatch.errors import UsageError
+from mlbatch.writers import (
+    WriterOptions,
+    check_compression,
+    check_target,
+    choose_format,
+    extras,
+    format_names,
+    report_paths,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_formats_are_found_by_their_place() -> None:
+    modules = (ROOT / "mlbatch" / "writers" / "formats").glob("[!_]*.py")
+    assert format_names() == tuple(sorted(path.stem for path in modules))
+    assert set(format_names()) >= {"mcap", "npz", "ply", "rosbag1", "rosbag2"}
+
+
+def test_listing_formats_loads_no_heavy_package() -> None:
+    code = (
+        "import sys; from mlbatch.writers import format_names; format_names(); "
+        "sys.exit(any(name in sys.modules for name in ('numpy', 'mcap')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("target", "asked", "expected"),
+    [
+        ("out.mcap", None, "mcap"),
+        ("OUT.MCAP", None, "mcap"),
+        ("out", None, "npz"),
+        ("drive.2024", None, "npz"),
+        ("out", "ply", "ply"),
+        ("out", "npz", "npz"),
+        ("out", "mcap", "mcap"),
+        ("out.mcap", "mcap", "mcap"),
+        ("out.bag", None, "rosbag1"),
+        ("out", "rosbag1", "rosbag1"),
+        ("out", "rosbag2", "rosbag2"),
+    ],
+)
+def test_suffix_and_option_choose(target: str, asked: str | None, expected: str) -> None:
+    assert choose_format(Path(target), asked) == expected
+
+
+@pytest.mark.parametrize(
+    ("target", "asked", "hint"),
+    [
+        ("a/x.ply", None, "-o a/x --format ply"),
+        ("x.npz", "npz", "-o x --format npz"),
+        ("x.ply", "mcap", "folder"),
+        ("x.mcap", "npz", "leave out .mcap"),
+        ("x.pcd", None, "pcd, not in this version"),
+        ("x.db3", None, "-o x --format rosbag2"),
+        ("x.bag", "rosbag2", "leave out .bag"),
+        ("x.bag", "mcap", "the name of a .mcap file for --format mcap, found that of a rosbag1"),
+        ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
+        ("x", "las", "'las' (not in this version)"),
+        ("x", "stl", "one of mcap, npz, ply"),
+    ],
+)
+def test_refusals_name_a_remedy(target: str, asked: str | None, hint: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        choose_format(Path(target), asked)
+    assert hint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_paths_of_side_files() -> None:
+    folder = report_paths(Path("a/out"), "npz")
+    assert (folder.report, folder.scans_csv) == (Path("a/out/report.json"), Path("a/out/scans.csv"))
+    file = report_paths(Path("a/x.mcap"), "mcap")
+    assert file.report == Path("a/x.mcap.report.json")
+    assert file.scans_csv == Path("a/x.mcap.scans.csv")
+
+
+def test_contents_of_the_formats() -> None:
+    for name, encodings in (("mcap", {"cdr", "ros1"}), ("rosbag1", {"ros1"}), ("rosbag2", {"cdr"})):
+        assert extras(name, WriterOptions()) == {"imu", *encodings}
+        assert extras(name, WriterOptions("ouster")) == {
+            *("imu", "range_m", "reflectivity", *encodings)
+        }
+    for name in ("npz", "ply"):
+        assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
+
+
+@pytest.mark.parametrize("name", ["npz", "ply", "rosbag1"])
+def test_formats_without_compression_refuse_it(name: str) -> None:
+    check_compression(name, WriterOptions())
+    with pytest.raises(UsageError) as caught:
+        check_compression(name, WriterOptions(compression="zstd"))
+    assert str(caught.value) == (
+        f"--compression: expected none for {name}, found 'zstd'; leave it out, or write a .mcap "
+        "or rosbag2 output"
+    )
+    with pytest.raises(UsageError, match="zstd:1 to zstd:22, found 'gzip'"):
+        check_compression(name, WriterOptions(compression="gzip"))
+
+
+def test_ply_is_never_organized(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="organized"):
+        check_target("ply", tmp_path / "x", WriterOptions(), "organized")
+    assert not list(tmp_path.iterdir())
