@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mlbatch.verify.outputs import Proof, examine
-from mlbatch.verify.papers import Beside
+from mlbatch.verify.report_checks import Beside
 from mlbatch.verify.verdict import (
     CHECKS,
     Check,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.types import F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.verify.cursor import Cursor
+from mlbatch.verify.encoding import Cursor
 from mlbatch.verify.scan import HeldScan
 from mlbatch.verify.verdict import DamageError
 

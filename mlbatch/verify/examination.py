@@ -11,16 +11,16 @@ from mlbatch.verify.agreement import check_report
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.column_checks import Twins, check_columns
 from mlbatch.verify.geometry_checks import Geometry
-from mlbatch.verify.papers import Papers
 from mlbatch.verify.placing import Placing
-from mlbatch.verify.point_checks import (
+from mlbatch.verify.report import check_grid, check_ledger, poses_of
+from mlbatch.verify.report_checks import Papers
+from mlbatch.verify.scan import HeldScan
+from mlbatch.verify.scan_checks import (
     check_labels,
     check_times,
     fits_columns,
     valid_points,
 )
-from mlbatch.verify.report import check_grid, check_ledger, poses_of
-from mlbatch.verify.scan import HeldScan
 from mlbatch.verify.table import check_table
 from mlbatch.verify.tally import Tally
 from mlbatch.verify.verdict import Judge

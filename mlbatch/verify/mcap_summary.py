@@ -7,7 +7,7 @@ import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 
-from mlbatch.verify.cursor import Cursor
+from mlbatch.verify.encoding import Cursor
 from mlbatch.verify.verdict import DamageError, Judge
 
 _HEAD = struct.Struct("<BQ")

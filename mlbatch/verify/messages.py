@@ -13,8 +13,8 @@ import numpy as np
 from mlbatch.types import F64Array
 from mlbatch.verify.claims import Claims
 from mlbatch.verify.clouds import held, read_cloud
-from mlbatch.verify.cursor import Cursor
 from mlbatch.verify.document import Document
+from mlbatch.verify.encoding import Cursor
 from mlbatch.verify.examination import Examination
 from mlbatch.verify.report import poses_of
 from mlbatch.verify.verdict import DamageError, Judge

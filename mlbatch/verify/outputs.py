@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.verify import mcap, messages, npz, ply, rosbag1
+from mlbatch.verify import containers, messages, npz, ply, rosbag1
 from mlbatch.verify.claims import Claims
+from mlbatch.verify.containers import McapFile
 from mlbatch.verify.examination import Examination
 from mlbatch.verify.folders import entries, scan_files
-from mlbatch.verify.mcap import McapFile
 from mlbatch.verify.messages import LAYOUT_LIMITS, Topics
-from mlbatch.verify.papers import (
+from mlbatch.verify.report_checks import (
     TABLE,
     Beside,
     Papers,
@@ -70,7 +70,7 @@ def examine(proof: Proof) -> Verdict:
             head = file.read(16)
     except OSError as err:
         raise VerifyError(f"{path}: wanted to read it, got {err.strerror!r}") from err
-    if head.startswith(mcap.MAGIC):
+    if head.startswith(containers.MAGIC):
         return _of_mcap(proof, path, "mcap", Claims())
     if head.startswith(rosbag1.MAGIC):
         return _of_rosbag1(proof)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.unit.verify.made import (
+from tests.builders.outputs import (
     Edit,
     Values,
     arrays,

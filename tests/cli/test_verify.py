@@ -11,8 +11,8 @@ import pytest
 
 from mlbatch.cli.verify import SHOWN
 from mlbatch.verify import CHECKS
+from tests.builders.outputs import Values, arrays, copied, forget, made, npz, plus
 from tests.builders.run import ROOT, command
-from tests.unit.verify.made import Values, arrays, copied, forget, made, npz, plus
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -15,7 +15,7 @@ import zstandard
 from mlbatch.verify import verify
 from mlbatch.verify.unpacking import unpacked
 from mlbatch.verify.verdict import DamageError
-from tests.unit.verify.made import forget, found, made, spoiled, spoiled_places
+from tests.builders.outputs import forget, found, made, spoiled, spoiled_places
 
 MB = 1 << 20
 NAMES = ("zstd", "lz4")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.unit.verify.made import (
+from tests.builders.outputs import (
     Edit,
     flipped,
     forget,
@@ -27,7 +27,7 @@ from tests.unit.verify.made import (
     with_cell,
     with_value,
 )
-from tests.unit.verify.remade import (
+from tests.builders.rewritten import (
     Change,
     Notes,
     Sent,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mlbatch.verify import VerifyError, verify
-from tests.unit.verify.made import (
+from tests.builders.outputs import (
     Edit,
     both,
     copied,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mlbatch.verify import verify
-from mlbatch.verify.papers import claims_of_grid
+from mlbatch.verify.report_checks import claims_of_grid
 from mlbatch.verify.verdict import Judge, VerifyError
-from tests.unit.verify.made import (
+from tests.builders.outputs import (
     Edit,
     at,
     copied,
@@ -23,7 +23,7 @@ from tests.unit.verify.made import (
     spoiled_places,
     text,
 )
-from tests.unit.verify.remade import (
+from tests.builders.rewritten import (
     Change,
     Records,
     bag,

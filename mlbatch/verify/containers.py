@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from mlbatch.verify.cursor import Cursor
+from mlbatch.verify.encoding import Cursor
 from mlbatch.verify.mcap_summary import ChunkPlace, Found, check_summary
 from mlbatch.verify.messages import Message
 from mlbatch.verify.unpacking import unpacked

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from mlbatch.verify.clouds import PRESETS
-from tests.unit.verify.made import Edit
+from tests.builders.outputs import Edit
 
 Records = npt.NDArray[Any]
 _CODES = {2: "u1", 4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}
