@@ -1,217 +1,693 @@
-"""The MCAP container, held against itself: chunks, indexes, statistics, checksums (mcap.dev/spec).
+"""MCAP files and ROS bags: messages in the order of the file, and the indexes checked against them.
 
-Chunks are read one at a time; nothing that a length says is believed beyond the file's own size.
+`mcap` and `rosbags` parse the records. The lengths of records are checked against the file, and
+sizes of compressed chunks against a limit, before a library allocates anything.
+Sources: mcap.dev/spec; wiki.ros.org/Bags/Format/2.0; docs/sources/outputs.md section 4.
 """
 
 from __future__ import annotations
 
+import importlib
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import SEEK_CUR, SEEK_END, BufferedReader, BytesIO, FileIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, TypeAlias, cast
 
-from mlbatch.verify.encoding import Cursor
-from mlbatch.verify.mcap_summary import ChunkPlace, Found, check_summary
-from mlbatch.verify.messages import Message
-from mlbatch.verify.unpacking import unpacked
-from mlbatch.verify.verdict import DamageError, Judge, VerifyError
+from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
-MAGIC = b"\x89MCAP0\r\n"
+if TYPE_CHECKING:
+    from mcap.records import Chunk, McapRecord
+    from rosbags.rosbag1 import Reader
+    from rosbags.rosbag1.reader import Header
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+BAG_MAGIC = b"#ROSBAG V2.0\n"
+BAG_LIMITS = {"container": "lengths and indexes; bags have no checksums"}
+METADATA_YAML = "metadata.yaml"
+
 _HEAD = struct.Struct("<BQ")
 _FOOTER_BYTES = _HEAD.size + 20
-_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 1, 3, 4, 5, 6, 7
-_ATTACHMENT, _METADATA, _DATA_END = 9, 12, 15
-# Parts of the data whose damage is told with their place.
-_NAMES = {_CHUNK: "chunk", _INDEX: "message index"}
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
+# Of a chunk: all but compression and records.
+_CHUNK_BYTES = 40
+_HEADER = 1
+_MESSAGE = 5
+_CHUNK = 6
+_MESSAGE_INDEX = 7
+_ATTACHMENT = 9
+_METADATA = 12
+_DATA_END = 15
+
+_PIECE_BYTES = 1 << 20
+# Largest chunk: this size, or this multiple of its stored bytes. Scans shrink to a half or a tenth;
+# decompression bombs are a thousand times larger than their stored bytes.
+_USUAL_BYTES = 1 << 28
+_MOST_TIMES = 256
+
+_METADATA_VERSION = 5
+_LARGEST_YAML_BYTES = 1 << 20
+Yaml: TypeAlias = "dict[str, Yaml] | list[Yaml] | str | int | float | bool | None"
+# Log time and offset of each message, by channel or connection.
+Index: TypeAlias = dict[int, list[tuple[int, int]]]
 
 
 @dataclass(frozen=True, slots=True)
-class _Record:
+class Message:
+    """A message in a file."""
+
+    where: str
+    topic: str
+    # package/Type
+    type: str
+    # cdr or ros1
+    encoding: str
+    log_ns: int
+    publish_ns: int
+    data: bytes | memoryview
+
+
+@contextmanager
+def library_errors(expected: str) -> Iterator[None]:
+    """Raise DamageError for whatever a library raises on damaged bytes."""
+    try:
+        yield
+    except DamageError:
+        raise
+    except Exception as err:
+        raise DamageError(expected, str(err) or type(err).__name__) from err
+
+
+class BoundedFile(BufferedReader):
+    """A file that refuses to read past its end, before anything is allocated."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(FileIO(path))
+        self.size = self.seek(0, SEEK_END)
+        self.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Exactly `size` bytes, or DamageError; all up to the end for -1."""
+        left = self.size - self.tell()
+        if size is None or size < 0:
+            return super().read(left)
+        if size > left:
+            raise DamageError(f"{size} bytes at byte {self.tell()}", f"{left} to the end of file")
+        return super().read(size)
+
+
+# -- MCAP -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a record is in the file."""
+
     opcode: int
     at: int
-    length: int
-
-    @property
-    def size(self) -> int:
-        return _HEAD.size + self.length
+    size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """A topic; type: package/Type."""
+@dataclass(slots=True)
+class _ChunkFound:
+    """What was read of one chunk and of its message indexes."""
 
-    topic: str
-    type: str
-    encoding: str
+    place: _Place
+    compression: str
+    stored_size: int
+    # Uncompressed.
+    size: int = 0
+    # False where the chunk is damaged: its messages are not known.
+    whole: bool = False
+    messages: Index = field(default_factory=dict)
+    indexed: Index = field(default_factory=dict)
+    index_at: dict[int, int] = field(default_factory=dict)
+    index_bytes: int = 0
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    def add(self, channel: int, log_ns: int, offset: int) -> None:
+        """Count a message."""
+        self.messages.setdefault(channel, []).append((log_ns, offset))
+        self.first_ns = log_ns if self.first_ns is None else min(self.first_ns, log_ns)
+        self.last_ns = max(self.last_ns, log_ns)
+
+    def index_record(self) -> McapRecord:
+        """The record that the summary should contain."""
+        from mcap.records import ChunkIndex
+
+        return ChunkIndex(
+            chunk_length=self.place.size,
+            chunk_start_offset=self.place.at,
+            compression=self.compression,
+            compressed_size=self.stored_size,
+            message_end_time=self.last_ns,
+            message_index_length=self.index_bytes,
+            message_index_offsets=self.index_at,
+            message_start_time=self.first_ns or 0,
+            uncompressed_size=self.size,
+        )
 
 
 class McapFile:
-    """An MCAP file; `open` tells what is in it besides chunks, `messages` reads these."""
+    """An MCAP file of mlbatch; its metadata and attachments are read at once."""
 
-    def __init__(self, judge: Judge, path: Path, where: str) -> None:
+    def __init__(self, log: CheckLog, path: Path, where: str) -> None:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
-        self.profile = self.library = ""
-        self._judge = judge
+        self.profile = ""
+        self.library = ""
+        # First and last log time, after all messages are read.
+        self.span_ns = (0, 0)
+        self._log = log
         self._path = path
         self._where = where
-        self._found = Found()
-        self._types: dict[int, str] = {}
-        self._channels: dict[int, Channel] = {}
-        self._sent: dict[int, int] = {}
-        with path.open("rb") as file:
-            self._size = path.stat().st_size
-            self._records = self._walk(file)
-            for record in self._records:
-                self._note(file, record)
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str, str]] = {}
+        self._counts: Counter[int] = Counter()
+        self._chunk: _ChunkFound | None = None
+        self._damaged = False
+        self._counted = False
+        # Index records that the summary should contain.
+        self._chunk_indexes: list[McapRecord] = []
+        self._metadata_indexes: list[McapRecord] = []
+        self._attachment_indexes: list[McapRecord] = []
+        with BoundedFile(path) as file:
+            self._places = self._walk(file)
+            for place in self._places:
+                if place.opcode in (_HEADER, _ATTACHMENT, _METADATA):
+                    try:
+                        self._describe_file(file, place)
+                    except DamageError as err:
+                        raise VerifyError(f"{path}: byte {place.at}: {err}; convert again") from err
 
-    # -- the file's level ---------------------------------------------------------------------
-
-    def _walk(self, file: BinaryIO) -> list[_Record]:
-        """All records up to the end of the data."""
-        if file.read(len(MAGIC)) != MAGIC:
-            raise VerifyError(f"{self._path}: wanted an MCAP file, got another; check the name")
-        records: list[_Record] = []
-        at = len(MAGIC)
-        while not records or records[-1].opcode != _DATA_END:
-            file.seek(at)
-            head = file.read(_HEAD.size)
-            opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            if not opcode or at + _HEAD.size + length + _FOOTER_BYTES + len(MAGIC) > self._size:
+    def _walk(self, file: BoundedFile) -> list[_Place]:
+        """All records to the end of the data section."""
+        if not file.read(min(len(MCAP_MAGIC), file.size)) == MCAP_MAGIC:
+            raise VerifyError(f"{self._path}: expected an MCAP file, found another; check the name")
+        places: list[_Place] = []
+        at = len(MCAP_MAGIC)
+        while not places or places[-1].opcode != _DATA_END:
+            opcode, length = 0, 0
+            if at + _HEAD.size <= file.size:
+                file.seek(at)
+                opcode, length = _HEAD.unpack(file.read(_HEAD.size))
+            size = _HEAD.size + length
+            if not opcode or at + size + _FOOTER_BYTES + len(MCAP_MAGIC) > file.size:
                 raise VerifyError(
-                    f"{self._path}: wanted a whole MCAP file, got one that ends or is damaged at "
-                    f"byte {at}; convert again"
+                    f"{self._path}: expected a whole MCAP file, found one that ends or is damaged "
+                    f"at byte {at}; convert again"
                 )
-            records.append(_Record(opcode, at, length))
-            at += records[-1].size
-        return records
+            places.append(_Place(opcode, at, size))
+            at += size
+        return places
 
-    def _note(self, file: BinaryIO, record: _Record) -> None:
-        """Keep metadata and attachments."""
-        if record.opcode not in (_HEADER, _ATTACHMENT, _METADATA):
-            return
-        cursor = Cursor(self._body(file, record))
-        try:
-            if record.opcode == _HEADER:
-                self.profile, self.library = cursor.text(), cursor.text()
-            elif record.opcode == _METADATA:
-                name = cursor.text()
-                self.metadata[name] = dict(cursor.part().pairs(_texts))
-                self._found.metadata.append((record.at, record.size, name))
-            else:
-                self._attachment(cursor, record)
-        except DamageError as err:
-            raise VerifyError(f"{self._path}: byte {record.at}: {err}; convert again") from err
+    def _describe_file(self, file: BoundedFile, place: _Place) -> None:
+        """Read a header, metadata or attachment record."""
+        from mcap.records import Attachment, AttachmentIndex, Header, Metadata, MetadataIndex
 
-    def _attachment(self, cursor: Cursor, record: _Record) -> None:
-        log_ns, create_ns = cursor.whole("Q"), cursor.whole("Q")
-        name, media = cursor.text(), cursor.text()
-        data = bytes(cursor.raw(cursor.whole("Q")))
-        crc = zlib.crc32(cursor.data[: cursor.at])
-        self._judge.equal("container", f"{self._where} {name} CRC", crc, cursor.whole("I"))
-        self.attachments[name] = data
-        row = (record.at, record.size, log_ns, create_ns, len(data), name, media)
-        self._found.attachments.append(row)
-
-    def _body(self, file: BinaryIO, record: _Record) -> memoryview:
-        file.seek(record.at + _HEAD.size)
-        return memoryview(file.read(record.length))
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """First and last log time, once all messages are read."""
-        return self._found.first_ns or 0, self._found.last_ns
-
-    # -- messages -----------------------------------------------------------------------------
+        data = _bytes_of(file, place)
+        _, record = next(_records(data))
+        if isinstance(record, Header):
+            self.profile = record.profile
+            self.library = record.library
+        elif isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+            self._metadata_indexes.append(MetadataIndex(place.at, place.size, record.name))
+        elif isinstance(record, Attachment):
+            self.attachments[record.name] = record.data
+            # The library skips this checksum.
+            actual = zlib.crc32(memoryview(data)[_HEAD.size : -4])
+            stored = int.from_bytes(data[-4:], "little")
+            self._log.equal("container", f"{self._where} {record.name} CRC", actual, stored)
+            self._attachment_indexes.append(
+                AttachmentIndex(
+                    offset=place.at,
+                    length=place.size,
+                    log_time=record.log_time,
+                    create_time=record.create_time,
+                    data_size=len(record.data),
+                    name=record.name,
+                    media_type=record.media_type,
+                )
+            )
 
     def messages(self) -> Iterator[Message]:
-        """All messages in the order of the file; then the summary is held against them."""
-        with self._path.open("rb") as file:
-            for record in self._records:
-                if record.opcode in (_CHUNK, _DATA_END) and self._found.chunks:
-                    self._found.chunks[-1].settle(self._judge, self._where)
-                if record.opcode in _NAMES:
-                    try:
-                        yield from self._part(self._body(file, record), record)
-                    except DamageError as err:
-                        where = f"{self._where} {_NAMES[record.opcode]} at byte {record.at}"
-                        self._judge.blame("container", where, err.wanted, err.got)
-                elif record.opcode == _MESSAGE:
-                    where = f"{self._where} byte {record.at}"
-                    self._judge.blame("container", where, "messages in chunks", "one outside")
-            end = self._records[-1]
-            file.seek(end.at + end.size)
+        """All messages in the order of the file; then the summary is checked against them."""
+        with BoundedFile(self._path) as file:
+            for place in self._places:
+                where = f"{self._where} byte {place.at}"
+                if place.opcode in (_CHUNK, _DATA_END):
+                    self._finish_chunk()
+                if place.opcode == _MESSAGE:
+                    self._log.fail("container", where, "messages in chunks", "one outside")
+                if place.opcode not in (_CHUNK, _MESSAGE_INDEX):
+                    continue
+                name = "chunk" if place.opcode == _CHUNK else "message index"
+                try:
+                    _, record = next(_records(_bytes_of(file, place)))
+                    if place.opcode == _CHUNK:
+                        yield from self._chunk_messages(place, cast("Chunk", record))
+                    else:
+                        self._add_message_index(place, record)
+                except DamageError as err:
+                    where = f"{self._where} {name} at byte {place.at}"
+                    self._log.fail("container", where, err.expected, err.found)
+            summary_at = self._places[-1].at + self._places[-1].size
+            file.seek(summary_at)
             summary = file.read()
-        self._found.channels = len(self._channels)
-        self._found.schemas = len(self._types)
-        check_summary(self._judge, self._where, self._found, summary, end.at + end.size)
+        self._check_summary(summary, summary_at)
 
-    def _part(self, body: memoryview, record: _Record) -> Iterator[Message]:
-        if record.opcode == _CHUNK:
-            yield from self._chunk(body, record)
-        else:
-            self._found.index(Cursor(body), record.at, record.size)
+    def _chunk_messages(self, place: _Place, record: Chunk) -> Iterator[Message]:
+        from mcap.records import Channel, Schema
+        from mcap.records import Message as McapMessage
 
-    def _chunk(self, body: memoryview, record: _Record) -> Iterator[Message]:
-        judge, where = self._judge, f"{self._where} chunk at byte {record.at}"
-        cursor = Cursor(body)
-        first_ns, last_ns, size = cursor.whole("Q"), cursor.whole("Q"), cursor.whole("Q")
-        crc, compression = cursor.whole("I"), cursor.text()
-        stored = cursor.raw(cursor.whole("Q"))
-        cursor.end("a chunk")
-        place = ChunkPlace(record.at, record.size, size, compression, len(stored), is_broken=True)
-        self._found.chunks.append(place)
-        data = unpacked(compression, stored, size)
-        place.content = len(data)
-        judge.equal("container", f"{where} size", len(data), size)
-        if not judge.equal("container", f"{where} CRC", f"{zlib.crc32(data):08x}", f"{crc:08x}"):
+        log = self._log
+        where = f"{self._where} chunk at byte {place.at}"
+        chunk = _ChunkFound(place, record.compression, len(record.data))
+        self._chunk = chunk
+        stored = _HEAD.size + _CHUNK_BYTES + len(record.compression.encode()) + len(record.data)
+        if stored != place.size:
+            raise DamageError(f"a chunk of {stored} bytes", f"{place.size} bytes")
+        data = unpacked(record.compression, record.data, record.uncompressed_size)
+        chunk.size = len(data)
+        log.equal("container", f"{where} size", len(data), record.uncompressed_size)
+        crc = f"{record.uncompressed_crc:08x}"
+        if not log.equal("container", f"{where} CRC", f"{zlib.crc32(data):08x}", crc):
             return
-        place.is_broken = False
-        at = 0
-        while at < len(data):
-            opcode, length = _HEAD.unpack_from(data, at) if at + 9 <= len(data) else (0, 0)
-            begin = at + _HEAD.size
-            if begin + length > len(data) or opcode not in (_SCHEMA, _CHANNEL, _MESSAGE):
-                raise DamageError("a schema, channel or message", f"opcode {opcode} at {at}")
-            inner = data[begin : begin + length]
-            if opcode == _MESSAGE:
-                yield self._message(inner, place, at)
+        chunk.whole = True
+        for offset, inner in _records(data):
+            if isinstance(inner, McapMessage):
+                yield self._message(inner)
+                chunk.add(inner.channel_id, inner.log_time, offset)
+            elif isinstance(inner, Channel):
+                kind = self._schemas.get(inner.schema_id, "")
+                self._channels[inner.id] = (inner.topic, kind, inner.message_encoding)
+            elif isinstance(inner, Schema):
+                self._schemas[inner.id] = inner.name.replace("/msg/", "/")
             else:
-                self._describe(opcode, Cursor(inner))
-            at = begin + length
-        judge.equal("container", f"{where} first and last", place.span_ns, (first_ns, last_ns))
+                found = f"{type(inner).__name__} at {offset}"
+                raise DamageError("a schema, channel or message", found)
+        said_ns = (record.message_start_time, record.message_end_time)
+        span_ns = (chunk.first_ns or 0, chunk.last_ns)
+        log.equal("container", f"{where} first and last", span_ns, said_ns)
 
-    def _message(self, data: memoryview, place: ChunkPlace, at: int) -> Message:
-        if len(data) < _MESSAGE_HEAD.size:
-            raise DamageError("a message", f"{len(data)} bytes")
-        number, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(data)
-        channel = self._channels.get(number)
+    def _message(self, record: McapRecord) -> Message:
+        from mcap.records import Message as McapMessage
+
+        message = cast(McapMessage, record)
+        channel = self._channels.get(message.channel_id)
         if channel is None:
-            raise DamageError("a message of a channel before it", f"channel {number}")
-        sent = self._sent.get(number, 0)
-        where = f"{self._where} {channel.topic} message {sent}"
-        self._judge.equal("container", f"{where} sequence", sent, sequence)
-        self._sent[number] = sent + 1
-        place.add(number, log_ns, at)
-        self._found.add(number, log_ns)
-        body = data[_MESSAGE_HEAD.size :]
+            raise DamageError("a message of a channel before it", f"channel {message.channel_id}")
+        topic, kind, encoding = channel
+        number = self._counts[message.channel_id]
+        self._counts[message.channel_id] += 1
+        where = f"{self._where} {topic} message {number}"
+        self._log.equal("container", f"{where} sequence", number, message.sequence)
         return Message(
-            where, channel.topic, channel.type, channel.encoding, log_ns, publish_ns, body
+            where, topic, kind, encoding, message.log_time, message.publish_time, message.data
         )
 
-    def _describe(self, opcode: int, cursor: Cursor) -> None:
-        """A schema or channel."""
-        number = cursor.whole("H")
-        if opcode == _SCHEMA:
-            self._types[number] = cursor.text().replace("/msg/", "/")
+    def _add_message_index(self, place: _Place, record: McapRecord) -> None:
+        from mcap.records import MessageIndex
+
+        index = cast(MessageIndex, record)
+        chunk = self._chunk
+        if chunk is None:
             return
-        kind = self._types.get(cursor.whole("H"), "")
-        topic, encoding = cursor.text(), cursor.text()
-        self._channels[number] = Channel(topic, kind, encoding)
+        chunk.indexed[index.channel_id] = index.records
+        chunk.index_at[index.channel_id] = place.at
+        chunk.index_bytes += place.size
+
+    def _finish_chunk(self) -> None:
+        """Check the message indexes of the last chunk; nothing but its index record is kept."""
+        chunk = self._chunk
+        if chunk is None:
+            return
+        self._chunk = None
+        if not chunk.whole:
+            self._damaged = True
+            return
+        where = f"{self._where} message indexes after the chunk at byte {chunk.place.at}"
+        self._log.equal("container", where, chunk.messages, chunk.indexed)
+        self._chunk_indexes.append(chunk.index_record())
+        if chunk.first_ns is not None:
+            first_ns, last_ns = self.span_ns if self._counted else (chunk.first_ns, 0)
+            self.span_ns = (min(first_ns, chunk.first_ns), max(last_ns, chunk.last_ns))
+            self._counted = True
+
+    def _check_summary(self, data: bytes, at: int) -> None:
+        """Check the summary section, `data` from byte `at` on, against what was read."""
+        from mcap.records import AttachmentIndex, ChunkIndex, Footer, MetadataIndex, Statistics
+
+        log = self._log
+        where = self._where
+        if not log.equal("container", f"{where} last bytes", MCAP_MAGIC, data[-len(MCAP_MAGIC) :]):
+            return
+        data = data[: -len(MCAP_MAGIC)]
+        crc = f"{int.from_bytes(data[-4:], 'little'):08x}"
+        actual = f"{zlib.crc32(data[:-4]):08x}"
+        if not log.equal("container", f"{where} CRC of the summary", actual, crc):
+            return
+        try:
+            records = [record for _, record in _records(data)]
+        except DamageError as err:
+            log.fail("container", f"{where} summary", err.expected, err.found)
+            return
+        footers = [record.summary_start for record in records if isinstance(record, Footer)]
+        log.equal("container", f"{where} start of the summary", [at], footers)
+        if self._damaged:
+            return  # The messages of some chunks are not known.
+        expected: dict[type[McapRecord], list[McapRecord]] = {
+            ChunkIndex: self._chunk_indexes,
+            Statistics: [self._statistics()],
+            AttachmentIndex: self._attachment_indexes,
+            MetadataIndex: self._metadata_indexes,
+        }
+        for kind, own in expected.items():
+            name = f"{where} {kind.__name__}"
+            found = [record for record in records if isinstance(record, kind)]
+            log.equal("container", f"{name} records", len(own), len(found))
+            for number, (one, other) in enumerate(zip(own, found, strict=False)):
+                left = vars(one)
+                right = vars(other)
+                differs = [key for key in left if left[key] != right[key]]
+                log.equal(
+                    "container",
+                    f"{name} {number}",
+                    {key: left[key] for key in differs},
+                    {key: right[key] for key in differs},
+                )
+
+    def _statistics(self) -> McapRecord:
+        from mcap.records import Statistics
+
+        return Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunk_indexes),
+            message_count=self._counts.total(),
+            message_end_time=self.span_ns[1],
+            message_start_time=self.span_ns[0],
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self._schemas),
+        )
 
 
-def _texts(cursor: Cursor) -> tuple[str, str]:
-    return cursor.text(), cursor.text()
+def _bytes_of(file: BoundedFile, place: _Place) -> bytes:
+    file.seek(place.at)
+    return file.read(place.size)
+
+
+def _records(data: bytes) -> Iterator[tuple[int, McapRecord]]:
+    """The records in `data` as `mcap` reads them, with their offsets."""
+    from mcap.stream_reader import StreamReader
+
+    stream = BytesIO(data)
+    records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
+    begin = 0
+    while begin < len(data):
+        try:
+            record = next(records)
+        except Exception as err:
+            found = str(err) or type(err).__name__
+            raise DamageError(f"an MCAP record at offset {begin}", found) from err
+        # The library skips unknown records, and does not always stop at the end of a record.
+        length = _HEAD.unpack_from(data, begin)[1]
+        end = stream.tell()
+        if begin + _HEAD.size + length != end:
+            size = end - begin - _HEAD.size
+            raise DamageError(f"a record of {length} bytes at offset {begin}", f"{size} bytes")
+        yield begin, record
+        begin = end
+
+
+def unpacked(compression: str, stored: bytes, size: int) -> bytes:
+    """The records of a chunk, `size` bytes by its header; DamageError if they are not."""
+    if not compression:
+        return stored
+    if compression not in ("zstd", "lz4"):
+        raise DamageError("a chunk as it is, or packed by lz4 or zstd", repr(compression))
+    most = max(_USUAL_BYTES, _MOST_TIMES * len(stored))
+    if size > most:
+        raise DamageError(f"at most {most} bytes in {len(stored)} that are stored", f"{size}")
+    pieces = _zstd_pieces(stored) if compression == "zstd" else _lz4_pieces(stored)
+    records = bytearray()
+    with library_errors(f"a frame of {compression}"):
+        for piece in pieces:
+            records += piece
+            if len(records) > size:
+                raise DamageError(f"{size} bytes of records", "more")
+    return bytes(records)
+
+
+def _zstd_pieces(stored: bytes) -> Iterator[bytes]:
+    import zstandard
+
+    with zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True) as reader:
+        while piece := reader.read(_PIECE_BYTES):
+            yield piece
+
+
+def _lz4_pieces(stored: bytes) -> Iterator[bytes]:
+    # The package has no types: a plain import would not pass the type checker.
+    frame = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
+    piece = frame.decompress(stored, _PIECE_BYTES)
+    while piece:
+        yield piece
+        piece = b"" if frame.eof else frame.decompress(b"", _PIECE_BYTES)
+
+
+# -- ROS 1 bags -----------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _BagOutline:
+    """The records of a bag outside its chunks."""
+
+    # Header fields, offset and size of the data of each chunk, by its position.
+    chunks: dict[int, tuple[Header, int, int]] = field(default_factory=dict)
+    # Positions of chunks, as the index at the end has them.
+    chunk_infos: list[int] = field(default_factory=list)
+    connections: int = 0
+
+
+class BagFile:
+    """A ROS 1 bag of mlbatch. It has no metadata: report and table are separate files."""
+
+    def __init__(self, log: CheckLog, path: Path, where: str) -> None:
+        self._log = log
+        self._path = path
+        self._where = where
+        self._counts: Counter[str] = Counter()
+
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of the file; each chunk is checked against the index."""
+        from rosbags.rosbag1 import Reader
+
+        try:
+            with BoundedFile(self._path) as file:
+                outline = self._outline(file)
+                # The library follows these positions without a check.
+                expected = list(outline.chunks)
+                if outline.chunk_infos != expected:
+                    raise DamageError(f"chunks {expected} in the index", str(outline.chunk_infos))
+                reader = Reader(self._path)
+                with library_errors("the index of a bag"):
+                    reader.open()
+                try:
+                    yield from self._chunk_messages(file, outline, reader)
+                finally:
+                    reader.close()
+        except DamageError as err:
+            raise VerifyError(f"{self._path}: {err}; convert again") from err
+
+    def _outline(self, file: BoundedFile) -> _BagOutline:
+        """Read the headers of all records, and skip their data."""
+        from rosbags.rosbag1.reader import Header, RecordType, read_uint32
+
+        outline = _BagOutline()
+        kinds: Counter[int] = Counter()
+        index_at = 0
+        first_index_at = file.size
+        head = Header()
+        file.seek(len(BAG_MAGIC))
+        while (at := file.tell()) < file.size:
+            with library_errors(f"a record at byte {at}"):
+                header = Header.read(file)
+                kind = header.get_uint8("op")
+                size = read_uint32(file)
+                data_at = file.tell()
+                if size > file.size - data_at:
+                    raise DamageError(f"{size} bytes at byte {data_at}", "the end of the file")
+                if not kinds:
+                    head = header
+                    index_at = head.get_uint64("index_pos")
+                    allowed = {RecordType.BAGHEADER}
+                elif at < index_at:
+                    allowed = {RecordType.CHUNK, RecordType.IDXDATA}
+                else:
+                    allowed = {RecordType.CONNECTION, RecordType.CHUNK_INFO}
+                    first_index_at = min(first_index_at, at)
+                if kind not in allowed:
+                    names = " or ".join(record.name for record in sorted(allowed))
+                    raise DamageError(f"a record {names} at byte {at}", f"type {kind}")
+                if kind == RecordType.CHUNK:
+                    outline.chunks[at] = (header, data_at, size)
+                elif kind == RecordType.CHUNK_INFO:
+                    outline.chunk_infos.append(header.get_uint64("chunk_pos"))
+            kinds[kind] += 1
+            file.seek(size, SEEK_CUR)
+        if index_at != first_index_at:
+            raise DamageError(f"an index at byte {first_index_at}", f"byte {index_at}")
+        with library_errors("a bag with an index"):
+            outline.connections = kinds[RecordType.CONNECTION]
+            said = (head.get_uint32("conn_count"), head.get_uint32("chunk_count"))
+            counts = (outline.connections, len(outline.chunk_infos))
+            where = f"{self._where} connections and chunks"
+            if not self._log.equal("container", where, counts, said):
+                raise DamageError(f"{counts[0]} connections, {counts[1]} chunks", str(said))
+        return outline
+
+    def _chunk_messages(
+        self, file: BoundedFile, outline: _BagOutline, reader: Reader
+    ) -> Iterator[Message]:
+        log = self._log
+        indexes: dict[int, Index] = {}
+        for number, entries in reader.indexes.items():
+            for time_ns, chunk_at, offset in entries:
+                own = indexes.setdefault(chunk_at, {})
+                own.setdefault(number, []).append((time_ns, offset))
+        topics = {
+            connection.id: (connection.topic, connection.msgtype.replace("/msg/", "/"))
+            for connection in reader.connections
+        }
+        seen: set[int] = set()
+        for info in reader.chunk_infos:
+            header, data_at, size = outline.chunks[info.pos]
+            where = f"{self._where} chunk at byte {info.pos}"
+            compression = header.get("compression", b"").decode("ascii", "replace")
+            if compression != "none":
+                raise DamageError("a chunk without compression, as mlbatch writes it", compression)
+            with library_errors("a chunk with its size"):
+                log.equal("container", f"{where} size", size, header.get_uint32("size"))
+            file.seek(data_at)
+            data = file.read(size)
+            found: Index = {}
+            for offset, number, message in self._in_chunk(data, topics, seen):
+                found.setdefault(number, []).append((message.log_ns, offset))
+                yield message
+            # `rosbags` sorts entries by time.
+            found = {number: sorted(entries) for number, entries in found.items()}
+            index = {number: sorted(own) for number, own in indexes.pop(info.pos, {}).items()}
+            log.equal("container", f"{self._where} index of the {where}", found, index)
+            times_ns = [time_ns for entries in found.values() for time_ns, _ in entries]
+            counts = {number: len(entries) for number, entries in found.items()}
+            # The library adds 1 to the end.
+            expected = (min(times_ns, default=2**63 - 1), max(times_ns, default=-1) + 1, counts)
+            said = (info.start_time, info.end_time, dict(info.connection_counts))
+            log.equal("container", f"{where} in the index", expected, said)
+        log.equal("container", f"{self._where} connections in the index", set(topics), seen)
+
+    def _in_chunk(
+        self, data: bytes, topics: dict[int, tuple[str, str]], seen: set[int]
+    ) -> Iterator[tuple[int, int, Message]]:
+        """Offset, connection and message of each message of a chunk; `seen` gets connections."""
+        from rosbags.rosbag1.reader import Header, RecordType, read_uint32
+
+        view = memoryview(data)
+        stream = BytesIO(data)
+        while (offset := stream.tell()) < len(data):
+            with library_errors(f"a record at offset {offset} of a chunk"):
+                header = Header.read(stream)
+                kind = header.get_uint8("op")
+                number = header.get_uint32("conn")
+                size = read_uint32(stream)
+                begin = stream.tell()
+                content = view[begin : begin + size]
+                if len(content) != size:
+                    raise DamageError(f"{size} bytes at offset {begin}", f"{len(content)}")
+                stream.seek(size, SEEK_CUR)
+                topic, msgtype = topics.get(number, ("", ""))
+                if kind == RecordType.CONNECTION:
+                    if header.get_string("topic") != topic:
+                        raise DamageError(f"topic {topic!r}", header.get_string("topic"))
+                    seen.add(number)
+                    continue
+                if kind != RecordType.MSGDATA or number not in seen:
+                    raise DamageError("a connection or a message of one", f"type {kind}")
+                log_ns = header.get_time("time")
+            where = f"{self._where} {topic} message {self._counts[topic]}"
+            self._counts[topic] += 1
+            yield offset, number, Message(where, topic, msgtype, "ros1", log_ns, log_ns, content)
+
+
+# -- ROS 2 bags -----------------------------------------------------------------------------------
+
+
+def rosbag2_file(log: CheckLog, folder: Path) -> tuple[Path, Yaml]:
+    """The MCAP file of a bag, and the content of metadata.yaml."""
+    # Only bags need it.
+    import yaml
+
+    class PlainLoader(yaml.SafeLoader):
+        """Refuses aliases: a few of them can stand for gigabytes."""
+
+        def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError("an alias")
+            return super().compose_node(parent, index)
+
+    path = folder / METADATA_YAML
+    try:
+        if path.stat().st_size > _LARGEST_YAML_BYTES:
+            raise VerifyError(f"{path}: expected a few lines, found more than 1 MiB; restore it")
+        root: Yaml = yaml.load(path.read_text(encoding="utf-8"), PlainLoader)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as err:
+        text = " ".join(str(err).split())
+        raise VerifyError(f"{path}: expected YAML, found {text}; restore it") from err
+    about = _value_at(root, "rosbag2_bagfile_information")
+    files = sorted(found for found in folder.iterdir() if found.suffix == ".mcap")
+    names = [found.name for found in files]
+    said = _value_at(about, "relative_file_paths")
+    log.equal("names", f"{METADATA_YAML} relative_file_paths", names, said)
+    if len(files) != 1:
+        raise VerifyError(
+            f"{folder}: expected a bag with one MCAP file, found {len(files)}; convert again"
+        )
+    return files[0], about
+
+
+def check_metadata_yaml(
+    log: CheckLog, about: Yaml, name: str, counts: Counter[str], span_ns: tuple[int, int]
+) -> None:
+    """Check the content of metadata.yaml against the messages of the file `name`."""
+    first_ns, last_ns = span_ns
+    total = counts.total()
+    times: dict[str, Yaml] = {
+        "starting_time": {"nanoseconds_since_epoch": first_ns},
+        "duration": {"nanoseconds": last_ns - first_ns},
+        "message_count": total,
+    }
+    expected: dict[str, Yaml] = {
+        "version": _METADATA_VERSION,
+        "storage_identifier": "mcap",
+        **times,
+        "files": [{"path": name, **times}],
+    }
+    for key, value in expected.items():
+        log.equal("metadata", f"{METADATA_YAML} {key}", value, _value_at(about, key))
+    topics = _value_at(about, "topics_with_message_count")
+    said = {}
+    for topic in topics if isinstance(topics, list) else []:
+        name_of = _value_at(_value_at(topic, "topic_metadata"), "name")
+        said[str(name_of)] = _value_at(topic, "message_count")
+    log.equal("metadata", f"{METADATA_YAML} topics", dict(counts), said)
+
+
+def _value_at(value: Yaml, key: str) -> Yaml:
+    return value.get(key) if isinstance(value, dict) else None

@@ -14,7 +14,7 @@ import rosbags.rosbag1 as bags
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from mlbatch.verify.clouds import PRESETS
+from mlbatch.verify.messages import PRESETS
 from tests.builders.outputs import Edit
 
 Records = npt.NDArray[Any]

@@ -26,9 +26,9 @@ def test_a_clean_output(tmp_path: Path) -> None:
     assert (told.code, told.err) == (0, "")
     first, head, *rows = told.out.splitlines()
     assert first.startswith(f"{made('npz')}: npz, 4 scans, ")
-    assert head.split() == ["check", "judged", "outcome", "what", "stays", "open"]
+    assert head.split() == ["check", "checked", "outcome", "not", "checkable"]
     assert [row.split()[0] for row in rows] == list(CHECKS)
-    assert "not provable" in next(row for row in rows if row.startswith("imu"))
+    assert "not checkable" in next(row for row in rows if row.startswith("imu"))
 
 
 def test_a_violation_is_told_with_its_place(tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_a_violation_is_told_with_its_place(tmp_path: Path) -> None:
     told = command("verify", path)
     assert told.code == 1
     assert (
-        "grid: 000001.npz start_ns: wanted 1777881600200000000, got 1777881600200000001" in told.out
+        "grid: 000001.npz start_ns: expected 1777881600200000000, found 1777881600200000001" in told.out
     )
     (line,) = told.err.splitlines()
     assert line.startswith("mlbatch: error: ")
@@ -55,7 +55,7 @@ def test_many_violations_are_counted(tmp_path: Path) -> None:
     for name in sorted(path.glob("*.npz")):
         arrays(name.name, spoil)(path)
     told = command("verify", path)
-    broken = [line for line in told.out.splitlines() if ": wanted " in line]
+    broken = [line for line in told.out.splitlines() if ": expected " in line]
     assert len(broken) == SHOWN
     assert told.out.splitlines()[-1].startswith("and ")
     found = json.loads(command("verify", path, "--json").out)
@@ -74,7 +74,7 @@ def test_json(tmp_path: Path) -> None:
     assert [check["name"] for check in found["checks"]] == list(CHECKS)
     by_name = {check["name"]: check for check in found["checks"]}
     assert by_name["grid"]["outcome"] == "ok"
-    assert by_name["duplicates"]["outcome"] == "not provable"
+    assert by_name["duplicates"]["outcome"] == "not checkable"
     assert "column" in by_name["duplicates"]["limit"]
 
 
@@ -83,7 +83,7 @@ def test_nothing_to_judge_is_one_line(name: str, tmp_path: Path) -> None:
     told = command("verify", tmp_path / name)
     assert (told.code, told.out) == (1, "")
     assert len(told.err.splitlines()) == 1
-    assert "wanted" in told.err
+    assert "expected" in told.err
 
 
 def test_the_page_names_every_check() -> None:

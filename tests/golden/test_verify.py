@@ -80,7 +80,7 @@ def test_fixtures_are_clean(form: str, fixture: str, tmp_path: Path) -> None:
         assert verdict.ok, (words, verdict.violations)
         # The Velodyne, the HESAI and the ROBOSENSE of the other fixture have no IMU packets.
         if not words and fixture == "two_lidars":
-            judged = {check.name for check in verdict.checks if check.judged}
+            judged = {check.name for check in verdict.checks if check.checked}
             assert judged == JUDGED[name]
 
 
@@ -129,7 +129,7 @@ def test_recorded_messages_are_counted(tmp_path: Path) -> None:
         assert told.code == 0, told.err
         verdict = verify(tmp_path / name)
         assert verdict.ok, verdict.violations
-        judged = {check.name: check.judged for check in verdict.checks}
+        judged = {check.name: check.checked for check in verdict.checks}
         assert judged["messages"] > 0
         assert judged["imu"] > 0
 

@@ -13,7 +13,7 @@ import pytest
 import zstandard
 
 from mlbatch.verify import verify
-from mlbatch.verify.unpacking import unpacked
+from mlbatch.verify.containers import unpacked
 from mlbatch.verify.verdict import DamageError
 from tests.builders.outputs import forget, found, made, spoiled, spoiled_places
 
@@ -62,8 +62,8 @@ def chunks(data: bytes) -> Iterator[Chunk]:
 def test_the_same_is_proven(name: str) -> None:
     plain, packed = verify(made("scans.mcap")), verify(made(f"{name}.mcap"))
     assert packed.ok, packed.violations
-    assert [(one.name, one.judged) for one in packed.checks] == [
-        (one.name, one.judged) for one in plain.checks
+    assert [(one.name, one.checked) for one in packed.checks] == [
+        (one.name, one.checked) for one in plain.checks
     ]
     assert made(f"{name}.mcap").stat().st_size < made("scans.mcap").stat().st_size
 

@@ -137,7 +137,7 @@ NOTHING: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "no grid": ("scans.mcap", text("", "mlbatch.grid", "mlbatch.gird"), "mlbatch.grid"),
     "damaged bag": ("scans.bag", raw("", lambda data: data[:200_000]), "convert again"),
     "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with one MCAP file"),
-    "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "wanted YAML"),
+    "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "expected YAML"),
 }
 
 
@@ -164,11 +164,11 @@ def test_a_report_elsewhere_is_taken(tmp_path: Path) -> None:
     path = copied("npz", tmp_path)
     other = (path / "report.json").rename(tmp_path / "told.json")
     without = {check.name: check for check in verify(path).checks}
-    assert without["ledger"].outcome == without["report"].outcome == "not provable"
+    assert without["ledger"].outcome == without["report"].outcome == "not checkable"
     assert "--report" in without["ledger"].limit
     with_it = {check.name: check.outcome for check in verify(path, other).checks}
     assert with_it["ledger"] == with_it["report"] == "ok"
-    with pytest.raises(VerifyError, match="wanted a report"):
+    with pytest.raises(VerifyError, match="expected a report"):
         verify(path, tmp_path / "none.json")
 
 
@@ -176,5 +176,5 @@ def test_a_bag_alone_tells_what_stays_open(tmp_path: Path) -> None:
     path = Path(shutil.copy(made("scans.bag"), tmp_path))
     verdict = verify(path)
     assert verdict.ok
-    open_ = {check.name for check in verdict.checks if check.outcome == "not provable"}
+    open_ = {check.name for check in verdict.checks if check.outcome == "not checkable"}
     assert {"grid", "index", "t_init", "columns", "table", "ledger", "report"} <= open_
