@@ -99,6 +99,21 @@ class BoundedFile(BufferedReader):
         return super().read(size)
 
 
+class WholeReads(BytesIO):
+    """Bytes that refuse to read past their end; libraries take what is left as whole."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self.size = len(data)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Exactly `size` bytes, or DamageError."""
+        left = self.size - self.tell()
+        if size is None or not 0 <= size <= left:
+            raise DamageError(f"{size} bytes at offset {self.tell()}", str(left))
+        return super().read(size)
+
+
 # -- MCAP -----------------------------------------------------------------------------------------
 
 
@@ -407,16 +422,18 @@ def _records(data: bytes) -> Iterator[tuple[int, McapRecord]]:
     """The records in `data` as `mcap` reads them, with their offsets."""
     from mcap.stream_reader import StreamReader
 
-    stream = BytesIO(data)
+    stream = WholeReads(data)
     records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
     begin = 0
     while begin < len(data):
         try:
             record = next(records)
+        except DamageError:
+            raise
         except Exception as err:
             found = str(err) or type(err).__name__
             raise DamageError(f"an MCAP record at offset {begin}", found) from err
-        # The library skips unknown records, and does not always stop at the end of a record.
+        # The library skips unknown records, and reads past the end of a record.
         length = _HEAD.unpack_from(data, begin)[1]
         end = stream.tell()
         if begin + _HEAD.size + length != end:
