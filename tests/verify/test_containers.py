@@ -1,4 +1,4 @@
-"""Compressed chunks are proven as others are; what their heads claim is not believed."""
+"""MCAP files and bags: damaged records are found, and declared sizes bound no memory."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from mlbatch.verify import verify
+from mlbatch.verify import VerifyError, verify
 from mlbatch.verify.containers import unpacked
 from mlbatch.verify.verdict import DamageError
-from tests.builders.outputs import forget, found, made, spoiled, spoiled_places
+from tests.builders.verify_outputs import Case, Edit, cases, check_case, damaged, made, raw
 
 MB = 1 << 20
 NAMES = ("zstd", "lz4")
@@ -25,12 +25,6 @@ PACK: dict[str, Callable[[bytes], bytes]] = {
 }
 # Magic of the file; opcode and length of a record; what a chunk has before its compression.
 _MAGIC_BYTES, _HEAD, _CHUNK = 8, struct.Struct("<BQ"), struct.Struct("<QQQII")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _clean() -> Iterator[None]:
-    yield
-    forget()
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +53,7 @@ def chunks(data: bytes) -> Iterator[Chunk]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_same_is_proven(name: str) -> None:
+def test_compressed_chunks_are_checked_alike(name: str) -> None:
     plain, packed = verify(made("scans.mcap")), verify(made(f"{name}.mcap"))
     assert packed.ok, packed.violations
     assert [(one.name, one.checked) for one in packed.checks] == [
@@ -68,73 +62,176 @@ def test_the_same_is_proven(name: str) -> None:
     assert made(f"{name}.mcap").stat().st_size < made("scans.mcap").stat().st_size
 
 
-def _size(change: int) -> Callable[[bytearray, Chunk], None]:
-    return lambda data, chunk: struct.pack_into("<Q", data, chunk.size_at, chunk.size + change)
-
-
-def _name(data: bytearray, chunk: Chunk) -> None:
-    data[chunk.name_at] ^= 1
-
-
-def _middle(data: bytearray, chunk: Chunk) -> None:
-    data[chunk.stored_at + chunk.stored // 2] ^= 0xFF
-
-
-def _magic(data: bytearray, chunk: Chunk) -> None:
-    data[chunk.stored_at] ^= 0xFF
-
-
-SPOILT: dict[str, tuple[Callable[[bytearray, Chunk], None], str]] = {
-    "larger than it says": (_size(-1), "bytes of records"),
-    "smaller than it says": (_size(1), "size"),
-    "much smaller": (_size(1 << 40), "that are stored"),
-    "another compression": (_name, "packed by lz4 or zstd"),
-    "no frame": (_magic, "a frame of"),
-    "damaged inside": (_middle, ""),
-}
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("how", SPOILT)
-def test_damage_is_found(name: str, how: str, tmp_path: Path) -> None:
-    change, wanted = SPOILT[how]
+def first_chunk(change: Callable[[bytearray, Chunk], None]) -> Edit:
+    """Change the first chunk of a file."""
 
     def edit(path: Path) -> None:
         data = bytearray(path.read_bytes())
         change(data, next(chunks(bytes(data))))
         path.write_bytes(data)
 
-    violations = spoiled(f"{name}.mcap", tmp_path, edit).violations
-    found = [one for one in violations if one.check == "container"]
-    assert found
-    assert wanted in " ".join(str(one) for one in found)
+    return edit
+
+
+def size(change: int) -> Edit:
+    """Another uncompressed size."""
+    return first_chunk(
+        lambda data, chunk: struct.pack_into("<Q", data, chunk.size_at, chunk.size + change)
+    )
+
+
+def stored(change: int) -> Edit:
+    """Another number of stored bytes."""
+    return first_chunk(
+        lambda data, chunk: struct.pack_into("<Q", data, chunk.stored_at - 8, chunk.stored + change)
+    )
+
+
+def compression(data: bytearray, chunk: Chunk) -> None:
+    data[chunk.name_at] ^= 1
+
+
+def middle(data: bytearray, chunk: Chunk) -> None:
+    data[chunk.stored_at + chunk.stored // 2] ^= 0xFF
+
+
+def magic(data: bytearray, chunk: Chunk) -> None:
+    data[chunk.stored_at] ^= 0xFF
+
+
+def message_index(change: Callable[[bytearray, int], None]) -> Edit:
+    """Change the first message index."""
+
+    def edit(path: Path) -> None:
+        data = bytearray(path.read_bytes())
+        at = _MAGIC_BYTES
+        while data[at] != 7:
+            at += _HEAD.size + _HEAD.unpack_from(data, at)[1]
+        change(data, at + _HEAD.size)
+        path.write_bytes(data)
+
+    return edit
+
+
+def more_entries(data: bytearray, at: int) -> None:
+    # The length of the entries is behind the number of the channel.
+    struct.pack_into("<I", data, at + 2, 19_849)
+
+
+def other_offset(data: bytearray, at: int) -> None:
+    data[at + 14] ^= 1
+
+
+SIZES: dict[str, Case] = {
+    "more stored bytes": (stored(1 << 40), "container", "chunk at byte"),
+    "fewer stored bytes": (stored(-1), "container", "chunk at byte"),
+    "entries past the index": (message_index(more_entries), "container", "message index at byte"),
+    "offset of a message": (message_index(other_offset), "container", "message indexes after"),
+}
+DAMAGED: dict[str, tuple[Edit, str]] = {
+    "larger than declared": (size(-1), "bytes of records"),
+    "smaller than declared": (size(1), "size"),
+    "much smaller": (size(1 << 40), "that are stored"),
+    "another compression": (first_chunk(compression), "packed by lz4 or zstd"),
+    "no frame": (first_chunk(magic), "a frame of"),
+    "damaged inside": (first_chunk(middle), ""),
+}
+
+
+@pytest.mark.parametrize(("kind", "case"), cases({f"{name}.mcap": SIZES for name in NAMES}))
+def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
+    check_case(kind, case, tmp_path)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_said_bounds_what_is_held(name: str) -> None:
-    """Little that becomes much: 256 MB of zeros in a chunk."""
-    stored = memoryview(PACK[name](bytes(256 * MB)))
+@pytest.mark.parametrize("how", DAMAGED)
+def test_damaged_chunks_are_found(name: str, how: str, tmp_path: Path) -> None:
+    edit, expected = DAMAGED[how]
+    violations = damaged(f"{name}.mcap", tmp_path, edit).violations
+    found = [str(one) for one in violations if one.check == "container"]
+    assert found
+    assert expected in " ".join(found)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_declared_sizes_bound_memory(name: str) -> None:
+    """256 MB of zeros in a chunk."""
+    packed = PACK[name](bytes(256 * MB))
     tracemalloc.start()
     try:
         with pytest.raises(DamageError):
-            unpacked(name, stored, 1000)
+            unpacked(name, packed, 1000)
         with pytest.raises(DamageError):
-            unpacked(name, stored[: len(stored) // 100], 300 * MB * 256)
+            unpacked(name, packed[: len(packed) // 100], 300 * MB * 256)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert most < 8 * MB
-    assert len(unpacked(name, stored, 256 * MB)) == 256 * MB
+    assert len(unpacked(name, packed, 256 * MB)) == 256 * MB
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_message_index_that_claims_more_than_it_has(name: str, tmp_path: Path) -> None:
-    def lie(path: Path) -> None:
-        data, at = bytearray(path.read_bytes()), _MAGIC_BYTES
-        while data[at] != 7:
-            at += _HEAD.size + _HEAD.unpack_from(data, at)[1]
-        # The length of its entries stands behind the number of the channel.
-        struct.pack_into("<I", data, at + _HEAD.size + 2, 19_849)
-        path.write_bytes(data)
+# -- ROS 1 bags -----------------------------------------------------------------------------------
 
-    found(spoiled_places(f"{name}.mcap", tmp_path, lie), "container", "message index at byte")
+
+CHUNK, INDEX, CHUNK_INFO = 5, 4, 6
+
+
+def bag_record(data: bytearray, op: int) -> tuple[int, int, int]:
+    """Begin, begin of the data and end of the first record of a type."""
+    at = len(b"#ROSBAG V2.0\n")
+    while True:
+        (head,) = struct.unpack_from("<I", data, at)
+        (size,) = struct.unpack_from("<I", data, at + 4 + head)
+        begin = at + 8 + head
+        if data[data.index(b"op=", at) + 3] == op:
+            return at, begin, begin + size
+        at = begin + size
+
+
+def repeated_index(data: bytearray) -> bytes:
+    """Thousands of entries of the index are one chunk."""
+    begin, _, end = bag_record(data, CHUNK_INFO)
+    count_at = data.index(b"chunk_count=") + 12
+    (count,) = struct.unpack_from("<I", data, count_at)
+    struct.pack_into("<I", data, count_at, count + 5000)
+    return bytes(data) + bytes(data[begin:end]) * 5000
+
+
+def inside_a_chunk(data: bytearray) -> bytearray:
+    data[data.index(b"chunk_pos=") + 10] ^= 1
+    return data
+
+
+def huge_header(data: bytearray) -> bytearray:
+    struct.pack_into("<I", data, bag_record(data, CHUNK)[0], 0xFFFFFFF0)
+    return data
+
+
+def huge_record(data: bytearray) -> bytearray:
+    struct.pack_into("<I", data, bag_record(data, CHUNK)[1] - 4, 0xFFFFFFF0)
+    return data
+
+
+def other_time(data: bytearray) -> bytearray:
+    data[bag_record(data, INDEX)[1] + 4] ^= 1
+    return data
+
+
+REFUSED: dict[str, Callable[[bytearray], bytes | bytearray]] = {
+    "thousands of chunks in the index": repeated_index,
+    "position inside a chunk": inside_a_chunk,
+    "header past the end": huge_header,
+    "record past the end": huge_record,
+    "compressed chunk": lambda data: data.replace(b"compression=none", b"compression=bz22", 1),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_damaged_bags_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(VerifyError, match="convert again") as error:
+        damaged("scans.bag", tmp_path, raw("", REFUSED[name]))
+    assert "\n" not in str(error.value)
+
+
+def test_indexes_of_bags_are_checked(tmp_path: Path) -> None:
+    check_case("scans.bag", (raw("", other_time), "container", "index of the"), tmp_path)

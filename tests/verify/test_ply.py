@@ -1,27 +1,22 @@
-"""PLY folders and outputs that cannot be judged at all."""
+"""Folders of PLY files: every damage is found, and named with its place."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mlbatch.verify import VerifyError, verify
-from tests.builders.outputs import (
+from tests.builders.verify_outputs import (
+    Case,
     Edit,
-    both,
-    copied,
-    forget,
-    made,
+    cases,
+    check_case,
     raw,
     removed,
     renamed,
     report,
     row,
-    spoiled,
     text,
 )
 
@@ -30,12 +25,6 @@ VERTEX = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "intensity")]
     + [("time", "<f8"), ("ring", "<i4"), ("return_type", "u1"), ("lidar_id", "u1")]
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _clean() -> Iterator[None]:
-    yield
-    forget()
 
 
 def vertex(name: str, place: int, value: float | None) -> Edit:
@@ -50,7 +39,7 @@ def vertex(name: str, place: int, value: float | None) -> Edit:
     return raw(ONE, change)
 
 
-PLY: dict[str, tuple[Edit, str, str]] = {
+PLY: dict[str, Case] = {
     "start": (text(ONE, "200000000\ncomment end", "200000007\ncomment end"), "grid", "start_ns"),
     "end": (text(ONE, "00\ncomment index", "01\ncomment index"), "grid", "000001.ply end_ns"),
     "index": (text(ONE, "index 1", "index 2"), "index", "000001.ply index"),
@@ -91,90 +80,6 @@ PLY: dict[str, tuple[Edit, str, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", PLY)
-def test_ply(name: str, tmp_path: Path) -> None:
-    edit, check, where = PLY[name]
-    places = [(one.check, one.where) for one in spoiled("ply", tmp_path, edit).violations]
-    assert any(one == check and where in place for one, place in places), places
-
-
-# -- nothing to judge -----------------------------------------------------------------------------
-
-
-def emptied(folder: Path) -> None:
-    for file in folder.iterdir():
-        file.unlink()
-
-
-def foreign(path: Path) -> None:
-    path.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-
-
-NOTHING: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "no such output": ("npz", shutil.rmtree, "no such file or folder"),
-    "empty folder": ("npz", emptied, "an empty folder"),
-    "folder without scans": (
-        "npz",
-        both(*(removed(f"{name}.npz") for name in ("head", "000000", "000001", "000002"))),
-        "a folder without scans",
-    ),
-    "scans of strange names": (
-        "npz",
-        both(*(renamed(f"{n}.npz", f"x{n}.npz") for n in ("head", "000000", "000001", "000002"))),
-        "strange names",
-    ),
-    "first scan damaged": ("npz", raw("head.npz", lambda data: b"PK"), "restore the first scan"),
-    "rate that is none": (
-        "ply",
-        text("head.ply", "rate_hz 10", "rate_hz ten"),
-        "wanted a positive number of Hz",
-    ),
-    "report that is no JSON": ("npz", text("report.json", "{", "["), "a report in JSON"),
-    "empty file": ("scans.mcap", raw("", lambda data: b""), "an empty file"),
-    "other file": ("scans.mcap", raw("", lambda data: b"abc"), "a file of another kind"),
-    "damaged MCAP": ("scans.mcap", raw("", lambda data: data[:200_000]), "a whole MCAP file"),
-    "foreign MCAP": ("scans.mcap", foreign, "a whole MCAP file"),
-    "no grid": ("scans.mcap", text("", "mlbatch.grid", "mlbatch.gird"), "mlbatch.grid"),
-    "damaged bag": ("scans.bag", raw("", lambda data: data[:200_000]), "convert again"),
-    "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with one MCAP file"),
-    "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "expected YAML"),
-}
-
-
-@pytest.mark.parametrize("name", NOTHING)
-def test_one_line_says_what_is_wrong(name: str, tmp_path: Path) -> None:
-    kind, edit, words = NOTHING[name]
-    with pytest.raises(VerifyError, match=words) as error:
-        spoiled(kind, tmp_path, edit)
-    assert "\n" not in str(error.value)
-    assert str(tmp_path) in str(error.value)
-
-
-def test_what_an_unfinished_run_left_is_no_output(tmp_path: Path) -> None:
-    path = copied("npz", tmp_path)
-    left = path.rename(tmp_path / "npz.partial")
-    with pytest.raises(VerifyError, match="unfinished"):
-        verify(left)
-    copied("npz", tmp_path)
-    verdict = verify(path)
-    assert [(one.check, one.where) for one in verdict.violations] == [("container", "npz.partial")]
-
-
-def test_a_report_elsewhere_is_taken(tmp_path: Path) -> None:
-    path = copied("npz", tmp_path)
-    other = (path / "report.json").rename(tmp_path / "told.json")
-    without = {check.name: check for check in verify(path).checks}
-    assert without["ledger"].outcome == without["report"].outcome == "not checkable"
-    assert "--report" in without["ledger"].limit
-    with_it = {check.name: check.outcome for check in verify(path, other).checks}
-    assert with_it["ledger"] == with_it["report"] == "ok"
-    with pytest.raises(VerifyError, match="expected a report"):
-        verify(path, tmp_path / "none.json")
-
-
-def test_a_bag_alone_tells_what_stays_open(tmp_path: Path) -> None:
-    path = Path(shutil.copy(made("scans.bag"), tmp_path))
-    verdict = verify(path)
-    assert verdict.ok
-    open_ = {check.name for check in verdict.checks if check.outcome == "not checkable"}
-    assert {"grid", "index", "t_init", "columns", "table", "ledger", "report"} <= open_
+@pytest.mark.parametrize(("kind", "case"), cases({"ply": PLY}))
+def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
+    check_case(kind, case, tmp_path)
