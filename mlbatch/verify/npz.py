@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.types import F32Array, I64Array, U8Array, U16Array, U32Array
-from mlbatch.verify.containers import library_errors
+from mlbatch.verify.containers import check_unpacked_size, library_errors
 from mlbatch.verify.folders import ScanFile
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
@@ -49,9 +49,6 @@ _NUMBERS = {
 _TEXTS = ("sensors", "frame_id", "rate_hz", "timescale", "schema")
 # The same in every scan of a run.
 _CONSTANT = ("slices", *_TEXTS)
-# Unpacked size of a file: at most this, or this multiple of its size on the disk.
-_USUAL_BYTES = 1 << 28
-_MOST_TIMES = 256
 
 LIMITS = {
     "tf_static": "npz has no transforms",
@@ -204,13 +201,10 @@ class NpzReader:
 def _members(file: ScanFile) -> dict[str, bytes]:
     """The bytes of each array by key."""
     data = file.read()
-    most = max(_USUAL_BYTES, _MOST_TIMES * len(data))
     found: dict[str, bytes] = {}
     with library_errors("a zip with whole members"), ZipFile(BytesIO(data)) as archive:
         members = archive.infolist()
-        total = sum(member.file_size for member in members)
-        if total > most:
-            raise DamageError(f"at most {most} bytes in a file of {len(data)}", str(total))
+        check_unpacked_size(sum(member.file_size for member in members), len(data))
         for member in members:
             if member.filename in found:
                 raise DamageError(f"one member {member.filename}", "two")

@@ -1,4 +1,7 @@
-"""The kinds of outputs: how each is read, and what it cannot show."""
+"""The kinds of outputs: how each is read, and what it cannot show.
+
+Libraries of a format are loaded only for outputs of that format.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.verify import messages, npz, ply
-from mlbatch.verify.containers import (
-    BAG_LIMITS,
-    BAG_MAGIC,
-    MCAP_MAGIC,
-    METADATA_YAML,
-    BagFile,
-    McapFile,
-    check_metadata_yaml,
-    rosbag2_file,
-)
 from mlbatch.verify.examination import Examination
 from mlbatch.verify.folders import entries, scan_files
 from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
@@ -29,6 +22,9 @@ from mlbatch.verify.report_checks import (
 )
 from mlbatch.verify.verdict import CheckLog, DamageError, Verdict, VerifyError
 
+_METADATA = "metadata.yaml"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_BAG_MAGIC = b"#ROSBAG V2.0\n"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
 _FOREIGN = "expected an output of mlbatch (a folder of npz or PLY files, an MCAP file, a bag)"
@@ -74,9 +70,9 @@ def check_output(output: Output) -> Verdict:
             head = file.read(16)
     except OSError as err:
         raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
-    if head.startswith(MCAP_MAGIC):
+    if head.startswith(_MCAP_MAGIC):
         return _check_mcap(output, path, "mcap")
-    if head.startswith(BAG_MAGIC):
+    if head.startswith(_BAG_MAGIC):
         return _check_bag(output)
     kind = "an empty file" if not head else "a file of another kind"
     raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
@@ -84,7 +80,7 @@ def check_output(output: Output) -> Verdict:
 
 def _check_of_folder(path: Path) -> Callable[[Output], Verdict]:
     inside = entries(path)
-    if any(entry.name == METADATA_YAML for entry in inside):
+    if any(entry.name == _METADATA for entry in inside):
         return _check_rosbag2
     folders = [entry for entry in inside if entry.is_dir() and not entry.name.startswith(".")]
     names = [*inside, *(inner for folder in folders for inner in entries(folder))]
@@ -136,10 +132,12 @@ def _check_files(
 
 
 def _check_rosbag2(output: Output) -> Verdict:
-    path, about = rosbag2_file(output.log, output.path)
+    from mlbatch.verify.rosbag2 import check_metadata, open_bag
+
+    path, about = open_bag(output.log, output.path)
 
     def check_yaml(topics: TopicChecks, span_ns: tuple[int, int]) -> None:
-        check_metadata_yaml(output.log, about, path.name, topics.counts, span_ns)
+        check_metadata(output.log, about, path.name, topics.counts, span_ns)
 
     return _check_mcap(output, path, "rosbag2", check_yaml)
 
@@ -150,6 +148,8 @@ def _check_mcap(
     name: str,
     check_yaml: Callable[[TopicChecks, tuple[int, int]], None] | None = None,
 ) -> Verdict:
+    from mlbatch.verify.mcap_file import McapFile
+
     log = output.log
     where = path.name
     file = McapFile(log, path, where)
@@ -175,6 +175,8 @@ def _check_mcap(
 
 
 def _check_bag(output: Output) -> Verdict:
+    from mlbatch.verify.rosbag1 import LIMITS, BagFile
+
     log = output.log
     path = output.path
     files = ReportFiles.read(log, output.places)
@@ -184,7 +186,7 @@ def _check_bag(output: Output) -> Verdict:
     for message in BagFile(log, path, path.name).messages():
         topics.check(message)
     topics.finish(path.name)
-    limits = _limits(topics) | BAG_LIMITS
+    limits = _limits(topics) | LIMITS
     if metadata.rate is None:
         limits |= dict.fromkeys(("grid", "index"), f"a bag has no rate; {_NO_REPORT}")
     if files.table is None:

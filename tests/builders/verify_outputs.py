@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-import pytest
 
 from mlbatch.verify import Verdict, verify
 from tests.builders.run import TWO_LIDARS, command

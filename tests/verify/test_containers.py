@@ -13,7 +13,7 @@ import pytest
 import zstandard
 
 from mlbatch.verify import VerifyError, verify
-from mlbatch.verify.containers import unpacked
+from mlbatch.verify.mcap_file import unpacked
 from mlbatch.verify.verdict import DamageError
 from tests.builders.verify_outputs import Case, Edit, cases, check_case, damaged, made, raw
 
@@ -222,6 +222,8 @@ REFUSED: dict[str, Callable[[bytearray], bytes | bytearray]] = {
     "position inside a chunk": inside_a_chunk,
     "header past the end": huge_header,
     "record past the end": huge_record,
+    "other type in a chunk": lambda data: data.replace(b"type=sensor_msgs", b"type=sensor_msgz", 1),
+    "no type in a chunk": lambda data: data.replace(b"type=sensor_msgs", b"typo=sensor_msgs", 1),
     "compressed chunk": lambda data: data.replace(b"compression=none", b"compression=bz22", 1),
 }
 

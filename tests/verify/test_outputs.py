@@ -13,6 +13,7 @@ from tests.builders.verify_outputs import (
     both,
     copied,
     damaged,
+    flipped,
     made,
     raw,
     removed,
@@ -63,6 +64,7 @@ NOTHING: dict[str, tuple[str, Edit, str]] = {
         "an alias",
     ),
     "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with one MCAP file"),
+    "other file of a bag": ("bag2", raw("bag2_0.mcap", flipped(0)), "an MCAP file, found another"),
     "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "expected YAML"),
 }
 

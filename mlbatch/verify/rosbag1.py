@@ -1,0 +1,183 @@
+"""ROS 1 bags: chunks checked against the indexes; there are no checksums.
+
+`rosbags` parses the records. Source: wiki.ros.org/Bags/Format/2.0.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import SEEK_CUR
+from pathlib import Path
+from typing import TypeAlias
+
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Header, RecordType, read_uint32
+
+from mlbatch.verify.containers import BoundedFile, Message, WholeReads, library_errors
+from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+
+BAG_MAGIC = b"#ROSBAG V2.0\n"
+LIMITS = {"container": "lengths and indexes; bags have no checksums"}
+# Time and offset of each message, by connection.
+Index: TypeAlias = dict[int, list[tuple[int, int]]]
+
+
+@dataclass(slots=True)
+class _BagOutline:
+    """The records of a bag outside its chunks."""
+
+    # Header fields, offset and size of the data of each chunk, by its position.
+    chunks: dict[int, tuple[Header, int, int]] = field(default_factory=dict)
+    # Positions of chunks, as the index at the end has them.
+    chunk_infos: list[int] = field(default_factory=list)
+    connections: int = 0
+
+
+class BagFile:
+    """A ROS 1 bag of mlbatch. It has no metadata: report and table are separate files."""
+
+    def __init__(self, log: CheckLog, path: Path, where: str) -> None:
+        self._log = log
+        self._path = path
+        self._where = where
+        self._counts: Counter[str] = Counter()
+
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of the file; each chunk is checked against the index."""
+        try:
+            with BoundedFile(self._path) as file:
+                outline = self._outline(file)
+                # The library follows these positions without a check.
+                expected = list(outline.chunks)
+                if outline.chunk_infos != expected:
+                    raise DamageError(f"chunks {expected} in the index", str(outline.chunk_infos))
+                reader = Reader(self._path)
+                with library_errors("the index of a bag"):
+                    reader.open()
+                try:
+                    yield from self._chunk_messages(file, outline, reader)
+                finally:
+                    reader.close()
+        except DamageError as err:
+            raise VerifyError(f"{self._path}: {err}; convert again") from err
+
+    def _outline(self, file: BoundedFile) -> _BagOutline:
+        """Read the headers of all records, and skip their data."""
+        outline = _BagOutline()
+        kinds: Counter[int] = Counter()
+        index_at = 0
+        first_index_at = file.size
+        head = Header()
+        file.seek(len(BAG_MAGIC))
+        while (at := file.tell()) < file.size:
+            with library_errors(f"a record at byte {at}"):
+                header = Header.read(file)
+                kind = header.get_uint8("op")
+                size = read_uint32(file)
+                data_at = file.tell()
+                if size > file.size - data_at:
+                    raise DamageError(f"{size} bytes at byte {data_at}", "the end of the file")
+                if not kinds:
+                    head = header
+                    index_at = head.get_uint64("index_pos")
+                    allowed = {RecordType.BAGHEADER}
+                elif at < index_at:
+                    allowed = {RecordType.CHUNK, RecordType.IDXDATA}
+                else:
+                    allowed = {RecordType.CONNECTION, RecordType.CHUNK_INFO}
+                    first_index_at = min(first_index_at, at)
+                if kind not in allowed:
+                    names = " or ".join(record.name for record in sorted(allowed))
+                    raise DamageError(f"a record {names} at byte {at}", f"type {kind}")
+                if kind == RecordType.CHUNK:
+                    outline.chunks[at] = (header, data_at, size)
+                elif kind == RecordType.CHUNK_INFO:
+                    outline.chunk_infos.append(header.get_uint64("chunk_pos"))
+            kinds[kind] += 1
+            file.seek(size, SEEK_CUR)
+        if index_at != first_index_at:
+            raise DamageError(f"an index at byte {first_index_at}", f"byte {index_at}")
+        with library_errors("a bag with an index"):
+            outline.connections = kinds[RecordType.CONNECTION]
+            said = (head.get_uint32("conn_count"), head.get_uint32("chunk_count"))
+            counts = (outline.connections, len(outline.chunk_infos))
+            where = f"{self._where} connections and chunks"
+            if not self._log.equal("container", where, counts, said):
+                raise DamageError(f"{counts[0]} connections, {counts[1]} chunks", str(said))
+        return outline
+
+    def _chunk_messages(
+        self, file: BoundedFile, outline: _BagOutline, reader: Reader
+    ) -> Iterator[Message]:
+        log = self._log
+        indexes: dict[int, Index] = {}
+        for number, entries in reader.indexes.items():
+            for time_ns, chunk_at, offset in entries:
+                own = indexes.setdefault(chunk_at, {})
+                own.setdefault(number, []).append((time_ns, offset))
+        topics = {
+            connection.id: (connection.topic, connection.msgtype.replace("/msg/", "/"))
+            for connection in reader.connections
+        }
+        seen: set[int] = set()
+        for info in reader.chunk_infos:
+            header, data_at, size = outline.chunks[info.pos]
+            where = f"{self._where} chunk at byte {info.pos}"
+            compression = header.get("compression", b"").decode("ascii", "replace")
+            if compression != "none":
+                raise DamageError("a chunk without compression, as mlbatch writes it", compression)
+            with library_errors("a chunk with its size"):
+                log.equal("container", f"{where} size", size, header.get_uint32("size"))
+            file.seek(data_at)
+            data = file.read(size)
+            found: Index = {}
+            for offset, number, message in self._in_chunk(data, topics, seen):
+                found.setdefault(number, []).append((message.log_ns, offset))
+                yield message
+            # `rosbags` sorts entries by time.
+            found = {number: sorted(entries) for number, entries in found.items()}
+            index = {number: sorted(own) for number, own in indexes.pop(info.pos, {}).items()}
+            log.equal("container", f"{self._where} index of the {where}", found, index)
+            times_ns = [time_ns for entries in found.values() for time_ns, _ in entries]
+            counts = {number: len(entries) for number, entries in found.items()}
+            # The library adds 1 to the end.
+            expected = (min(times_ns, default=2**63 - 1), max(times_ns, default=-1) + 1, counts)
+            said = (info.start_time, info.end_time, dict(info.connection_counts))
+            log.equal("container", f"{where} in the index", expected, said)
+        log.equal("container", f"{self._where} connections in the index", set(topics), seen)
+
+    def _in_chunk(
+        self, data: bytes, topics: dict[int, tuple[str, str]], seen: set[int]
+    ) -> Iterator[tuple[int, int, Message]]:
+        """Offset, connection and message of each message of a chunk; `seen` gets connections."""
+        view = memoryview(data)
+        stream = WholeReads(data)
+        while (offset := stream.tell()) < len(data):
+            with library_errors(f"a record at offset {offset} of a chunk"):
+                header = Header.read(stream)
+                kind = header.get_uint8("op")
+                number = header.get_uint32("conn")
+                size = read_uint32(stream)
+                begin = stream.tell()
+                content = view[begin : begin + size]
+                if len(content) != size:
+                    raise DamageError(f"{size} bytes at offset {begin}", f"{len(content)}")
+                stream.seek(size, SEEK_CUR)
+                topic, msgtype = topics.get(number, ("", ""))
+                if kind == RecordType.CONNECTION:
+                    # The data are another header.
+                    about = Header.read(WholeReads(struct.pack("<I", size) + content))
+                    said = (header.get_string("topic"), about.get_string("type"))
+                    if said != (topic, msgtype):
+                        raise DamageError(f"{topic!r} of {msgtype!r}", str(said))
+                    seen.add(number)
+                    continue
+                if kind != RecordType.MSGDATA or number not in seen:
+                    raise DamageError("a connection or a message of one", f"type {kind}")
+                log_ns = header.get_time("time")
+            where = f"{self._where} {topic} message {self._counts[topic]}"
+            self._counts[topic] += 1
+            yield offset, number, Message(where, topic, msgtype, "ros1", log_ns, log_ns, content)
