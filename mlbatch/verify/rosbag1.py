@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import SEEK_CUR
 from pathlib import Path
 from typing import TypeAlias
@@ -25,15 +25,13 @@ LIMITS = {"container": "lengths and indexes; bags have no checksums"}
 Index: TypeAlias = dict[int, list[tuple[int, int]]]
 
 
-@dataclass(slots=True)
-class _BagOutline:
-    """The records of a bag outside its chunks."""
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """A chunk record, and offset and size of its data."""
 
-    # Header fields, offset and size of the data of each chunk, by its position.
-    chunks: dict[int, tuple[Header, int, int]] = field(default_factory=dict)
-    # Positions of chunks, as the index at the end has them.
-    chunk_infos: list[int] = field(default_factory=list)
-    connections: int = 0
+    header: Header
+    at: int
+    size: int
 
 
 class BagFile:
@@ -49,28 +47,26 @@ class BagFile:
         """All messages in the order of the file; each chunk is checked against the index."""
         try:
             with BoundedFile(self._path) as file:
-                outline = self._outline(file)
-                # The library follows these positions without a check.
-                expected = list(outline.chunks)
-                if outline.chunk_infos != expected:
-                    raise DamageError(f"chunks {expected} in the index", str(outline.chunk_infos))
+                chunks = self._chunks(file)
                 reader = Reader(self._path)
                 with library_errors("the index of a bag"):
                     reader.open()
                 try:
-                    yield from self._chunk_messages(file, outline, reader)
+                    yield from self._messages(file, chunks, reader)
                 finally:
                     reader.close()
         except DamageError as err:
             raise VerifyError(f"{self._path}: {err}; convert again") from err
 
-    def _outline(self, file: BoundedFile) -> _BagOutline:
-        """Read the headers of all records, and skip their data."""
-        outline = _BagOutline()
+    def _chunks(self, file: BoundedFile) -> dict[int, _Chunk]:
+        """All chunks by position; the records of the bag and its index are checked against them."""
+        chunks: dict[int, _Chunk] = {}
+        # Positions of chunks by the index at the end.
+        indexed: list[int] = []
         kinds: Counter[int] = Counter()
         index_at = 0
         first_index_at = file.size
-        head = Header()
+        counts = (0, 0)
         file.seek(len(BAG_MAGIC))
         while (at := file.tell()) < file.size:
             with library_errors(f"a record at byte {at}"):
@@ -81,9 +77,9 @@ class BagFile:
                 if size > file.size - data_at:
                     raise DamageError(f"{size} bytes at byte {data_at}", "the end of the file")
                 if not kinds:
-                    head = header
-                    index_at = head.get_uint64("index_pos")
                     allowed = {RecordType.BAGHEADER}
+                    index_at = header.get_uint64("index_pos")
+                    counts = (header.get_uint32("conn_count"), header.get_uint32("chunk_count"))
                 elif at < index_at:
                     allowed = {RecordType.CHUNK, RecordType.IDXDATA}
                 else:
@@ -93,24 +89,25 @@ class BagFile:
                     names = " or ".join(record.name for record in sorted(allowed))
                     raise DamageError(f"a record {names} at byte {at}", f"type {kind}")
                 if kind == RecordType.CHUNK:
-                    outline.chunks[at] = (header, data_at, size)
+                    chunks[at] = _Chunk(header, data_at, size)
                 elif kind == RecordType.CHUNK_INFO:
-                    outline.chunk_infos.append(header.get_uint64("chunk_pos"))
+                    indexed.append(header.get_uint64("chunk_pos"))
             kinds[kind] += 1
             file.seek(size, SEEK_CUR)
         if index_at != first_index_at:
             raise DamageError(f"an index at byte {first_index_at}", f"byte {index_at}")
-        with library_errors("a bag with an index"):
-            outline.connections = kinds[RecordType.CONNECTION]
-            said = (head.get_uint32("conn_count"), head.get_uint32("chunk_count"))
-            counts = (outline.connections, len(outline.chunk_infos))
-            where = f"{self._where} connections and chunks"
-            if not self._log.equal("container", where, counts, said):
-                raise DamageError(f"{counts[0]} connections, {counts[1]} chunks", str(said))
-        return outline
+        found = (kinds[RecordType.CONNECTION], len(indexed))
+        if counts != found:
+            raise DamageError(
+                f"{counts[0]} connections, {counts[1]} chunks in the index", f"{found}"
+            )
+        # The library follows these positions without a check.
+        if indexed != list(chunks):
+            raise DamageError(f"chunks at {list(chunks)} in the index", f"{indexed}")
+        return chunks
 
-    def _chunk_messages(
-        self, file: BoundedFile, outline: _BagOutline, reader: Reader
+    def _messages(
+        self, file: BoundedFile, chunks: dict[int, _Chunk], reader: Reader
     ) -> Iterator[Message]:
         log = self._log
         indexes: dict[int, Index] = {}
@@ -124,15 +121,16 @@ class BagFile:
         }
         seen: set[int] = set()
         for info in reader.chunk_infos:
-            header, data_at, size = outline.chunks[info.pos]
+            chunk = chunks[info.pos]
             where = f"{self._where} chunk at byte {info.pos}"
-            compression = header.get("compression", b"").decode("ascii", "replace")
+            compression = chunk.header.get("compression", b"").decode("ascii", "replace")
             if compression != "none":
                 raise DamageError("a chunk without compression, as mlbatch writes it", compression)
             with library_errors("a chunk with its size"):
-                log.equal("container", f"{where} size", size, header.get_uint32("size"))
-            file.seek(data_at)
-            data = file.read(size)
+                size = chunk.header.get_uint32("size")
+                log.equal("container", f"{where} size", chunk.size, size)
+            file.seek(chunk.at)
+            data = file.read(chunk.size)
             found: Index = {}
             for offset, number, message in self._in_chunk(data, topics, seen):
                 found.setdefault(number, []).append((message.log_ns, offset))
@@ -140,7 +138,8 @@ class BagFile:
             # `rosbags` sorts entries by time.
             found = {number: sorted(entries) for number, entries in found.items()}
             index = {number: sorted(own) for number, own in indexes.pop(info.pos, {}).items()}
-            log.equal("container", f"{self._where} index of the {where}", found, index)
+            name = f"{self._where} index of the chunk at byte {info.pos}"
+            log.equal("container", name, found, index)
             times_ns = [time_ns for entries in found.values() for time_ns, _ in entries]
             counts = {number: len(entries) for number, entries in found.items()}
             # The library adds 1 to the end.
