@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
 from typing import cast
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
@@ -223,17 +224,24 @@ def _members(file: ScanFile) -> dict[str, bytes]:
 
 def _array(key: str, data: bytes) -> Values:
     """The array in an npy of version 1.0."""
-    stream = BytesIO(data)
     with library_errors(f"{key} as an npy"):
-        version = read_magic(stream)
-        if version != (1, 0):
-            raise DamageError(f"{key} as an npy of version 1.0", str(version))
-        shape, is_fortran, dtype = read_array_header_1_0(stream)
+        begin = 10 + int.from_bytes(data[8:10], "little")
+        shape, dtype = _npy_header(data[:begin])
         count = math.prod(shape)
-        begin = stream.tell()
-        fits = begin + count * dtype.itemsize == len(data)
-        if is_fortran or dtype.hasobject or not fits:
-            expected = f"{key}: {count} values of {dtype.str} in C order"
-            raise DamageError(expected, f"{len(data) - begin} bytes")
+        if begin + count * dtype.itemsize != len(data):
+            raise DamageError(f"{key}: {count} values of {dtype.str}", f"{len(data) - begin} bytes")
         values: Values = np.frombuffer(data, dtype, count, begin).reshape(shape)
     return values
+
+
+@lru_cache(maxsize=256)
+def _npy_header(head: bytes) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
+    """Shape and type in a header; the same ones are in every scan, and slow to parse."""
+    stream = BytesIO(head)
+    version = read_magic(stream)
+    if version != (1, 0):
+        raise DamageError("npy version 1.0", str(version))
+    shape, is_fortran, dtype = read_array_header_1_0(stream)
+    if is_fortran or dtype.hasobject:
+        raise DamageError("numbers in C order", head[10:].decode("latin-1"))
+    return shape, dtype
