@@ -1,4 +1,4 @@
-"""Files of messages written again by libraries of others, with changes on the way."""
+"""Files of messages rewritten by `mcap` and `rosbags`, with changes: indexes and checksums fit."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ import rosbags.rosbag1 as bags
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from mlbatch.verify.clouds import PRESETS
-from tests.unit.verify.made import Edit
+from mlbatch.verify.messages import PRESETS
+from tests.builders.verify_outputs import Edit
 
 Records = npt.NDArray[Any]
-_CODES = {2: "u1", 4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Sent:
     kind: str = ""
 
 
-# What becomes of a message: nothing, itself, or several.
+# The messages that replace one: none, itself, or several.
 Change = Callable[[Sent], list[Sent]]
 Notes = Callable[[dict[str, dict[str, str]], dict[str, bytes]], None]
 
@@ -47,7 +46,7 @@ def _no_notes(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> N
 
 
 def mcap(change: Change = _same, notes: Notes = _no_notes, profile: str = "ros2") -> Edit:
-    """Write an MCAP file again by the reference library, all indexes and checksums right."""
+    """Rewrite an MCAP file, or that of a ROS 2 bag, with the reference library."""
 
     def edit(path: Path) -> None:
         (file,) = [*path.glob("*.mcap")] if path.is_dir() else [path]
@@ -94,7 +93,7 @@ def _write(writer: Writer, found: list[Any], change: Change) -> None:
 
 
 def bag(change: Change) -> Edit:
-    """Write a ROS 1 bag again by rosbags."""
+    """Rewrite a ROS 1 bag with rosbags."""
 
     def edit(path: Path) -> None:
         with bags.Reader(path) as reader:
@@ -127,24 +126,18 @@ def only(topic: str, number: int, change: Change) -> Change:
 def points(layout: str, change: Callable[[Records], None]) -> Change:
     """Change the points of a PointCloud2; they end one byte before the end."""
     preset = PRESETS[layout]
-    dtype = np.dtype(
-        {
-            "names": [name for name, _, _ in preset.fields],
-            "formats": [_CODES[code] for _, _, code in preset.fields],
-            "offsets": [offset for _, offset, _ in preset.fields],
-            "itemsize": preset.step,
-        }
-    )
 
     def changed(sent: Sent) -> list[Sent]:
         data = bytearray(sent.data)
-        # The number of their bytes stands before them.
+        # After their length.
         begin = next(
             begin
             for begin in range(len(data) % 4, 2048)
             if struct.unpack_from("<I", data, begin)[0] == len(data) - begin - 5
         )
-        records = np.frombuffer(data, dtype, (len(data) - begin - 5) // preset.step, begin + 4)
+        records = np.frombuffer(
+            data, preset.dtype, (len(data) - begin - 5) // preset.step, begin + 4
+        )
         change(records)
         return [replace(sent, data=bytes(data))]
 

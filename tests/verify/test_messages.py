@@ -1,56 +1,52 @@
-"""Every edit of a file of messages that breaks a rule is found, and named with its place.
+"""Messages in MCAP files and bags: every damage is found, and named with its place.
 
-Files are written again by the reference library of MCAP and by rosbags, so that all indexes and
-checksums are right, and only what was changed is wrong.
+Files are rewritten by `mcap` and `rosbags`: only the change is wrong, not indexes or checksums.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.unit.verify.made import (
-    Edit,
-    flipped,
-    forget,
-    found,
-    raw,
-    report,
-    row,
-    spoiled_places,
-    text,
-    with_cell,
-    with_value,
-)
-from tests.unit.verify.remade import (
+from mlbatch.verify import verify
+from tests.builders.rewritten_outputs import (
     Change,
     Notes,
+    Records,
     Sent,
+    bag,
     gone,
     later,
     mcap,
     on,
     only,
     patched,
+    points,
     put,
     twice,
 )
+from tests.builders.verify_outputs import (
+    PERIOD_NS,
+    Case,
+    Edit,
+    cases,
+    check_case,
+    copied,
+    flipped,
+    raw,
+    report,
+    row,
+    text,
+    with_cell,
+    with_value,
+)
 
-PERIOD_NS = 100_000_000
 # Of a PointCloud2 on `base_link`: seconds and nanoseconds; height and width.
 STAMP, HEIGHT, WIDTH = 4, 28, 32
-Expected = tuple[Edit, str, str]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _clean() -> Iterator[None]:
-    yield
-    forget()
 
 
 def scan(number: int, change: Change) -> Edit:
@@ -121,7 +117,7 @@ def as_imu(sent: Sent) -> list[Sent]:
     return [replace(sent, kind="sensor_msgs/msg/Imu")]
 
 
-MCAP: dict[str, Expected] = {
+MCAP: dict[str, Case] = {
     "log time": (scan(1, later(1)), "stamps", "/points message 1 log time"),
     "publish time": (
         scan(1, lambda s: [replace(s, publish_ns=1)]),
@@ -192,7 +188,7 @@ MCAP: dict[str, Expected] = {
         "imu",
         "/left/imu message 4",
     ),
-    "message of nobody": (mcap(only("/left/imu", 4, on("/odd"))), "messages", "/odd"),
+    "message of an unknown topic": (mcap(only("/left/imu", 4, on("/odd"))), "messages", "/odd"),
     "rate of the grid": (mcap(notes=grid("rate_hz", "20")), "metadata", "rate"),
     "t_init of the grid": (mcap(notes=grid("t_init_ns", "5")), "metadata", "t_init_ns"),
     "t_init that is none": (mcap(notes=grid("t_init_ns", "")), "metadata", "t_init_ns"),
@@ -211,9 +207,13 @@ MCAP: dict[str, Expected] = {
         "ledger",
         "mlbatch.report capture.frames",
     ),
-    "report beside": (report("capture", "frames", to=1), "report", "report.json capture.frames"),
+    "copy of the report": (
+        report("capture", "frames", to=1),
+        "report",
+        "report.json capture.frames",
+    ),
     "table inside": (mcap(notes=table(1, "points", 1)), "table", "scans.csv line 3 points"),
-    "table beside": (row(1, "points", 1), "table", "scans.mcap.scans.csv"),
+    "copy of the table": (row(1, "points", 1), "table", "scans.mcap.scans.csv"),
     "profile": (mcap(profile="ros1"), "metadata", "profile"),
     "a byte of a chunk": (raw("", flipped(300_000)), "container", "chunk at byte"),
     "a byte of the summary": (raw("", flipped(-200)), "container", "CRC of the summary"),
@@ -222,7 +222,121 @@ MCAP: dict[str, Expected] = {
 }
 
 
-@pytest.mark.parametrize("name", MCAP)
-def test_mcap(name: str, tmp_path: Path) -> None:
-    edit, check, where = MCAP[name]
-    found(spoiled_places("scans.mcap", tmp_path, edit), check, where)
+def of_sensor(layout: str, name: str, value: float) -> Edit:
+    """Another value in point 3 of a scan of the left sensor."""
+    return mcap(only("/left/points", 1, put(layout, name, 3, value)))
+
+
+SPLIT: dict[str, Case] = {
+    "point of another sensor": (
+        of_sensor("standard", "lidar_id", 1),
+        "sensors",
+        "/left/points message 1 point 3",
+    ),
+    "scan of another sensor": (
+        mcap(only("/left/points", 1, on("/right/points"))),
+        "sensors",
+        "/right/points",
+    ),
+}
+AUTOWARE: dict[str, Case] = {
+    "azimuth": (
+        of_sensor("autoware", "azimuth", 9.0),
+        "geometry",
+        "/left/points message 1 point 3",
+    ),
+    "elevation": (of_sensor("autoware", "elevation", 1.5), "geometry", "point 3"),
+    "distance": (of_sensor("autoware", "distance", 1.5), "geometry", "point 3"),
+    "return type": (of_sensor("autoware", "return_type", 88), "returns", "point 3"),
+    "ns": (of_sensor("autoware", "time_stamp", 4e9), "times", "point 3"),
+}
+OUSTER: dict[str, Case] = {
+    "range in mm": (of_sensor("ouster", "range", 60_000), "geometry", "point 3"),
+}
+MINIMAL: dict[str, Case] = {
+    "place": (scan(1, put("minimal", "x", 3, np.inf)), "finite", "point 3"),
+}
+ROSBAG2: dict[str, Case] = {
+    "count of metadata.yaml": (
+        text("metadata.yaml", "message_count: ", "message_count: 1"),
+        "metadata",
+        "metadata.yaml",
+    ),
+    "file of metadata.yaml": (
+        text("metadata.yaml", "bag2_0.mcap", "other.mcap"),
+        "names",
+        "relative_file_paths",
+    ),
+    "start of metadata.yaml": (
+        text("metadata.yaml", "since_epoch: 1", "since_epoch: 2"),
+        "metadata",
+        "starting_time",
+    ),
+    "duration of metadata.yaml": (
+        text("metadata.yaml", "    nanoseconds: ", "    nanoseconds: 1"),
+        "metadata",
+        "duration",
+    ),
+    "scan left out": (scan(1, gone), "metadata", "metadata.yaml"),
+}
+ROSBAG1: dict[str, Case] = {
+    "log time": (bag(only("/points", 1, later(7))), "stamps", "message 1"),
+    "scan left out": (bag(only("/points", 1, gone)), "table", "scan"),
+    "value": (
+        bag(only("/points", 1, put("standard", "x", 3, np.nan))),
+        "finite",
+        "/points message 1 point 3",
+    ),
+    "IMU left out": (bag(only("/left/imu", 3, gone)), "imu", "sensors.0"),
+    "table": (row(1, "points", 1), "table", "line 3 points"),
+    "sensors of the report": (report("sensors", to=[]), "metadata", "scans.csv sensors"),
+    "report": (report("scans", "points", to=1), "report", "points"),
+}
+
+
+def half(records: Records) -> None:
+    records["y"][np.flatnonzero(np.isfinite(records["x"]))[7]] = np.nan
+
+
+def owner(records: Records) -> None:
+    records["lidar_id"][np.flatnonzero(np.isnan(records["x"]))[7]] ^= 1
+
+
+def moment(records: Records) -> None:
+    records["time"][np.flatnonzero(np.isfinite(records["x"]))[7]] += 0.05
+
+
+def ring(records: Records) -> None:
+    records["ring"][np.flatnonzero(np.isnan(records["x"]))[7]] = 3
+
+
+ORGANIZED: dict[str, Case] = {
+    change.__name__: (scan(1, points("standard", change)), check, "/points message 1")
+    for change, check in ((half, "finite"), (owner, "sensors"), (moment, "times"), (ring, "finite"))
+}
+TABLES = {
+    "scans.mcap": MCAP,
+    "split.mcap": SPLIT,
+    "organized.mcap": ORGANIZED,
+    "autoware.mcap": AUTOWARE,
+    "ouster.mcap": OUSTER,
+    "minimal.mcap": MINIMAL,
+    "bag2": ROSBAG2,
+    "scans.bag": ROSBAG1,
+}
+
+
+@pytest.mark.parametrize(("kind", "case"), cases(TABLES))
+def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
+    check_case(kind, case, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "kind", ["scans.mcap", "split.mcap", "organized.mcap", "bag2", "scans.bag"]
+)
+def test_rewritten_files_are_clean(kind: str, tmp_path: Path) -> None:
+    path = copied(kind, tmp_path)
+    edit = bag(lambda sent: [sent]) if kind == "scans.bag" else mcap()
+    edit(path)
+    verdict = verify(path)
+    assert verdict.ok, verdict.violations

@@ -1,4 +1,4 @@
-"""Outputs of the fixture in all formats, made once, and the edits that spoil copies of them."""
+"""Outputs of the fixture in all formats, made once, and edits that damage copies of them."""
 
 from __future__ import annotations
 
@@ -6,21 +6,26 @@ import csv
 import io
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from mlbatch.verify import Verdict, verify
 from tests.builders.run import TWO_LIDARS, command
 
 Values = npt.NDArray[Any]
+Arrays = dict[str, Values]
 Edit = Callable[[Path], None]
+# An edit, and check and place of the violation that is expected.
+Case = tuple[Edit, str, str]
 
+PERIOD_NS = 100_000_000
 # Head and three windows of the fixture; near points only, to keep files small.
 COMMON = ("--keep-partial", "--end", "+0.3", "--max-range", "9", "--quiet")
 KINDS: dict[str, tuple[str, ...]] = {
@@ -43,29 +48,23 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 
 @cache
-def _folder() -> Path:
-    return Path(mkdtemp(prefix="verify-"))
+def _folder() -> TemporaryDirectory[str]:
+    return TemporaryDirectory(prefix="verify-")
 
 
 @cache
 def made(kind: str) -> Path:
     """The output of this kind; not to be changed."""
-    target = _folder() / kind
-    recording, rig = TWO_LIDARS / "two_lidars.pcap", TWO_LIDARS / "rig.yaml"
-    told = command("convert", recording, "--rig", rig, "-o", target, *COMMON, *KINDS[kind])
-    assert (told.code, told.err) == (0, "")
+    target = Path(_folder().name) / kind
+    recording = TWO_LIDARS / "two_lidars.pcap"
+    rig = TWO_LIDARS / "rig.yaml"
+    run = command("convert", recording, "--rig", rig, "-o", target, *COMMON, *KINDS[kind])
+    assert (run.code, run.err) == (0, "")
     return target
 
 
-def forget() -> None:
-    """Remove all of it."""
-    shutil.rmtree(_folder(), ignore_errors=True)
-    made.cache_clear()
-    _folder.cache_clear()
-
-
 def copied(kind: str, folder: Path) -> Path:
-    """A copy of an output, with what lies beside it."""
+    """A copy of an output, with the files next to it."""
     source = made(kind)
     if source.is_dir():
         return Path(shutil.copytree(source, folder / kind))
@@ -74,39 +73,33 @@ def copied(kind: str, folder: Path) -> Path:
     return folder / kind
 
 
-def spoiled(kind: str, folder: Path, edit: Edit) -> Verdict:
-    """What is said of a copy after an edit."""
+def damaged(kind: str, folder: Path, edit: Edit) -> Verdict:
+    """The verdict on a copy after an edit."""
     path = copied(kind, folder)
     edit(path)
     return verify(path)
 
 
-def found(places: list[tuple[str, str]], check: str, where: str) -> None:
-    """A violation of this check names this place."""
-    assert any(one == check and where in place for one, place in places), places
+def cases(tables: dict[str, dict[str, Case]]) -> list[Any]:
+    """Parameters of a test, from tables of cases by kind of output."""
+    return [
+        pytest.param(kind, case, id=f"{kind}-{name}")
+        for kind, table in tables.items()
+        for name, case in table.items()
+    ]
 
 
-def spoiled_places(kind: str, folder: Path, edit: Edit) -> list[tuple[str, str]]:
-    """Check and place of every violation."""
-    return [(one.check, one.where) for one in spoiled(kind, folder, edit).violations]
+def check_case(kind: str, case: Case, folder: Path) -> None:
+    """The edit gives a violation of this check that names this place."""
+    edit, check, where = case
+    places = [(one.check, one.where) for one in damaged(kind, folder, edit).violations]
+    assert any(name == check and where in place for name, place in places), places
 
 
 # -- edits ----------------------------------------------------------------------------------------
 
 
-def npz(name: str, key: str, change: Callable[[Values], Values]) -> Edit:
-    """Change an array of a scan."""
-
-    def edit(folder: Path) -> None:
-        with np.load(folder / name) as archive:
-            arrays = dict(archive)
-        arrays[key] = change(arrays[key].copy())
-        np.savez(folder / name, **arrays)
-
-    return edit
-
-
-def arrays(name: str, change: Callable[[dict[str, Values]], None]) -> Edit:
+def arrays(name: str, change: Callable[[Arrays], None]) -> Edit:
     """Change arrays of a scan together."""
 
     def edit(folder: Path) -> None:
@@ -116,6 +109,15 @@ def arrays(name: str, change: Callable[[dict[str, Values]], None]) -> Edit:
         np.savez(folder / name, **found)
 
     return edit
+
+
+def npz(name: str, key: str, change: Callable[[Values], Values]) -> Edit:
+    """Change an array of a scan."""
+
+    def changed(found: Arrays) -> None:
+        found[key] = change(found[key].copy())
+
+    return arrays(name, changed)
 
 
 def at(place: Any, value: Any) -> Callable[[Values], Values]:
@@ -130,32 +132,36 @@ def at(place: Any, value: Any) -> Callable[[Values], Values]:
 
 def plus(place: Any, value: Any) -> Callable[[Values], Values]:
     """Add a value at a place."""
-
-    def change(values: Values) -> Values:
-        values[place] = values[place].item() + value
-        return values
-
-    return change
+    return lambda values: at(place, values[place].item() + value)(values)
 
 
 def swapped(first: int, second: int) -> Callable[[Values], Values]:
     """Exchange two values."""
-
-    def change(values: Values) -> Values:
-        values[[first, second]] = values[[second, first]]
-        return values
-
-    return change
+    return lambda values: at([first, second], values[[second, first]])(values)
 
 
-def row(line: int, column: str, value: object, name: str = "scans.csv") -> Edit:
-    """Change a cell of a table; lines are counted from the first scan."""
+def row(line: int, column: str, value: object) -> Edit:
+    """Change a cell of scans.csv; lines are counted from the first scan."""
 
     def edit(path: Path) -> None:
-        table = path / name if path.is_dir() else path.with_name(f"{path.name}.{name}")
+        table = _part(path, "scans.csv")
         table.write_text(with_cell(table.read_text(), line, column, value))
 
     return edit
+
+
+def report(*path: str | int, to: Any) -> Edit:
+    """Change a value of report.json; `to`: a value, or a function of the old one."""
+
+    def edit(output: Path) -> None:
+        file = _part(output, "report.json")
+        file.write_text(with_value(file.read_text(), path, to))
+
+    return edit
+
+
+def _part(output: Path, name: str) -> Path:
+    return output / name if output.is_dir() else output.with_name(f"{output.name}.{name}")
 
 
 def with_cell(text: str, line: int, column: str, value: object) -> str:
@@ -169,18 +175,7 @@ def with_cell(text: str, line: int, column: str, value: object) -> str:
     return out.getvalue()
 
 
-def report(*path: str | int, to: Any) -> Edit:
-    """Change a value of the report beside or inside; `to`: a value, or a function of the old."""
-
-    def edit(output: Path) -> None:
-        inside = output / "report.json"
-        file = inside if output.is_dir() else output.with_name(f"{output.name}.report.json")
-        file.write_text(with_value(file.read_text(), path, to))
-
-    return edit
-
-
-def with_value(text: str, path: tuple[str | int, ...], to: Any) -> str:
+def with_value(text: str, path: Sequence[str | int], to: Any) -> str:
     """A JSON text with another value."""
     root = json.loads(text)
     place = root
@@ -210,12 +205,8 @@ def renamed(old: str, new: str) -> Edit:
 
 
 def removed(name: str) -> Edit:
-    """Take a file away."""
-
-    def edit(folder: Path) -> None:
-        (folder / name).unlink()
-
-    return edit
+    """Remove a file."""
+    return lambda folder: (folder / name).unlink()
 
 
 def raw(name: str, change: Callable[[bytearray], bytes | bytearray]) -> Edit:

@@ -1,74 +1,80 @@
-"""Every edit of a folder of scans that breaks a rule is found, and named with its place."""
+"""Folders of npz files: every damage is found, and named with its place."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+import shutil
+import struct
+import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.unit.verify.made import (
+from tests.builders.verify_outputs import (
+    PERIOD_NS,
+    Arrays,
+    Case,
     Edit,
-    Values,
     arrays,
     at,
     both,
+    cases,
+    check_case,
     flipped,
-    forget,
-    found,
     npz,
     plus,
     raw,
     removed,
     renamed,
-    report,
-    row,
-    spoiled_places,
     swapped,
-    text,
 )
 
 ONE = "000001.npz"
-PERIOD_NS = 100_000_000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _clean() -> Iterator[None]:
-    yield
-    forget()
+POINTS = (
+    "xyz",
+    "intensity",
+    "reflectivity",
+    "range_m",
+    "time_ns",
+    "ring",
+    "return_type",
+    "lidar_id",
+)
+COLUMNS = ("column_stamp_ns", "column_lidar_id")
 
 
-def drop_columns(found: dict[str, Values]) -> None:
-    """The last column and its points are gone."""
+def drop_column(found: Arrays) -> None:
+    """Remove the last column and its points."""
     last = len(found["column_stamp_ns"]) - 1
     keep = found["column"] < last
-    for key in ("xyz", "intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type"):
+    for key in (*POINTS, "column"):
         found[key] = found[key][keep]
-    found["lidar_id"], found["column"] = found["lidar_id"][keep], found["column"][keep]
-    found["column_stamp_ns"] = found["column_stamp_ns"][:last]
-    found["column_lidar_id"] = found["column_lidar_id"][:last]
+    for key in COLUMNS:
+        found[key] = found[key][:last]
 
 
-def repeat_column(found: dict[str, Values]) -> None:
-    """A column with points is there twice in a row."""
+def repeat_column(found: Arrays) -> None:
+    """Insert a copy of a column with points after it."""
     column = int(found["column"][len(found["column"]) // 2])
     rows = np.flatnonzero(found["column"] == column)
     end = rows[-1] + 1
-    for key in ("xyz", "intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type"):
+    for key in POINTS:
         found[key] = np.insert(found[key], end, found[key][rows], axis=0)
-    found["lidar_id"] = np.insert(found["lidar_id"], end, found["lidar_id"][rows])
     old = found["column"].copy()
     old[old > column] += 1
     found["column"] = np.insert(old, end, np.full(len(rows), column + 1, old.dtype))
-    for key in ("column_stamp_ns", "column_lidar_id"):
+    for key in COLUMNS:
         found[key] = np.insert(found[key], column, found[key][column])
 
 
 def shifted(by_ns: int) -> Edit:
     """A scan of another time, all of it."""
 
-    def change(found: dict[str, Values]) -> None:
+    def change(found: Arrays) -> None:
         for key in ("column_stamp_ns", "start_ns", "end_ns"):
             found[key] = found[key] + np.int64(by_ns)
 
@@ -76,19 +82,50 @@ def shifted(by_ns: int) -> Edit:
 
 
 def without(key: str) -> Edit:
-    def change(found: dict[str, Values]) -> None:
+    """Remove a key."""
+
+    def change(found: Arrays) -> None:
         del found[key]
 
     return arrays(ONE, change)
 
 
 def as_type(kind: str) -> Edit:
+    """Another type of intensities."""
     return npz(ONE, "intensity", lambda values: values.astype(kind))
 
 
-# The first by name: it tells the constants that others are held against.
+def member(name: str, data: bytes, method: int = zipfile.ZIP_STORED, size: int = 0) -> Edit:
+    """Add a member to the zip; size: declared size, if not the true one."""
+
+    def change(old: bytearray) -> bytearray:
+        file = io.BytesIO(old)
+        with zipfile.ZipFile(file, "a") as archive, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            archive.writestr(name, data, method)
+        new = bytearray(file.getvalue())
+        if size:
+            struct.pack_into("<I", new, new.rindex(b"PK\x01\x02") + 24, size)
+        return new
+
+    return raw(ONE, change)
+
+
+def npy(head: str) -> bytes:
+    """An npy with this header and 8 bytes of data."""
+    data = head.encode()
+    return b"\x93NUMPY\x01\x00" + len(data).to_bytes(2, "little") + data + bytes(8)
+
+
+HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,), }"
+TWISTED = "{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -1), }"
+FORTRAN = "{'descr': '<f8', 'fortran_order': True, 'shape': (1,), }"
+OBJECTS = "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }"
+NO_HEAD = "{'descr': '<f8', " + "(" * 200
+
+# The first by name: its constants are those of the run.
 HEAD = "head.npz"
-NPZ: dict[str, tuple[Edit, str, str]] = {
+NPZ: dict[str, Case] = {
     "start off the grid": (npz(ONE, "start_ns", plus((), -5)), "grid", "000001.npz start_ns"),
     "end off the grid": (npz(ONE, "end_ns", plus((), 1)), "grid", "000001.npz end_ns"),
     "period too long": (npz(ONE, "end_ns", plus((), PERIOD_NS)), "grid", "000001.npz end_ns"),
@@ -141,7 +178,7 @@ NPZ: dict[str, tuple[Edit, str, str]] = {
     "ring that is none": (npz(ONE, "ring", at(-1, 500)), "rings", "000001.npz point"),
     "return type that is none": (npz(ONE, "return_type", at(6, 8)), "returns", "point 6"),
     "column twice": (arrays(ONE, repeat_column), "duplicates", "000001.npz column"),
-    "column left out": (arrays(ONE, drop_columns), "table", "scans.csv line 4 columns_"),
+    "column left out": (arrays(ONE, drop_column), "table", "scans.csv line 4 columns_"),
     "incomplete": (npz(ONE, "complete", at((), False)), "table", "scans.csv line 4 complete"),
     "key left out": (without("ring"), "container", "000001.npz"),
     "key of others left out": (without("reflectivity"), "layout", "000001.npz"),
@@ -169,6 +206,16 @@ NPZ: dict[str, tuple[Edit, str, str]] = {
     "text for sensors": (npz(HEAD, "sensors", lambda v: v[0]), "layout", "head.npz sensors"),
     "fewer values": (npz(ONE, "ring", lambda v: v[1:]), "layout", "000001.npz ring"),
     "two axes": (npz(ONE, "ring", lambda v: v[None]), "layout", "000001.npz ring"),
+    "more values than bytes": (member("x.npy", npy(HUGE)), "container", "000001.npz"),
+    "negative shape": (member("x.npy", npy(TWISTED)), "container", "000001.npz"),
+    "order of Fortran": (member("x.npy", npy(FORTRAN)), "container", "000001.npz"),
+    "pickled objects": (member("x.npy", npy(OBJECTS)), "container", "000001.npz"),
+    "header that is none": (member("x.npy", npy(NO_HEAD)), "container", "000001.npz"),
+    "no npy": (member("x.npy", b"no npy"), "container", "000001.npz"),
+    "member twice": (member("ring.npy", b""), "container", "000001.npz"),
+    "other compression": (member("x.npy", b"", zipfile.ZIP_LZMA), "container", "000001.npz"),
+    "bomb": (member("x.npy", npy(HUGE), size=1 << 30), "container", "000001.npz"),
+    "smaller than declared": (member("x.npy", npy(HUGE), size=400), "container", "000001.npz"),
     "a byte of an array": (raw(ONE, flipped(4000)), "container", "000001.npz"),
     "file cut off": (raw(ONE, lambda data: data[:9000]), "container", "000001.npz"),
     "empty file": (raw(ONE, lambda data: b""), "container", "000001.npz"),
@@ -177,84 +224,100 @@ NPZ: dict[str, tuple[Edit, str, str]] = {
     "name of five digits": (renamed(ONE, "00001.npz"), "names", "00001.npz"),
     "name with a slice": (renamed(ONE, "000001-0.npz"), "names", "000001-0.npz"),
     "left by a run": (renamed(ONE, f"{ONE}.partial"), "names", "000001.npz.partial"),
-    "no table": (removed("scans.csv"), "table", "scans.csv"),
-    "points of a line": (row(1, "points", lambda n: n + 1), "table", "line 3 points"),
-    "stamp of a line": (row(1, "last_stamp_ns", lambda n: n - 1), "table", "last_stamp_ns"),
-    "stamp past its line": (row(1, "last_stamp_ns", lambda n: n + PERIOD_NS), "columns", "line 3"),
-    "start of a line": (row(1, "start_ns", lambda n: n + 1), "grid", "line 3 start_ns"),
-    "end of a line": (row(2, "end_ns", lambda n: n + 1), "grid", "line 4 end_ns"),
-    "columns of a line": (row(1, "columns", lambda n: n + 1), "table", "line 3 columns"),
-    "columns of a sensor": (row(1, "columns_left", lambda n: n - 1), "table", "columns_left"),
-    "gap of a line": (row(1, "max_gap_ns_right", lambda n: n + 1), "table", "max_gap_ns_right"),
-    "line out of order": (row(1, "index", 7), "table", "line 4 index and slice"),
-    "no number in a line": (row(1, "points", "many"), "table", "line 3 points"),
-    "word in a line": (row(1, "complete", "yes"), "table", "line 3 complete"),
-    "header of the table": (text("scans.csv", "index,", "no,"), "table", "scans.csv line 1"),
-    "line cut off": (text("scans.csv", ",true", ""), "table", "scans.csv"),
-    "frames of the report": (report("capture", "frames", to=1), "ledger", "capture.frames"),
-    "packets of the report": (
-        report("sensors", 0, "packets", "accepted", to=1),
-        "ledger",
-        "sensors.0.packets.read",
-    ),
-    "columns of the report": (
-        report("sensors", 1, "columns", "dropped", "head", to=1),
-        "ledger",
-        "sensors.1.columns.decoded",
-    ),
-    "slots of the report": (
-        report("sensors", 0, "points", "no_return", to=1),
-        "ledger",
-        "sensors.0.points.slots",
-    ),
-    "balanced, but not so in the file": (
-        both(
-            report("sensors", 0, "points", "written", to=lambda n: n + 5),
-            report("sensors", 0, "points", "no_return", to=lambda n: n - 5),
-        ),
-        "report",
-        "sensors.0.points.written",
-    ),
-    "columns that are not there": (
-        both(
-            report("sensors", 0, "columns", "written", to=lambda n: n + 5),
-            report("sensors", 0, "columns", "decoded", to=lambda n: n + 5),
-        ),
-        "report",
-        "sensors.0.columns.written",
-    ),
-    "scans of the report": (report("scans", "written", to=9), "report", "scans.written"),
-    "points of the report": (report("scans", "points", to=9), "report", "scans.points"),
-    "incomplete of the report": (report("scans", "incomplete", to=3), "report", "incomplete"),
-    "span of the report": (report("scans", "span_ms", "max", to=101.0), "report", "span_ms.max"),
-    "period of the report": (report("scans", "period_ms", "p50", to=99.0), "report", "p50"),
-    "start of the report": (report("grid", "t_init_ns", to=7), "t_init", "t_init_ns"),
-    "start by a period": (
-        report("grid", "t_init_ns", to=lambda n: n + PERIOD_NS),
-        "index",
-        "head.npz index, slice",
-    ),
-    "rate of the report": (report("grid", "rate_hz", to="20"), "metadata", "report.json rate"),
-    "period of the grid": (report("grid", "period_ns", to="1"), "grid", "grid.period_ns"),
-    "slices of the report": (report("grid", "slices", to=2), "metadata", "report.json slices"),
-    "sensor of the report": (report("sensors", 0, "name", to="x"), "metadata", "sensors"),
-    "number of a sensor": (report("sensors", 1, "lidar_id", to=0), "ledger", "1.lidar_id"),
-    "report of others": (report("schema", to="x"), "ledger", "report.json schema"),
-    "count that is none": (report("capture", "frames", to="many"), "ledger", "capture.frames"),
-    "sensor far away": (
-        report("sensors", 0, "extrinsics", "body_from_sensor", 0, 3, to=40.0),
-        "geometry",
-        "000000.npz point",
-    ),
-    "extrinsics that are none": (
-        report("sensors", 0, "extrinsics", "body_from_sensor", to=[[1, 0], [0, 1]]),
-        "report",
-        "body_from_sensor",
+}
+
+
+def empty_slot(key: str, value: float) -> Edit:
+    """A value where an organized scan has no point."""
+
+    def change(scan: Arrays) -> None:
+        empty = np.isnan(scan["xyz"]).all(axis=2)
+        place = tuple(np.argwhere(empty)[5])
+        scan[key][place] = value
+
+    return arrays(ONE, change)
+
+
+def valid_slot(key: str, value: float) -> Edit:
+    """A value where an organized scan has a point."""
+
+    def change(scan: Arrays) -> None:
+        place = tuple(np.argwhere(np.isfinite(scan["range_m"]))[5])
+        scan[key][place] = value
+
+    return arrays(ONE, change)
+
+
+def half_a_place(scan: Arrays) -> None:
+    """One coordinate of three is missing."""
+    place = tuple(np.argwhere(np.isfinite(scan["range_m"]))[5])
+    scan["xyz"][place][1] = np.nan
+
+
+ORGANIZED: dict[str, Case] = {
+    "range in an empty slot": (empty_slot("range_m", 1.0), "finite", "slot"),
+    "intensity in an empty slot": (empty_slot("intensity", 1.0), "finite", "slot"),
+    "time in an empty slot": (empty_slot("time_ns", 1), "finite", "slot"),
+    "ring in an empty slot": (empty_slot("ring", 1), "finite", "slot"),
+    "return in an empty slot": (empty_slot("return_type", 1), "finite", "slot"),
+    "no place": (valid_slot("xyz", np.nan), "finite", "slot"),
+    "half a place": (arrays(ONE, half_a_place), "finite", "slot"),
+    "no range": (valid_slot("range_m", np.nan), "finite", "slot"),
+    "sensor of a slot": (empty_slot("lidar_id", 1), "sensors", "slot"),
+    "time of a slot": (valid_slot("time_ns", 50_000_000), "times", "slot"),
+    "rows missing": (npz(ONE, "ring", lambda v: v[:-1]), "layout", "ring"),
+    "column past the window": (
+        npz(ONE, "column_stamp_ns", plus(-1, PERIOD_NS)),
+        "columns",
+        "column 1023",
     ),
 }
 
 
-@pytest.mark.parametrize("name", NPZ)
-def test_npz(name: str, tmp_path: Path) -> None:
-    edit, check, where = NPZ[name]
-    found(spoiled_places("npz", tmp_path, edit), check, where)
+def of_other_sensor(folder: Path) -> None:
+    shutil.copy(folder / "right" / ONE, folder / "left" / ONE)
+
+
+SPLIT: dict[str, Case] = {
+    "scan of the other sensor": (of_other_sensor, "sensors", "left/000001.npz"),
+    "folder of no sensor": (renamed("left", "middle"), "names", "middle/"),
+    "scan missing": (removed(f"left/{ONE}"), "table", "line 4 points"),
+    "scan outside the folders": (renamed(f"left/{ONE}", ONE), "names", "left/"),
+}
+
+# Times at the limits of int64, in the first scan: without a report nothing says where it begins.
+EXTREME: dict[str, Case] = {
+    f"start {ns}": (
+        both(removed("report.json"), npz(HEAD, "start_ns", at((), ns))),
+        "grid",
+        "head.npz start_ns",
+    )
+    for ns in (2**63 - 1, -(2**63))
+}
+
+SLICES: dict[str, Case] = {
+    "slice missing": (removed("000001-1.npz"), "table", "scan"),
+    "slices swapped": (
+        both(
+            renamed("000001-1.npz", "x"),
+            renamed("000001-2.npz", "000001-1.npz"),
+            renamed("x", "000001-2.npz"),
+        ),
+        "names",
+        "000001-",
+    ),
+    "slice past the window": (npz("000001-2.npz", "slice", at((), 3)), "index", "000001-2.npz"),
+    "bound of a slice": (npz("000001-1.npz", "start_ns", plus((), 1)), "grid", "000001-1.npz"),
+}
+
+TABLES = {
+    "npz": NPZ | EXTREME,
+    "npz-organized": ORGANIZED,
+    "npz-split": SPLIT,
+    "npz-slices": SLICES,
+}
+
+
+@pytest.mark.parametrize(("kind", "case"), cases(TABLES))
+def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
+    check_case(kind, case, tmp_path)
