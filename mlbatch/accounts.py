@@ -77,7 +77,7 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
     if not any(recording.topics for recording in run.recordings):
         return
     # Captures have no topics, and so no clouds: they need not wait for what reads these.
-    from mlbatch.clouds import CloudRecording
+    from mlbatch.readers.bag.clouds import CloudRecording
 
     for recording in run.recordings:
         if isinstance(recording, CloudRecording):

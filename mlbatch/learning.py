@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from mlbatch import readers, sensors
+from mlbatch import readers, ros, sensors
 from mlbatch.errors import MlbatchError
 from mlbatch.frames import nearest_topic
 from mlbatch.knowledge import Knowledge
@@ -63,17 +63,17 @@ class Learner:
     def _learn(self, message: Message) -> None:
         topic = message.topic
         if topic.type in TRANSFORM_TYPES:
-            stated = readers.decode_transforms(topic, message.data)
+            stated = ros.decode_transforms(topic, message.data)
             self.knowledge.add_transforms("tf_static" if _tail(topic) == STATIC else "tf", stated)
         elif topic.type == TEXT_TYPE and _tail(topic) == METADATA:
             # Of several, the first: it is the one under which the recording began.
-            self._texts.setdefault(topic.name, readers.decode_string(topic, message.data).encode())
+            self._texts.setdefault(topic.name, ros.decode_string(topic, message.data).encode())
         elif topic.type == BYTES_TYPE and _tail(topic) == CORRECTIONS:
-            self._texts.setdefault(topic.name, readers.decode_bytes(topic, message.data))
+            self._texts.setdefault(topic.name, ros.decode_bytes(topic, message.data))
         elif topic.type == readers.CORRECTION_TYPE:
             self._texts.setdefault(topic.name, message.data)
         elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
-            self.knowledge.add_urdf(readers.decode_string(topic, message.data))
+            self.knowledge.add_urdf(ros.decode_string(topic, message.data))
 
     @property
     def metadata_topics(self) -> tuple[str, ...]:

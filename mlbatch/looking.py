@@ -40,7 +40,7 @@ def with_clouds(
     if not topics:
         return list(recordings)
     # Not loaded for captures.
-    from mlbatch.clouds import CloudRecording, Layout, cloud_topics
+    from mlbatch.readers.bag.clouds import CloudRecording, Layout, cloud_topics
 
     clouds = {topic.name: topic for topic in cloud_topics(topics)}
     # A capture has no topics, and nothing but packets.
@@ -57,7 +57,7 @@ def is_without_packets(recording: Recording) -> bool:
     if not recording.topics or any(map(holds_packets, recording.topics)):
         return False
     # As above.
-    from mlbatch.clouds import CloudRecording
+    from mlbatch.readers.bag.clouds import CloudRecording
 
     clouds = recording.topics_of_clouds if isinstance(recording, CloudRecording) else ()
     return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}

@@ -13,7 +13,6 @@ from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.clock import timescale
 from mlbatch.clock_compare import Comparison, compare
-from mlbatch.clouds import CloudRecording
 from mlbatch.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.doctor import ClockWatch
 from mlbatch.errors import RigError
@@ -22,6 +21,7 @@ from mlbatch.looking import calibrations_for, first_seconds, look, with_clouds
 from mlbatch.matching import match
 from mlbatch.mounting import Mounted, in_words, mount
 from mlbatch.readers import merge, open_recording
+from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.ring import RawRing
 from mlbatch.sharing import shared_by

@@ -1,4 +1,4 @@
-"""Readers of recordings. A module here without leading underscore is a plug-in for one container.
+"""Readers of recordings. Every module in `formats` is a plug-in for one container.
 
 A plug-in has `CONTAINER`, `recognises(head)` and `open_packets(path, streams)`, as in `Reader`;
 one for bags that are folders also `open_folder(folder, files, streams, notes)`.
@@ -13,23 +13,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._merge import merge
-from mlbatch.readers._source import read_head
+from mlbatch.readers import formats
+from mlbatch.readers.merge import merge
+from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable, Topic
 
 if TYPE_CHECKING:
-    from mlbatch.readers._envelopes import CORRECTION_TYPE as CORRECTION_TYPE
-    from mlbatch.readers._knowledge import decode_bytes as decode_bytes
-    from mlbatch.readers._knowledge import decode_string as decode_string
-    from mlbatch.readers._knowledge import decode_transforms as decode_transforms
-    from mlbatch.readers._packet_types import Envelope
+    from mlbatch.readers.bag.packet_messages import CORRECTION_TYPE as CORRECTION_TYPE
+    from mlbatch.readers.bag.packet_messages import Envelope
 
 __all__ = [
     "CORRECTION_TYPE",
     "Reader",
-    "decode_bytes",
-    "decode_string",
-    "decode_transforms",
     "holds_corrections",
     "holds_packets",
     "merge",
@@ -41,10 +36,7 @@ __all__ = [
 _SHOWN_BYTES = 8
 # What only messages need.
 _PLACES = {
-    "CORRECTION_TYPE": "_envelopes",
-    "decode_bytes": "_knowledge",
-    "decode_string": "_knowledge",
-    "decode_transforms": "_knowledge",
+    "CORRECTION_TYPE": "bag.packet_messages",
 }
 
 
@@ -93,8 +85,8 @@ def holds_corrections(topic: Topic) -> bool:
 
 def _envelope(topic: Topic) -> Envelope | None:
     # As above: asked of topics only.
-    from mlbatch.readers._definitions import type_key
-    from mlbatch.readers._packet_types import PACKET_TYPES
+    from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+    from mlbatch.ros.definitions import type_key
 
     return PACKET_TYPES.get(type_key(topic.type))
 
@@ -106,12 +98,11 @@ def readers() -> list[Reader]:
 
 def _names() -> list[str]:
     """Names of the plug-ins; none is imported."""
-    modules = pkgutil.iter_modules(__path__)
-    return sorted(info.name for info in modules if not info.name.startswith("_"))
+    return sorted(info.name for info in pkgutil.iter_modules(formats.__path__))
 
 
 def _reader(name: str) -> Reader:
-    return cast(Reader, importlib.import_module(f"{__name__}.{name}"))
+    return cast(Reader, importlib.import_module(f"{formats.__name__}.{name}"))
 
 
 def open_recording(path: Path, streams: StreamTable) -> Recording:
@@ -153,7 +144,7 @@ def _reader_of(path: Path) -> Reader:
 
 def _open_folder(path: Path, streams: StreamTable) -> Recording:
     """Open a bag that is a folder."""
-    from mlbatch.readers._folder import bag_folder
+    from mlbatch.readers.bag.folder import bag_folder
 
     folder = bag_folder(path)
     found = [_reader_of(file) for file in folder.files]

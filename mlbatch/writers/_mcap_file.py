@@ -32,11 +32,11 @@ from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
 from mlbatch.errors import ExportError
+from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Topic
 from mlbatch.writers._chunk import Chunk, Compress
 from mlbatch.writers._compression import compression_of
 from mlbatch.writers._gathered import OutputFile, crc32, taken
-from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
 
 CHUNK_BYTES = 4 * 2**20
 # Messages of this size end the chunk they are in; smaller ones are collected.

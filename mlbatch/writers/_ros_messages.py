@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mlbatch.ros.definitions import FIELD_CODES
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import F64Array, ImuSamples, RunInfo
 from mlbatch.writers._layouts import Layout
 from mlbatch.writers._points import Points
-from mlbatch.writers._ros2_types import FIELD_CODES
-from mlbatch.writers._wire import Wire
 
 NewWire = Callable[[], Wire]
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RunInfo
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._options import ScanWriter, WriterOptions
-from mlbatch.writers._wire import Cdr
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Ros1
 from mlbatch.types import Message, RunInfo, Summary, Topic
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._chunk import Chunk
 from mlbatch.writers._kept import open_output
 from mlbatch.writers._options import ScanWriter, WriterOptions
-from mlbatch.writers._wire import Ros1
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import Message, RunInfo, Summary
 from mlbatch.writers._atomic import prepare
 from mlbatch.writers._bag_writer import BagWriter, Sink, extras_of, layout_of
 from mlbatch.writers._chunk import Chunk
 from mlbatch.writers._options import ScanWriter, WriterOptions
-from mlbatch.writers._wire import Cdr
 
 if TYPE_CHECKING:
     from mlbatch.writers._mcap_file import Container

@@ -22,7 +22,7 @@ from mlbatch.discover import Wishes
 from mlbatch.job import Job
 from mlbatch.pipeline import Conversion
 from mlbatch.readers import open_recording
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.report import ReportInputs
 from mlbatch.types import (
     EXTRAS,

@@ -13,9 +13,9 @@ import numpy as np
 
 from mlbatch.frames import Candidate
 from mlbatch.looking import look, with_clouds
-from mlbatch.readers._bag import BagRecording, Portion
-from mlbatch.readers._definitions import definition_text
-from mlbatch.readers._packet_types import PACKET_TYPES
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+from mlbatch.readers.bag.recording import BagRecording, Portion
+from mlbatch.ros.definitions import definition_text
 from mlbatch.types import StreamTable, Topic
 from tests.builders import points
 from tests.builders.bags import Body, Recorded, definition, packet_message, transforms_message

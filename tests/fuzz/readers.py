@@ -20,7 +20,7 @@ import zstandard
 from mlbatch.errors import MlbatchError
 from mlbatch.kernels import is_installed
 from mlbatch.readers import open_recording, use_engine
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from tests.builders import mcaps, rosbag1
 from tests.builders.bags import Recorded, fixture_messages

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RecordingError, RigError, one_line
-from mlbatch.readers import decode_transforms, open_recording
-from mlbatch.readers._envelopes import Unpacker
+from mlbatch.readers import open_recording
+from mlbatch.readers.bag.packet_messages import Unpacker
 from mlbatch.rig import read_rig
+from mlbatch.ros import decode_transforms
 from mlbatch.types import StreamTable, Topic
 from tests.builders.bags import Recorded, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from mlbatch._cloud_messages import Cloud, read_cloud
+from mlbatch.ros.pointcloud2 import Cloud, read_cloud
 from mlbatch.types import Message, Topic
 from tests.builders.points import (
     AUTOWARE,

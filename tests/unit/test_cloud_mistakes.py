@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mlbatch._cloud_messages import Cloud, read_cloud
-from mlbatch._cloud_packets import CloudError
+from mlbatch.ros.point_packets import CloudError
+from mlbatch.ros.pointcloud2 import Cloud, read_cloud
 from mlbatch.types import Message, Topic
 from tests.builders.points import (
     CLOUD,

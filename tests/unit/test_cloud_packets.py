@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch._cloud_packets import CloudError, Layout, Points, layout_of, pack
+from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from tests.builders.points import (
     STAMP_NS,
     read_packets,

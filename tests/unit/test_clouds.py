@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch._cloud_packets import Layout
-from mlbatch.clouds import CloudRecording, cloud_topics
 from mlbatch.ledger import check_capture
 from mlbatch.readers import merge, open_recording
+from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+from mlbatch.ros.point_packets import Layout
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
 from tests.builders.points import (
@@ -180,7 +180,7 @@ def test_large_clouds_come_in_parts_and_lose_nothing(
     clouds = write_points("/points", [_turn(n) for n in range(5)])
     bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
     whole = _payloads(_open(bag)[0].packets())
-    monkeypatch.setattr("mlbatch.clouds._PART_BYTES", 1)
+    monkeypatch.setattr("mlbatch.readers.bag.clouds._PART_BYTES", 1)
     batches = list(_open(bag)[0].packets())
     assert len(batches) > 4
     assert _payloads(iter(batches)) == whole

@@ -15,7 +15,7 @@ import pytest
 from mlbatch import _resume_state, resume
 from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
-from mlbatch.readers import _source
+from mlbatch.readers import source as _source
 from mlbatch.types import Scan
 from mlbatch.writers import npz
 from tests.resume_storm import contents

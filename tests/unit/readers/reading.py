@@ -9,7 +9,7 @@ from pathlib import Path
 import dpkt
 
 from mlbatch.readers import open_recording
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
 
 RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"

@@ -10,7 +10,7 @@ import pytest
 
 from mlbatch.errors import RecordingError
 from mlbatch.kernels.reading import CaptureKernel
-from mlbatch.readers._bytes import copy_runs
+from mlbatch.readers.byte_records import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.engines import few_kernels, needs_numba
 from tests.unit.readers.reading import Seen, open_capture, read

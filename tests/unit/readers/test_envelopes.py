@@ -13,16 +13,14 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._definitions import definition_text, definitions_of
-from mlbatch.readers._envelopes import (
+from mlbatch.readers.bag.packet_messages import (
     PACKET_TYPES,
     Found,
     MessageError,
     Unpacker,
-    decode_bytes,
-    decode_string,
-    decode_transforms,
 )
+from mlbatch.ros import decode_bytes, decode_string, decode_transforms
+from mlbatch.ros.definitions import definition_text, definitions_of
 from mlbatch.types import Topic, U8Array
 from tests.builders.bags import Body, definition, transforms_message
 

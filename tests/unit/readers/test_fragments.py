@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.readers import _fragments
+from mlbatch.readers.capture import fragments as _fragments
 from tests.builders.captures import ipv4_packet, link_frame, udp_frame, write_pcap
 from tests.unit.readers.reading import Seen, open_capture, read
 
@@ -167,7 +167,7 @@ def test_ipv6_fragments_interleave_with_ipv4() -> None:
 
 def test_open_sets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_fragments, "MAX_SETS", 3)
-    monkeypatch.setattr("mlbatch.readers._reassembly.MAX_SETS", 3)
+    monkeypatch.setattr("mlbatch.readers.capture.fragments.MAX_SETS", 3)
     sets = [fragments(i, ident=i) for i in range(5)]
     frames = [one[0] for one in sets] + [frame for one in sets for frame in one[1:]]
     payloads, skipped = found(frames)

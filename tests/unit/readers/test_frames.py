@@ -7,9 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from mlbatch.readers._addresses import Addresses
-from mlbatch.readers._bytes import SLACK
-from mlbatch.readers._frames import Frames, dissect
+from mlbatch.readers.byte_records import SLACK
+from mlbatch.readers.capture.frames import Addresses, Frames, dissect
 
 _PAYLOAD = bytes(range(100, 110))
 # Ethernet (no tag), IPv4 of five words, UDP from port 5000 to 7502, ten bytes; RFC 791 and 768.

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers.capture.recording import CaptureRecording
 from tests.builders.captures import (
     Interface,
     Other,

@@ -12,7 +12,8 @@ from mcap import records as mcap_records
 from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
-from mlbatch.readers import mcap, open_recording
+from mlbatch.readers import open_recording
+from mlbatch.readers.formats import mcap
 from mlbatch.types import Message, Recording, StreamTable
 from tests.builders.mcaps import (
     FORMS,

@@ -12,7 +12,7 @@ import zstandard
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers import open_recording, readers
-from mlbatch.readers._source import Source
+from mlbatch.readers.source import Source
 from mlbatch.types import StreamTable
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.unit.readers.reading import open_capture, read

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._ticks import Resolution
+from mlbatch.readers.formats.pcapng import Resolution
 from tests.builders.captures import (
     OLD_PACKET,
     RAW,

@@ -12,8 +12,9 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers import decode_string, open_recording
-from mlbatch.readers._bag import BagRecording
+from mlbatch.readers import open_recording
+from mlbatch.readers.bag.recording import BagRecording
+from mlbatch.ros import decode_string
 from mlbatch.types import Message, StreamTable, Topic
 from tests.builders.bags import (
     OUSTER_ROS1,

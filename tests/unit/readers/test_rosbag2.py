@@ -20,9 +20,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers import _db3, decode_transforms, open_recording
-from mlbatch.readers._bag import BagRecording, Portion
-from mlbatch.readers._sqlite_table import HandOver, Rows, Table
+from mlbatch.readers import open_recording
+from mlbatch.readers.bag.recording import BagRecording, Portion
+from mlbatch.readers.bag.sqlite_table import HandOver, Rows, Table
+from mlbatch.readers.formats import rosbag2 as _db3
+from mlbatch.ros import decode_transforms
 from mlbatch.types import Message, StreamTable
 from tests.builders.bags import Recorded, fixture_messages, fixture_packets, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2

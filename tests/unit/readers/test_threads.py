@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.readers import _db3, merge, open_recording
+from mlbatch.readers import merge, open_recording
+from mlbatch.readers.formats import rosbag2 as _db3
 from mlbatch.types import StreamTable
 from tests.builders.bags import fixture_messages
 from tests.builders.rosbag2 import write_rosbag2
