@@ -26,7 +26,7 @@ from tests.fuzz.framing import Part, joined, parts_of
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.fuzz.readers import check_batch
-from tests.unit.readers.test_envelopes import serialised
+from tests.readers.bag.test_packet_messages import serialised
 
 # Parts of an input: the topic (type, encoding and format as a line), its definition, messages.
 _TOPIC, _DEFINITION, _MESSAGE = range(3)

@@ -13,7 +13,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.mcaps import FORMS, LZ4, ZSTD, Form, packet_messages, write_mcap
-from tests.unit.readers.test_mcap import EXPECTED, PACKETS, packets_of
+from tests.readers.formats.test_mcap import EXPECTED, PACKETS, packets_of
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER = struct.pack("<BQII", 1, 8, 0, 0)

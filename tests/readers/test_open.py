@@ -15,7 +15,7 @@ from mlbatch.readers import open_recording, readers
 from mlbatch.readers.source import Source
 from mlbatch.types import StreamTable
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
-from tests.unit.readers.reading import open_capture, read
+from tests.builders.reading import open_capture, read
 
 CONTENT = pcap_bytes((i, udp_frame(random.Random(i).randbytes(1000))[0]) for i in range(300))
 

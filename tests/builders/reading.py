@@ -12,7 +12,7 @@ from mlbatch.readers import open_recording
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
 
-RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from mlbatch.readers.formats import rosbag2 as _db3
 from mlbatch.ros import decode_transforms
 from mlbatch.types import Message, StreamTable
 from tests.builders.bags import Recorded, fixture_messages, fixture_packets, packet_message
+from tests.builders.reading import RECORDINGS, Seen, assert_balanced, seen_of
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
-from tests.unit.readers.reading import RECORDINGS, Seen, assert_balanced, seen_of
 
 PACKETS = [Seen(host_ns, topic, payload) for topic, host_ns, payload in fixture_packets()]
 OUSTER = "ouster_sensor_msgs/PacketMsg"

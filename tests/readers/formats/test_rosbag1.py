@@ -24,8 +24,8 @@ from tests.builders.bags import (
     fixture_packets,
     packet_message,
 )
+from tests.builders.reading import Seen, assert_balanced, seen_of
 from tests.builders.rosbag1 import open_chunk, without_index, write_rosbag1
-from tests.unit.readers.reading import Seen, assert_balanced, seen_of
 
 PACKETS = [Seen(host_ns, topic, payload) for topic, host_ns, payload in fixture_packets()]
 

@@ -28,7 +28,7 @@ from tests.builders.mcaps import (
     text_message,
     write_mcap,
 )
-from tests.unit.readers.reading import Seen, assert_balanced, seen_of
+from tests.builders.reading import Seen, assert_balanced, seen_of
 
 PACKETS = fixture_packets()
 EXPECTED = [Seen(p.host_ns, p.topic, p.payload) for p in PACKETS]

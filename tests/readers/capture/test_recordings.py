@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.readers.reading import RECORDINGS, dpkt_read, open_capture, read
+from tests.builders.reading import RECORDINGS, dpkt_read, open_capture, read
 
 # (port, payload size): packets; MANIFEST.md, columns "transport" and "packets".
 MANIFEST = {

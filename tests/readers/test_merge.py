@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mlbatch.readers import merge
 from mlbatch.types import CaptureCounts, Message, PacketBatch, StreamTable, Topic
 from tests.builders.captures import udp_frame, write_pcap
-from tests.unit.readers.reading import Seen, open_capture, seen_of
+from tests.builders.reading import Seen, open_capture, seen_of
 
 Session = list[list[int]]
 

@@ -13,8 +13,8 @@ from mlbatch.kernels.reading import CaptureKernel
 from mlbatch.readers.byte_records import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.engines import few_kernels, needs_numba
-from tests.unit.readers.reading import Seen, open_capture, read
-from tests.unit.readers.test_laws import damaged, mixed_file
+from tests.builders.reading import Seen, open_capture, read
+from tests.readers.capture.test_recording import damaged, mixed_file
 
 pytestmark = needs_numba
 

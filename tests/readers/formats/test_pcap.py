@@ -23,7 +23,7 @@ from tests.builders.captures import (
     udp_frame,
     write_pcap,
 )
-from tests.unit.readers.reading import Seen, open_capture, read
+from tests.builders.reading import Seen, open_capture, read
 
 PAYLOAD = bytes(range(256)) * 4
 T0_NS = 1_700_000_000_123_456_789

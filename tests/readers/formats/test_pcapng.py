@@ -24,7 +24,7 @@ from tests.builders.captures import (
     udp_frame,
     write_pcapng,
 )
-from tests.unit.readers.reading import open_capture, read
+from tests.builders.reading import open_capture, read
 
 (FRAME,) = udp_frame(b"payload")
 

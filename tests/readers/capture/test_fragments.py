@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mlbatch.readers.capture import fragments as _fragments
 from tests.builders.captures import ipv4_packet, link_frame, udp_frame, write_pcap
-from tests.unit.readers.reading import Seen, open_capture, read
+from tests.builders.reading import Seen, open_capture, read
 
 SECOND_NS = 1_000_000_000
 MTU = 576  # 552 bytes of data a fragment

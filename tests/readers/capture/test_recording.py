@@ -20,7 +20,7 @@ from tests.builders.captures import (
     section_bytes,
     udp_frame,
 )
-from tests.unit.readers.reading import Seen, assert_balanced, open_capture, read
+from tests.builders.reading import Seen, assert_balanced, open_capture, read
 
 BUFFERS = st.sampled_from([64, 700, 4096, 20_000, 65_536])
 
