@@ -31,7 +31,7 @@ def teaches(topic: Topic) -> bool:
         return _tail(topic) in (METADATA, DESCRIPTION)
     if topic.type == BYTES_TYPE:
         return _tail(topic) == CORRECTIONS
-    return topic.type in TRANSFORM_TYPES or readers.holds_corrections(topic)
+    return topic.type in TRANSFORM_TYPES or readers.has_corrections(topic)
 
 
 def listen(recordings: Iterable[Recording]) -> None:

@@ -13,7 +13,7 @@ from mlbatch import sensors
 from mlbatch.errors import RigError
 from mlbatch.learning import Learner, listen
 from mlbatch.lidar import Calibration
-from mlbatch.readers import holds_packets, merge
+from mlbatch.readers import has_packets, merge
 from mlbatch.rig import Rig
 from mlbatch.streams import Sampler, split_by_kind
 from mlbatch.types import PacketBatch, Recording, StreamTable
@@ -40,11 +40,12 @@ def with_clouds(
     if not topics:
         return list(recordings)
     # Not loaded for captures.
-    from mlbatch.readers.bag.clouds import CloudRecording, Layout, cloud_topics
+    from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+    from mlbatch.ros.point_packets import Layout
 
     clouds = {topic.name: topic for topic in cloud_topics(topics)}
     # A capture has no topics, and nothing but packets.
-    raw = any(not recording.topics for recording in recordings) or any(map(holds_packets, topics))
+    raw = any(not recording.topics for recording in recordings) or any(map(has_packets, topics))
     chosen = [topic for name, topic in clouds.items() if name in named or (not raw and not named)]
     if not chosen:
         return list(recordings)
@@ -54,7 +55,7 @@ def with_clouds(
 
 def is_without_packets(recording: Recording) -> bool:
     """Whether a recording can only hold messages beside the packets of others."""
-    if not recording.topics or any(map(holds_packets, recording.topics)):
+    if not recording.topics or any(map(has_packets, recording.topics)):
         return False
     # As above.
     from mlbatch.readers.bag.clouds import CloudRecording

@@ -27,7 +27,7 @@ from mlbatch.kernels import choose_engine
 from mlbatch.looking import is_without_packets
 from mlbatch.mounting import Mounted
 from mlbatch.passing import PassQueue
-from mlbatch.readers import merge, open_recording, use_engine
+from mlbatch.readers import merge, open_recording
 from mlbatch.scan_table import ScanTable
 from mlbatch.timekeeping import Timekeeper
 from mlbatch.types import (
@@ -77,7 +77,8 @@ class Conversion:
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
         self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
-        use_engine(opened, self.engine)
+        for recording in opened:
+            recording.use_engine(self.engine)
         if job.part != Part():
             opened = [ClippedRecording(recording, job.part) for recording in opened]
         self.setup: Setup = discover(opened, streams, job.wishes)

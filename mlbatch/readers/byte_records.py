@@ -1,4 +1,4 @@
-"""Records and runs of bytes at arbitrary places of one array, many at once."""
+"""Records and byte runs at any places of one array, many at once."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mlbatch.types import I64Array, U8Array
 # A structured array; numpy has no type for the fields of a dtype.
 Records: TypeAlias = npt.NDArray[Any]
 
-# Bytes that must follow the last record's first byte: no layout read here is longer.
+# Bytes required after the end of the data: no record layout is longer.
 SLACK = 128
 
 
 def records(data: U8Array, layout: np.dtype[np.void], at: I64Array) -> Records:
-    """The `layout` records that begin at bytes `at`; all must lie within `data`."""
+    """The `layout` records that begin at bytes `at`; all must be within `data`."""
     return _windows(data, layout.itemsize)[at].view(layout)
 
 
@@ -32,7 +32,7 @@ def copy_runs(source: U8Array, start: I64Array, size: I64Array, out: U8Array, at
     Runs of one size are copied together, as elements of that many bytes: ten times faster than a
     loop over slices. Targets must not overlap each other or any source.
     """
-    # numpy's unique would load its masked arrays.
+    # np.unique would import numpy.ma.
     for length in sorted(set(size.tolist())):
         if length:
             rows = np.flatnonzero(size == length)

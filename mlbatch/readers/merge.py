@@ -1,9 +1,9 @@
-"""Several recordings as one session: packets in the order of their arrival at the recorder.
+"""Several recordings as one session: packets in order of their receive times.
 
-The order depends on host times alone, then on the order of the recordings; where a recording's own
-times step back, its packets keep their order and count with the largest time so far. A recording
-of messages alone is read first, so that all it teaches is known before a packet comes, or by its
-log times, so that memory holds little of it.
+Equal times keep the order of the recordings. Where a recording's own times step back, its packets
+keep their order and count with the largest time so far. A recording of messages alone is read
+first, so that its metadata are known before any packet, or by its log times, so that memory needs
+to contain little of it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ import numpy as np
 from mlbatch.readers.byte_records import SLACK, copy_runs
 from mlbatch.types import I64Array, PacketBatch, Recording, U8Array
 
-
-def close(packets: Iterator[PacketBatch]) -> None:
-    """End a reading now, in this thread, and not when its last reference goes."""
-    if isinstance(packets, Generator):
-        packets.close()
+_NONE = np.zeros(0, np.int64)
+_NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)
 
 
 def _never(recording: Recording) -> bool:
@@ -30,11 +27,11 @@ def _never(recording: Recording) -> bool:
 def merge(
     recordings: Sequence[Recording], by_log_time: Callable[[Recording], bool] = _never
 ) -> Generator[PacketBatch, None, None]:
-    """Yield all packets of all recordings; a single recording passes through untouched.
+    """Yield all packets of all recordings; batches of a single recording are passed on as they are.
 
-    A recording is opened when its time has come: memory holds those that overlap, not all.
-    by_log_time: whether a recording runs by the log times of its messages; to be said of those
-    without a packet only, since packets have times of their own.
+    Each recording is opened at its first receive time: memory contains those that overlap, not all.
+    by_log_time: whether to order a recording by the log times of its messages; only for recordings
+    without packets, which have times of their own.
     """
     if len(recordings) == 1:
         yield from recordings[0].packets()
@@ -50,15 +47,16 @@ def merge(
 def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
     out: U8Array = np.zeros(0, np.uint8)
     while waiting := [feed for feed in feeds if not feed.ended]:
-        # The feed that ends first bounds what is known; of equals, the first in order.
+        # The feed that is known up to the earliest time bounds the others; of equals, the first.
         slowest = min(waiting, key=lambda feed: feed.known_until_ns)
-        bound_ns, before = slowest.known_until_ns, True
+        bound_ns = slowest.known_until_ns
+        is_before = True
         ready = []
         for feed in waiting:
-            before = before and feed is not slowest
-            ready.append(feed.take(bound_ns, inclusive=before or feed is slowest))
+            is_before = is_before and feed is not slowest
+            ready.append(feed.take(bound_ns, inclusive=is_before or feed is slowest))
         messages = tuple(message for batch, _ in ready for message in batch.messages)
-        ready = [(batch, key) for batch, key in ready if len(batch)]
+        ready = [(batch, key_ns) for batch, key_ns in ready if len(batch)]
         if len(ready) == 1:
             yield replace(ready[0][0], messages=messages)
         elif ready:
@@ -71,9 +69,9 @@ def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
 
 @dataclass(slots=True)
 class _Feed:
-    """One recording's packets that are known and not yet given out.
+    """Packets of one recording that are known and not yet given out.
 
-    key_ns: (n,) largest host time up to each packet of `batch`; known_until_ns: no later packet
+    key_ns: (n,) largest receive time up to each packet of `batch`; known_until_ns: no later packet
     of this recording can come before it.
     """
 
@@ -82,45 +80,49 @@ class _Feed:
     known_until_ns: int = 0
     ended: bool = False
     batch: PacketBatch | None = None
-    key_ns: I64Array = field(default_factory=lambda: np.zeros(0, np.int64))
-    _source: Iterator[PacketBatch] | None = None
+    key_ns: I64Array = field(default_factory=lambda: _NONE)
+    _packets: Generator[PacketBatch, None, None] | None = None
 
     @classmethod
     def peek(cls, recording: Recording, by_log_time: bool) -> _Feed:
-        """A feed that knows its first packet's time, but holds no buffer yet."""
-        packets = recording.packets(until_ns=0)
+        """A feed that knows its first packet's time, but has no buffer yet."""
+        packets = recording.packets()
         first = next((batch for batch in packets if len(batch) or batch.messages), None)
-        # Closing ends the look ahead, and gives its buffer back.
-        close(packets)
+        # Closing now returns the buffer.
+        packets.close()
         if first is None:
             return cls(recording, by_log_time, ended=True)
         if len(first):
             known_until_ns = int(first.host_ns[0])
         else:
-            # Messages are no clock for the packets of others, unless that is said.
+            # Log times of messages are no clock for the packets of others unless `by_log_time`.
             known_until_ns = first.messages[0].host_ns if by_log_time else 0
         return cls(recording, by_log_time, known_until_ns)
 
     def take(self, bound_ns: int, inclusive: bool) -> tuple[PacketBatch, I64Array]:
-        """The packets up to `bound_ns`, with their keys; they are then given out."""
+        """Give out the packets up to `bound_ns`, with their keys."""
         if self.batch is None:
             return _NOTHING, self.key_ns
-        messages, self.batch = self.batch.messages, replace(self.batch, messages=())
+        messages = self.batch.messages
         stop = int(np.searchsorted(self.key_ns, bound_ns, side="right" if inclusive else "left"))
-        given, key = self.batch.take(slice(0, stop)), self.key_ns[:stop]
-        self.batch, self.key_ns = self.batch.take(slice(stop, None)), self.key_ns[stop:]
-        return replace(given, messages=messages), key
+        given = replace(self.batch.take(slice(0, stop)), messages=messages)
+        key_ns = self.key_ns[:stop]
+        self.batch = self.batch.take(slice(stop, None))
+        self.key_ns = self.key_ns[stop:]
+        return given, key_ns
 
     def advance(self) -> None:
         """Get the next batch; its bytes replace those of the one before."""
-        if self._source is None:
-            self._source = self.recording.packets()
-        batch = next((batch for batch in self._source if len(batch) or batch.messages), None)
+        if self._packets is None:
+            self._packets = self.recording.packets()
+        batch = next((batch for batch in self._packets if len(batch) or batch.messages), None)
         if batch is None:
-            self.ended, self.batch, self._source = True, None, None
+            self.ended = True
+            self.batch = None
+            self._packets = None
             return
-        largest = np.maximum.accumulate(batch.host_ns)
-        self.batch, self.key_ns = batch, np.maximum(largest, self.known_until_ns)
+        self.batch = batch
+        self.key_ns = np.maximum(np.maximum.accumulate(batch.host_ns), self.known_until_ns)
         if len(batch):
             self.known_until_ns = int(self.key_ns[-1])
         elif self.by_log_time:
@@ -128,15 +130,15 @@ class _Feed:
             self.known_until_ns = max(self.known_until_ns, last_ns)
 
     def close(self) -> None:
-        """End the reading."""
-        if self._source is not None:
-            close(self._source)
+        """End the reading in this thread, not when the last reference is dropped."""
+        if self._packets is not None:
+            self._packets.close()
 
 
 def _interleave(
     ready: list[tuple[PacketBatch, I64Array]], out: U8Array
 ) -> tuple[PacketBatch, U8Array]:
-    """One batch in the order of keys, its payloads copied to `out` (grown where it is small)."""
+    """One batch in order of keys, its payloads copied to `out` (replaced if too small)."""
     size = np.concatenate([batch.size for batch, _ in ready])
     end = np.cumsum(size)
     start = end - size
@@ -147,11 +149,7 @@ def _interleave(
         rows = slice(first, first + len(batch))
         copy_runs(batch.data, batch.start, batch.size, out, start[rows])
         first += len(batch)
-    order = np.argsort(np.concatenate([key for _, key in ready]), kind="stable")
+    order = np.argsort(np.concatenate([key_ns for _, key_ns in ready]), kind="stable")
     stream = np.concatenate([batch.stream for batch, _ in ready])
     host_ns = np.concatenate([batch.host_ns for batch, _ in ready])
     return PacketBatch(out, start, size, stream, host_ns).take(order), out
-
-
-_NONE = np.zeros(0, np.int64)
-_NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)

@@ -1,9 +1,9 @@
-"""Packets of our own, in which points of decoded clouds travel: one column a packet.
+"""An own packet format for points of decoded clouds: one column per packet.
 
-Points that share a stamp are a column; a packet holds one, so that none is padded with columns that
-nobody measured, and every column counts. Layout, little endian (version 1): a head of 24 bytes,
-then planes of B slots each: x, y, z (m), intensity (float32), ring (uint16), return type and tag
-(uint8); zeros up to a multiple of 8 bytes. A slot at x = y = z = 0 is empty.
+Points that share a timestamp are a column. A packet contains one column, so that none is padded
+with columns that nobody measured, and every column is counted. Layout, little endian (version 1): a
+head of 24 bytes, then planes of B slots each: x, y, z (m), intensity (float32), ring (uint16),
+return type and tag (uint8); zeros up to a multiple of 8 bytes. A slot at x = y = z = 0 is empty.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from mlbatch.types import BoolArray, F32Array, I64Array, U8Array, U16Array
 
 # Source of the points, by its number in packets.
 KINDS = ("PointCloud2", "CustomMsg")
-MAGIC, VERSION = int.from_bytes(b"MLPC", "little"), 1
-# `number`: of the column in its message, so that equal columns of one message stay two.
+MAGIC = int.from_bytes(b"MLPC", "little")
+VERSION = 1
+# `number`: of the column in its message, so that equal columns of one message stay distinct.
 HEAD = np.dtype(
     [
         ("magic", "<u4"),
@@ -39,10 +40,11 @@ MOST_SLOTS = 256
 # By ring only where at least a quarter of the slots would be used.
 _RING_SLOTS = (16, 32, 64, 128, MOST_SLOTS)
 _MOST_PER_POINT = 4
-# Where the first cloud gives all its points one time, it says nothing of columns.
-_UNTOLD_SLOTS = 16
+# If all points of the first cloud have one time, it says nothing about columns.
+_DEFAULT_SLOTS = 16
 # A cloud whose points share fewer times than those of the first one must not fill the memory.
-_MOST_GROWTH, _FREE_BYTES = 32, 16 << 20
+_MOST_GROWTH = 32
+_FREE_BYTES = 16 << 20
 
 
 class CloudError(RecordingError):
@@ -79,9 +81,9 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the packets of a topic are made; kind: index into KINDS.
+    """Packets of a topic; kind: index into KINDS.
 
-    slots: most points of a column; by_ring: the slot is the point's ring, else its turn.
+    slots: most points of a column; by_ring: the slot is the ring of a point, else its turn.
     """
 
     kind: int
@@ -100,16 +102,18 @@ class Layout:
 
     @property
     def begin(self) -> npt.NDArray[np.void]:
-        """The head of all packets, (1,), as far as they share it."""
+        """The head, (1,), with the fields that all packets share."""
         head = np.zeros(1, HEAD)
-        for name, value in (("magic", MAGIC), ("version", VERSION), ("kind", self.kind)):
-            head[name] = value
-        head["slots"], head["by_ring"] = self.slots, self.by_ring
+        head["magic"] = MAGIC
+        head["version"] = VERSION
+        head["kind"] = self.kind
+        head["slots"] = self.slots
+        head["by_ring"] = self.by_ring
         return head
 
 
 def layout_of(points: Points, kind: int) -> Layout:
-    """The layout that suits the first cloud of a topic, and then holds for all."""
+    """The layout for the first cloud of a topic, and then for all of them."""
     order, is_first = _by_stamp(points)
     if points.ring is not None and int(points.ring.max()) < MOST_SLOTS:
         rings = int(points.ring.max()) + 1
@@ -119,7 +123,7 @@ def layout_of(points: Points, kind: int) -> Layout:
             return Layout(kind, slots, by_ring=True)
     starts = is_first.nonzero()[0]
     if len(starts) == 1:
-        return Layout(kind, min(len(points), _UNTOLD_SLOTS))
+        return Layout(kind, min(len(points), _DEFAULT_SLOTS))
     widest = int(np.diff(starts, append=len(points)).max())
     # Few long runs among short ones are split, so that most slots are used.
     usual = 2 * len(points) // len(starts) - 1
@@ -127,7 +131,7 @@ def layout_of(points: Points, kind: int) -> Layout:
 
 
 def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
-    """Packets (P, layout.size) of the points of one message, columns in the order of time.
+    """Packets (P, layout.size) of the points of one message, columns in order of time.
 
     With slots by ring, all rings are below `layout.slots`.
     """
@@ -141,11 +145,12 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
         slot = rank % layout.slots
         column = _column(rank // layout.slots, is_first)
     # The last ring of the last time may have fewer points than others.
-    columns, size = int(column.max()) + 1, layout.size
+    columns = int(column.max()) + 1
+    size = layout.size
     if columns * size > _MOST_GROWTH * message_bytes + _FREE_BYTES:
         raise CloudError(
-            f"wanted points that share times as in the first cloud (up to {layout.slots} one), got "
-            f"{columns} times for {len(points)} points; record the clouds of one driver alone"
+            f"expected points that share times as in the first cloud (up to {layout.slots} one), "
+            f"found {columns} times for {len(points)} points; record the clouds of one driver alone"
         )
     packets = np.zeros((columns, size), np.uint8)
     head = packets[:, : HEAD.itemsize].view(HEAD)[:, 0]
@@ -153,7 +158,8 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
     head["number"] = np.arange(columns)
     head["stamp_ns"][column] = points.stamp_ns[order]
     head["count"] = np.bincount(column)
-    flat, at = packets.reshape(-1), HEAD.itemsize
+    flat = packets.reshape(-1)
+    at = HEAD.itemsize
     for plane in (*points.reals, rings, points.return_type, points.tag):
         width = plane.dtype.itemsize
         place = column * (size // width) + (at // width + slot)
@@ -163,7 +169,7 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
 
 
 def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:
-    """Points by stamp, then ring, then as they came: their order, and which begin a new stamp.
+    """Points by stamp, then ring, then message order: their order, and which begin a new stamp.
 
     The stamps lie within seconds, so that a ring fits below them in 64 bits.
     """
@@ -187,14 +193,14 @@ def _rank(is_first: BoolArray) -> I64Array:
 
 
 def _same_ring(ring: U16Array | I64Array, is_first: BoolArray) -> I64Array:
-    """How many points before it in its run each has on its own ring; rings rise in a run."""
+    """Number of earlier points of each point's run on its ring; rings rise in a run."""
     begins = is_first.copy()
     begins[1:] |= ring[1:] != ring[:-1]
     return _rank(begins)
 
 
 def _column(layer: I64Array, is_first: BoolArray) -> I64Array:
-    """Column of each point, where each run takes as many as it has layers."""
+    """Column of each point; each run takes as many columns as it has layers."""
     columns = np.maximum.reduceat(layer, is_first.nonzero()[0]) + 1
     before = np.cumsum(columns) - columns
     column: I64Array = before[np.cumsum(is_first) - 1] + layer

@@ -50,10 +50,10 @@ def seen_of(batch: PacketBatch, streams: StreamTable) -> list[Seen]:
     ]
 
 
-def read(recording: CaptureRecording, until_ns: int | None = None) -> list[Seen]:
+def read(recording: CaptureRecording) -> list[Seen]:
     """All packets; the ledger must balance afterwards."""
     seen = []
-    for batch in recording.packets(until_ns):
+    for batch in recording.packets():
         seen += seen_of(batch, recording.streams)
     assert_balanced(recording)
     return seen

@@ -142,7 +142,7 @@ def _read(data: bytes, folder: Path) -> None:
         log_ns = 10**18 + np.arange(len(size)) * 10**8
         yield Portion(whole, end - size, end, log_ns, np.zeros(len(size), np.int64))
 
-    bag = BagRecording(folder, "bag", 0, (topic,), table, portions)
+    bag = BagRecording(folder, "bag", 0, table, portions, topics=(topic,))
     recordings = with_clouds([bag], table, {topic.name})
     sampler, learner = look(recordings, table)
     for recording in recordings:

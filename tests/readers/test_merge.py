@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +11,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.readers import merge
-from mlbatch.types import CaptureCounts, Message, PacketBatch, StreamTable, Topic
+from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.reading import Seen, open_capture, seen_of
 
 Session = list[list[int]]
 
 
-class Batches:
+class Batches(Recording):
     """A recording made of host times; its batches share one array, as readers' batches do."""
 
     def __init__(self, number: int, host_ns: list[int], cuts: random.Random) -> None:
-        self.path = Path(f"recording {number}")
-        self.container = "values"
-        self.counts = CaptureCounts()
-        self.size_bytes = self.position_bytes = 0
-        self.topics: tuple[Topic, ...] = ()
-        self.keep: frozenset[str] = frozenset()
-        self.notes: list[str] = []
+        super().__init__(Path(f"recording {number}"), "values", 0)
         self.number = number
         self.host_ns = host_ns
         self.cuts = cuts
         self.open = 0
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+    def packets(self) -> Generator[PacketBatch, None, None]:
         """Payloads of two bytes: number of the recording, index."""
         data = np.zeros(64, np.uint8)
         self.open += 1
@@ -88,7 +82,7 @@ def test_a_step_back_keeps_its_recordings_order() -> None:
 class Notes(Batches):
     """A recording of nothing but messages, three in a batch."""
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+    def packets(self) -> Generator[PacketBatch, None, None]:
         """Messages at the host times."""
         none = np.zeros(0, np.int64)
         topic = Topic("/note", "std_msgs/String", "cdr")

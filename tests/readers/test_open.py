@@ -109,7 +109,7 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
     assert "68 65 6c 6c 6f 2c 20 77" in message
     assert "pcap, pcapng" in message
     (tmp_path / "short").write_bytes(CONTENT[:10])
-    assert "got 10" in refusal(tmp_path / "short")
+    assert "found 10" in refusal(tmp_path / "short")
     os.mkfifo(tmp_path / "pipe")
     assert "regular file" in refusal(tmp_path / "pipe")
 

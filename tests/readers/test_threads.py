@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from mlbatch.readers import merge, open_recording
-from mlbatch.readers.formats import rosbag2 as _db3
-from mlbatch.types import StreamTable
+from mlbatch.readers.formats import rosbag2
+from mlbatch.types import Recording, StreamTable
 from tests.builders.bags import fixture_messages
 from tests.builders.rosbag2 import write_rosbag2
 
@@ -41,14 +41,17 @@ def test_another_thread_goes_on(
     bags: int,
     tmp_path: Path,
     elsewhere: Callable[[Callable[[], object]], object],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # Several batches a file.
-    monkeypatch.setattr(_db3, "BUFFER_BYTES", 1 << 16)
     paths = _bags(tmp_path, bags)
-    streams = StreamTable()
-    whole = [len(b) for b in merge([open_recording(path, streams) for path in paths])]
-    batches = merge([open_recording(path, streams) for path in paths])
+
+    def opened() -> list[Recording]:
+        # Several batches a file.
+        return [
+            rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=1 << 16) for path in paths
+        ]
+
+    whole = [len(batch) for batch in merge(opened())]
+    batches = merge(opened())
     counts = [len(next(batches))]
     rest = elsewhere(lambda: [len(batch) for batch in batches])
     assert isinstance(rest, list)

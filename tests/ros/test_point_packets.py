@@ -104,7 +104,7 @@ def test_slots_suit_the_first_cloud(
 
 def test_memory_is_bounded_where_later_clouds_share_no_times() -> None:
     points = _points(range(10_000))
-    with pytest.raises(CloudError, match="wanted points that share times as in the first cloud"):
+    with pytest.raises(CloudError, match="expected points that share times as in the first cloud"):
         pack(points, Layout(0, 256), 22 * 10_000)
 
 

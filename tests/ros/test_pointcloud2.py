@@ -84,7 +84,7 @@ def test_times_of_drivers(driver: str, encoding: str) -> None:
     fields, points, stamps_ns, verdict = DRIVERS[driver]
     cloud = _read(cloud_message(fields, points, form=Form(encoding)), encoding=encoding)
     assert cloud.points.stamp_ns.tolist() == stamps_ns
-    assert (cloud.verdict, cloud.frame) == (verdict, "lidar")
+    assert (cloud.time_meaning, cloud.frame) == (verdict, "lidar")
     assert cloud.points.reals.tolist() == [[1, 4], [2, 5], [3, 6], [9, 9]]
     ring = cloud.points.ring
     assert ring is not None
@@ -124,13 +124,16 @@ def test_custom_messages_count_from_their_timebase(kind: str, encoding: str) -> 
     assert cloud.points.ring is not None
     assert cloud.points.ring.tolist() == [0, 3]
     assert cloud.points.tag.tolist() == [16, 0]
-    assert (cloud.verdict, cloud.placeless) == ("offset_time (uint32), ns after timebase", 1)
+    assert (cloud.time_meaning, cloud.without_place) == (
+        "offset_time (uint32), ns after timebase",
+        1,
+    )
 
 
 def test_a_custom_message_without_timebase_counts_from_its_header() -> None:
     cloud = _read(custom_message([(5, 1, 2, 3, 7, 16, 0)], 0, STAMP_NS), CUSTOM)
     assert cloud.points.stamp_ns.tolist() == [STAMP_NS + 5]
-    assert cloud.verdict.endswith(HEADER)
+    assert cloud.time_meaning.endswith(HEADER)
 
 
 def test_points_without_place_or_time_are_counted() -> None:
@@ -138,7 +141,7 @@ def test_points_without_place_or_time_are_counted() -> None:
     points: list[Point] = [(1, 2, 3, 9, 4, 0.5), (0, 0, 0, 9, 4, 0.5), (nan, 2, 3, 9, 4, 0.5)]
     points += [(1, inf, 3, 9, 4, 0.5), (1, 2, 3, 9, 4, nan), (1e30, 2, 3, 9, 4, 0.5)]
     cloud = _read(cloud_message(VELODYNE, points))
-    assert (len(cloud.points), cloud.placeless, cloud.timeless) == (1, 4, 1)
+    assert (len(cloud.points), cloud.without_place, cloud.without_time) == (1, 4, 1)
 
 
 def test_rows_and_points_may_have_gaps() -> None:

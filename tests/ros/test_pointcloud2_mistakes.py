@@ -29,85 +29,85 @@ SECONDS = (*XYZ, ("time", "float64"))
 MISTAKES: dict[str, tuple[bytes, str]] = {
     "no time": (
         cloud_message(OUSTER[:4], [(1, 2, 3, 9)]),
-        "wanted the time of each point in a field t, time, timestamp, time_stamp, timestamps, "
-        "offset_time or ts, got x, y, z, intensity; record the raw packets, or clouds with times",
+        "expected the time of each point in a field t, time, timestamp, time_stamp, timestamps, "
+        "offset_time or ts, found x, y, z, intensity; record the raw packets, or clouds with times",
     ),
     "no z": (
         cloud_message((*XYZ[:2], ("t", "uint32")), [(1, 2, 3)]),
-        "wanted fields x, y, z, got x, y, t; choose a topic of points",
+        "expected fields x, y, z, found x, y, t; choose a topic of points",
     ),
     "no fields": (
         cloud_message((), []),
-        "wanted fields x, y, z, got none; choose a topic of points",
+        "expected fields x, y, z, found none; choose a topic of points",
     ),
     "big endian": (
         cloud_message(OUSTER, ONE, form=Form(bigendian=True)),
-        "wanted a cloud in little endian, got is_bigendian; convert the recording",
+        "expected a cloud in little endian, found is_bigendian; convert the recording",
     ),
     "count": (
         cloud_message(OUSTER, ONE, form=Form(count=3)),
-        "field x: wanted count 1, got 3; convert the recording",
+        "field x: expected count 1, found 3; convert the recording",
     ),
     "whole places": (
         cloud_message((("x", "int32"), *XYZ[1:], ("t", "uint32")), [(1, 2, 3, 4)]),
-        "field x: wanted datatype 7 or 8 (float), got 5; convert the recording",
+        "field x: expected datatype 7 or 8 (float), found 5; convert the recording",
     ),
     "width": (
         cloud_message(OUSTER, ONE, form=Form(width=2_000_000_000)),
-        "wanted 1 x 2000000000 points of 22 bytes in rows of 22, got 22 bytes of data; the cloud "
-        "was cut off, or written wrongly",
+        "expected 1 x 2000000000 points of 22 bytes in rows of 22, found 22 bytes of data; the "
+        "cloud was cut off, or written wrongly",
     ),
     "step": (
         cloud_message(OUSTER, ONE, form=Form(point_step=20)),
-        "field ring: wanted it within the 20 bytes of a point, got its end at byte 22; the cloud "
-        "was written wrongly",
+        "field ring: expected it within the 20 bytes of a point, found its end at byte 22; the "
+        "cloud was written wrongly",
     ),
     "no step": (
         cloud_message(OUSTER, ONE, form=Form(width=4_000_000_000, point_step=0)),
-        "field x: wanted it within the 0 bytes of a point, got its end at byte 4; the cloud was "
-        "written wrongly",
+        "field x: expected it within the 0 bytes of a point, found its end at byte 4; the "
+        "cloud was written wrongly",
     ),
     "rows": (
         cloud_message(OUSTER, ONE * 4, form=Form(height=2, row_step=21)),
-        "wanted 2 x 2 points of 22 bytes in rows of 21, got 88 bytes of data; the cloud was cut "
-        "off, or written wrongly",
+        "expected 2 x 2 points of 22 bytes in rows of 21, found 88 bytes of data; the cloud "
+        "was cut off, or written wrongly",
     ),
     "header": (
         cloud_message(OUSTER, ONE, stamp_ns=0),
-        "field t (uint32): wanted times after the header's stamp, got 0 ns there; set the clock "
-        "of its driver and record again",
+        "field t (uint32): expected times after the header's stamp, found 0 ns there; set the "
+        "clock of its driver and record again",
     ),
     "unit": (
         cloud_message(TIMES, [(1, 2, 3, 1e5)]),
-        "field time (float32): wanted s after the header's stamp (below 1000), or float64 s or ns "
-        "since 1970, got 100000; its unit is not known, record the raw packets",
+        "field time (float32): expected s after the header's stamp (below 1000), or float64 s "
+        "or ns since 1970, found 100000; its unit is not known, record the raw packets",
     ),
     "float32 since 1970": (
         cloud_message(TIMES, [(1, 2, 3, 1.7e9)]),
-        "field time (float32): wanted s after the header's stamp (below 1000), or float64 s or ns "
-        "since 1970, got 1.7e+09; its unit is not known, record the raw packets",
+        "field time (float32): expected s after the header's stamp (below 1000), or float64 s "
+        "or ns since 1970, found 1.7e+09; its unit is not known, record the raw packets",
     ),
     "far too late": (
         cloud_message(SECONDS, [(1, 2, 3, 1e300)]),
-        "field time (float64): wanted s after the header's stamp (below 1000), or float64 s or ns "
-        "since 1970, got 1e+300; its unit is not known, record the raw packets",
+        "field time (float64): expected s after the header's stamp (below 1000), or float64 s "
+        "or ns since 1970, found 1e+300; its unit is not known, record the raw packets",
     ),
     "milliseconds": (
         cloud_message(TIMES, [(1, 2, 3, 0), (1, 2, 3, 100)]),
-        "field time (float32): wanted times of one cloud within 10 s, got 100 s; its unit is not "
-        "known, record the raw packets",
+        "field time (float32): expected times of one cloud within 10 s, found 100 s; its unit "
+        "is not known, record the raw packets",
     ),
     "far too early": (
         cloud_message(SECONDS, [(1, 2, 3, -1e300), (1, 2, 3, 0.5)]),
-        "field time (float64): wanted times of one cloud within 10 s, got 1e+300 s; its unit is "
-        "not known, record the raw packets",
+        "field time (float64): expected times of one cloud within 10 s, found 1e+300 s; its "
+        "unit is not known, record the raw packets",
     ),
     "other CDR": (
         b"\0\0" + cloud_message(OUSTER, ONE)[2:],
-        "wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; convert the "
+        "expected a message of little-endian CDR (00 01 00 00), found 00 00 00 00; convert the "
         "recording to that encoding",
     ),
-    "empty": (b"", "wanted a message of little-endian CDR (00 01 00 00), got nothing; convert"),
+    "empty": (b"", "expected 4 bytes at byte 0 of a message, found its end; it was cut off"),
 }
 
 

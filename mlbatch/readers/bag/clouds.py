@@ -1,36 +1,23 @@
-"""Decoded clouds of a bag as packets, so that their points are batched by time like all others.
+"""The trick for decoded clouds: their points are re-packed as packets of an own format.
 
-Source of the message types: facts/messages.md, section 8. A `CloudRecording` stands for a
-recording and adds, for every cloud, packets of one size per topic (`_cloud_packets`) at its log
-time. A packet is one column: frames and datagrams count them; a cloud that cannot be read is one
-frame, `truncated`. What the times of a topic were taken for, and how many points had no place, is
-a note.
+The rest of the pipeline then batches them like raw packets: each packet is one column, i.e. points
+that share a timestamp (`ros.point_packets`), of one size per topic, received at the log time of its
+message. `CloudRecording` wraps a recording and adds these packets. Message types:
+docs/sources/messages.md, section 8.
+Counts: a packet is a frame with a datagram; an unreadable cloud is one frame, `truncated`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.ros.point_packets import (
-    HEAD,
-    KINDS,
-    MAGIC,
-    MOST_SLOTS,
-    REALS,
-    VERSION,
-    CloudError,
-    Layout,
-    Points,
-    layout_of,
-    pack,
-)
+from mlbatch.ros.encoding import ENCODINGS
+from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, read_cloud
 from mlbatch.types import (
-    CaptureCounts,
     Message,
     PacketBatch,
     Recording,
@@ -38,194 +25,161 @@ from mlbatch.types import (
     StreamTable,
     Topic,
     U8Array,
+    WrappedRecording,
 )
 
-__all__ = [
-    "CLOUD_TYPES",
-    "HEAD",
-    "KINDS",
-    "MAGIC",
-    "MOST_SLOTS",
-    "REALS",
-    "VERSION",
-    "CloudRecording",
-    "Layout",
-    "cloud_topics",
-]
-
-_ENCODINGS = ("cdr", "ros1")
-# Packets that are made before they are handed on.
-_PART_BYTES = 8 << 20
+# A batch ends when this many bytes of packets have been made.
+_BATCH_BYTES = 8 << 20
 
 
 def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """The topics whose messages are decoded clouds, in their order."""
-    return tuple(t for t in topics if t.type in CLOUD_TYPES and t.encoding in _ENCODINGS)
+    """The topics of decoded clouds, in order."""
+    return tuple(
+        topic for topic in topics if topic.type in CLOUD_TYPES and topic.encoding in ENCODINGS
+    )
 
 
 @dataclass(slots=True)
-class _Tally:
-    """What became of the clouds of a topic; points: of all that were read."""
+class _TopicCounts:
+    """Clouds and points of a topic; points: of all clouds that could be read."""
 
-    verdict: str = ""
+    time_meaning: str = ""
     points: int = 0
-    placeless: int = 0
-    timeless: int = 0
-    ringless: int = 0
+    without_place: int = 0
+    without_time: int = 0
+    beyond_rings: int = 0
     faults: int = 0
     first_fault: str = ""
 
     def add(self, cloud: Cloud) -> None:
         """Count a cloud that was read."""
-        self.verdict = self.verdict or cloud.verdict
-        self.points += len(cloud.points) + cloud.placeless + cloud.timeless
-        self.placeless += cloud.placeless
-        self.timeless += cloud.timeless
+        self.time_meaning = self.time_meaning or cloud.time_meaning
+        self.points += len(cloud.points) + cloud.without_place + cloud.without_time
+        self.without_place += cloud.without_place
+        self.without_time += cloud.without_time
 
-    def verdicts(self, layout: Layout | None) -> Iterator[str]:
-        """What the times of a topic were taken for, and what had no place."""
-        if self.points:
-            left_out = [
-                f"{count} {why}"
-                for count, why in (
-                    (self.placeless, "without a place (NaN or zero)"),
-                    (self.timeless, "without a time"),
-                    (self.ringless, "on rings beyond those of the first cloud"),
-                )
-                if count
-            ]
-            verdict = f"times of points from {self.verdict}; {layout}; " if self.verdict else ""
-            yield f"{verdict}left out of {self.points} points: {', '.join(left_out) or 'none'}"
+    def add_fault(self, why: str) -> None:
+        """Count a cloud that could not be read."""
+        self.faults += 1
+        self.first_fault = self.first_fault or why
 
-    def notes(self) -> Iterator[str]:
-        """What is wrong with the clouds of a topic."""
-        if self.faults:
-            yield f"{self.faults} clouds could not be read; the first: {self.first_fault}"
+    def verdict(self, layout: Layout | None) -> str:
+        """Meaning of the time field, layout of the packets, points left out; "" without points."""
+        if not self.points:
+            return ""
+        reasons = (
+            (self.without_place, "without a place (NaN or zero)"),
+            (self.without_time, "without a time"),
+            (self.beyond_rings, "on rings beyond those of the first cloud"),
+        )
+        left_out = ", ".join(f"{count} {why}" for count, why in reasons if count) or "none"
+        start = f"times of points from {self.time_meaning}; {layout}; " if self.time_meaning else ""
+        return f"{start}left out of {self.points} points: {left_out}"
 
 
 @dataclass(slots=True)
-class _Made:
-    """Packets that were made of one message."""
+class _Packed:
+    """Packets (n, size) of one message."""
 
     message: Message
     packets: U8Array
 
 
-@dataclass(slots=True)
-class CloudRecording:
-    """A recording whose clouds come as packets, too; implements `Recording`.
+class CloudRecording(WrappedRecording):
+    """A recording whose decoded clouds come as packets, too.
 
-    topics_of_clouds: as `cloud_topics` gives them; layouts: how the packets of each topic are made,
-    shared by the recordings of a session, since a topic may be spread over several; frames: the
-    frame_id of each topic's first cloud. Messages of cloud topics are handed over only if `keep`
-    names them.
+    topics_of_clouds: as given by `cloud_topics`; layouts: of the packets of each topic, shared by
+    the recordings of a session, since a topic may be spread over several; frames: frame_id of the
+    first cloud of each topic. Messages of cloud topics are passed on only if `keep` names them.
     """
 
-    inner: Recording
-    streams: StreamTable
-    topics_of_clouds: Sequence[Topic]
-    layouts: dict[str, Layout] = field(default_factory=dict)
-    frames: dict[str, str] = field(default_factory=dict)
-    keep: frozenset[str] = frozenset()
-    notes: list[str] = field(default_factory=list)
-    verdicts: list[str] = field(default_factory=list)
-    counts: CaptureCounts = field(default_factory=CaptureCounts)
-    topics: tuple[Topic, ...] = ()
-    path: Path = Path()
-    container: str = ""
-    size_bytes: int = 0
-    position_bytes: int = 0
-    _tallies: dict[str, _Tally] = field(default_factory=dict)
+    __slots__ = ("_counts", "frames", "layouts", "streams", "topics_of_clouds")
 
-    def __post_init__(self) -> None:
-        self.path, self.container = self.inner.path, self.inner.container
-        self.size_bytes = self.inner.size_bytes
-        self._follow()
+    def __init__(
+        self,
+        inner: Recording,
+        streams: StreamTable,
+        topics_of_clouds: Sequence[Topic],
+        layouts: dict[str, Layout] | None = None,
+    ) -> None:
+        super().__init__(inner)
+        self.streams = streams
+        self.topics_of_clouds = topics_of_clouds
+        self.layouts = {} if layouts is None else layouts
+        self.frames: dict[str, str] = {}
+        self._counts: dict[str, _TopicCounts] = {}
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
-        """Yield all packets from the start, in file order; may be called again (counts restart).
+    @property
+    def verdicts(self) -> list[str]:
+        """Per topic: the meaning of its time field, and the points left out; one line each."""
+        texts = (
+            (name, counts.verdict(self.layouts.get(name))) for name, counts in self._counts.items()
+        )
+        return [f"{name}: {text}" for name, text in texts if text]
 
-        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
-        """
-        self._tallies = {topic.name: _Tally() for topic in self.topics_of_clouds}
-        self.inner.keep = self.keep | self._tallies.keys()
-        # The recording knows no packet of a bag that holds clouds alone, hence no limit either.
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield all packets from the start, those of clouds among them; each call is a new pass."""
+        self._counts = {topic.name: _TopicCounts() for topic in self.topics_of_clouds}
+        self.inner.keep = self.keep | self._counts.keys()
         batches = self.inner.packets()
-        first_ns: int | None = None
         try:
             for batch in batches:
-                for part in self._parts(batch):
-                    if first_ns is None and len(part):
-                        first_ns = int(part.host_ns[0])
-                    limit_ns = None if until_ns is None or first_ns is None else first_ns + until_ns
-                    cut = part if limit_ns is None else self._until(part, limit_ns)
-                    self._follow()
-                    if len(cut) or cut.messages:
-                        yield cut
-                    if cut is not part:
-                        return
+                for part in self._with_clouds(batch):
+                    if len(part) or part.messages:
+                        yield part
         finally:
-            if isinstance(batches, Generator):
-                batches.close()
-            self._follow()
+            batches.close()
+            self.inner.notes += [
+                f"{name}: {counts.faults} clouds could not be read; the first: {counts.first_fault}"
+                for name, counts in self._counts.items()
+                if counts.faults
+            ]
 
-    def _follow(self) -> None:
-        """Take over what the inner recording says of itself, and add what was found here."""
-        inner = self.inner
-        self.topics, self.counts = inner.topics, inner.counts
-        self.position_bytes = inner.position_bytes
-        tallies = self._tallies.items()
-        self.notes = inner.notes + [
-            f"{name}: {n}" for name, tally in tallies for n in tally.notes()
-        ]
-        self.verdicts = [
-            f"{name}: {verdict}"
-            for name, tally in tallies
-            for verdict in tally.verdicts(self.layouts.get(name))
-        ]
-
-    def _parts(self, batch: PacketBatch) -> Iterator[PacketBatch]:
-        """A batch with the packets of its clouds, cut where these grow large."""
+    def _with_clouds(self, batch: PacketBatch) -> Iterator[PacketBatch]:
+        """The batch with the packets of its clouds, in parts where these are large."""
         messages = tuple(m for m in batch.messages if m.topic.name in self.keep)
-        clouds = [m for m in batch.messages if m.topic.name in self._tallies]
+        clouds = [m for m in batch.messages if m.topic.name in self._counts]
         if not clouds:
             yield replace(batch, messages=messages)
             return
-        arrival_ns = np.maximum.accumulate(batch.host_ns)
-        made: list[_Made] = []
-        done, latest_ns = 0, 0
+        receive_ns = np.maximum.accumulate(batch.host_ns)
+        packed: list[_Packed] = []
+        done = 0
+        latest_ns = 0
         for message in clouds:
             latest_ns = max(latest_ns, message.host_ns)
-            packets = self._made(message)
+            packets = self._packets_of(message)
             if packets is not None:
-                made.append(_Made(message, packets))
-            if sum(one.packets.nbytes for one in made) >= _PART_BYTES:
-                upto = int(np.searchsorted(arrival_ns, latest_ns, side="right"))
-                yield replace(self._joined(batch.take(slice(done, upto)), made), messages=messages)
-                done, made, messages = max(done, upto), [], ()
-        yield replace(self._joined(batch.take(slice(done, None)), made), messages=messages)
+                packed.append(_Packed(message, packets))
+            if sum(one.packets.nbytes for one in packed) >= _BATCH_BYTES:
+                stop = int(np.searchsorted(receive_ns, latest_ns, side="right"))
+                part = self._joined(batch.take(slice(done, stop)), packed)
+                yield replace(part, messages=messages)
+                done = max(done, stop)
+                packed = []
+                messages = ()
+        yield replace(self._joined(batch.take(slice(done, None)), packed), messages=messages)
 
-    def _made(self, message: Message) -> U8Array | None:
-        """The packets of a cloud; None where it has none, which is counted."""
+    def _packets_of(self, message: Message) -> U8Array | None:
+        """The packets (n, size) of a cloud; None where it has none or cannot be read."""
         name = message.topic.name
-        tally, counts = self._tallies[name], self.inner.counts
+        counts = self.inner.counts
         try:
             cloud = read_cloud(message)
-            packets = self._packed(message, cloud.points) if len(cloud.points) else None
+            packets = self._pack(message, cloud.points) if len(cloud.points) else None
         except CloudError as err:
-            tally.faults += 1
-            tally.first_fault = tally.first_fault or str(err)
+            self._counts[name].add_fault(str(err))
             counts.frames += 1
             counts.skip("truncated")
             return None
-        tally.add(cloud)
+        self._counts[name].add(cloud)
         self.frames.setdefault(name, cloud.frame)
         if packets is not None:
             counts.frames += len(packets)
             counts.datagrams += len(packets)
         return packets
 
-    def _packed(self, message: Message, points: Points) -> U8Array | None:
+    def _pack(self, message: Message, points: Points) -> U8Array | None:
         """The packets of points that all have a place and a time."""
         name = message.topic.name
         layout = self.layouts.get(name)
@@ -233,47 +187,38 @@ class CloudRecording:
             layout = self.layouts[name] = layout_of(points, CLOUD_TYPES[message.topic.type])
         if layout.by_ring:
             if points.ring is None:
-                raise CloudError("wanted rings as in the first cloud, got none")
+                raise CloudError("expected rings as in the first cloud, found none")
             known = points.ring < layout.slots
-            self._tallies[name].ringless += len(points) - int(np.count_nonzero(known))
+            self._counts[name].beyond_rings += len(points) - int(np.count_nonzero(known))
             points = points.take(known)
         return pack(points, layout, len(message.data)) if len(points) else None
 
-    def _joined(self, batch: PacketBatch, made: Sequence[_Made]) -> PacketBatch:
-        """Packets of a recording and those made of clouds, in the order of their arrival."""
-        if not made:
+    def _joined(self, batch: PacketBatch, packed: Sequence[_Packed]) -> PacketBatch:
+        """Packets of the recording and of its clouds, in receive order."""
+        if not packed:
             return batch
         # The bytes of the recording's own packets are copied only where there are any.
         data = [batch.data] if len(batch) else []
         end = len(batch.data) if len(batch) else 0
-        arrival_ns = np.maximum.accumulate(batch.host_ns)
-        rows = [np.stack([batch.start, batch.size, batch.stream, batch.host_ns, arrival_ns])]
-        for one in made:
-            count, width = one.packets.shape
-            row = np.empty((5, count), np.int64)
-            row[0] = end + np.arange(count) * width
-            row[1], row[2] = width, self._number(one.message.topic)
-            row[3:] = one.message.host_ns
-            rows.append(row)
+        receive_ns = np.maximum.accumulate(batch.host_ns)
+        # Rows: start, size, stream, host_ns, and the key of the order.
+        parts = [np.stack([batch.start, batch.size, batch.stream, batch.host_ns, receive_ns])]
+        for one in packed:
+            count, size = one.packets.shape
+            part = np.empty((5, count), np.int64)
+            part[0] = end + np.arange(count) * size
+            part[1] = size
+            part[2] = self._stream(one.message.topic)
+            part[3:] = one.message.host_ns
+            parts.append(part)
             data.append(one.packets.reshape(-1))
-            end += count * width
-        whole = np.concatenate(rows, axis=1)
-        whole = whole[:, np.argsort(whole[4], kind="stable")]
-        return PacketBatch(np.concatenate(data), whole[0], whole[1], whole[2], whole[3])
+            end += count * size
+        columns = np.concatenate(parts, axis=1)
+        columns = columns[:, np.argsort(columns[4], kind="stable")]
+        return PacketBatch(np.concatenate(data), columns[0], columns[1], columns[2], columns[3])
 
-    def _number(self, topic: Topic) -> int:
-        """Number of a topic's stream, whose packets have no arrival time of their own."""
+    def _stream(self, topic: Topic) -> int:
+        """Number of a topic's stream; its packets have no receive time of their own."""
         number = self.streams.number(Stream(topic=topic.name))
         self.streams.untimed.add(number)
         return number
-
-    def _until(self, batch: PacketBatch, limit_ns: int) -> PacketBatch:
-        """The batch itself, or its front part up to the first packet beyond the limit."""
-        beyond = np.flatnonzero(batch.host_ns > limit_ns)
-        if not len(beyond):
-            return batch
-        left_out = len(batch) - int(beyond[0])
-        self.inner.counts.frames -= left_out
-        self.inner.counts.datagrams -= left_out
-        messages = tuple(m for m in batch.messages if m.host_ns <= limit_ns)
-        return replace(batch.take(slice(0, int(beyond[0]))), messages=messages)

@@ -1,7 +1,7 @@
 """The files of a ROS 2 bag that is a folder.
 
-Source: facts/messages.md, section 5. Files on disk win over metadata.yaml, which may be missing,
-stale or empty; what differs is noted.
+Source: docs/sources/messages.md, section 5. The files on disk decide; metadata.yaml may be missing,
+stale or empty, and differences are noted.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ _METADATA = "metadata.yaml"
 
 @dataclass(frozen=True, slots=True)
 class BagFolder:
-    """Files of a bag in the order of their names; notes: what is wrong, a line each."""
+    """Files of a bag in the order of their names; notes: what is wrong, one line each."""
 
     files: tuple[Path, ...]
     notes: tuple[str, ...]
 
 
 def bag_folder(folder: Path) -> BagFolder:
-    """The files of a bag; RecordingError where a folder holds none."""
+    """The files of a bag; RecordingError where the folder contains none."""
     try:
         inside = sorted(folder.iterdir(), key=lambda path: _natural(path.name))
         files = [path for path in inside if path.is_file() and _BAG_FILE.search(path.name)]
     except OSError as err:
         raise RecordingError(
-            f"{folder}: wanted the folder of a bag, could not read it ({err.strerror}); "
+            f"{folder}: expected the folder of a bag, could not read it ({err.strerror}); "
             "check its access rights"
         ) from err
     if not files:
         raise RecordingError(
-            f"{folder}: wanted a recording, got a folder without .db3 or .mcap files; "
+            f"{folder}: expected a recording, found a folder without .db3 or .mcap files; "
             "name the files inside it"
         )
     names = {path.name for path in files}
@@ -54,15 +54,15 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _stale(metadata: Path, names: set[str], read: Sequence[Path]) -> list[str]:
-    """How metadata.yaml differs from the files that are there."""
+    """How metadata.yaml differs from the files on disk."""
     if not metadata.is_file():
         return []
     listed = _listed(metadata)
     if listed is None:
-        return [f"{metadata.name}: cannot be read; the files in the folder are taken"]
-    missing = [name for name in listed if name not in names and not _packed(name, names)]
+        return [f"{metadata.name}: cannot be read; the files in the folder are read"]
+    missing = [name for name in listed if name not in names and not _is_packed(name, names)]
     known = {*listed, *(f"{name}.zstd" for name in listed)}
-    notes = [f"{name}: listed in {metadata.name}, but not there" for name in missing]
+    notes = [f"{name}: listed in {metadata.name}, but missing" for name in missing]
     extra = [
         f"{path.name}: not listed in {metadata.name}, but read"
         for path in read
@@ -71,13 +71,13 @@ def _stale(metadata: Path, names: set[str], read: Sequence[Path]) -> list[str]:
     return [*notes, *extra]
 
 
-def _packed(name: str, names: set[str]) -> bool:
-    """Whether a listed file is there under the name that it has with or without compression."""
+def _is_packed(name: str, names: set[str]) -> bool:
+    """Whether a listed file exists under its name with or without the compression's suffix."""
     return f"{name}.zstd" in names or name.removesuffix(".zstd") in names
 
 
 def _listed(metadata: Path) -> list[str] | None:
-    """Names of files in metadata.yaml, None where it is no such file."""
+    """Names of files in metadata.yaml; None where it cannot be read as such."""
     from mlbatch._yaml_tree import read_yaml
 
     # Only names are compared: no file outside the folder is ever opened.

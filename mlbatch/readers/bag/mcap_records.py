@@ -1,8 +1,8 @@
-"""Records of an MCAP file that are not messages: channels, chunks and the summary.
+"""Records of an MCAP file other than messages: channels, chunks and the summary.
 
-Layouts: MCAP specification (mcap.dev/spec) and its registry of encodings (facts/messages.md,
-section 5). Small records are parsed by the reference library, out of bytes that are already there,
-so that no length within them can lie its way to memory.
+Layouts: MCAP specification (mcap.dev/spec) and its registry of encodings
+(docs/sources/messages.md, section 5). Small records are parsed by the library `mcap`, from bytes
+that are already in memory, so that no length within them can allocate more.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
-# Opcode and length of what follows.
+# Opcode, and length of the body.
 HEAD = struct.Struct("<BQ")
 
 
@@ -37,28 +37,30 @@ class Op(IntEnum):
     CHUNK = 0x06
     CHUNK_INDEX = 0x08
     DATA_END = 0x0F
-    PRIVATE = 0x80  # From here on records of applications, to be skipped.
+    PRIVATE = 0x80  # From here on records of applications, which are skipped.
 
 
-# Of a record's body: what precedes the data of a message (channel, sequence, two times).
+# Body of a message before its data: channel, sequence, two times.
 MESSAGE_HEAD_BYTES = 22
 # First and last time, size of the records, their CRC, length of the compression's name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _LONGEST_NAME = 64
 CHUNK_HEAD_BYTES = _CHUNK_HEAD.size + _LONGEST_NAME + _LENGTH.size
-# Record of two places and a CRC, then the magic again: the last bytes of a whole file.
+# Record of two places and a CRC; with the magic the last bytes of a whole file.
 _FOOTER = struct.Struct("<BQQQI")
 FOOTER_BYTES = _FOOTER.size + len(MAGIC)
 _INDEX_HEAD = struct.Struct("<QQQQI")
 _INDEX_ENTRY = struct.Struct("<HQ")
 
 _LATCHED_ROS1 = frozenset({"1", "true", "True"})
+# Bytes of schemas and channels that are remembered as known.
+_MOST_KNOWN_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """What a chunk says of itself; start: of its records in the body; length: theirs, stored."""
+    """Head of a chunk; start: of its records in the body; length: theirs as stored; size: plain."""
 
     compression: str
     start: int
@@ -80,27 +82,23 @@ def chunk_head(data: memoryview, at: int, length: int) -> ChunkHead | None:
     return None if stored > length - start else ChunkHead(name, start, stored, size)
 
 
-# Beyond, a file does not repeat its schemas, but goes on with new ones.
-_MOST_SEEN_BYTES = 64 << 20
-
-
 @dataclass(slots=True)
 class Channels:
-    """Schemas and channels met so far; topics: by the channel's number."""
+    """Schemas and channels so far; topics: by the channel's number."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     topics: dict[int, Topic] = field(default_factory=dict)
-    _seen: set[tuple[int, bytes]] = field(default_factory=set)
-    _seen_bytes: int = 0
+    _known: set[tuple[int, bytes]] = field(default_factory=set)
+    _known_bytes: int = 0
     # Texts of schemas: channels share them, since many may name one long schema.
     _texts: dict[int, str] = field(default_factory=dict)
 
     def knows(self, opcode: int, body: bytes) -> bool:
-        """Whether this very schema or channel was there before."""
-        return (opcode, body) in self._seen
+        """Whether the same schema or channel was added before."""
+        return (opcode, body) in self._known
 
     def add(self, opcode: int, body: bytes) -> bool:
-        """Learn a schema or a channel; False if it cannot be parsed."""
+        """Add a schema or a channel; False if it cannot be parsed."""
         from mcap.data_stream import ReadDataStream
         from mcap.exceptions import EndOfFile
         from mcap.records import Channel, Schema
@@ -110,7 +108,7 @@ class Channels:
             if opcode == Op.SCHEMA:
                 schema = Schema.read(stream)
                 self.schemas[schema.id] = schema
-                # Definitions that are no text come back byte for byte.
+                # Definitions that are no text are kept byte for byte.
                 self._texts[schema.id] = schema.data.decode("utf-8", "surrogateescape")
             else:
                 channel = Channel.read(stream)
@@ -119,15 +117,15 @@ class Channels:
                 self.topics[channel.id] = _topic(channel, self.schemas.get(schema_id), text)
         except (EndOfFile, struct.error, UnicodeDecodeError):
             return False
-        if self._seen_bytes > _MOST_SEEN_BYTES:
-            self._seen, self._seen_bytes = set(), 0
-        self._seen.add((opcode, body))
-        self._seen_bytes += len(body)
+        if self._known_bytes > _MOST_KNOWN_BYTES:
+            self._known = set()
+            self._known_bytes = 0
+        self._known.add((opcode, body))
+        self._known_bytes += len(body)
         return True
 
 
 def _topic(channel: Channel, schema: Schema | None, definition: str) -> Topic:
-    """A channel in the words of bags."""
     metadata = channel.metadata
     qos = metadata.get("offered_qos_profiles", "")
     latched = metadata.get("latching", "") in _LATCHED_ROS1 or is_latched(qos)
@@ -143,7 +141,7 @@ def _topic(channel: Channel, schema: Schema | None, definition: str) -> Topic:
 
 
 def summary_start(tail: bytes) -> int | None:
-    """Where the summary begins, by the last FOOTER_BYTES of a file; 0: none; None: cut off."""
+    """Place of the summary, by the last FOOTER_BYTES of a file; 0: none; None: cut off."""
     if len(tail) != FOOTER_BYTES or not tail.endswith(MAGIC):
         return None
     opcode, length, start, _, _ = _FOOTER.unpack_from(tail)
@@ -151,7 +149,7 @@ def summary_start(tail: bytes) -> int | None:
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Opcode and body of the whole records that lie one after the other."""
+    """Opcode and body of the whole records from the front of `data`."""
     at = 0
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
@@ -163,7 +161,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def chunk_of_index(body: bytes) -> tuple[int, frozenset[int]] | None:
-    """Place of a chunk and the channels that have messages in it; None: the index does not tell."""
+    """Place of a chunk and its channels with messages; None for an index without channels."""
     if len(body) < _INDEX_HEAD.size:
         return None
     *_, start, _, length = _INDEX_HEAD.unpack_from(body)

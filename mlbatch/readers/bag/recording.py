@@ -1,40 +1,36 @@
-"""Reading of bags, whatever their container: messages in, batches of packets out.
+"""Bags, whatever their container: portions of messages in, batches of packets out.
 
-A container supplies portions of messages that lie in one array. Message types and what their stamps
-mean: facts/messages.md, sections 1 and 3. Counting: one frame per UDP payload found in messages of
-packet types, and one (`truncated`) per message of them that cannot be read.
+Message types and the meaning of their stamps: docs/sources/messages.md, sections 1 and 3.
+Counts: one frame per UDP payload in messages of packet types, and one (`truncated`) per message of
+them that cannot be read.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.readers.bag.packet_messages import (
-    CORRECTION_TYPE,
-    PACKET_TYPES,
-    Found,
-    MessageError,
-    Unpacker,
-)
+from mlbatch.readers import CORRECTION_TYPE
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
 from mlbatch.ros.definitions import type_key
+from mlbatch.ros.encoding import MessageError
 from mlbatch.types import (
     CaptureCounts,
     I64Array,
     Message,
     PacketBatch,
+    Recording,
     Stream,
     StreamTable,
     Topic,
     U8Array,
 )
 
-# A file of nothing but damage would fill memory and screen with what is wrong with it.
+# A file full of damage would fill memory and screen with notes.
 MOST_NOTES = 100
 
 
@@ -53,41 +49,30 @@ class Portion:
     topic: I64Array
 
 
-# One pass over the messages that `BagRecording.wants`; it tells the recording what it loses.
-Pass: TypeAlias = "Callable[[BagRecording], Generator[Portion, None, None]]"
+# Begins a pass over the messages that `BagRecording.wants`; reports losses to the recording.
+PortionReader: TypeAlias = "Callable[[BagRecording], Generator[Portion, None, None]]"
 
 
 @dataclass(slots=True)
-class BagRecording:
-    """A bag; implements `Recording`.
+class BagRecording(Recording):
+    """A bag; opening_notes: what was wrong when it was opened, part of the notes of every pass."""
 
-    start: begins a pass over the messages; standing: notes that hold for every pass.
-    """
-
-    path: Path
-    container: str
-    size_bytes: int
-    topics: tuple[Topic, ...]
     streams: StreamTable
-    start: Pass
-    standing: tuple[str, ...] = ()
-    counts: CaptureCounts = field(default_factory=CaptureCounts)
-    notes: list[str] = field(default_factory=list)
-    position_bytes: int = 0
-    keep: frozenset[str] = frozenset()
+    portions: PortionReader
+    opening_notes: tuple[str, ...] = ()
     _numbers: dict[Topic, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.notes = list(self.standing)
+        self.notes = list(self.opening_notes)
         for number, topic in enumerate(self.topics):
             self._numbers.setdefault(topic, number)
 
     def wants(self, topic: Topic) -> bool:
-        """Whether the messages of a topic are asked for: they hold packets, or shall be kept."""
+        """Whether the messages of a topic are read: they contain packets, or are to be kept."""
         return topic.name in self.keep or type_key(topic.type) in PACKET_TYPES
 
     def number(self, topic: Topic) -> int:
-        """Number of a topic, also of one that is met only while reading."""
+        """Number of a topic, also of one that first appears while reading."""
         number = self._numbers.setdefault(topic, len(self.topics))
         if number == len(self.topics):
             self.topics = (*self.topics, topic)
@@ -100,48 +85,39 @@ class BagRecording:
         self.counts.frames += count
         self.counts.skip("truncated", count)
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
-        """Yield all packets from the start, in file order; may be called again (counts restart).
-
-        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
-        """
-        self.counts, self.notes, self.position_bytes = CaptureCounts(), list(self.standing), 0
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield all packets from the start, in file order; each call is a new pass."""
+        self.counts = CaptureCounts()
+        self.notes = list(self.opening_notes)
+        self.position_bytes = 0
         unpacking = _Unpacking(self)
-        portions = self.start(self)
+        portions = self.portions(self)
         try:
-            first_ns: int | None = None
             for portion in portions:
                 batch = unpacking.batch(portion)
-                if first_ns is None and len(batch):
-                    first_ns = int(batch.host_ns[0])
-                limit_ns = None if until_ns is None or first_ns is None else first_ns + until_ns
-                cut = batch if limit_ns is None else self._until(batch, limit_ns)
-                if len(cut) or cut.messages:
-                    yield cut
-                if cut is not batch:
-                    return
+                if len(batch) or batch.messages:
+                    yield batch
         finally:
             self.notes += unpacking.faults()
             portions.close()
 
-    def _until(self, batch: PacketBatch, limit_ns: int) -> PacketBatch:
-        """The batch itself, or its front part up to the first packet beyond the limit."""
-        beyond = np.flatnonzero(batch.host_ns > limit_ns)
-        if not len(beyond):
-            return batch
-        left_out = len(batch) - int(beyond[0])
-        self.counts.frames -= left_out
-        self.counts.datagrams -= left_out
-        messages = tuple(m for m in batch.messages if m.host_ns <= limit_ns)
-        return replace(batch.take(slice(0, int(beyond[0]))), messages=messages)
+
+@dataclass(frozen=True, slots=True)
+class _TopicPackets:
+    """Packets of one topic in a portion; row: (p,) int64, message of each in the portion."""
+
+    found: PacketsFound
+    row: I64Array
+    stream: int
 
 
 class _Unpacking:
-    """Turns portions into batches; remembers which topics cannot be read."""
+    """Converts portions to batches; remembers which topics cannot be read."""
 
     def __init__(self, recording: BagRecording) -> None:
         self._recording = recording
         self._unpackers: dict[int, Unpacker | None] = {}
+        # By topic: number of unreadable messages, and why the first of them is.
         self._faulty: dict[int, tuple[int, str]] = {}
 
     def faults(self) -> list[str]:
@@ -155,8 +131,8 @@ class _Unpacking:
     def batch(self, portion: Portion) -> PacketBatch:
         """Packets and kept messages of a portion."""
         kept: list[tuple[int, Message]] = []
-        parts: list[tuple[I64Array, Found, int]] = []
-        # Streams get their numbers in the order in which they appear.
+        parts: list[_TopicPackets] = []
+        # Streams are numbered in order of appearance.
         for number in dict.fromkeys(portion.topic.tolist()):
             topic = self._recording.topics[number]
             rows = np.flatnonzero(portion.topic == number)
@@ -165,16 +141,16 @@ class _Unpacking:
             unpacker = self._unpacker(number, topic, len(rows))
             if unpacker is None:
                 continue
-            begin, end, log_ns = (a[rows] for a in (portion.begin, portion.end, portion.log_ns))
-            found = unpacker.find_many(portion.data, begin, end, log_ns)
+            log_ns = portion.log_ns[rows]
+            found = unpacker.find_many(portion.data, portion.begin[rows], portion.end[rows], log_ns)
             self._count(number, found)
             kept += self._corrections(topic, found, rows, log_ns)
-            parts.append((rows[found.message], found, self._stream(topic, found)))
+            parts.append(_TopicPackets(found, rows[found.message], self._stream(topic, found)))
         kept.sort(key=lambda entry: entry[0])
         return _joined(portion.data, parts, tuple(message for _, message in kept))
 
     def _unpacker(self, number: int, topic: Topic, messages: int) -> Unpacker | None:
-        """What finds packets in a topic's messages, None where they hold none."""
+        """Finds the packets in a topic's messages; None where they contain none."""
         if type_key(topic.type) not in PACKET_TYPES:
             return None
         if number not in self._unpackers:
@@ -185,26 +161,26 @@ class _Unpacking:
                 self._faulty[number] = (0, str(err))
         unpacker = self._unpackers[number]
         if unpacker is None:
-            self._blame(number, messages, "")
+            self._add_faults(number, messages, "")
         return unpacker
 
-    def _count(self, number: int, found: Found) -> None:
+    def _count(self, number: int, found: PacketsFound) -> None:
         counts = self._recording.counts
         counts.datagrams += len(found.start)
         counts.frames += len(found.start) + len(found.corrections) + found.empty
         counts.skip("no_stream", len(found.corrections))
         counts.skip("truncated", found.empty)
         if found.faults:
-            self._blame(number, len(found.faults), found.faults[0][1])
+            self._add_faults(number, len(found.faults), found.faults[0][1])
 
-    def _blame(self, number: int, messages: int, why: str) -> None:
+    def _add_faults(self, number: int, messages: int, why: str) -> None:
         before, first = self._faulty.get(number, (0, why))
-        self._faulty[number] = before + messages, first
+        self._faulty[number] = (before + messages, first)
         self._recording.counts.frames += messages
         self._recording.counts.skip("truncated", messages)
 
-    def _stream(self, topic: Topic, found: Found) -> int:
-        """Number of a topic's stream; a topic without packets is none."""
+    def _stream(self, topic: Topic, found: PacketsFound) -> int:
+        """Number of a topic's stream; a topic without packets has none, and gets 0."""
         if not len(found.start):
             return 0
         streams = self._recording.streams
@@ -214,9 +190,9 @@ class _Unpacking:
         return stream
 
     def _corrections(
-        self, topic: Topic, found: Found, rows: I64Array, log_ns: I64Array
+        self, topic: Topic, found: PacketsFound, rows: I64Array, log_ns: I64Array
     ) -> list[tuple[int, Message]]:
-        """Calibrations from among the packets, as messages of a type of our own."""
+        """Calibrations among the packets, as messages of an own type."""
         if topic.name not in self._recording.keep:
             return []
         own = Topic(topic.name, CORRECTION_TYPE, "bytes")
@@ -227,33 +203,33 @@ class _Unpacking:
 
 
 def _message(topic: Topic, portion: Portion, row: int) -> Message:
-    begin, end = int(portion.begin[row]), int(portion.end[row])
-    return Message(topic, int(portion.log_ns[row]), portion.data[begin:end].tobytes())
+    data = portion.data[int(portion.begin[row]) : int(portion.end[row])]
+    return Message(topic, int(portion.log_ns[row]), data.tobytes())
 
 
 def _joined(
-    data: U8Array, parts: list[tuple[I64Array, Found, int]], messages: tuple[Message, ...]
+    data: U8Array, parts: list[_TopicPackets], messages: tuple[Message, ...]
 ) -> PacketBatch:
     """Packets of several topics in the order of their messages."""
     if len(parts) == 1:
-        _, found, stream = parts[0]
-        numbers = np.full(len(found.start), stream, np.int64)
-        return PacketBatch(data, found.start, found.size, numbers, found.host_ns, messages)
+        found = parts[0].found
+        stream = np.full(len(found.start), parts[0].stream, np.int64)
+        return PacketBatch(data, found.start, found.size, stream, found.host_ns, messages)
     none = np.zeros(0, np.int64)
-    order = np.argsort(np.concatenate([none, *(row for row, _, _ in parts)]), kind="stable")
-    each = [np.full(len(found.start), stream, np.int64) for _, found, stream in parts]
+    streams = [np.full(len(part.row), part.stream, np.int64) for part in parts]
+    order = np.argsort(np.concatenate([none, *(part.row for part in parts)]), kind="stable")
     return PacketBatch(
         data,
-        np.concatenate([none, *(found.start for _, found, _ in parts)])[order],
-        np.concatenate([none, *(found.size for _, found, _ in parts)])[order],
-        np.concatenate([none, *each])[order],
-        np.concatenate([none, *(found.host_ns for _, found, _ in parts)])[order],
+        np.concatenate([none, *(part.found.start for part in parts)])[order],
+        np.concatenate([none, *(part.found.size for part in parts)])[order],
+        np.concatenate([none, *streams])[order],
+        np.concatenate([none, *(part.found.host_ns for part in parts)])[order],
         messages,
     )
 
 
 def is_latched(qos: str) -> bool:
-    """Whether a recorder's QoS text says transient local: as a word, or 1 in older versions."""
+    """Whether a recorded QoS text says transient local: as a word, or 1 in older versions."""
     words = qos.replace("\\n", "\n").split()
     pairs = itertools.pairwise(words)
     return any(a.lstrip("-") == "durability:" and b in ("1", "transient_local") for a, b in pairs)

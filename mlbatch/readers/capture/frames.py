@@ -1,7 +1,7 @@
 """From captured frames to UDP datagrams and IP fragments, all frames of a buffer at once.
 
-Layouts: RFC 791 (IPv4), RFC 768 (UDP); IPv6 goes frame by frame through `_ipv6`. A datagram is as
-long as its UDP header says, if that many bytes were captured: some sensors announce a wrong IP
+Layouts: RFC 791 (IPv4), RFC 768 (UDP); IPv6 packets are read one at a time (`ipv6`). A datagram is
+as long as its UDP header says, if that many bytes were captured: some sensors announce a wrong IP
 length, and Ethernet pads short frames.
 """
 
@@ -45,11 +45,18 @@ _USUAL = np.dtype(
     }
 )
 # Ethertype 0800, version 4, five words of header, any service.
-_USUAL_KIND, _USUAL_MASK = 0x08004500, 0xFFFFFF00
-_MORE, _OFFSET = 0x2000, 0x1FFF
+_USUAL_KIND = 0x08004500
+_USUAL_MASK = 0xFFFFFF00
+# Of the fragment field: more fragments follow; offset in units of 8 bytes.
+_MORE = 0x2000
+_OFFSET = 0x1FFF
 
-# Verdicts on a frame; those with a name in _SKIPPED give nothing.
-_WHOLE, _FRAGMENT, _NOT_IP, _NOT_UDP, _TRUNCATED = range(5)
+# Verdicts on a frame; those with a name in _SKIPPED give no packet.
+_WHOLE = 0
+_FRAGMENT = 1
+_NOT_IP = 2
+_NOT_UDP = 3
+_TRUNCATED = 4
 _SKIPPED = {_NOT_IP: "not_ip", _NOT_UDP: "not_udp", _TRUNCATED: "truncated"}
 
 
@@ -102,9 +109,9 @@ class Datagrams:
 
 @dataclass(slots=True)
 class Fragments:
-    """IP fragments of UDP datagrams in order of arrival; all fields (n,), int64 but `more`.
+    """IP fragments of UDP datagrams in file order; all fields (n,), int64 but `more`.
 
-    offset: place of the data within the datagram, bytes; start, size: where the data lie.
+    offset: place of the data within the datagram, bytes; start, size: of the data in the buffer.
     """
 
     frame: I64Array
@@ -129,7 +136,7 @@ class Fragments:
 
 @dataclass(slots=True)
 class Dissection:
-    """What the frames of a buffer hold; `skipped` frames per reason hold nothing."""
+    """Content of the frames of a buffer; skipped: frames without, by reason."""
 
     datagrams: Datagrams
     fragments: Fragments
@@ -150,7 +157,7 @@ def dissect(
 def _by_kernel(
     kernel: CaptureKernel, data: U8Array, frames: Frames, addresses: Addresses
 ) -> Dissection | None:
-    """What Ethernet frames hold; None where frames hold something that compiled loops leave out."""
+    """Content of Ethernet frames; None if some have content that the compiled loops do not read."""
     found = kernel.dissect(data, frames.start, frames.captured, frames.original)
     rest = _dissect(data, frames.take(found.others), addresses)
     if len(rest.datagrams.frame) or len(rest.fragments):
@@ -161,7 +168,7 @@ def _by_kernel(
 
 
 def _plain(data: U8Array, frames: Frames) -> Dissection | None:
-    """What Ethernet frames hold that are whole datagrams in usual headers; None if not all are."""
+    """Content of Ethernet frames if all are whole datagrams with usual headers, else None."""
     header = records(data, _USUAL, frames.start)
     size = header["length"].astype(np.int64)
     is_usual = (header["kind"] & _USUAL_MASK) == _USUAL_KIND
@@ -183,7 +190,7 @@ def _plain(data: U8Array, frames: Frames) -> Dissection | None:
 
 
 def _dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:
-    """The same, whatever the frames are."""
+    """Content of frames of any kind."""
     stop = frames.start + frames.captured
     network, family = link_types.locate(data, frames.start, stop, frames.link)
     verdict = np.full(len(frames), _NOT_IP, np.uint8)
@@ -191,31 +198,34 @@ def _dissect(data: U8Array, frames: Frames, addresses: Addresses) -> Dissection:
     rows = np.flatnonzero(family == link_types.IPV4)
     header, body = _ipv4_headers(data, network[rows])
     udp = records(data, UDP, body)
-    verdict[rows] = _judge(header, udp, network[rows], body, stop[rows])
+    verdict[rows] = _verdicts(header, udp, network[rows], body, stop[rows])
     cut = frames.captured < frames.original
     verdict[cut & (verdict <= _FRAGMENT)] = _TRUNCATED
-    whole, parts = verdict[rows] == _WHOLE, verdict[rows] == _FRAGMENT
+    whole = verdict[rows] == _WHOLE
+    parts = verdict[rows] == _FRAGMENT
     datagrams = _datagrams(rows[whole], header[whole], udp[whole], body[whole])
     fragments = _fragments(rows[parts], header[parts], network[rows][parts], body[parts])
     found = Dissection(datagrams, fragments, {})
-    seldom = np.flatnonzero(family == link_types.IPV6)
-    if len(seldom):
-        verdict[seldom] = _add_ipv6(found, data, seldom, network, stop, cut, addresses)
+    rare = np.flatnonzero(family == link_types.IPV6)
+    if len(rare):
+        verdict[rare] = _add_ipv6(found, data, rare, network, stop, cut, addresses)
     count = np.bincount(verdict, minlength=len(_SKIPPED) + 2).tolist()
     found.skipped = {name: count[code] for code, name in _SKIPPED.items() if count[code]}
     return found
 
 
 def _ipv4_headers(data: U8Array, at: I64Array) -> tuple[Records, I64Array]:
-    """The IPv4 headers at `at`, and where the bytes after them begin."""
+    """The IPv4 headers at `at`, and the places of the bytes after them."""
     header = records(data, IPV4, at)
     return header, at + (header["version_words"] & 15).astype(np.int64) * 4
 
 
-def _judge(header: Records, udp: Records, at: I64Array, body: I64Array, stop: I64Array) -> U8Array:
-    """Verdicts on IPv4 packets captured from `at` to `stop`; the later rule outranks."""
+def _verdicts(
+    header: Records, udp: Records, at: I64Array, body: I64Array, stop: I64Array
+) -> U8Array:
+    """Verdicts on IPv4 packets captured from `at` to `stop`; a later rule has precedence."""
     fragment = (header["fragment"] & (_MORE | _OFFSET)) != 0
-    # A fragment has no UDP length of its own: there the IP length has to be right.
+    # A fragment has no UDP length: its IP length has to be right.
     end = np.where(fragment, at + header["length"], body + udp["length"])
     least = np.where(fragment, body + 1, body + UDP.itemsize)
     verdict: U8Array = np.where(fragment, np.uint8(_FRAGMENT), np.uint8(_WHOLE))
@@ -262,7 +272,8 @@ def _add_ipv6(
     view = data.data
     reasons = {name: code for code, name in _SKIPPED.items()}
     verdicts = np.zeros(len(rows), np.uint8)
-    whole, parts = [], []
+    whole = []
+    parts = []
     for i, row in enumerate(rows.tolist()):
         packet = ipv6.dissect(view, int(network[row]), int(stop[row]))
         if isinstance(packet, str):
@@ -274,9 +285,18 @@ def _add_ipv6(
             whole.append((row, packet.start, packet.size, source, packet.port))
             verdicts[i] = _WHOLE
         else:
-            pair = addresses.number(packet.source), addresses.number(packet.destination)
-            place = packet.ident, packet.offset, packet.more, packet.start, packet.size
-            parts.append((row, *pair, *place))
+            parts.append(
+                (
+                    row,
+                    addresses.number(packet.source),
+                    addresses.number(packet.destination),
+                    packet.ident,
+                    packet.offset,
+                    packet.more,
+                    packet.start,
+                    packet.size,
+                )
+            )
             verdicts[i] = _FRAGMENT
     found.datagrams = in_order(found.datagrams, Datagrams(*_columns(whole, 5)))
     found.fragments = _with_fragments(found.fragments, _columns(parts, 8))
@@ -313,12 +333,18 @@ def _columns(rows: Sequence[tuple[int, ...]], width: int) -> I64Array:
     return columns
 
 
+# -- addresses and streams -------------------------------------------------------------------------
+
+# Of a key: source address above, destination port below.
 _PORT_BITS = 16
 
 
 @dataclass(slots=True)
 class Addresses:
-    """IPv4 addresses are their own value; IPv6 addresses get negative numbers as they appear."""
+    """Addresses as numbers, so that columns of them can be compared.
+
+    IPv4 addresses are their value; IPv6 addresses get negative numbers in order of appearance.
+    """
 
     _ipv6: dict[bytes, int] = field(default_factory=dict)
 
@@ -343,7 +369,7 @@ class StreamNumbers:
     _numbers: I64Array = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def numbers(self, source: I64Array, port: I64Array) -> I64Array:
-        """(n,) stream numbers; new streams are numbered in the order of their first packets."""
+        """(n,) stream numbers; new streams are numbered in order of their first packets."""
         key = source << _PORT_BITS | port
         at = self._find(key)
         if at is None:
@@ -363,4 +389,5 @@ class StreamNumbers:
             self._known = np.append(self._known, one)
             self._numbers = np.append(self._numbers, self.table.number(stream))
         order = np.argsort(self._known)
-        self._known, self._numbers = self._known[order], self._numbers[order]
+        self._known = self._known[order]
+        self._numbers = self._numbers[order]

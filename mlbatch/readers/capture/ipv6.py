@@ -1,6 +1,9 @@
-"""One IPv6 packet at a time: the chain of headers down to UDP.
+"""IPv6 packets, one at a time: the chain of headers down to UDP.
 
-Layouts: RFC 8200 (headers, fragments), RFC 4302 (authentication header), RFC 768 (UDP).
+Layouts: RFC 8200 (headers, fragments), RFC 4302 (authentication header), RFC 768 (UDP). Not read by
+`dpkt.ip6`: it cuts the payload at the IP length, which some sensors announce wrongly; sees a
+fragment only directly behind the fixed header; does not skip the headers 135, 139 and 140; and
+copies the payload for every header of a chain of any length.
 """
 
 from __future__ import annotations
@@ -11,10 +14,12 @@ from dataclasses import dataclass
 _HEADER = struct.Struct(">IHBB16s16s")
 _FRAGMENT = struct.Struct(">BBHI")
 _UDP = struct.Struct(">HHHH")
-_UDP_PROTOCOL, _FRAGMENT_HEADER, _AUTHENTICATION = 17, 44, 51
-# Headers that begin with the next one's number and their length in 8 bytes beyond the first 8.
+_UDP_PROTOCOL = 17
+_FRAGMENT_HEADER = 44
+_AUTHENTICATION = 51
+# Headers of two bytes: number of the next header, length in units of 8 bytes after the first 8.
 _PLAIN_HEADERS = frozenset((0, 43, 60, 135, 139, 140))
-# More headers than this are not a sensor's; the bound keeps a crafted packet cheap.
+# No sensor sends more headers; the bound keeps a crafted packet cheap.
 _MOST_HEADERS = 16
 
 
@@ -52,15 +57,16 @@ def dissect(data: memoryview, at: int, stop: int) -> Packet | str:
                 return "truncated"
             kind, _, place, ident = _FRAGMENT.unpack_from(data, at)
             at += _FRAGMENT.size
-            # A fragment that is the whole datagram (RFC 6946) has nothing to wait for.
+            # A fragment that is the whole datagram (RFC 6946) is read like one.
             if place & ~6:
                 return _fragment(source, destination, kind, place, ident, at, min(end, stop), end)
         elif kind in _PLAIN_HEADERS or kind == _AUTHENTICATION:
             if at + 2 > stop:
                 return "truncated"
-            unit, extra = (4, 2) if kind == _AUTHENTICATION else (8, 1)
-            kind, words = data[at], data[at + 1]
-            at += (words + extra) * unit
+            next_kind = data[at]
+            length_words = data[at + 1]
+            at += (length_words + 2) * 4 if kind == _AUTHENTICATION else (length_words + 1) * 8
+            kind = next_kind
         else:
             break
     return "not_udp"
@@ -91,5 +97,6 @@ def _fragment(
         return "not_udp"
     if end > stop or end <= at:
         return "truncated"
-    more, offset = bool(place & 1), place & ~7
-    return Packet(source, destination, at, end - at, 0, ident, offset, more)
+    return Packet(
+        source, destination, at, end - at, ident=ident, offset=place & ~7, more=bool(place & 1)
+    )

@@ -1,4 +1,4 @@
-"""Link types of captures: where the network packet begins in a frame, and of which family it is.
+"""Link types of captures: place and family of the network packet in a frame.
 
 Numbers and headers: tcpdump.org/linktypes.html; ethertypes: IEEE 802 numbers of IANA; address
 families of NULL and LOOP: 2 everywhere, IPv6 differs with the system (10, 24, 28, 30).
@@ -13,8 +13,13 @@ import numpy as np
 from mlbatch.readers.byte_records import records
 from mlbatch.types import I64Array, U8Array
 
-CUT, NOT_IP, IPV4, IPV6, _TAG = 0, 1, 4, 6, 7
-# A frame with more tags than this is not a network's; the bound keeps the loop short.
+# Families. CUT: the capture ends before the packet; _TAG: a VLAN tag.
+CUT = 0
+NOT_IP = 1
+IPV4 = 4
+IPV6 = 6
+_TAG = 7
+# No network adds more tags; the bound keeps the loop short.
 _MOST_TAGS = 8
 _WORD = np.dtype([("ethertype", ">u2")])
 
@@ -34,7 +39,7 @@ _ADDRESS_FAMILY = _table(1 << 8, {2: IPV4, 10: IPV6, 24: IPV6, 28: IPV6, 30: IPV
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A link header of `header` bytes; `ethertype_at` is None where it has no ethertype.
+    """A link header of `header` bytes; ethertype_at: place of the ethertype, if it has one.
 
     has_family: the header is an address family of four bytes, in either byte order.
     """
@@ -73,11 +78,11 @@ _NAMES = {
 
 
 def unknown_link(number: int) -> str:
-    """The words of an error about frames of this link type."""
+    """Text of an error about frames of this link type."""
     name = _NAMES.get(number, "unknown")
     known = ", ".join(map(str, sorted(LINKS)))
     return (
-        f"wanted frames of link type {known}, got {number} ({name}); "
+        f"expected frames of link type {known}, found {number} ({name}); "
         "capture on the network interface that the sensors are connected to"
     )
 
@@ -85,15 +90,16 @@ def unknown_link(number: int) -> str:
 def locate(
     data: U8Array, start: I64Array, stop: I64Array, link: I64Array
 ) -> tuple[I64Array, U8Array]:
-    """Where the network packet of each frame begins, and its family.
+    """Place of the network packet of each frame, and its family.
 
     start, stop: (n,) first byte of each frame and the one after its last captured byte.
-    Family: IPV4, IPV6, NOT_IP, or CUT where the capture ends before it can be told.
+    Family: IPV4, IPV6, NOT_IP, or CUT where the capture ends before the packet.
     """
     kinds = sorted(set(link.tolist()))
     if len(kinds) == 1:
         return _locate_one(data, start, stop, kinds[0])
-    network, family = start.copy(), np.full(len(start), NOT_IP, np.uint8)
+    network = start.copy()
+    family = np.full(len(start), NOT_IP, np.uint8)
     for kind in kinds:
         rows = np.flatnonzero(link == kind)
         network[rows], family[rows] = _locate_one(data, start[rows], stop[rows], kind)
@@ -114,7 +120,7 @@ def _locate_one(
         family = _BY_VERSION[data[network]]
         if link.has_family:
             family[_families(data, start) != family] = NOT_IP
-    # An IP packet needs at least one byte to be there; anything else only its link header.
+    # An IP packet needs at least one captured byte; anything else only its link header.
     family[network + (family != NOT_IP) > stop] = CUT
     return network, family
 
@@ -122,12 +128,12 @@ def _locate_one(
 def _skip_tags(
     data: U8Array, network: I64Array, stop: I64Array, family: U8Array
 ) -> tuple[I64Array, U8Array]:
-    """Step over VLAN tags: two bytes of tag, then the ethertype of what follows."""
+    """Skip VLAN tags: two bytes of tag, then the ethertype of the next header."""
     for _ in range(_MOST_TAGS):
         tagged = np.flatnonzero(family == _TAG)
         if not len(tagged):
             return network, family
-        # A frame that ends here must not lead the next look beyond the buffer.
+        # Never read beyond the buffer for a frame that ends here.
         at = np.minimum(network[tagged], stop[tagged])
         family[tagged] = _BY_ETHERTYPE[records(data, _WORD, at + 2)["ethertype"]]
         network[tagged] = at + 4

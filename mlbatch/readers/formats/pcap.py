@@ -24,7 +24,7 @@ from mlbatch.units import NS_PER_S, NS_PER_US
 
 CONTAINER = "pcap"
 
-# Magic as it stands in the file: byte order and nanoseconds per unit of the fraction.
+# First bytes of the file: byte order, and nanoseconds per unit of the fraction.
 _MAGIC = {
     b"\xd4\xc3\xb2\xa1": ("<", NS_PER_US),
     b"\xa1\xb2\xc3\xd4": (">", NS_PER_US),
@@ -37,7 +37,7 @@ _FILE_HEADER_BYTES = 24
 _LINK_AT = 20
 _RECORD_BYTES = 16
 _LENGTH_AT = 8
-# So many frames of one length in a row make it likely that more follow.
+# After this many frames of one length in a row, more are likely.
 _ALIKE = 16
 
 
@@ -51,12 +51,12 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
     head = read_head(path)
     if head[:4] in _MODIFIED:
         raise RecordingError(
-            f"{path}: wanted a pcap file, got the modified kind (magic a1b2cd34); "
+            f"{path}: expected a pcap file, found the modified kind (magic a1b2cd34); "
             f"convert it: editcap -F pcap {path.name} plain.pcap"
         )
     if head[:4] not in _MAGIC or len(head) < _FILE_HEADER_BYTES:
         raise RecordingError(
-            f"{path}: wanted a pcap header of {_FILE_HEADER_BYTES} bytes, got {len(head)} "
+            f"{path}: expected a pcap header of {_FILE_HEADER_BYTES} bytes, found {len(head)} "
             f"({head[:8].hex(' ')}); record or copy it again"
         )
     order, unit_ns = _MAGIC[head[:4]]
@@ -83,16 +83,19 @@ class _Walker:
         self.skip = _FILE_HEADER_BYTES
 
     def walk(self, data: U8Array, begin: int, end: int) -> Walk:
-        """The frames in `data[begin:end]`, as far as their records are whole."""
-        begin, self.skip = begin + self.skip, 0
+        """The frames in `data[begin:end]`, as far as their records are complete."""
+        begin += self.skip
+        self.skip = 0
         if self.kernel is not None:
             return self._walk_by(self.kernel, data, begin, end)
         starts = self._starts(data, begin, end)
         record = records(data, self.layout, starts)
         captured = record["captured"].astype(np.int64)
         after = starts + _RECORD_BYTES + captured
-        lies = np.flatnonzero(captured > MAX_FRAME_BYTES)
-        count = int(lies[0]) if len(lies) else int(np.searchsorted(after, end, side="right"))
+        too_long = np.flatnonzero(captured > MAX_FRAME_BYTES)
+        count = (
+            int(too_long[0]) if len(too_long) else int(np.searchsorted(after, end, side="right"))
+        )
         frames = Frames(
             start=starts[:count] + _RECORD_BYTES,
             captured=captured[:count],
@@ -102,13 +105,13 @@ class _Walker:
             + record["fraction"][:count].astype(np.int64) * self.unit_ns,
         )
         place = int(after[count - 1]) if count else begin
-        if len(lies):
+        if len(too_long):
             return Walk(place, fault=_too_long(int(captured[count])), frames=frames)
         more = int(captured[count]) if count < len(starts) else 0
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
     def _walk_by(self, kernel: CaptureKernel, data: U8Array, begin: int, end: int) -> Walk:
-        """The same, by compiled loops; at most as many frames as they have room for."""
+        """The same by compiled loops; at most as many frames as they have room for."""
         records, place, why = kernel.walk(
             data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
         )
@@ -117,18 +120,22 @@ class _Walker:
         frames = Frames(start, captured, original, link, host_ns)
         if why == NO_ROOM:
             return Walk(place, frames=frames)
-        is_told = place <= end - _RECORD_BYTES
-        more = self.length.unpack_from(data.data, place + _LENGTH_AT)[0] if is_told else 0
+        more = 0
+        if place <= end - _RECORD_BYTES:
+            more = self.length.unpack_from(data.data, place + _LENGTH_AT)[0]
         if why == TOO_LONG:
             return Walk(place, fault=_too_long(more), frames=frames)
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
     def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
-        """Where records begin whose headers are whole; the last one's frame may be cut off."""
-        view, length_at = data.data, self.length.unpack_from
+        """Places of records with complete headers; the last one's frame may be cut off."""
+        view = data.data
+        length_at = self.length.unpack_from
         parts: list[I64Array] = []
         starts: list[int] = []
-        at, before, alike = begin, -1, 0
+        at = begin
+        before = -1
+        alike = 0
         while at <= end - _RECORD_BYTES:
             starts.append(at)
             length = length_at(view, at + _LENGTH_AT)[0]
@@ -139,11 +146,12 @@ class _Walker:
                 run = self._alike(data, at, end, length)
                 parts += [np.array(starts, np.int64), run]
                 at += len(run) * (_RECORD_BYTES + length)
-                starts, alike = [], 0
+                starts = []
+                alike = 0
         return np.concatenate([*parts, np.array(starts, np.int64)])
 
     def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
-        """Where records begin that follow each other with frames of one length; none to many."""
+        """Places of the next records as long as their frames have this length; none to many."""
         step = _RECORD_BYTES + length
         count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
         at = begin + _LENGTH_AT
@@ -154,4 +162,4 @@ class _Walker:
 
 
 def _too_long(size: int) -> str:
-    return f"wanted a frame of at most {MAX_FRAME_BYTES} bytes, got {size}"
+    return f"expected a frame of at most {MAX_FRAME_BYTES} bytes, found {size}"

@@ -17,24 +17,41 @@ import numpy.typing as npt
 from mlbatch.readers.byte_records import records
 from mlbatch.readers.capture.frames import Frames
 from mlbatch.readers.capture.link_types import NO_LINK
-from mlbatch.readers.capture.recording import MAX_RECORD_BYTES, CaptureRecording, Walk
+from mlbatch.readers.capture.recording import MAX_BLOCK_BYTES, CaptureRecording, Walk
 from mlbatch.readers.source import read_head
 from mlbatch.types import I64Array, Recording, StreamTable, U8Array
 from mlbatch.units import NS_PER_S
 
 CONTAINER = "pcapng"
 
-_SECTION, _INTERFACE, _OLD_PACKET, _SIMPLE, _ENHANCED = 0x0A0D0D0A, 1, 2, 3, 6
+U64Array: TypeAlias = npt.NDArray[np.uint64]
+
+# Block types.
+_SECTION = 0x0A0D0D0A
+_INTERFACE = 1
+_OLD_PACKET = 2
+_SIMPLE = 3
+_ENHANCED = 6
 _PACKETS = frozenset((_OLD_PACKET, _SIMPLE, _ENHANCED))
 _NEEDED = _PACKETS | {_SECTION, _INTERFACE}
 _ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 _MAGIC_AT = 8
 _LEAST_BLOCK_BYTES = 12
 _OPTIONS_AT = 16
-_TSRESOL, _TSOFFSET = 9, 14
-# Bytes of a packet block around its frame, and where the frame begins.
-_ENHANCED_BYTES, _ENHANCED_FRAME_AT = 32, 28
-_SIMPLE_BYTES, _SIMPLE_FRAME_AT = 16, 12
+# Options if_tsresol and if_tsoffset (section 4.2).
+_TSRESOL = 9
+_TSOFFSET = 14
+# Bytes of a packet block around its frame, and place of the frame.
+_ENHANCED_BYTES = 32
+_ENHANCED_FRAME_AT = 28
+_SIMPLE_BYTES = 16
+_SIMPLE_FRAME_AT = 12
+# if_tsresol: exponent of 2 instead of 10.
+_BINARY = 0x80
+# Up to here the nanoseconds of a second times the ticks of a second are below 2^64.
+_MOST_EXACT = 1 << 34
+# Stamps beyond int64 nanoseconds come from damaged files; they are set to the bound.
+_MOST_S = (1 << 63) // NS_PER_S - 1
 
 
 def recognises(head: bytes) -> bool:
@@ -50,6 +67,41 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
 
 
 @dataclass(frozen=True, slots=True)
+class Resolution:
+    """Time resolution of an interface: ticks in a second, and the seconds at tick 0."""
+
+    per_second: int
+    offset_s: int
+
+    @classmethod
+    def of(cls, code: int, offset_s: int) -> Resolution:
+        """From if_tsresol: n for 10^-n s, or 0x80 | n for 2^-n s."""
+        exponent = code & ~_BINARY
+        return cls((2 if code & _BINARY else 10) ** exponent, offset_s)
+
+    def ns(self, ticks: U64Array) -> I64Array:
+        """(n,) int64 nanoseconds of (n,) ticks, exact, rounded down."""
+        if self.per_second > _MOST_EXACT:
+            return self._slow_ns(ticks)
+        per_second = np.uint64(self.per_second)
+        seconds = ticks // per_second
+        rest_ns = (ticks % per_second) * np.uint64(NS_PER_S) // per_second
+        # Bounded so that the sum of both stays within int64.
+        whole = np.minimum(seconds, np.uint64(1 << 62)).astype(np.int64)
+        offset_s = min(max(self.offset_s, -(1 << 61)), 1 << 61)
+        whole_ns: I64Array = np.clip(whole + offset_s, -_MOST_S, _MOST_S) * NS_PER_S
+        whole_ns += rest_ns.astype(np.int64)
+        return whole_ns
+
+    def _slow_ns(self, ticks: U64Array) -> I64Array:
+        bound_ns = _MOST_S * NS_PER_S
+        exact = [
+            tick * NS_PER_S // self.per_second + self.offset_s * NS_PER_S for tick in ticks.tolist()
+        ]
+        return np.array([min(max(ns, -bound_ns), bound_ns) for ns in exact], np.int64)
+
+
+@dataclass(frozen=True, slots=True)
 class _Interface:
     """An interface; snaplen 0 means no limit."""
 
@@ -60,7 +112,7 @@ class _Interface:
 
 @dataclass(slots=True)
 class _Walker:
-    """Steps from block to block; knows the section's byte order and interfaces."""
+    """Steps from block to block; keeps the section's byte order and interfaces."""
 
     order: str = "<"
     interfaces: list[_Interface] = field(default_factory=list)
@@ -73,23 +125,24 @@ class _Walker:
         return stop
 
     def _step(self, view: memoryview, begin: int, end: int, starts: list[int]) -> Walk:
-        """Collect the packet blocks from `begin` on; where and why this ends."""
-        at, head = begin, struct.Struct(self.order + "II").unpack_from
+        """Add the packet blocks from `begin` on to `starts`; where and why this ends."""
+        at = begin
+        head = struct.Struct(self.order + "II").unpack_from
         while at + _LEAST_BLOCK_BYTES <= end:
             kind, length = head(view, at)
             if kind == _SECTION:
                 if starts:
-                    # Its interfaces replace those that the frames before it refer to.
+                    # Its interfaces replace those of the frames before it.
                     break
                 self.order = _ORDERS.get(bytes(view[at + _MAGIC_AT : at + 12]), self.order)
                 head = struct.Struct(self.order + "II").unpack_from
                 kind, length = head(view, at)
             if length < _LEAST_BLOCK_BYTES or length % 4:
-                return Walk(at, fault=f"wanted the length of a block, got {length}")
+                return Walk(at, fault=f"expected the length of a block, found {length}")
             if kind in _NEEDED:
-                if length > MAX_RECORD_BYTES:
-                    wanted = f"wanted a block of at most {MAX_RECORD_BYTES} bytes, got {length}"
-                    return Walk(at, fault=wanted)
+                if length > MAX_BLOCK_BYTES:
+                    fault = f"expected a block of at most {MAX_BLOCK_BYTES} bytes, found {length}"
+                    return Walk(at, fault=fault)
                 if at + length > end:
                     return Walk(at, length, kind in _PACKETS)
                 if kind in _PACKETS:
@@ -109,7 +162,9 @@ class _Walker:
             self.interfaces.append(_Interface(link, snaplen, resolution))
 
     def _resolution(self, options: bytes) -> Resolution:
-        resolution, offset_s, at = 6, 0, 0
+        resolution = 6
+        offset_s = 0
+        at = 0
         while at + 4 <= len(options):
             code, length = struct.unpack_from(self.order + "HH", options, at)
             value = options[at + 4 : at + 4 + length]
@@ -124,7 +179,8 @@ class _Walker:
         names = ("kind", "length", "interface", "high", "low", "captured", "original")
         block = records(data, np.dtype([(name, self.order + "u4") for name in names]), at)
         field = {name: block[name].astype(np.int64) for name in names}
-        interface, start = field["interface"], at + _ENHANCED_FRAME_AT
+        interface = field["interface"]
+        start = at + _ENHANCED_FRAME_AT
         room = field["length"] - _ENHANCED_BYTES
         simple = field["kind"] == _SIMPLE
         if simple.any():
@@ -135,9 +191,9 @@ class _Walker:
             field["captured"][simple] = self._simple_sizes(field["original"][simple], room[simple])
         old = field["kind"] == _OLD_PACKET
         if old.any():
-            # A 16-bit number and a 16-bit drop count share the place of the 32-bit number.
+            # A 16-bit number and a 16-bit drop count in place of the 32-bit number.
             interface[old] = interface[old] >> 16 if self.order == ">" else interface[old] & 0xFFFF
-        # A block that claims more than it holds is cut: it counts as truncated.
+        # A block that claims more bytes than it has is cut: it counts as truncated.
         captured = np.clip(field["captured"], 0, np.maximum(room, 0))
         field["original"] = np.maximum(field["original"], field["captured"])
         ticks = block["high"].astype(np.uint64) << np.uint64(32) | block["low"].astype(np.uint64)
@@ -146,7 +202,7 @@ class _Walker:
         return Frames(start, captured, field["original"], self._links(interface), host_ns)
 
     def _simple_sizes(self, original: I64Array, room: I64Array) -> I64Array:
-        """Captured bytes of simple packets: they do not say, but may be padded."""
+        """Captured bytes of simple packets, which do not state them and may be padded."""
         limit = self.interfaces[0].snaplen if self.interfaces else 0
         size = np.minimum(original, room)
         return np.minimum(size, limit) if limit else size
@@ -163,47 +219,3 @@ class _Walker:
                 rows = interface == number
                 host_ns[rows] = self.interfaces[number].resolution.ns(ticks[rows])
         return host_ns
-
-
-U64Array: TypeAlias = npt.NDArray[np.uint64]
-
-_BINARY = 0x80
-# Up to here the nanoseconds of a second times the ticks of a second stay below 2^64.
-_MOST_EXACT = 1 << 34
-# Stamps beyond int64 nanoseconds come from damaged files; they stay at the bound.
-_MOST_S = (1 << 63) // NS_PER_S - 1
-
-
-@dataclass(frozen=True, slots=True)
-class Resolution:
-    """Ticks in a second, and the seconds at tick 0."""
-
-    per_second: int
-    offset_s: int
-
-    @classmethod
-    def of(cls, code: int, offset_s: int) -> Resolution:
-        """From if_tsresol: n for 10^-n s, or 0x80 | n for 2^-n s."""
-        exponent = code & ~_BINARY
-        return cls((2 if code & _BINARY else 10) ** exponent, offset_s)
-
-    def ns(self, ticks: U64Array) -> I64Array:
-        """(n,) nanoseconds of (n,) ticks."""
-        if self.per_second > _MOST_EXACT:
-            return self._slow_ns(ticks)
-        per_second = np.uint64(self.per_second)
-        seconds = ticks // per_second
-        rest_ns = (ticks % per_second) * np.uint64(NS_PER_S) // per_second
-        # Bounded so that the sum of both stays within int64.
-        whole = np.minimum(seconds, np.uint64(1 << 62)).astype(np.int64)
-        offset_s = min(max(self.offset_s, -(1 << 61)), 1 << 61)
-        whole_ns: I64Array = np.clip(whole + offset_s, -_MOST_S, _MOST_S) * NS_PER_S
-        whole_ns += rest_ns.astype(np.int64)
-        return whole_ns
-
-    def _slow_ns(self, ticks: U64Array) -> I64Array:
-        bound_ns = _MOST_S * NS_PER_S
-        exact = [
-            tick * NS_PER_S // self.per_second + self.offset_s * NS_PER_S for tick in ticks.tolist()
-        ]
-        return np.array([min(max(ns, -bound_ns), bound_ns) for ns in exact], np.int64)

@@ -1,12 +1,13 @@
 """ROS 1 bags: read from front to back, with and without an index, in constant memory.
 
-Source: wiki.ros.org/Bags/Format/2.0; facts/messages.md, section 5. The order is that of the file,
-and recordings that were cut off by a crash (`.active`) read like whole ones.
+Source: wiki.ros.org/Bags/Format/2.0; docs/sources/messages.md, section 5. A record is a header of
+`name=value` fields with a length before it, and data with a length before them. Messages come in
+file order; recordings that were cut off by a crash (`.active`) are read as far as they go. Records
+are read many at once where their headers differ in values alone.
 """
 
 from __future__ import annotations
 
-import bz2
 import contextlib
 import struct
 from collections.abc import Generator, Iterator, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 from mlbatch.errors import RecordingError
 from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.readers.byte_records import records, single
-from mlbatch.readers.source import SkippingSource, Unzipper, Window, in_pieces, read_head
+from mlbatch.readers.source import Decompressor, Source, Window, read_head
 from mlbatch.ros.definitions import type_key
 from mlbatch.types import BoolArray, I64Array, Recording, StreamTable, Topic, U8Array
 from mlbatch.units import NS_PER_S
@@ -28,11 +29,20 @@ CONTAINER = "ROS 1 bag"
 
 _NAME = b"#ROSBAG V"
 _MAGIC = b"#ROSBAG V2.0\n"
-# The recorder begins a new chunk every 0.75 MB, unless it is told otherwise.
+# The recorder begins a new chunk every 0.75 MB by default.
 _MAX_CHUNK_BYTES = 1 << 28
 _MAX_INDEX_BYTES = 16 << 20
-_WORD_BYTES = 4
 _PLAIN = "none"
+_COMPRESSIONS = ("lz4", "bz2")
+_U32 = struct.Struct("<I")
+_WORD_BYTES = 4
+# The field `op=` with the length of a value of one byte before it.
+_OP = b"\x04\0\0\0op="
+# The longest header contains the name of a topic; the shortest the kind of the record.
+_MAX_HEAD_BYTES = 1 << 20
+_LEAST_HEAD_BYTES = len(_OP) + 1
+# Records may be as short as their lengths: most records kept at a time.
+_MOST_RECORDS = 1 << 18
 
 
 def recognises(head: bytes) -> bool:
@@ -46,267 +56,59 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
     if not head.startswith(_MAGIC):
         version = head[: len(_MAGIC)].split(b"\n")[0].decode("latin-1")
         raise RecordingError(
-            f"{path}: wanted a bag of version 2.0 ({_MAGIC.decode().strip()}), got {version}; "
+            f"{path}: expected a bag of version 2.0 ({_MAGIC.decode().strip()}), found {version}; "
             "convert it with `rosbag fix` or `rosbag reindex`"
         )
-    with SkippingSource(path) as source:
+    with Source(path) as source:
         size_bytes = source.size_bytes
         topics, note = _indexed_topics(source, path)
-    standing = (note,) if note else ()
-    recording = BagRecording(path, CONTAINER, size_bytes, topics, streams, _portions, standing)
+    opening_notes = (note,) if note else ()
+    recording = BagRecording(
+        path, CONTAINER, size_bytes, streams, _portions, opening_notes, topics=topics
+    )
     if not topics:
-        # Connections stand where their first message does, so that all have to be passed.
+        # A connection precedes its first message: all messages have to be read.
         for _ in _portions(recording):
             pass
-        recording.notes = list(standing)
+            recording.notes = list(opening_notes)
     return recording
 
 
-def _indexed_topics(source: SkippingSource, path: Path) -> tuple[tuple[Topic, ...], str]:
+def _indexed_topics(source: Source, path: Path) -> tuple[tuple[Topic, ...], str]:
     """Topics by the index at a bag's end, or none and why (a note, if something is wrong)."""
     window = Window(source)
     window.begin = len(_MAGIC)
     try:
-        while not len((walked := walk(window.data, window.begin, window.end)).head):
+        while not len((walked := _walk(window.data, window.begin, window.end)).head):
             if _claims_too_much(window) or not window.refill():
                 return (), "the bag ends within its header"
-        fields = head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
-        place, count = number(fields, "index_pos"), number(fields, "conn_count")
+        fields = _head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
+        place = _number(fields, "index_pos")
+        count = _number(fields, "conn_count")
         if fields.get("encryptor"):
             raise RecordingError(
-                f"{path}: wanted a bag that can be read, got one that is encrypted "
+                f"{path}: expected a bag that can be read, found one that is encrypted "
                 f"({fields['encryptor'].decode('latin-1')}); decrypt it with `rosbag decrypt`"
             )
         if not place:
             return (), "the bag was not closed and has no index; it is read record by record"
         if not source.is_plain:
-            # What is compressed as a whole has no places to look at; its index is not to blame.
+            # A file compressed as a whole is only read in order; its index may be intact.
             return (), ""
         index = np.frombuffer(source.look_at(place, _MAX_INDEX_BYTES), np.uint8)
-        topics = [topic for _, topic in _connections(index, walk(index, 0, len(index)))]
-    except HeadError as err:
+        topics = [topic for _, topic in _connections(index, _walk(index, 0, len(index)))]
+    except _HeadError as err:
         return (), f"the bag's index is damaged ({err}); it is read record by record"
     if len(topics) < count:
-        return (), "the bag's index is not whole; it is read record by record"
+        return (), "the bag's index is incomplete; it is read record by record"
     return tuple(dict.fromkeys(topics)), ""
 
 
-def _bytes(data: U8Array, begin: int, size: int) -> bytes:
-    return data[begin : begin + size].tobytes()
+# -- records --------------------------------------------------------------------------------------
 
 
-def _rows(walked: Walked) -> list[tuple[int, int, int, int]]:
-    """Records as (header, its size, data, their size)."""
-    columns = (walked.head, walked.head_size, walked.data, walked.data_size)
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _connections(data: U8Array, walked: Walked) -> Iterator[tuple[int, Topic]]:
-    """The connections among records, with their numbers."""
-    for head, head_size, body, size in _rows(walked):
-        fields = head_fields(_bytes(data, head, head_size))
-        if number(fields, "op") == Op.CONNECTION:
-            yield connection_topic(fields, _bytes(data, body, size))
-
-
-def _claims_too_much(window: Window) -> str:
-    """Why the record at the front of the window cannot be one, "" if it can."""
-    data, at, end = window.data, window.begin, window.end
-    if at + _WORD_BYTES > end:
-        return ""
-    head = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little")
-    if not LEAST_HEAD_BYTES <= head <= MAX_HEAD_BYTES:
-        return f"wanted a header of {LEAST_HEAD_BYTES} to {MAX_HEAD_BYTES} bytes, got {head}"
-    at += _WORD_BYTES + head
-    size = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little") if at + 4 <= end else 0
-    if size > _MAX_CHUNK_BYTES:
-        return f"wanted a record of at most {_MAX_CHUNK_BYTES} bytes, got {size}"
-    return ""
-
-
-def _portions(recording: BagRecording) -> Generator[Portion, None, None]:
-    """One pass over a bag."""
-    with SkippingSource(recording.path) as source:
-        yield from _Pass(recording, source).portions()
-
-
-class _Pass:
-    """Reads a bag from front to back; what it cannot read is noted and counted."""
-
-    def __init__(self, recording: BagRecording, source: SkippingSource) -> None:
-        self._recording, self._source = recording, source
-        self._reader = HeadReader()
-        # Topic of each connection, -1 where its messages are not asked for.
-        self._topics: dict[int, int] = {}
-        self._cut = False
-
-    def portions(self) -> Generator[Portion, None, None]:
-        """All wanted messages."""
-        window = Window(self._source)
-        window.begin = len(_MAGIC)
-        window.refill()
-        while True:
-            self._recording.position_bytes = self._source.position_bytes
-            walked = walk(window.data, window.begin, window.end)
-            try:
-                yield from self._records(window.data, walked)
-            except HeadError as err:
-                self._recording.lose(f"{_at(window)}: {err}; the rest of the bag was not read")
-                return
-            window.begin = walked.next
-            fault = _claims_too_much(window)
-            if fault:
-                self._recording.lose(f"{_at(window)}: {fault}; the rest of the bag was not read")
-                return
-            if len(walked.head) < MOST_RECORDS and not window.refill():
-                yield from self._end(window)
-                return
-
-    def _records(self, data: U8Array, walked: Walked) -> Generator[Portion, None, None]:
-        """Records of the file's level: chunks, and messages of one that was never closed."""
-        plain: list[Walked] = []
-        bare: list[int] = []
-        for index, (head, head_size, body, size) in enumerate(_rows(walked)):
-            raw = _bytes(data, head, head_size)
-            op = op_of(raw)
-            if op in (Op.MESSAGE, Op.CONNECTION):
-                bare.append(index)
-            elif op == Op.CHUNK:
-                fields = head_fields(raw)
-                if _compression(fields) == _PLAIN:
-                    # Messages of chunks that lie in one buffer are dealt with together.
-                    for part in self._inside(data, body, body + size):
-                        plain.append(part)
-                        if len(part.head) == MOST_RECORDS:
-                            yield from self._messages(data, plain)
-                            plain = []
-                    continue
-                yield from self._messages(data, plain)
-                plain = []
-                unpacked = self._unpack(fields, data.data[body : body + size])
-                for part in self._inside(unpacked, 0, len(unpacked)):
-                    yield from self._messages(unpacked, [part])
-        plain.append(walked.take(np.array(bare, np.int64)))
-        yield from self._messages(data, plain)
-
-    def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[Walked]:
-        """The records of a chunk, in parts."""
-        for walked in _parts(data, begin, end):
-            yield walked
-        if walked.next < end and not self._cut:
-            self._recording.lose(
-                f"a chunk: wanted whole records, got {end - walked.next} bytes that are none; "
-                "the rest of the chunk was not read"
-            )
-
-    def _unpack(self, fields: dict[str, bytes], stored: memoryview) -> U8Array:
-        """The bytes of a compressed chunk, as far as they can be had."""
-        compression, whole = _compression(fields), number(fields, "size")
-        found = _unpacked(compression, stored, whole)
-        if len(found) < whole and not self._cut:
-            self._recording.lose(
-                f"a chunk ({compression}): wanted {whole} bytes, got {len(found)}; "
-                "the rest of the chunk was not read"
-            )
-            # Of a part of a record nothing is told again.
-            *_, last = _parts(found, 0, len(found))
-            return found[: last.next]
-        return found
-
-    def _messages(self, data: U8Array, parts: list[Walked]) -> Generator[Portion, None, None]:
-        """The wanted among messages; connections on the way are remembered."""
-        walked = joined(parts)
-        if not len(walked.head):
-            return
-        try:
-            heads = self._reader.read(data, walked)
-            others = walked.take(np.flatnonzero(~heads.is_message))
-            for connection, topic in _connections(data, others):
-                self._connect(connection, topic)
-        except HeadError as err:
-            if len(parts) == 1:
-                self._recording.lose(f"a chunk: {err}; it was not read")
-                return
-            for part in parts:
-                yield from self._messages(data, [part])
-            return
-        rows = np.flatnonzero(heads.is_message)
-        numbers, inverse = np.unique(heads.connection[rows], return_inverse=True)
-        known = np.array([self._topics.get(at, -1) for at in numbers.tolist()], np.int64)
-        topic_of = known[inverse]
-        rows, topic_of = rows[topic_of >= 0], topic_of[topic_of >= 0]
-        if len(rows):
-            begin = walked.data[rows]
-            end = begin + walked.data_size[rows]
-            yield Portion(data, begin, end, heads.log_ns[rows], topic_of)
-
-    def _connect(self, connection: int, topic: Topic) -> None:
-        at = self._recording.number(topic)
-        self._topics[connection] = at if self._recording.wants(topic) else -1
-
-    def _end(self, window: Window) -> Generator[Portion, None, None]:
-        """What is left at the end of the file: nothing, or a part of a record."""
-        left = window.end - window.begin
-        if self._source.fault:
-            self._recording.notes.append(f"{_at(window)}: {self._source.fault}")
-        if left <= 0:
-            return
-        self._recording.lose(f"{_at(window)}: the bag ends within a record; it was cut off")
-        head = window.begin + _WORD_BYTES
-        body = head + int.from_bytes(_bytes(window.data, window.begin, _WORD_BYTES), "little")
-        # What is there of a chunk is read like a whole one; that it was cut off is counted.
-        self._cut = True
-        data = body + _WORD_BYTES
-        record = Walked(
-            single(head), single(body - head), single(data), single(window.end - data), 0
-        )
-        with contextlib.suppress(HeadError):
-            if window.end > data:
-                yield from self._records(window.data, record)
-
-
-def _parts(data: U8Array, begin: int, end: int) -> Iterator[Walked]:
-    """The records of `data[begin:end]`, as many at a time as are kept; at least one part."""
-    yield (walked := walk(data, begin, end))
-    while len(walked.head) == MOST_RECORDS:
-        yield (walked := walk(data, walked.next, end))
-
-
-def _compression(fields: dict[str, bytes]) -> str:
-    return fields.get("compression", b"").decode("latin-1") or _PLAIN
-
-
-def _at(window: Window) -> str:
-    return f"byte {window.place}"
-
-
-def _unpacked(compression: str, stored: memoryview, size: int) -> U8Array:
-    """Up to `size` bytes of a chunk; none where it is corrupt."""
-    if not size or size > _MAX_CHUNK_BYTES:
-        return np.zeros(0, np.uint8)
-    if compression == "lz4":
-        return Unzipper().unpack(compression, stored, size)
-    if compression != "bz2":
-        return np.zeros(0, np.uint8)
-    return in_pieces(bz2.BZ2Decompressor().decompress, stored, size)
-
-
-_U32 = struct.Struct("<I")
-_WORD_BYTES = 4
-# The field `op=` with the length of a value of one byte before it.
-_OP = b"\x04\0\0\0op="
-# A header holds the name of a topic at most.
-MAX_HEAD_BYTES = 1 << 20
-# The field that tells what a record is.
-LEAST_HEAD_BYTES = len(_OP) + 1
-
-
-# Records may be as short as their lengths: so many are kept at a time.
-MOST_RECORDS = 1 << 18
-
-
-class Op(IntEnum):
-    """What a record is."""
+class _Op(IntEnum):
+    """Kind of a record."""
 
     MESSAGE = 2
     BAG = 3
@@ -316,11 +118,11 @@ class Op(IntEnum):
     CONNECTION = 7
 
 
-class HeadError(ValueError):
+class _HeadError(ValueError):
     """Bytes that are no header."""
 
 
-def head_fields(raw: bytes) -> dict[str, bytes]:
+def _head_fields(raw: bytes) -> dict[str, bytes]:
     """Fields of a header."""
     return {
         raw[name:begin].rstrip(b"=").decode("latin-1"): raw[begin:end]
@@ -329,43 +131,44 @@ def head_fields(raw: bytes) -> dict[str, bytes]:
 
 
 def _places(raw: bytes) -> list[tuple[int, int, int]]:
-    """Where the fields of a header lie: begin of the name, begin and end of the value."""
-    found, at = [], 0
+    """Places of the fields of a header: begin of the name, begin and end of the value."""
+    found = []
+    at = 0
     while at < len(raw):
         if at + _WORD_BYTES > len(raw):
-            raise HeadError("a field without a length")
+            raise _HeadError("a field without a length")
         end = at + _WORD_BYTES + _U32.unpack_from(raw, at)[0]
         equals = raw.find(b"=", at + _WORD_BYTES, end)
         if end > len(raw) or equals < 0:
-            raise HeadError("a field that is longer than its header, or has no value")
+            raise _HeadError("a field that is longer than its header, or has no value")
         found.append((at + _WORD_BYTES, equals + 1, end))
         at = end
     return found
 
 
-def number(fields: dict[str, bytes], name: str) -> int:
+def _number(fields: dict[str, bytes], name: str) -> int:
     """The value of a field that holds a little-endian number."""
     if name not in fields or len(fields[name]) not in (1, 4, 8):
-        raise HeadError(f"no number {name!r}")
+        raise _HeadError(f"no number {name!r}")
     return int.from_bytes(fields[name], "little")
 
 
-def op_of(raw: bytes) -> int:
-    """What a record with this header is; quicker than reading all fields."""
+def _op_of(raw: bytes) -> int:
+    """Kind of a record with this header; quicker than reading all fields."""
     at = raw.find(_OP)
     if at < 0:
-        raise HeadError("a record that does not say what it is")
+        raise _HeadError("a record without a kind")
     return raw[at + len(_OP)] if at + len(_OP) < len(raw) else 0
 
 
-def connection_topic(fields: dict[str, bytes], data: bytes) -> tuple[int, Topic]:
+def _connection_topic(fields: dict[str, bytes], data: bytes) -> tuple[int, Topic]:
     """Number and topic of a connection, from its record's header and data."""
-    about = head_fields(data)
+    about = _head_fields(data)
     texts = {name: value.decode("utf-8", "replace") for name, value in about.items()}
     topic = fields.get("topic", about.get("topic", b"")).decode("utf-8", "replace")
     if not topic or "type" not in texts:
-        raise HeadError("a connection without topic or type")
-    return number(fields, "conn"), Topic(
+        raise _HeadError("a connection without topic or type")
+    return _number(fields, "conn"), Topic(
         topic,
         type_key(texts["type"]),
         "ros1",
@@ -376,8 +179,11 @@ def connection_topic(fields: dict[str, bytes], data: bytes) -> tuple[int, Topic]
 
 
 @dataclass(frozen=True, slots=True)
-class Walked:
-    """Records in a row, (n,) int64 each: where header and data lie; all before `next` are whole."""
+class _Records:
+    """n records in a row, (n,) int64 each: places and sizes of headers and data.
+
+    The records before byte `next` are complete.
+    """
 
     head: I64Array
     head_size: I64Array
@@ -385,18 +191,23 @@ class Walked:
     data_size: I64Array
     next: int
 
-    def take(self, index: I64Array) -> Walked:
+    def take(self, index: I64Array) -> _Records:
         """The records at `index`."""
-        head, head_size = self.head[index], self.head_size[index]
-        return Walked(head, head_size, self.data[index], self.data_size[index], self.next)
+        return _Records(
+            self.head[index],
+            self.head_size[index],
+            self.data[index],
+            self.data_size[index],
+            self.next,
+        )
 
 
-def joined(parts: Sequence[Walked]) -> Walked:
-    """Records of several stretches of one array."""
+def _joined(parts: Sequence[_Records]) -> _Records:
+    """Records of several parts of one array."""
     if len(parts) == 1:
         return parts[0]
     none = np.zeros(0, np.int64)
-    return Walked(
+    return _Records(
         np.concatenate([none, *(part.head for part in parts)]),
         np.concatenate([none, *(part.head_size for part in parts)]),
         np.concatenate([none, *(part.data for part in parts)]),
@@ -405,17 +216,20 @@ def joined(parts: Sequence[Walked]) -> Walked:
     )
 
 
-def walk(data: U8Array, begin: int, end: int) -> Walked:
-    """The whole records of `data[begin:end]`, at most MOST_RECORDS of them."""
-    heads, bodies = [], []
-    view, length_at, at = data.data, _U32.unpack_from, begin
-    for _ in range(MOST_RECORDS):
+def _walk(data: U8Array, begin: int, end: int) -> _Records:
+    """The whole records of `data[begin:end]`, at most _MOST_RECORDS of them."""
+    heads = []
+    bodies = []
+    view = data.data
+    length_at = _U32.unpack_from
+    at = begin
+    for _ in range(_MOST_RECORDS):
         if at + _WORD_BYTES > end:
             break
         head_size = length_at(view, at)[0]
         body = at + _WORD_BYTES + head_size
         # Zeros would be records without a header, very many of them.
-        if body + _WORD_BYTES > end or head_size < LEAST_HEAD_BYTES:
+        if body + _WORD_BYTES > end or head_size < _LEAST_HEAD_BYTES:
             break
         after = body + _WORD_BYTES + length_at(view, body)[0]
         if after > end:
@@ -427,12 +241,12 @@ def walk(data: U8Array, begin: int, end: int) -> Walked:
     body_at = np.array(bodies, np.int64)
     data_at = body_at + _WORD_BYTES
     following = np.append(head[1:] - _WORD_BYTES, at)[: len(head)]
-    return Walked(head, body_at - head, data_at, following - data_at, at)
+    return _Records(head, body_at - head, data_at, following - data_at, at)
 
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """A header of a message; others of its length with the same fixed bytes are read like it."""
+    """A message header; others of its length with the same fixed bytes have its layout."""
 
     fixed: I64Array
     value: U8Array
@@ -443,21 +257,23 @@ class _Template:
     def of(cls, raw: bytes) -> _Template | None:
         """From one header; None if it is not that of a message."""
         places = {raw[name : begin - 1]: (begin, end) for name, begin, end in _places(raw)}
-        connection, time = places.get(b"conn", (0, 0)), places.get(b"time", (0, 0))
+        connection = places.get(b"conn", (0, 0))
+        time = places.get(b"time", (0, 0))
         op = places.get(b"op", (0, 0))
-        if raw[op[0] : op[1]] != bytes([Op.MESSAGE]):
+        if raw[op[0] : op[1]] != bytes([_Op.MESSAGE]):
             return None
         if connection[1] - connection[0] != 4 or time[1] - time[0] != 8:
-            raise HeadError("a message without connection or time")
+            raise _HeadError("a message without connection or time")
         fixed = np.ones(len(raw), bool)
-        fixed[slice(*connection)] = fixed[slice(*time)] = False
+        fixed[slice(*connection)] = False
+        fixed[slice(*time)] = False
         at = np.flatnonzero(fixed)
         return cls(at, np.frombuffer(raw, np.uint8)[at], connection[0], time[0])
 
 
 @dataclass(frozen=True, slots=True)
-class Heads:
-    """What the headers of n records say: is_message (n,) bool; connection, log_ns: (n,) int64."""
+class _Headers:
+    """Headers of n records: is_message (n,) bool; connection, log_ns: (n,) int64."""
 
     is_message: BoolArray
     connection: I64Array
@@ -465,15 +281,17 @@ class Heads:
 
 
 @dataclass(slots=True)
-class HeadReader:
-    """Reads headers, and remembers those of messages by their length."""
+class _HeaderReader:
+    """Reads headers; remembers layouts of message headers by their length."""
 
     _templates: dict[int, list[_Template]] = field(default_factory=dict)
 
-    def read(self, data: U8Array, walked: Walked) -> Heads:
-        """Headers of records; HeadError where one is damaged."""
+    def read(self, data: U8Array, walked: _Records) -> _Headers:
+        """Headers of records; _HeadError where one is damaged."""
         count = len(walked.head)
-        heads = Heads(np.zeros(count, bool), np.zeros(count, np.int64), np.zeros(count, np.int64))
+        heads = _Headers(
+            np.zeros(count, bool), np.zeros(count, np.int64), np.zeros(count, np.int64)
+        )
         for size in np.unique(walked.head_size).tolist():
             rows = np.flatnonzero(walked.head_size == size)
             if size:
@@ -481,7 +299,7 @@ class HeadReader:
         return heads
 
     def _read_equal(
-        self, data: U8Array, begin: I64Array, size: int, rows: I64Array, heads: Heads
+        self, data: U8Array, begin: I64Array, size: int, rows: I64Array, heads: _Headers
     ) -> None:
         """Headers of one length."""
         raw = records(data, np.dtype([("byte", "u1", (size,))]), begin)["byte"]
@@ -491,7 +309,8 @@ class HeadReader:
             if tried == len(known):
                 template = _Template.of(raw[0].tobytes())
                 if template is None:
-                    raw, rows = raw[1:], rows[1:]
+                    raw = raw[1:]
+                    rows = rows[1:]
                     continue
                 known.append(template)
             template = known[tried]
@@ -500,12 +319,214 @@ class HeadReader:
             words = np.ascontiguousarray(raw[fits])
             heads.is_message[rows[fits]] = True
             heads.connection[rows[fits]] = _u32(words, template.connection_at)
-            seconds, rest_ns = (_u32(words, template.time_at + part) for part in (0, 4))
+            seconds = _u32(words, template.time_at)
+            rest_ns = _u32(words, template.time_at + 4)
             heads.log_ns[rows[fits]] = seconds * NS_PER_S + rest_ns
-            raw, rows = raw[~fits], rows[~fits]
+            raw = raw[~fits]
+            rows = rows[~fits]
 
 
 def _u32(rows: U8Array, at: int) -> I64Array:
     """Little-endian words at byte `at` of each row."""
     word: I64Array = np.ascontiguousarray(rows[:, at : at + 4]).view("<u4")[:, 0].astype(np.int64)
     return word
+
+
+# -- one pass -------------------------------------------------------------------------------------
+
+
+def _bytes(data: U8Array, begin: int, size: int) -> bytes:
+    return data[begin : begin + size].tobytes()
+
+
+def _rows(walked: _Records) -> list[tuple[int, int, int, int]]:
+    """Records as (header, its size, data, their size)."""
+    columns = (walked.head, walked.head_size, walked.data, walked.data_size)
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _connections(data: U8Array, walked: _Records) -> Iterator[tuple[int, Topic]]:
+    """The connections among records, with their numbers."""
+    for head, head_size, body, size in _rows(walked):
+        fields = _head_fields(_bytes(data, head, head_size))
+        if _number(fields, "op") == _Op.CONNECTION:
+            yield _connection_topic(fields, _bytes(data, body, size))
+
+
+def _claims_too_much(window: Window) -> str:
+    """Why the bytes at the front of the window cannot be a record, or ""."""
+    data = window.data
+    at = window.begin
+    end = window.end
+    if at + _WORD_BYTES > end:
+        return ""
+    head = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little")
+    if not _LEAST_HEAD_BYTES <= head <= _MAX_HEAD_BYTES:
+        return f"expected a header of {_LEAST_HEAD_BYTES} to {_MAX_HEAD_BYTES} bytes, found {head}"
+    at += _WORD_BYTES + head
+    size = int.from_bytes(_bytes(data, at, _WORD_BYTES), "little") if at + 4 <= end else 0
+    if size > _MAX_CHUNK_BYTES:
+        return f"expected a record of at most {_MAX_CHUNK_BYTES} bytes, found {size}"
+    return ""
+
+
+def _portions(recording: BagRecording) -> Generator[Portion, None, None]:
+    """One pass over a bag."""
+    with Source(recording.path) as source:
+        yield from _Pass(recording, source).portions()
+
+
+class _Pass:
+    """Reads a bag from front to back; notes and counts what it cannot read."""
+
+    def __init__(self, recording: BagRecording, source: Source) -> None:
+        self._recording = recording
+        self._source = source
+        self._reader = _HeaderReader()
+        self._decompressor = Decompressor()
+        # Topic of each connection, -1 where its messages are not wanted.
+        self._topics: dict[int, int] = {}
+        self._cut = False
+
+    def portions(self) -> Generator[Portion, None, None]:
+        """All wanted messages."""
+        window = Window(self._source)
+        window.begin = len(_MAGIC)
+        window.refill()
+        while True:
+            self._recording.position_bytes = self._source.position_bytes
+            walked = _walk(window.data, window.begin, window.end)
+            try:
+                yield from self._records(window.data, walked)
+            except _HeadError as err:
+                self._recording.lose(f"{_at(window)}: {err}; the rest of the bag was not read")
+                return
+            window.begin = walked.next
+            fault = _claims_too_much(window)
+            if fault:
+                self._recording.lose(f"{_at(window)}: {fault}; the rest of the bag was not read")
+                return
+            if len(walked.head) < _MOST_RECORDS and not window.refill():
+                yield from self._end(window)
+                return
+
+    def _records(self, data: U8Array, walked: _Records) -> Generator[Portion, None, None]:
+        """Records outside chunks: chunks, and messages of a bag that was never closed."""
+        plain: list[_Records] = []
+        bare: list[int] = []
+        for index, (head, head_size, body, size) in enumerate(_rows(walked)):
+            raw = _bytes(data, head, head_size)
+            op = _op_of(raw)
+            if op in (_Op.MESSAGE, _Op.CONNECTION):
+                bare.append(index)
+            elif op == _Op.CHUNK:
+                fields = _head_fields(raw)
+                if _compression(fields) == _PLAIN:
+                    # Messages of all chunks in one buffer are read together.
+                    for part in self._inside(data, body, body + size):
+                        plain.append(part)
+                        if len(part.head) == _MOST_RECORDS:
+                            yield from self._messages(data, plain)
+                            plain = []
+                    continue
+                yield from self._messages(data, plain)
+                plain = []
+                unpacked = self._unpack(fields, data.data[body : body + size])
+                for part in self._inside(unpacked, 0, len(unpacked)):
+                    yield from self._messages(unpacked, [part])
+        plain.append(walked.take(np.array(bare, np.int64)))
+        yield from self._messages(data, plain)
+
+    def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[_Records]:
+        """The records of a chunk, in parts."""
+        for walked in _parts(data, begin, end):
+            yield walked
+        if walked.next < end and not self._cut:
+            self._recording.lose(
+                f"a chunk: expected whole records, found {end - walked.next} other bytes; "
+                "the rest of the chunk was not read"
+            )
+
+    def _unpack(self, fields: dict[str, bytes], stored: memoryview) -> U8Array:
+        """The bytes of a compressed chunk, as far as they can be read."""
+        compression = _compression(fields)
+        whole = _number(fields, "size")
+        found = np.zeros(0, np.uint8)
+        if 0 < whole <= _MAX_CHUNK_BYTES and compression in _COMPRESSIONS:
+            found = self._decompressor.decompress(compression, stored, whole)
+        if len(found) < whole and not self._cut:
+            self._recording.lose(
+                f"a chunk ({compression}): expected {whole} bytes, found {len(found)}; "
+                "the rest of the chunk was not read"
+            )
+            # A cut record at its end is not reported again.
+            *_, last = _parts(found, 0, len(found))
+            return found[: last.next]
+        return found
+
+    def _messages(self, data: U8Array, parts: list[_Records]) -> Generator[Portion, None, None]:
+        """The wanted messages among records; connections are remembered."""
+        walked = _joined(parts)
+        if not len(walked.head):
+            return
+        try:
+            heads = self._reader.read(data, walked)
+            others = walked.take(np.flatnonzero(~heads.is_message))
+            for connection, topic in _connections(data, others):
+                self._connect(connection, topic)
+        except _HeadError as err:
+            if len(parts) == 1:
+                self._recording.lose(f"a chunk: {err}; it was not read")
+                return
+            for part in parts:
+                yield from self._messages(data, [part])
+            return
+        rows = np.flatnonzero(heads.is_message)
+        numbers, inverse = np.unique(heads.connection[rows], return_inverse=True)
+        known = np.array([self._topics.get(at, -1) for at in numbers.tolist()], np.int64)
+        topic_of = known[inverse]
+        rows = rows[topic_of >= 0]
+        topic_of = topic_of[topic_of >= 0]
+        if len(rows):
+            begin = walked.data[rows]
+            end = begin + walked.data_size[rows]
+            yield Portion(data, begin, end, heads.log_ns[rows], topic_of)
+
+    def _connect(self, connection: int, topic: Topic) -> None:
+        at = self._recording.number(topic)
+        self._topics[connection] = at if self._recording.wants(topic) else -1
+
+    def _end(self, window: Window) -> Generator[Portion, None, None]:
+        """The bytes left at the end of the file: none, or a part of a record."""
+        left = window.end - window.begin
+        if self._source.fault:
+            self._recording.notes.append(f"{_at(window)}: {self._source.fault}")
+        if left <= 0:
+            return
+        self._recording.lose(f"{_at(window)}: the bag ends within a record; it was cut off")
+        head = window.begin + _WORD_BYTES
+        body = head + int.from_bytes(_bytes(window.data, window.begin, _WORD_BYTES), "little")
+        # A cut chunk is read like a whole one; that it was cut is already counted.
+        self._cut = True
+        data = body + _WORD_BYTES
+        record = _Records(
+            single(head), single(body - head), single(data), single(window.end - data), 0
+        )
+        with contextlib.suppress(_HeadError):
+            if window.end > data:
+                yield from self._records(window.data, record)
+
+
+def _parts(data: U8Array, begin: int, end: int) -> Iterator[_Records]:
+    """The records of `data[begin:end]`, _MOST_RECORDS at a time; at least one part."""
+    yield (walked := _walk(data, begin, end))
+    while len(walked.head) == _MOST_RECORDS:
+        yield (walked := _walk(data, walked.next, end))
+
+
+def _compression(fields: dict[str, bytes]) -> str:
+    return fields.get("compression", b"").decode("latin-1") or _PLAIN
+
+
+def _at(window: Window) -> str:
+    return f"byte {window.place}"

@@ -13,16 +13,10 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers.bag.packet_messages import (
-    PACKET_TYPES,
-    Found,
-    MessageError,
-    Unpacker,
-)
-from mlbatch.ros import decode_bytes, decode_string, decode_transforms
-from mlbatch.ros.definitions import definition_text, definitions_of
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
+from mlbatch.ros.encoding import MessageError
 from mlbatch.types import Topic, U8Array
-from tests.builders.bags import Body, definition, transforms_message
+from tests.builders.bags import Body
 
 S = 1_000_000_000
 STAMP_NS, LOG_NS = 1_700_000_000 * S + 123_456_789, 1_700_000_001 * S
@@ -127,14 +121,14 @@ def payloads(name: str, count: int) -> list[bytes]:
     return [RANDOM.bytes(size) for size in sizes.tolist()]
 
 
-def find(topic: Topic, data: bytes, pad: int = 0) -> tuple[Found, list[bytes]]:
+def find(topic: Topic, data: bytes, pad: int = 0) -> tuple[PacketsFound, list[bytes]]:
     """What is found in a message that begins at byte `pad` of an array, and the payloads."""
     array: U8Array = np.frombuffer(bytes(pad) + data + bytes(3), np.uint8)
     found = Unpacker(topic).find(array, pad, pad + len(data), LOG_NS)
     return found, cut(array, found)
 
 
-def cut(data: U8Array, found: Found) -> list[bytes]:
+def cut(data: U8Array, found: PacketsFound) -> list[bytes]:
     """The payloads."""
     places = zip(found.start.tolist(), found.size.tolist(), strict=True)
     return [data[start : start + size].tobytes() for start, size in places]
@@ -190,11 +184,11 @@ def test_alignment_follows_the_frame_name(frame: str) -> None:
     assert found.host_ns.tolist() == [STAMP_NS, STAMP_NS + 1]
 
 
-@pytest.mark.parametrize(("told", "wanted"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
-def test_the_size_of_a_pandar_packet_tells_the_valid_bytes(told: int, wanted: int) -> None:
+@pytest.mark.parametrize(("told", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
+def test_the_size_of_a_pandar_packet_tells_the_valid_bytes(told: int, expected: int) -> None:
     body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", told)
     _, got = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
-    assert got == [bytes(wanted)]
+    assert got == [bytes(expected)]
 
 
 def test_a_packet_of_no_bytes_is_counted_apart() -> None:
@@ -273,7 +267,7 @@ def test_the_calibration_among_hesai_packets_is_kept_apart() -> None:
 
 
 @pytest.mark.parametrize(
-    ("payload", "wanted"),
+    ("payload", "expected"),
     [
         (b"\x55\xaa\x5a\xa5" + b"\1" * 1206, 1210),
         (b"\xa5\xff\x00\x5a" + b"\1" * 252, 256),
@@ -281,10 +275,10 @@ def test_the_calibration_among_hesai_packets_is_kept_apart() -> None:
         (b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0" + bytes(1240), 1248),
     ],
 )
-def test_short_robosense_packets_lose_their_padding(payload: bytes, wanted: int) -> None:
+def test_short_robosense_packets_lose_their_padding(payload: bytes, expected: int) -> None:
     body = Body("cdr").time(STAMP_NS).raw(payload.ljust(1248, b"\0"))
     _, got = find(Topic("/t", "rslidar_msgs/rslidarPacket", "cdr"), body.done())
-    assert got == [payload.ljust(1248, b"\0")[:wanted]]
+    assert got == [payload.ljust(1248, b"\0")[:expected]]
 
 
 def test_many_messages_give_what_they_give_one_by_one() -> None:
@@ -324,7 +318,7 @@ def test_lengths_that_lie_never_read_beyond_the_message(
     found = Unpacker(Topic("/t", name, encoding)).find_many(data, *one)
     assert (found.start >= 0).all()
     assert (found.start + found.size <= size).all()
-    assert all("wanted" in why and "\n" not in why for _, why in found.faults)
+    assert all("expected" in why and "\n" not in why for _, why in found.faults)
 
 
 SAMPLES = {
@@ -336,63 +330,30 @@ SAMPLES = {
 
 def test_big_endian_messages_are_refused_in_one_line() -> None:
     data = b"\x00\x00\x00\x00" + struct.pack(">I", 4) + b"abcd"
-    with pytest.raises(RecordingError, match=r"^/t: wanted .* little-endian .* got 00 00 00 00; "):
+    with pytest.raises(
+        RecordingError, match=r"^/t: expected .* little-endian .* found 00 00 00 00; "
+    ):
         find(Topic("/t", "ouster_ros/PacketMsg", "cdr"), data)
 
 
 @pytest.mark.parametrize(
     ("topic", "message"),
     [
-        (Topic("/t", "ouster_ros/PacketMsg", "protobuf"), "wanted messages encoded as cdr or ros1"),
+        (
+            Topic("/t", "ouster_ros/PacketMsg", "protobuf"),
+            "messages encoded as cdr or ros1",
+        ),
         (
             Topic("/t", "velodyne_msgs/VelodyneScan", "cdr", "uint8 other\n", "ros2msg"),
-            "wanted packets in the field packets.data of velodyne_msgs/VelodyneScan, got a "
+            "expected packets in the field packets.data of velodyne_msgs/VelodyneScan, found a "
             "definition with other",
         ),
         (
             Topic("/t", "ouster_ros/PacketMsg", "cdr", "string[] buf\n", "ros2msg"),
-            "wanted packets in the field buf",
+            "expected packets in the field buf",
         ),
     ],
 )
 def test_variants_that_are_not_known_are_refused(topic: Topic, message: str) -> None:
     with pytest.raises(MessageError, match=message):
         Unpacker(topic)
-
-
-@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_knowledge_is_decoded(encoding: str) -> None:
-    for embedded in (True, False):
-
-        def topic(name: str, *, stored: bool = embedded) -> Topic:
-            return Topic("/t", name, encoding, definition(name, encoding) if stored else "")
-
-        text = Body(encoding).text("ångström {}").done()
-        assert decode_string(topic("std_msgs/String"), text) == "ångström {}"
-        layout = Body(encoding).put("I", 1).text("rows").put("I", 5, 5, 0).blob(b"bytes")
-        assert decode_bytes(topic("std_msgs/UInt8MultiArray"), layout.done()) == b"bytes"
-        edges = [("/map", "/a", (1, 2, 3), (0, 0, 0, 1)), ("a", "bc", (-1, 0.5, 0), (1, 0, 0, 0))]
-        expected = [
-            (parent.lstrip("/"), child.lstrip("/"), *rest) for parent, child, *rest in edges
-        ]
-        data = transforms_message(encoding, edges)
-        assert decode_transforms(topic("tf2_msgs/TFMessage"), data) == expected
-    assert decode_transforms(Topic("/t", "tf/tfMessage", encoding), data) == expected
-
-
-def test_knowledge_that_is_cut_off_is_told_in_one_line() -> None:
-    data = transforms_message("cdr", [("a", "b", (1, 2, 3), (0, 0, 0, 1))])
-    with pytest.raises(RecordingError, match=r"^/tf: wanted \d+ bytes at byte \d+") as caught:
-        decode_transforms(Topic("/tf", "tf2_msgs/TFMessage", "cdr"), data[:-1])
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["tf2_msgs/TFMessage", "sensor_msgs/Imu", *sorted(PACKET_TYPES)])
-def test_our_own_texts_are_whole_definitions(name: str) -> None:
-    """rosbags reads them, and they say what we read without them."""
-    text = definition_text(name)
-    types = get_types_from_msg(text, name.replace("/", "/msg/"))
-    assert name.replace("/", "/msg/") in types
-    own = definitions_of(Topic("/t", name, "cdr"))
-    stored = definitions_of(Topic("/t", name, "cdr", text, "ros2msg"))
-    assert {key: own[key] for key in own} == {key: stored[key] for key in own}

@@ -123,15 +123,6 @@ def test_chunks_without_wanted_topics_are_not_looked_into(tmp_path: Path) -> Non
     assert recording.notes == []
 
 
-def test_reading_ends_after_a_while(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", packet_messages(PACKETS))
-    recording, streams = opened(path)
-    seen = [s for batch in recording.packets(100_000_000) for s in seen_of(batch, streams)]
-    end_ns = EXPECTED[0].host_ns + 100_000_000
-    assert seen == [s for s in EXPECTED if s.host_ns <= end_ns]
-    assert_balanced(recording)
-
-
 def test_several_files_are_one_bag(tmp_path: Path) -> None:
     """In the order of their first messages, whatever their names; channels differ in number."""
     late = write_mcap(tmp_path / "a_1.mcap", packet_messages(PACKETS[301:]), Form(ZSTD))

@@ -64,7 +64,7 @@ def test_a_file_cut_after_its_last_message(form: Form, tmp_path: Path) -> None:
     assert seen == EXPECTED
     assert recording.counts.skipped == {}
     assert recording.notes == [
-        f"byte {len(data)}: the file was cut off between records: wanted its footer; the rest "
+        f"byte {len(data)}: the file was cut off between records: expected its footer; the rest "
         "was read"
     ]
 
@@ -92,7 +92,7 @@ def test_a_corrupt_chunk_costs_itself(tmp_path: Path) -> None:
         seen, recording = packets_of(path)
         assert recording.counts.skipped == {"truncated": 1}
         [note] = recording.notes
-        assert "got 0 before their end or a fault; the rest of the chunk was not read" in note
+        assert "found 0 before their end or a fault; the rest of the chunk was not read" in note
         assert 0 < len(seen) < 60
         assert [s for s in EXPECTED[:60] if s in seen] == seen
         assert seen[-1] == EXPECTED[59]
@@ -112,24 +112,27 @@ def chunk(size: int, compression: bytes, stored: bytes, length: int | None = Non
 @pytest.mark.parametrize(
     ("tail", "said"),
     [
-        (bytes(500), "wanted a record, got one of kind 0x00; the rest of the file was not read"),
-        (broken(0x33, b"abc"), "got one of kind 0x33"),
-        (broken(5, b"abc"), "wanted a message, got a record of 3 bytes"),
-        (broken(5, struct.pack("<H", 1), 1 << 62), "wanted a record of at most 268435456 bytes"),
+        (
+            bytes(500),
+            "expected a record, found one of kind 0x00; the rest of the file was not read",
+        ),
+        (broken(0x33, b"abc"), "found one of kind 0x33"),
+        (broken(5, b"abc"), "expected a message, found a record of 3 bytes"),
+        (broken(5, struct.pack("<H", 1), 1 << 62), "expected a record of at most 268435456 bytes"),
         (broken(5, struct.pack("<H", 9), 1 << 62), "ends within a record"),
-        (broken(3, b"", 1 << 40), "wanted a record of at most 16777216 bytes"),
-        (broken(3, b"", 1 << 20), "ends within a record: wanted 1048585 bytes, got 9"),
+        (broken(3, b"", 1 << 40), "expected a record of at most 16777216 bytes"),
+        (broken(3, b"", 1 << 20), "ends within a record: expected 1048585 bytes, found 9"),
         (broken(3, bytes(50)), ""),
-        (broken(4, b"\1\0\1\0\xff\xff\xff\xff"), "wanted a channel, got garbage"),
-        (broken(6, b""), "wanted a chunk whose lengths agree"),
-        (chunk(5, b"", b"abc", 1 << 60), "wanted a chunk whose lengths agree"),
-        (chunk(1 << 40, b"zstd", b"abc"), "wanted a record of at most 268435456 bytes"),
-        (chunk(1 << 28, b"zstd", b"abc"), "wanted 268435456 bytes of zstd data, got 0"),
-        (chunk(1 << 28, b"lz4", b"abc"), "wanted 268435456 bytes of lz4 data, got 0"),
-        (chunk(9, b"brotli", b"abc"), "lz4 or zstd, got 'brotli'; the chunk was not read"),
-        (chunk(0, b"", broken(6, b"")), "wanted a record of a chunk, got one of kind 0x06"),
-        (chunk(0, b"", broken(0x90, b"", 99)), "wanted a record that ends within its chunk"),
-        (chunk(0, b"", b"\5\0"), "wanted a record that ends within its chunk"),
+        (broken(4, b"\1\0\1\0\xff\xff\xff\xff"), "expected a channel, found garbage"),
+        (broken(6, b""), "expected a chunk whose lengths agree"),
+        (chunk(5, b"", b"abc", 1 << 60), "expected a chunk whose lengths agree"),
+        (chunk(1 << 40, b"zstd", b"abc"), "expected a record of at most 268435456 bytes"),
+        (chunk(1 << 28, b"zstd", b"abc"), "expected 268435456 bytes of zstd data, found 0"),
+        (chunk(1 << 28, b"lz4", b"abc"), "expected 268435456 bytes of lz4 data, found 0"),
+        (chunk(9, b"brotli", b"abc"), "lz4 or zstd, found 'brotli'; the chunk was not read"),
+        (chunk(0, b"", broken(6, b"")), "expected a record of a chunk, found one of kind 0x06"),
+        (chunk(0, b"", broken(0x90, b"", 99)), "expected a record that ends within its chunk"),
+        (chunk(0, b"", b"\5\0"), "expected a record that ends within its chunk"),
     ],
 )
 def test_lies_are_noted_and_what_precedes_is_read(tail: bytes, said: str, tmp_path: Path) -> None:
@@ -150,7 +153,7 @@ def test_a_fault_in_a_chunk_leaves_the_next(tmp_path: Path) -> None:
     path.write_bytes(data)
     seen, recording = packets_of(path)
     assert recording.notes == [
-        f"byte {at}: wanted a record, got one of kind 0x00; the rest of the chunk was not read"
+        f"byte {at}: expected a record, found one of kind 0x00; the rest of the chunk was not read"
     ]
     assert 0 < len(seen) < 60
     assert seen[-1] == EXPECTED[59]
@@ -187,5 +190,5 @@ def test_a_file_of_nothing(tmp_path: Path) -> None:
         seen, recording = packets_of(path)
         assert (seen, recording.topics, len(recording.notes)) == ([], (), 1)
     path.write_bytes(MAGIC[:7])
-    with pytest.raises(RecordingError, match="wanted a recording"):
+    with pytest.raises(RecordingError, match="expected a recording"):
         open_recording(path, StreamTable())

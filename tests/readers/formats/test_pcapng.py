@@ -151,7 +151,7 @@ def test_packets_of_unknown_interfaces_are_not_ip(tmp_path: Path) -> None:
 
 def test_a_file_of_unknown_link_types_only_is_an_error(tmp_path: Path) -> None:
     path = write_pcapng(tmp_path / "a", [Section([Packet(FRAME)], [Interface(link=105)])])
-    with pytest.raises(RecordingError, match=r"got 105 \(IEEE 802\.11\)"):
+    with pytest.raises(RecordingError, match=r"found 105 \(IEEE 802\.11\)"):
         list(open_capture(path).packets())
 
 

@@ -7,8 +7,8 @@ import os
 import random
 import shutil
 import sqlite3
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -21,9 +21,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers import open_recording
-from mlbatch.readers.bag.recording import BagRecording, Portion
-from mlbatch.readers.bag.sqlite_table import HandOver, Rows, Table
-from mlbatch.readers.formats import rosbag2 as _db3
+from mlbatch.readers.bag.recording import BagRecording
 from mlbatch.ros import decode_transforms
 from mlbatch.types import Message, StreamTable
 from tests.builders.bags import Recorded, fixture_messages, fixture_packets, packet_message
@@ -66,11 +64,11 @@ def opened(path: Path) -> BagRecording:
     return recording
 
 
-def read(recording: BagRecording, until_ns: int | None = None) -> tuple[list[Seen], list[Message]]:
+def read(recording: BagRecording) -> tuple[list[Seen], list[Message]]:
     """All packets and kept messages; the ledger must balance afterwards."""
     seen: list[Seen] = []
     messages: list[Message] = []
-    for batch in recording.packets(until_ns):
+    for batch in recording.packets():
         seen += seen_of(batch, recording.streams)
         messages += batch.messages
     assert_balanced(recording)
@@ -194,7 +192,7 @@ def test_files_on_disk_win_over_the_metadata(tmp_path: Path) -> None:
     assert read(recording)[0] == PACKETS
     assert recording.notes == [
         "bag_9.db3: has 0 bytes and is left out",
-        "bag_2.db3: listed in metadata.yaml, but not there",
+        "bag_2.db3: listed in metadata.yaml, but missing",
         "renamed.db3: not listed in metadata.yaml, but read",
     ]
     (folder / "metadata.yaml").write_text("{", encoding="utf-8")
@@ -241,13 +239,6 @@ def test_messages_larger_than_the_buffer_are_read(tmp_path: Path) -> None:
     recording = opened(write_rosbag2(tmp_path / "a.db3", messages))
     sizes = [size for batch in recording.packets() for size in batch.size.tolist()]
     assert sizes == [9, 9, 9 << 20, 9, 9]
-
-
-def test_a_look_ahead_ends_where_it_is_told(tmp_path: Path) -> None:
-    recording = opened(write_rosbag2(tmp_path / "a.db3", fixture_messages("cdr")))
-    seen, _ = read(recording, until_ns=100_000_000)
-    limit_ns = PACKETS[0].host_ns + 100_000_000
-    assert seen == [packet for packet in PACKETS if packet.host_ns <= limit_ns]
 
 
 def test_a_recorder_that_crashed_leaves_its_last_messages_in_a_log(tmp_path: Path) -> None:
@@ -329,94 +320,23 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path: Path) -> None:
     with sqlite3.connect(foreign) as connection:
         connection.execute("CREATE TABLE other(a)")
     connection.close()
-    assert "wanted a ROS 2 bag (tables topics and messages), got a database" in refusal(foreign)
+    assert "expected a ROS 2 bag (tables topics and messages), found a database" in refusal(foreign)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "wanted a recording, got a folder without .db3 or .mcap files; name" in refusal(empty)
+    assert "found a folder without .db3 or .mcap files; name" in refusal(empty)
     (empty / "a.db3").touch()
-    assert "got 0 bytes" in refusal(empty)
+    assert "found 0 bytes" in refusal(empty)
     (empty / "a.db3").write_text("no database")
     assert "check that it is the right file" in refusal(empty)
     (empty / "a.db3").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(16) + b"\1\0\0\0")
-    assert "wanted the folder of a bag, got one with files of pcap" in refusal(empty)
+    assert "expected the folder of a bag, found one with files of pcap" in refusal(empty)
 
 
-@dataclass
-class Handed:
-    """How often pages were left to the library."""
-
-    times: int = 0
-
-
-@pytest.fixture
-def handed(monkeypatch: pytest.MonkeyPatch) -> Handed:
-    """Counts passes that needed the library, which a fault elsewhere would hide."""
-    count = Handed()
-    library = _db3._Reading.portions
-
-    def counted(reading: _db3._Reading, *, indexed: bool) -> Generator[Portion, None, None]:
-        count.times += 1
-        return library(reading, indexed=indexed)
-
-    monkeypatch.setattr(_db3._Reading, "portions", counted)
-    return count
-
-
-def test_bags_as_they_are_recorded_do_not_need_the_library(tmp_path: Path, handed: Handed) -> None:
-    for form in ("schema 3", "schema 4", "no index"):
-        path = write_rosbag2(tmp_path / f"{form}.db3", fixture_messages("cdr"), FORMS[form])
-        assert read(opened(path))[0] == PACKETS
-    assert handed.times == 0
-
-
-@pytest.mark.parametrize("page_bytes", [512, 1024, 4096, 65536])
-def test_pages_read_as_the_library_reads_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handed: Handed, page_bytes: int
-) -> None:
-    """Messages of every length around the bounds of a page, on topics that nobody asks for too."""
-    rng = random.Random(page_bytes)
-    sizes = [0, 1, 119, 120, 121, 122, 123, *range(page_bytes - 60, page_bytes + 8)]
-    sizes += [rng.randrange(20_000) for _ in range(300)]
-    messages = [
-        Recorded(f"/{number % 3}", OUSTER if number % 3 else "std_msgs/String", at, data)
-        for number, at, data in (
-            (rng.randrange(9), 1_000 * place // 3, packet_message("cdr", rng.randbytes(size)))
-            for place, size in enumerate(sizes)
-        )
-    ]
-    path = tmp_path / "a.db3"
-    with sqlite3.connect(path) as connection:
-        connection.execute(f"PRAGMA page_size = {page_bytes}")
-        connection.execute("VACUUM")
-    connection.close()
-    write_rosbag2(path, messages, Form(first_topic=100_000, row_step=40_000))
-    expected = [
-        Seen(message.log_ns, message.topic, message.data[8:])
-        for message in messages
-        if message.type == OUSTER and len(message.data) > 8
-    ]
-    assert read_sparse(opened(path)) == expected
-    assert handed.times == 0
-
-    def refuse(*_: object) -> Generator[Rows, None, None]:
-        raise HandOver
-
-    monkeypatch.setattr(Table, "rows", refuse)
-    assert read_sparse(opened(path)) == expected
-    assert handed.times == 1
-
-
-def read_sparse(recording: BagRecording) -> list[Seen]:
-    """All packets; packets without a byte are counted as cut off."""
-    return [seen for batch in recording.packets() for seen in seen_of(batch, recording.streams)]
-
-
-def test_topics_that_nobody_asks_for_are_not_read_in_vain(tmp_path: Path, handed: Handed) -> None:
+def test_topics_that_are_not_wanted_are_left_out(tmp_path: Path) -> None:
     image = Recorded("/image", "sensor_msgs/Image", 0, bytes(3 << 20))
     messages = []
     for number, packet in enumerate(fixture_messages("cdr")[:60]):
         messages += [packet, replace(image, log_ns=packet.log_ns)] if number % 4 else [packet]
     path = write_rosbag2(tmp_path / "a.db3", messages)
-    wanted = [m.log_ns for m in messages if m.type == OUSTER]
-    assert [one.host_ns for one in read(opened(path))[0]] == wanted
-    assert handed.times == 1
+    expected = [m.log_ns for m in messages if m.type == OUSTER]
+    assert [one.host_ns for one in read(opened(path))[0]] == expected
