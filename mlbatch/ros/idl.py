@@ -1,6 +1,6 @@
 """Message definitions written as OMG IDL 4.2, as ROS 2 derives them (schema encoding `ros2idl`).
 
-Only what generated files hold: modules, structs, typedefs of arrays, sequences and strings.
+Only what generated files contain: modules, structs, typedefs of arrays, sequences and strings.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import re
 
 from mlbatch.ros.definitions import PRIMITIVES, SEQUENCE, Field, resolve
 
-# What is never closed goes on to the end: to try anew at every place would take hours.
+# Unclosed text extends to the end: trying again at every place would take hours.
 _NOISE = re.compile(
     r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t]*#[^\n]*|^=+\s*$|^IDL:[^\n]*"
     r"|@\w+\s*(\((\"(\\.|[^\"\\])*(?:\"|\\?\Z)|[^()\"])*\)?)?",
@@ -32,7 +32,7 @@ _WORDS = {
 
 
 def parse_idl(text: str) -> dict[str, tuple[Field, ...]]:
-    """Types of an IDL text; what it holds beside structs is passed over."""
+    """Types of an IDL text; everything but structs and typedefs is ignored."""
     found: dict[str, tuple[Field, ...]] = {}
     aliases: dict[str, Field] = {}
     scope: list[str] = []

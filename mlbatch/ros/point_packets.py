@@ -83,7 +83,7 @@ class Points:
 class Layout:
     """Packets of a topic; kind: index into KINDS.
 
-    slots: most points of a column; by_ring: the slot is the ring of a point, else its turn.
+    slots: most points of a column; by_ring: the slot of a point is its ring, else its order.
     """
 
     kind: int

@@ -267,28 +267,32 @@ class _Page:
         view = self._buffer.data
         room = len(view)
         fill = 0
-        with contextlib.closing(connection.execute(query, self._last)) as cursor:
-            for number, topic, log_ns, data in cursor:
-                if not isinstance(data, bytes) or not isinstance(log_ns, int):
-                    self._damage.add(f"{self._name}: a message without bytes or time")
-                    self._last = (self._last[0], number)
-                    continue
-                if data[:4] == ZSTD_MAGIC:
-                    # Some recorders compress each message.
-                    data = decompressed(data, MAX_RECORD_BYTES)
-                end = fill + len(data)
-                if end > room:
-                    if fill:
-                        return True
-                    # A single message that is larger than the buffer.
-                    room = 2 * end
-                    self._buffer = np.zeros(room, np.uint8)
-                    view = self._buffer.data
-                view[fill:end] = data
-                rows.append((fill, end, log_ns, numbers[topic]))
-                fill = end
-                self._last = (log_ns, number)
-        return False
+        last = self._last
+        try:
+            with contextlib.closing(connection.execute(query, last)) as cursor:
+                for number, topic, log_ns, data in cursor:
+                    if not isinstance(data, bytes) or not isinstance(log_ns, int):
+                        self._damage.add(f"{self._name}: a message without bytes or time")
+                        last = (last[0], number)
+                        continue
+                    if data.startswith(ZSTD_MAGIC):
+                        # Some recorders compress each message.
+                        data = decompressed(data, MAX_RECORD_BYTES)
+                    end = fill + len(data)
+                    if end > room:
+                        if fill:
+                            return True
+                        # A single message that is larger than the buffer.
+                        room = 2 * end
+                        self._buffer = np.zeros(room, np.uint8)
+                        view = self._buffer.data
+                    view[fill:end] = data
+                    rows.append((fill, end, log_ns, numbers[topic]))
+                    fill = end
+                    last = (log_ns, number)
+            return False
+        finally:
+            self._last = last
 
     def portion(self) -> Portion:
         """The messages as arrays."""

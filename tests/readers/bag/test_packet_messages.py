@@ -21,7 +21,7 @@ from tests.builders.bags import Body
 S = 1_000_000_000
 STAMP_NS, LOG_NS = 1_700_000_000 * S + 123_456_789, 1_700_000_001 * S
 HEADER = "std_msgs/Header header\n"
-# Texts of facts/messages.md, section 1: the packet's own fields, and the type around it.
+# Texts of docs/sources/messages.md, section 1: the packet's own fields, and the type around it.
 OWN = {
     "ouster_ros/PacketMsg": "uint8[] buf",
     "ouster_msgs/PacketMsg": "uint8[] buf",

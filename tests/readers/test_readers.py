@@ -1,21 +1,27 @@
-"""Opening: by content, plain or compressed; what cannot be read is said in one line."""
+"""Opening by content, compressed files, and reading from several threads."""
 
 from __future__ import annotations
 
 import gzip
 import os
 import random
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 import zstandard
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers import open_recording, readers
+from mlbatch.readers import merge, open_recording, readers
+from mlbatch.readers.formats import rosbag2
 from mlbatch.readers.source import Source
-from mlbatch.types import StreamTable
+from mlbatch.types import Recording, StreamTable
+from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.builders.reading import open_capture, read
+from tests.builders.rosbag2 import write_rosbag2
 
 CONTENT = pcap_bytes((i, udp_frame(random.Random(i).randbytes(1000))[0]) for i in range(300))
 
@@ -137,3 +143,60 @@ def test_a_bomb_is_read_in_bounded_pieces(tmp_path: Path) -> None:
     with Source(tmp_path / "a") as source:
         assert source.fill(piece) == 1000
         assert source.size_bytes < 10_000
+
+
+def _bags(folder: Path, count: int) -> list[Path]:
+    messages = fixture_messages("cdr")
+    step = len(messages) // count
+    return [
+        write_rosbag2(folder / f"{number}.db3", messages[number * step : (number + 1) * step])
+        for number in range(count)
+    ]
+
+
+@pytest.fixture
+def elsewhere() -> Callable[[Callable[[], object]], object]:
+    """What a function gives in a thread of its own."""
+
+    def run(what: Callable[[], object]) -> object:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(what).result()
+
+    return run
+
+
+@pytest.mark.parametrize("bags", [1, 3])
+def test_another_thread_goes_on(
+    bags: int,
+    tmp_path: Path,
+    elsewhere: Callable[[Callable[[], object]], object],
+) -> None:
+    paths = _bags(tmp_path, bags)
+
+    def opened() -> list[Recording]:
+        # Several batches a file.
+        return [
+            rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=1 << 16) for path in paths
+        ]
+
+    whole = [len(batch) for batch in merge(opened())]
+    batches = merge(opened())
+    counts = [len(next(batches))]
+    rest = elsewhere(lambda: [len(batch) for batch in batches])
+    assert isinstance(rest, list)
+    assert counts + rest == whole
+    assert len(whole) > 1 or bags == 1
+
+
+@pytest.mark.parametrize("bags", [1, 3])
+def test_another_thread_ends(
+    bags: int, tmp_path: Path, elsewhere: Callable[[Callable[[], object]], object]
+) -> None:
+    """Errors at the end of objects are failures of tests (see pyproject.toml)."""
+    streams = StreamTable()
+    batches = merge([open_recording(path, streams) for path in _bags(tmp_path, bags)])
+    next(batches)
+    elsewhere(batches.close)
+    assert next(batches, None) is None
+    with closing(merge([open_recording(tmp_path / "0.db3", streams)])) as again:
+        assert len(next(again))
