@@ -17,7 +17,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.readers import merge, open_recording, readers
 from mlbatch.readers.formats import rosbag2
 from mlbatch.readers.source import Source
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import Recording, StreamTable, WrappedRecording
 from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.builders.reading import open_capture, read
@@ -200,3 +200,19 @@ def test_another_thread_ends(
     assert next(batches, None) is None
     with closing(merge([open_recording(tmp_path / "0.db3", streams)])) as again:
         assert len(next(again))
+
+
+def test_a_wrapped_recording_reports_what_its_inner_one_does(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcap"
+    path.write_bytes(CONTENT)
+    inner = open_capture(path)
+    outer = WrappedRecording(inner)
+    outer.use_engine("numba")
+    assert inner.engine == "numba"
+    inner.use_engine("numpy")
+    read(inner)
+    assert (outer.path, outer.container, outer.notes) == (inner.path, "pcap", [])
+    assert outer.counts is inner.counts
+    assert outer.position_bytes == inner.size_bytes > 0
+    outer.keep = frozenset({"/own"})
+    assert inner.keep == frozenset()
