@@ -14,7 +14,6 @@ from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.clouds import CloudRecording
 from mlbatch.decode.packet_ring import RawRing
 from mlbatch.discovery.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.discovery.extrinsics import Mounted, in_words, mount
@@ -33,6 +32,7 @@ from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import merge, open_recording
+from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch import readers, sensors
+from mlbatch import readers, ros, sensors
 from mlbatch.discovery.extrinsics import Knowledge
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.tree import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
-from mlbatch.readers import holds_packets, merge
+from mlbatch.readers import has_packets, merge
 from mlbatch.rig.rig import Rig
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
@@ -41,11 +41,12 @@ def with_clouds(
     if not topics:
         return list(recordings)
     # Not loaded for captures.
-    from mlbatch.clouds import CloudRecording, Layout, cloud_topics
+    from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+    from mlbatch.ros.point_packets import Layout
 
     clouds = {topic.name: topic for topic in cloud_topics(topics)}
     # A capture has no topics, and nothing but packets.
-    raw = any(not recording.topics for recording in recordings) or any(map(holds_packets, topics))
+    raw = any(not recording.topics for recording in recordings) or any(map(has_packets, topics))
     chosen = [topic for name, topic in clouds.items() if name in named or (not raw and not named)]
     if not chosen:
         return list(recordings)
@@ -55,10 +56,10 @@ def with_clouds(
 
 def is_without_packets(recording: Recording) -> bool:
     """Whether a recording can only hold messages beside the packets of others."""
-    if not recording.topics or any(map(holds_packets, recording.topics)):
+    if not recording.topics or any(map(has_packets, recording.topics)):
         return False
     # As above.
-    from mlbatch.clouds import CloudRecording
+    from mlbatch.readers.bag.clouds import CloudRecording
 
     clouds = recording.topics_of_clouds if isinstance(recording, CloudRecording) else ()
     return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
@@ -195,7 +196,7 @@ def teaches(topic: Topic) -> bool:
         return _tail(topic) in (METADATA, DESCRIPTION)
     if topic.type == BYTES_TYPE:
         return _tail(topic) == CORRECTIONS
-    return topic.type in TRANSFORM_TYPES or readers.holds_corrections(topic)
+    return topic.type in TRANSFORM_TYPES or readers.has_corrections(topic)
 
 
 def listen(recordings: Iterable[Recording]) -> None:
@@ -227,17 +228,17 @@ class Learner:
     def _learn(self, message: Message) -> None:
         topic = message.topic
         if topic.type in TRANSFORM_TYPES:
-            stated = readers.decode_transforms(topic, message.data)
+            stated = ros.decode_transforms(topic, message.data)
             self.knowledge.add_transforms("tf_static" if _tail(topic) == STATIC else "tf", stated)
         elif topic.type == TEXT_TYPE and _tail(topic) == METADATA:
             # Of several, the first: it is the one under which the recording began.
-            self._texts.setdefault(topic.name, readers.decode_string(topic, message.data).encode())
+            self._texts.setdefault(topic.name, ros.decode_string(topic, message.data).encode())
         elif topic.type == BYTES_TYPE and _tail(topic) == CORRECTIONS:
-            self._texts.setdefault(topic.name, readers.decode_bytes(topic, message.data))
+            self._texts.setdefault(topic.name, ros.decode_bytes(topic, message.data))
         elif topic.type == readers.CORRECTION_TYPE:
             self._texts.setdefault(topic.name, message.data)
         elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
-            self.knowledge.add_urdf(readers.decode_string(topic, message.data))
+            self.knowledge.add_urdf(ros.decode_string(topic, message.data))
 
     @property
     def metadata_topics(self) -> tuple[str, ...]:

@@ -79,7 +79,7 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
     if not any(recording.topics for recording in run.session.recordings):
         return
     # Captures have no topics, hence no clouds: do not load their reader.
-    from mlbatch.clouds import CloudRecording
+    from mlbatch.readers.bag.clouds import CloudRecording
 
     for recording in run.session.recordings:
         if isinstance(recording, CloudRecording):

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Generator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.discovery.probe import teaches
-from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
+from mlbatch.types import Message, PacketBatch, Recording, WrappedRecording
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,55 +20,33 @@ class TimeSegment:
     end_ns: int | None = None
 
 
-@dataclass(slots=True)
-class ClippedRecording:
+class ClippedRecording(WrappedRecording):
     """The packets and messages of a recording that were received within a segment.
 
     Others are not counted either: they belong to another segment. Messages from before the segment
-    are given only if they are metadata of sensors, which are recorded once, at the start.
+    are given only if they describe sensors, since metadata are recorded once, at the start.
     """
 
-    inner: Recording
-    segment: TimeSegment
-    topics: tuple[Topic, ...] = ()
-    keep: frozenset[str] = frozenset()
-    notes: list[str] = field(default_factory=list)
-    path: Path = Path()
-    container: str = ""
-    counts: CaptureCounts = field(default_factory=CaptureCounts)
-    size_bytes: int = 0
-    position_bytes: int = 0
+    __slots__ = ("segment",)
 
-    def __post_init__(self) -> None:
-        self.path, self.container = self.inner.path, self.inner.container
-        self.size_bytes = self.inner.size_bytes
-        self._follow()
+    def __init__(self, inner: Recording, segment: TimeSegment) -> None:
+        super().__init__(inner)
+        self.segment = segment
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
-        """Yield the packets of the segment, in file order; may be called again (counts restart).
-
-        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
-        """
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield the packets of the segment, in file order; each call is a new pass."""
         self.inner.keep = self.keep
         batches = self.inner.packets()
-        first_ns = None
         try:
             for batch in batches:
                 inside = self._inside(batch)
                 self._leave_out(len(batch) - int(np.count_nonzero(inside)))
-                self._follow()
                 clipped = batch if inside.all() else batch.take(np.flatnonzero(inside))
                 clipped = replace(clipped, messages=self._messages(batch))
                 if len(clipped) or clipped.messages:
                     yield clipped
-                if len(clipped):
-                    first_ns = int(clipped.host_ns[0]) if first_ns is None else first_ns
-                    if until_ns is not None and int(clipped.host_ns[-1]) - first_ns > until_ns:
-                        return
         finally:
-            if isinstance(batches, Generator):
-                batches.close()
-            self._follow()
+            batches.close()
 
     def _inside(self, batch: PacketBatch) -> BoolArray:
         low, high = self.segment.begin_ns, self.segment.end_ns
@@ -90,12 +67,6 @@ class ClippedRecording:
         return low is None or message.host_ns >= low or teaches(message.topic)
 
     def _leave_out(self, count: int) -> None:
-        """Remove packets from the inner counts, where packets made of clouds are counted, too."""
+        """Take packets out of the inner counts."""
         self.inner.counts.frames -= count
         self.inner.counts.datagrams -= count
-
-    def _follow(self) -> None:
-        """Copy the attributes of the inner recording that change while it is read."""
-        inner = self.inner
-        self.topics, self.notes, self.counts = inner.topics, inner.notes, inner.counts
-        self.position_bytes = inner.position_bytes

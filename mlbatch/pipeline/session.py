@@ -21,7 +21,7 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
-from mlbatch.readers import merge, open_recording, use_engine
+from mlbatch.readers import merge, open_recording
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
@@ -49,7 +49,8 @@ class Session:
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
         self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
-        use_engine(opened, self.engine)
+        for recording in opened:
+            recording.use_engine(self.engine)
         if job.segment != TimeSegment():
             opened = [ClippedRecording(recording, job.segment) for recording in opened]
         self.setup: Setup = discover(opened, streams, job.wishes)

@@ -1,6 +1,6 @@
 """Clouds that a driver decoded: their points are batched anew by their own times.
 
-Source: facts/messages.md, section 8. The packets are those of `mlbatch.clouds`, one column each:
+Source: facts/messages.md, section 8. The packets are those of `ros.point_packets`, one column each:
 points that share a stamp. Points have a place already, so that no beam has angles; ranges are the
 distances of the points from the origin of the cloud's frame. A point's channel is its ring where
 many points of a stamp are on rings of their own, and where every point has a time of its own; else
@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
-from mlbatch.clouds import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
+from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors._options import check_options
 from mlbatch.sensors._turning_lidar import TurningLidar
 from mlbatch.types import Heads, Pixels

@@ -17,9 +17,9 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.ros.definitions import FIELD_CODES
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
-from mlbatch.writers._ros2_types import FIELD_CODES
-from mlbatch.writers._wire import Wire
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
 from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions
 from mlbatch.writers.output_file import borrow

@@ -10,8 +10,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "clouds.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
         " the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
-        "read; the first: wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; "
-        "convert the recording to that encoding)",
+        "read; the first: expected a message of little-endian CDR (00 01 00 00), found 00 00 "
+        "00 00; convert the recording to that encoding)",
     ),
     "clouds without times": (
         "timeless.db3",
@@ -19,8 +19,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "timeless.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
         " the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
-        "read; the first: wanted the time of each point in a field t, time, timestamp, "
-        "time_stamp, timestamps, offset_time or ts, got x, y, z; record the raw packets, or "
+        "read; the first: expected the time of each point in a field t, time, timestamp, "
+        "time_stamp, timestamps, offset_time or ts, found x, y, z; record the raw packets, or "
         "clouds with times)",
     ),
     "one of two lidars": (
@@ -60,30 +60,30 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "folder without a bag": (
         "papers",
         1,
-        "papers: wanted a recording, got a folder without .db3 or .mcap files; name the files"
+        "papers: expected a recording, found a folder without .db3 or .mcap files; name the files"
         " inside it",
     ),
     "two kinds in a folder": (
         "mixed",
         1,
-        "mixed: wanted a folder with the files of one bag, got several kinds (MCAP, ROS 2 bag"
+        "mixed: expected a folder with the files of one bag, found several kinds (MCAP, ROS 2 bag"
         " (sqlite3)); name the files of one kind",
     ),
     "text": (
         "text.db3",
         1,
-        "text.db3: wanted a recording ({*}; also gzip or zstd of them), got a file that "
+        "text.db3: expected a recording ({*}; also gzip or zstd of them), found a file that "
         "begins with 68 65 6c 6c 6f 0a; check that it is the right file",
     ),
     "empty database": (
         "empty.db3",
         1,
-        "empty.db3: wanted a recording, got 0 bytes; record or copy it again",
+        "empty.db3: expected a recording, found 0 bytes; record or copy it again",
     ),
     "another database": (
         "other.db3",
         1,
-        "other.db3: wanted a ROS 2 bag (tables topics and messages), got a database that "
+        "other.db3: expected a ROS 2 bag (tables topics and messages), found a database that "
         "cannot be read ({*}); record or copy it again, or try `sqlite3 "
         ".recover`",
     ),
@@ -92,7 +92,7 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "head.mcap: no lidar packets; wanted raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), got no UDP packet at all; check that the recording holds the "
-        "sensor's data port (head.mcap: byte 20: the file ends within a record: wanted its "
+        "sensor's data port (head.mcap: byte 20: the file ends within a record: expected its "
         "footer; the rest was read)",
     ),
     "cut ROS 1 bag": (
@@ -106,7 +106,7 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "cut database": (
         "head.db3",
         1,
-        "head.db3: wanted a ROS 2 bag (tables topics and messages), got a database that "
+        "head.db3: expected a ROS 2 bag (tables topics and messages), found a database that "
         "cannot be read ({*}); record or copy it again, or try "
         "`sqlite3 .recover`",
     ),
@@ -226,6 +226,6 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "file of a bag that is gone": (
         "bag/bag_2.db3",
         1,
-        "bag/bag_2.db3: wanted a recording, got no such file; check the path",
+        "bag/bag_2.db3: expected a recording, found no such file; check the path",
     ),
 }

@@ -28,23 +28,23 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "missing recording": (
         "none.pcap",
         1,
-        "none.pcap: wanted a recording, got no such file; check the path",
+        "none.pcap: expected a recording, found no such file; check the path",
     ),
     "folder": (
         "fix",
         1,
-        "fix: wanted a recording, got a folder without .db3 or .mcap files; "
+        "fix: expected a recording, found a folder without .db3 or .mcap files; "
         "name the files inside it",
     ),
     "empty file": (
         "empty.pcap",
         1,
-        "empty.pcap: wanted a recording, got 0 bytes; record or copy it again",
+        "empty.pcap: expected a recording, found 0 bytes; record or copy it again",
     ),
     "text": (
         "text.txt",
         1,
-        "text.txt: wanted a recording ({*}; also gzip or zstd of them), got a file that "
+        "text.txt: expected a recording ({*}; also gzip or zstd of them), found a file that "
         "begins with 68 65 6c 6c 6f 0a; check that it is the right file",
     ),
     "no output": (
@@ -380,7 +380,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with a warning": (
         "cut/drive.pcap --strict",
         1,
-        "drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1000 "
+        "drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, found 1000 "
         "(recording, an error because of --strict)",
     ),
     "only partial scans": (

@@ -23,7 +23,7 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import open_recording
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.report.report import RunReport
 from mlbatch.types import (
     EXTRAS,

@@ -107,7 +107,8 @@ def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     capture.write_bytes(capture.read_bytes()[:-100])
     outcome = shell(f"inspect {capture}")
     assert outcome.out.splitlines()[-1] == (
-        "note: drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1238"
+        "note: drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, "
+        "found 1238"
     )
 
 

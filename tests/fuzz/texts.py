@@ -67,7 +67,7 @@ def _sampler() -> Sampler:
     from mlbatch.readers import open_recording
 
     recording = open_recording(_FIXTURES[-1].parent / "two_lidars.pcap", table)
-    for batch in recording.packets(100_000_000):
+    for batch in recording.packets():
         sampler.add(batch)
     return sampler
 

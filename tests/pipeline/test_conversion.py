@@ -195,7 +195,7 @@ def test_scans_in_python_may_be_kept() -> None:
 def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
     with pytest.raises(UsageError, match="clock: wanted sensor or host, got 'gps'"):
         next(iter(mlbatch.scans(CAPTURE, clock="gps")))
-    with pytest.raises(RecordingError, match=r"none\.pcap: wanted a recording, got no such file"):
+    with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
         next(iter(mlbatch.scans("none.pcap")))
     for seconds in (math.nan, 0.0, -1.0, -math.inf):
         with pytest.raises(UsageError, match="max_wait: wanted seconds above 0, or inf, got "):

@@ -16,7 +16,7 @@ from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.pipeline import resume
 from mlbatch.pipeline import resume as _resume_state
-from mlbatch.readers import _source
+from mlbatch.readers import source
 from mlbatch.types import Scan
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
@@ -316,7 +316,7 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     assert outcome.code == 1
     assert outcome.err == (
         "mlbatch: error: out.partial/000004.npz: expected to write it, found 'No space left on "
-        "device'; free space on this disk or choose another output; then --resume goes on after "
+        "device'; free space on this disk or choose another output; then --resume continues after "
         "the 4 scans that are safe\n"
     )
     assert shell(f"convert {CAPTURE} -o out --resume").code == 0
@@ -330,21 +330,21 @@ def test_an_unreadable_disk_names_the_way_on(
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=60))
     whole = _whole(shell, str(capture))
-    fill = _source.Source.fill
+    fill = source.Source.fill
 
-    def failing(source: _source.Source, target: memoryview) -> int:
-        if source.position_bytes > 0.9 * source.size_bytes and Path("out.partial").exists():
-            raise RecordingError(
-                _source._unreadable(source.path, OSError(5, "Input/output error"))
-            ) from OSError(5, "Input/output error")
-        return fill(source, target)
+    def failing(opened: source.Source, target: memoryview) -> int:
+        if opened.position_bytes > 0.9 * opened.size_bytes and Path("out.partial").exists():
+            broken = OSError(5, "Input/output error")
+            text = f"{opened.path}: could not read it (Input/output error); check the disk"
+            raise RecordingError(text) from broken
+        return fill(opened, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(_source.Source, "fill", failing)
+        patch.setattr(source.Source, "fill", failing)
         outcome = shell(f"convert {capture} -o out")
     assert outcome.code == 1
     assert (
-        "could not read it (Input/output error); check the disk; then --resume goes on after"
+        "could not read it (Input/output error); check the disk; then --resume continues after"
         in (outcome.err)
     )
     assert shell(f"convert {capture} -o out --resume").code == 0

@@ -9,8 +9,8 @@ vendors are converted, with random receive times and batches.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from unittest.mock import patch
@@ -23,7 +23,7 @@ from mlbatch.faults import Fault, parse_fault
 from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
-from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable, Topic
+from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable
 from tests.builders import livox
 from tests.builders.run import Values, csv_without_arrival, print_of
 from tests.matrix.cells import NOON_NS
@@ -43,22 +43,15 @@ LIVOX_PORT = 57000
 Print = tuple[list[Values], str, list[str], str]
 
 
-@dataclass(slots=True)
-class Memory:
-    """A recording of packets in memory; `Recording`. cuts: where its batches end."""
+class Memory(Recording):
+    """A recording of packets in memory; cuts: where its batches end."""
 
-    batch: PacketBatch
-    cuts: Sequence[int]
-    topics: tuple[Topic, ...] = ()
-    keep: frozenset[str] = frozenset()
-    notes: list[str] = field(default_factory=list)
-    path: Path = Path("memory.pcap")
-    container: str = "pcap"
-    counts: CaptureCounts = field(default_factory=CaptureCounts)
-    size_bytes: int = 0
-    position_bytes: int = 0
+    def __init__(self, batch: PacketBatch, cuts: Sequence[int]) -> None:
+        super().__init__(Path("memory.pcap"), "pcap", 0)
+        self.batch = batch
+        self.cuts = cuts
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+    def packets(self) -> Generator[PacketBatch, None, None]:
         """All batches, again from the start."""
         self.counts = CaptureCounts()
         ends = [*self.cuts, len(self.batch)]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RunInfo
-from mlbatch.writers._wire import Cdr
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Ros1
 from mlbatch.types import Message, RunInfo, Summary, Topic
-from mlbatch.writers._wire import Ros1
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of
 from mlbatch.writers.output_file import open_buffered

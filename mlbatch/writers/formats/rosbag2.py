@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RunInfo, Topic
-from mlbatch.writers._wire import Cdr
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
 

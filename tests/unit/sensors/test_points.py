@@ -10,12 +10,12 @@ import pytest
 
 import mlbatch
 from mlbatch import sensors
-from mlbatch._cloud_packets import Layout, Points, layout_of, pack
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.decode.packet_ring import RawRing
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
+from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
 from mlbatch.sensors.points import BUILT_IN, MODELS
 from mlbatch.types import Pixels, Stream
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
