@@ -1,7 +1,7 @@
 """All makers' modules behind one door: models, calibration files, names of unknown streams.
 
-A module of this package without a leading underscore is a plug-in, found by its name. It offers
-what `Plugin` lists.
+A folder of this package is a vendor. Its module `sensor` is the plug-in, found by its place; it
+offers what `Plugin` lists.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Protocol, cast
 
 from mlbatch.errors import RigError
 from mlbatch.lidar import Calibration, SensorModel
-from mlbatch.sensors._options import DECODE_OPTIONS
-from mlbatch.sensors._turning_lidar import content_keys
+from mlbatch.sensors.base import content_keys
+from mlbatch.sensors.options import DECODE_OPTIONS
 from mlbatch.types import U8Array
 
 __all__ = [
@@ -61,13 +61,12 @@ def plugins() -> tuple[Plugin, ...]:
 def _one_by_one() -> Iterator[Plugin]:
     """The same; a maker's tables are loaded when it is asked, and those before could not answer."""
     for name in _names():
-        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}"))
+        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
 
 
 @lru_cache(maxsize=1)
 def _names() -> tuple[str, ...]:
-    names = (module.name for module in pkgutil.iter_modules(__path__))
-    return tuple(sorted(name for name in names if not name.startswith("_")))
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__) if module.ispkg))
 
 
 def models() -> tuple[SensorModel, ...]:

@@ -13,7 +13,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from mlbatch.sensors import _hesai_firing as firing
+from mlbatch.sensors.hesai import firing
 from mlbatch.types import I64Array
 
 SEQUENCE, IMU, SAFETY, SIGNATURE, CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10

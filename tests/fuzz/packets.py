@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch import sensors
 from mlbatch.errors import MlbatchError
 from mlbatch.lidar import Calibration, Evidence, ModelFile
-from mlbatch.sensors._ouster_profiles import PROFILES
+from mlbatch.sensors.ouster.profiles import PROFILES
 from tests.builders import ouster, robosense, velodyne
 from tests.builders.livox import (
     CARTESIAN16,

@@ -14,7 +14,7 @@ from mlbatch._rigged import Wanted, match_rig
 from mlbatch.cli import values
 from mlbatch.errors import MlbatchError
 from mlbatch.rig import Rig, StreamSelector, read_rig, write_rig
-from mlbatch.sensors._options import check_options
+from mlbatch.sensors.options import check_options
 from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
 from mlbatch.urdf import fixed_joints, joints

@@ -23,8 +23,8 @@ from mlbatch.kernels import native
 from mlbatch.lidar import Lidar
 from mlbatch.pipeline import Conversion
 from mlbatch.ring import RawRing
-from mlbatch.sensors._ouster_profiles import PROFILES
-from mlbatch.sensors.ouster import read_calibration
+from mlbatch.sensors.ouster.profiles import PROFILES
+from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.transforms import from_rpy_deg
 from mlbatch.types import EXTRAS, I64Array, RunInfo, SensorInfo
 from tests.builders.engines import BOXES_M, Pair, few_kernels, needs_numba

@@ -11,7 +11,7 @@ import numpy as np
 from mlbatch.geometry import Turning
 from mlbatch.lidar import Calibration, Evidence, Lidar
 from mlbatch.readers import open_recording
-from mlbatch.sensors import hesai
+from mlbatch.sensors.hesai import sensor as hesai
 from mlbatch.types import F32Array, Heads, I64Array, Pixels, Stream, StreamTable, U8Array
 
 HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.geometry import read_rotor_words
 from mlbatch.lidar import Beside, Evidence, Lidar
-from mlbatch.sensors import robosense
+from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
 from tests.builders.others import rows
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.sensors._crc import crc64
+from mlbatch.sensors.crc import crc64
 
 
 def bitwise(message: bytes) -> int:

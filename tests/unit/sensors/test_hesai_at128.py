@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mlbatch.geometry import Projection, read_rotor_words, rotor_words
-from mlbatch.sensors._hesai_at128 import at128_projection
-from mlbatch.sensors._hesai_corrections import At128File, read_at128
+from mlbatch.sensors.hesai.angles import At128File, read_at128
+from mlbatch.sensors.hesai.at128 import at128_projection
 from mlbatch.types import F32Array, F64Array, I64Array
 
 FILE = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError
-from mlbatch.sensors._hesai_corrections import HesaiAngles, read_angles, read_at128
+from mlbatch.sensors.hesai.angles import HesaiAngles, read_angles, read_at128
 
 HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
 NAME = Path("unit.csv")

@@ -11,8 +11,8 @@ import pytest
 from mlbatch.errors import MlbatchError, RigError, UsageError
 from mlbatch.geometry import Turning
 from mlbatch.lidar import FAULTS
-from mlbatch.sensors import _hesai_crc as crc
-from mlbatch.sensors import hesai
+from mlbatch.sensors.hesai import crc
+from mlbatch.sensors.hesai import sensor as hesai
 from mlbatch.types import F64Array, I64Array, U8Array
 from tests.builders import hesai as builder
 from tests.builders.hesai import HesaiSpec, angles_csv, encode_packets

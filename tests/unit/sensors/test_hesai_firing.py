@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.sensors import _hesai_firing as firing
-from mlbatch.sensors._hesai_firing import E128, E128_NEAR, HIGH, NEVER, OT128, SAVING, STANDARD
+from mlbatch.sensors.hesai import firing
+from mlbatch.sensors.hesai.firing import E128, E128_NEAR, HIGH, NEVER, OT128, SAVING, STANDARD
 from mlbatch.types import I64Array
 
 # Channel (from 1) and its ns, picked by eye in the sheet.

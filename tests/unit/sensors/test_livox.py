@@ -10,7 +10,7 @@ import pytest
 
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar import FAULTS, Evidence
-from mlbatch.sensors import livox
+from mlbatch.sensors.livox import sensor as livox
 from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
 from tests.builders.livox import (
     CARTESIAN16,

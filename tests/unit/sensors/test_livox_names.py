@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.sensors import livox
-from mlbatch.sensors._recognise_bytes import NO_DECODER
+from mlbatch.sensors.livox import sensor as livox
+from mlbatch.sensors.packet_bytes import NO_DECODER
 from tests.builders.others import livox1_packets, livox2_packets
 
 

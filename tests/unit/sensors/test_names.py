@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mlbatch import sensors
 from mlbatch.readers import open_recording
-from mlbatch.sensors._ouster_profiles import PROFILES
+from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
 from tests.builders.others import (

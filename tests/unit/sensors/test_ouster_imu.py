@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mlbatch.sensors import read_calibration as read_file
-from mlbatch.sensors._ouster_imu import read_legacy
-from mlbatch.sensors.ouster import OusterLidar, read_calibration
+from mlbatch.sensors.ouster.imu import read_legacy
+from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
 from mlbatch.types import U8Array
 from tests.builders.ouster import OusterSpec, imu_packet, metadata_json
 from tests.unit.sensors.captures import CASES, Case, needs_recordings

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from mlbatch.lidar import Evidence
-from mlbatch.sensors import describe, ouster, read_calibration
-from mlbatch.sensors.ouster import OusterCalibration
-from mlbatch.sensors.ouster import read_calibration as read_content
+from mlbatch.sensors import describe, read_calibration
+from mlbatch.sensors.ouster import sensor as ouster
+from mlbatch.sensors.ouster.sensor import OusterCalibration
+from mlbatch.sensors.ouster.sensor import read_calibration as read_content
 from mlbatch.types import Stream, U8Array
 from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
 from tests.unit.sensors.captures import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError, UsageError
-from mlbatch.sensors._ouster_metadata import Metadata
-from mlbatch.sensors.ouster import OusterCalibration, read_calibration
+from mlbatch.sensors.ouster.metadata import Metadata
+from mlbatch.sensors.ouster.sensor import OusterCalibration, read_calibration
 from tests.builders.ouster import JsonObject, OusterSpec, flat_json, metadata_json
 
 PATH = Path("front.json")

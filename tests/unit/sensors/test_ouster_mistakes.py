@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError
-from mlbatch.sensors.ouster import OusterCalibration, read_calibration
+from mlbatch.sensors.ouster.sensor import OusterCalibration, read_calibration
 from tests.builders.ouster import JsonObject, OusterSpec, metadata_json
 
 PATH = Path("front.json")

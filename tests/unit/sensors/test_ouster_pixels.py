@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.sensors._ouster_pixels import PixelReader
-from mlbatch.sensors._ouster_profiles import PROFILES, PacketLayout
-from mlbatch.sensors.ouster import OusterLidar, read_calibration
+from mlbatch.sensors.ouster.pixels import PixelReader
+from mlbatch.sensors.ouster.profiles import PROFILES, PacketLayout
+from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
 from mlbatch.types import Pixels, U8Array
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets, metadata_json
 

@@ -10,8 +10,8 @@ import pytest
 
 from mlbatch.lidar import Evidence
 from mlbatch.sensors import read_calibration
-from mlbatch.sensors._crc import crc64
-from mlbatch.sensors.ouster import OusterCalibration, OusterLidar
+from mlbatch.sensors.crc import crc64
+from mlbatch.sensors.ouster.sensor import OusterCalibration, OusterLidar
 from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array, U16Array
 from tests.unit.sensors.captures import CASES, OUSTER, Case, Reference, needs_recordings
 

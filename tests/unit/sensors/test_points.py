@@ -14,7 +14,7 @@ from mlbatch._cloud_packets import Layout, Points, layout_of, pack
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar import FAULTS, Calibration, Evidence, Lidar
 from mlbatch.ring import RawRing
-from mlbatch.sensors.points import BUILT_IN, MODELS
+from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS
 from mlbatch.transforms import from_quaternion
 from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points

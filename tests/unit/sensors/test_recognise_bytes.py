@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.sensors._recognise_bytes import block_time_us
+from mlbatch.sensors.packet_bytes import block_time_us
 
 HOUR_US = 3_600_000_000
 # Ten packets of twelve blocks; a block takes 50 us, in which the rotor turns 0.36 degrees.

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from mlbatch.sensors.robosense import MODELS, RobosenseLidar
+from mlbatch.sensors.robosense.sensor import MODELS, RobosenseLidar
 from tests.builders.others import filled
 from tests.unit.sensors.robosense_cases import (
     CALENDAR,

@@ -10,9 +10,10 @@ import pytest
 
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar import READABLE, Beside, Evidence, ModelFile
-from mlbatch.sensors import models, robosense
-from mlbatch.sensors._robosense_difop import Angles, find_difop
-from mlbatch.sensors._robosense_models import AIRY_96, BPEARL_V4, RS16, RS32, Model
+from mlbatch.sensors import models
+from mlbatch.sensors.robosense import sensor as robosense
+from mlbatch.sensors.robosense.difop import Angles, find_difop
+from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, RS16, RS32, Model
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
 from tests.builders.robosense import RobosenseSpec, angles_csv, difop, fan, msop

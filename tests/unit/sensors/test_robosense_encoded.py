@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.sensors import robosense
+from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.types import F32Array, I64Array
 from tests.builders.robosense import (
     Angles,

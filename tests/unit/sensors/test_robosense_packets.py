@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from mlbatch.sensors._robosense_models import BPEARL_V3, BPEARL_V4
-from mlbatch.sensors._robosense_packets import times_ns
+from mlbatch.sensors.robosense.models import BPEARL_V3, BPEARL_V4
+from mlbatch.sensors.robosense.packets import times_ns
 from mlbatch.types import U8Array
 from tests.builders.others import filled, robosense_packets, rows
 from tests.builders.robosense import RobosenseSpec, difop, fan, msop

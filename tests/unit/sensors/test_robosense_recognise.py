@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch import sensors
-from mlbatch.sensors import robosense
+from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.types import U8Array
 from tests.builders.others import EE, filled, robosense_packets, rows
 

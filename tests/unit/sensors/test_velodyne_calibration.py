@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.errors import RigError
-from mlbatch.sensors._velodyne_calibration import MAX_BYTES, VelodyneFile, read_velodyne
+from mlbatch.sensors.velodyne.calibration import MAX_BYTES, VelodyneFile, read_velodyne
 from tests.builders.velodyne_tables import MODELS, calibration_yaml
 
 RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"

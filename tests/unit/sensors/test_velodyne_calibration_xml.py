@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.sensors._velodyne_calibration import MAX_BYTES
+from mlbatch.sensors.velodyne.calibration import MAX_BYTES
 from tests.unit.sensors.test_velodyne_calibration import fault, read
 
 XML = Path("drive/db.xml")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mlbatch.lidar import Beside, Evidence
-from mlbatch.sensors import velodyne
-from mlbatch.sensors._velodyne_clock import (
+from mlbatch.sensors.velodyne import sensor as velodyne
+from mlbatch.sensors.velodyne.clock import (
     HOUR_NS,
     absolute_ns,
     clock_offset_ns,

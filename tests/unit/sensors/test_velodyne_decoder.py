@@ -12,7 +12,7 @@ import pytest
 from mlbatch.errors import UsageError
 from mlbatch.geometry import read_rotor_words
 from mlbatch.lidar import FAULTS, READABLE, Evidence, ModelFile
-from mlbatch.sensors import velodyne
+from mlbatch.sensors.velodyne import sensor as velodyne
 from tests.builders.velodyne import (
     VelodyneSpec,
     directions,

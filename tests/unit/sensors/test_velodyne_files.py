@@ -11,7 +11,7 @@ import pytest
 
 from mlbatch.errors import RigError
 from mlbatch.lidar import READABLE
-from mlbatch.sensors import velodyne
+from mlbatch.sensors.velodyne import sensor as velodyne
 from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_tables import MODELS, calibration_yaml
 from tests.unit.sensors.velodyne_streams import PLAIN, evidence, made_of, pointing

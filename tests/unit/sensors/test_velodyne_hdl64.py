@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mlbatch.geometry import rotor_words
-from mlbatch.sensors._velodyne_calibration import VelodyneFile, read_velodyne
-from mlbatch.sensors._velodyne_hdl64 import hdl64_projection
+from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
+from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
 from mlbatch.types import F32Array, F64Array, I64Array
 from tests.builders.velodyne_tables import calibration_yaml
 

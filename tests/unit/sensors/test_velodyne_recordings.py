@@ -18,8 +18,8 @@ import pytest
 from mlbatch.geometry import read_rotor_words
 from mlbatch.lidar import Evidence
 from mlbatch.readers import open_recording
-from mlbatch.sensors import velodyne
-from mlbatch.sensors._velodyne_packets import VelodyneLidar
+from mlbatch.sensors.velodyne import sensor as velodyne
+from mlbatch.sensors.velodyne.packets import VelodyneLidar
 from mlbatch.streams import Sampler
 from mlbatch.types import BoolArray, F64Array, I64Array, StreamTable, U8Array
 from tests.builders.velodyne import Sent

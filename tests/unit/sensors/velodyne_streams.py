@@ -9,8 +9,8 @@ import numpy as np
 
 from mlbatch.geometry import read_rotor_words
 from mlbatch.lidar import Evidence
-from mlbatch.sensors import velodyne
-from mlbatch.sensors._velodyne_packets import VelodyneLidar
+from mlbatch.sensors.velodyne import sensor as velodyne
+from mlbatch.sensors.velodyne.packets import VelodyneLidar
 from mlbatch.types import F32Array, F64Array, I64Array, Pixels, Stream, U8Array
 from tests.builders.velodyne import Sent, VelodyneSpec, encode
 from tests.builders.velodyne_tables import calibration_yaml

@@ -1,0 +1,238 @@
+"""What HESAI packets are, by their content: lengths, header versions, return modes in the tail.
+
+Source: facts/hesai.md sections 1 to 4; facts/messages.md section 2 (correction); HesaiTechnology/
+HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC), HesaiLidar_General_SDK
+(Pandar20: 8 + 20 x 62 + 22 = 1270 bytes, never a sequence number).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mlbatch.sensors.hesai import models as rows
+from mlbatch.sensors.hesai.layout import (
+    AMBIENT,
+    ONLY_RETURN,
+    PREFIX_SIZE,
+    RETURN_MODES,
+    SEQUENCE,
+    Layout,
+    ReturnMode,
+    least_size,
+    tail_at,
+    unit_mm,
+)
+from mlbatch.sensors.hesai.models import Model
+from mlbatch.sensors.packet_bytes import NO_DECODER, mostly, number, starts, usual
+from mlbatch.types import BoolArray, U8Array
+
+_SOP = b"\xee\xff"
+_BLOCK_FLAG = b"\xff\xee"
+_HEADER_SIZE = 12
+_OTHERS = (
+    (512, _BLOCK_FLAG, "GPS packet"),
+    (99, b"\xcd\xdc", "fault packet"),
+    (0, bytes.fromhex("47740500"), "correction"),
+)
+_SEQUENCE_SIZE = 4
+# Bytes of a header that stay the same: marker, version, lasers, blocks, distance unit, flags.
+_FIXED = (0, 1, 2, 3, 6, 7, 9, 11)
+_FIXED_64 = (0, 1, 2, 3, 5)
+_FIXED_JT16 = (0, 1, 2, 3, 5)
+_PANDAR40_BLOCKS, _PANDAR40_STRIDE = 10, 124
+# Models whose header has lasers and blocks: payloads without and with a sequence number.
+_SIZED: tuple[tuple[Model, int, tuple[int, ...]], ...] = (
+    (rows.PANDAR64, 6, (1194, 1198)),
+    (rows.PANDAR64, 7, (1388, 1392)),
+    (rows.PANDAR20A, 20, (1270,)),
+)
+_PANDAR40_SIZE, _PANDAR40_UNDATED_SIZE = 1262, 1256
+_PANDAR20_MAGIC = _SOP + bytes((20, 20))
+_JT16_IMU_SIZE, _JT16_SIZE = 34, 80
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What packets of a stream are; layout: None where no decoder can read them.
+
+    mode: None where the packets do not say how many returns they hold.
+    """
+
+    name: str
+    mode: ReturnMode | None = None
+    layout: Layout | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Family:
+    """Models of a protocol version, told apart by lasers and blocks; the first one stands for all.
+
+    name: of those that are not in the list; turns: all but automotive models, which alone may
+    have a prefix.
+    """
+
+    name: str
+    models: tuple[Model, ...] = ()
+    turns: bool = True
+
+
+# Early firmware, known by the manual's text alone: named, not decoded.
+_PANDAR128 = replace(
+    rows.PANDAR128E3X,
+    name="Pandar128",
+    tail=rows.Tail(24, date_at=18, us_at=12, mode_at=16),
+    has_flagged_units=False,
+    has_checks=False,
+)
+_FAMILIES: Mapping[tuple[int, int], _Family] = {
+    (1, 3): _Family("Pandar128", (_PANDAR128,)),
+    (1, 8): _Family("JT16", (rows.JT16,)),
+    (3, 1): _Family("PandarQT{}", (rows.PANDARQT64,)),
+    (3, 2): _Family("QT128C2X", (rows.QT128,)),
+    (4, 1): _Family("AT128", (rows.AT128,), turns=False),
+    (4, 3): _Family("AT128", (rows.AT128,), turns=False),
+    (4, 7): _Family("ATX", turns=False),
+    (6, 1): _Family("PandarXT of {} channels", (rows.XT16, rows.XT32, rows.XT32M2X)),
+    (7, 2): _Family("FT120", turns=False),
+}
+_UNDECODED = frozenset({"Pandar128"})
+# Packets that several models send.
+_ALIKE = {
+    rows.PANDAR40P.name: "Pandar40P or Pandar40M",
+    rows.PANDAR20A.name: "Pandar20A or Pandar20B",
+}
+# Protocol 1.4 by the version of the status info: the first one at or below it.
+_STATUS_VERSION = (1, 4)
+_STATUS_VERSIONS = ((137, rows.JT128), (128, rows.OT128), (0, rows.PANDAR128E3X))
+
+
+def hesai(size: int, packets: U8Array) -> str | None:
+    """A line on HESAI packets, or None."""
+    for wanted, magic, name in _OTHERS:
+        good = starts(packets, magic)
+        if name == "GPS packet":
+            good &= _digits(packets, 2, 14)
+        if wanted in (0, size) and mostly(packets, good) is not None:
+            return f"HESAI {name}"
+    if size == _JT16_IMU_SIZE and mostly(packets, starts(packets, _SOP + b"\x01\x08")) is not None:
+        return "HESAI IMU packet, JT16"
+    found = identify(size, packets)
+    if found is None:
+        return None
+    name = _ALIKE.get(found.name, found.name)
+    mode = "" if found.mode is None else f", {found.mode.text}"
+    return f"HESAI lidar {name}{mode}{'' if found.layout else NO_DECODER}"
+
+
+def identify(size: int, packets: U8Array) -> Identity | None:
+    """What payloads (k, size) of a stream are, or None where they are not of a HESAI lidar."""
+    return (
+        _identify_sized(size, packets)
+        or _identify_version(size, 0, packets)
+        or _identify_version(size, PREFIX_SIZE, packets[:, PREFIX_SIZE:])
+    )
+
+
+def _digits(packets: U8Array, begin: int, end: int) -> BoolArray:
+    """(k,) whether these bytes are ASCII digits."""
+    text = packets[:, begin:end]
+    return np.asarray(((text >= ord("0")) & (text <= ord("9"))).all(axis=1))
+
+
+def _identify_sized(size: int, packets: U8Array) -> Identity | None:
+    """Models whose headers bear no protocol version."""
+    flagged = np.ones(len(packets), np.bool_)
+    for block in range(_PANDAR40_BLOCKS):
+        flagged &= starts(packets, _BLOCK_FLAG, _PANDAR40_STRIDE * block)
+    chosen = mostly(packets, flagged)
+    if chosen is not None:
+        if size == _PANDAR40_UNDATED_SIZE:
+            return Identity("Pandar40", RETURN_MODES.get(usual(number(chosen, 1254, 1))))
+        if size in (_PANDAR40_SIZE, _PANDAR40_SIZE + _SEQUENCE_SIZE):
+            flags = SEQUENCE if size > _PANDAR40_SIZE else 0
+            return _identity(rows.PANDAR40P, size, 0, chosen, _PANDAR40_BLOCKS, flags, ())
+    for model, blocks, sizes in _SIZED:
+        chosen = mostly(packets, starts(packets, _SOP + bytes((model.channels, blocks))))
+        if chosen is not None and size in sizes:
+            flags = SEQUENCE if size > sizes[0] else 0
+            return _identity(model, size, 0, chosen, blocks, flags, _FIXED_64)
+    if mostly(packets, starts(packets, _PANDAR20_MAGIC)) is not None:
+        return Identity("Pandar20")
+    return None
+
+
+def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | None:
+    """Models whose header has a protocol version; their size must hold the blocks announced."""
+    if packets.shape[1] < _HEADER_SIZE:
+        return None
+    chosen = mostly(packets, starts(packets, _SOP))
+    if chosen is None:
+        return None
+    head = [usual(number(chosen, at, 1)) for at in range(_HEADER_SIZE)]
+    version = head[2], head[3]
+    same = mostly(packets, starts(packets, bytes((*_SOP, *version))))
+    family = _family(version, head[4])
+    if family is None or same is None or (prefix and family.turns):
+        return None
+    if not family.models:
+        return Identity(family.name)
+    lasers, blocks, flags = head[6], head[7], head[11]
+    fixed: tuple[int, ...] = _FIXED
+    if family.models == (rows.JT16,):
+        # It has no lasers, blocks or flags in its header, but always a sequence number.
+        lasers, blocks, flags, fixed = rows.JT16.channels, 1, SEQUENCE, _FIXED_JT16
+        if size != _JT16_SIZE or head[5] != 0:
+            return None
+    return _identity(_model(family, lasers, blocks), size, prefix, same, blocks, flags, fixed)
+
+
+def _family(version: tuple[int, int], status: int) -> _Family | None:
+    if version != _STATUS_VERSION:
+        return _FAMILIES.get(version)
+    model = next(model for least, model in _STATUS_VERSIONS if status >= least)
+    return _Family(model.name + ", {} channels", (model,))
+
+
+def _model(family: _Family, lasers: int, blocks: int) -> Model:
+    """The row with these lasers and blocks, or one that is like the family's, to be named only."""
+    for model in family.models:
+        if model.channels == lasers and blocks in model.blocks:
+            return model
+    first, name = family.models[0], family.name.format(lasers)
+    return replace(first, name=name, channels=lasers, blocks=(), most_returns=0)
+
+
+def _identity(
+    model: Model,
+    size: int,
+    prefix: int,
+    packets: U8Array,
+    blocks: int,
+    flags: int,
+    fixed: tuple[int, ...],
+) -> Identity | None:
+    """What packets of a model are; packets: without their prefix."""
+    tail = tail_at(model, blocks, flags)
+    if prefix + least_size(model, blocks, flags) > size:
+        return None
+    mode: ReturnMode | None = ONLY_RETURN
+    if model.tail.mode_at is not None:
+        mode = RETURN_MODES.get(usual(number(packets, tail + model.tail.mode_at, 1)))
+    # What a header says once may be damaged: the usual value counts.
+    head = {at: usual(number(packets, at, 1)) for at in fixed}
+    chooses = model is rows.QT128 and bool(flags & AMBIENT)
+    millimetres = unit_mm(model, head)
+    if (
+        mode is None
+        or model.name in _UNDECODED
+        or chooses
+        or not millimetres
+        or mode.returns > model.most_returns
+        or blocks % mode.returns
+    ):
+        return Identity(model.name, mode)
+    layout = Layout(model, size, prefix, blocks, flags, millimetres, mode, head)
+    return Identity(model.name, mode, layout)

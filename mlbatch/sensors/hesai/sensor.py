@@ -1,0 +1,302 @@
+"""HESAI lidars: Pandar, XT, QT, OT128, AT128, JT, described by an angle file and their packets.
+
+Source: facts/hesai.md (HesaiLidar_SDK_2.0, HesaiLidar_General_SDK, tier4/nebula, user manuals). An
+angle file is of one unit and does not say of which model: the packets tell. Channels are numbered
+from 0 in the order of the wire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.geometry import BeamTable, Projection, spherical
+from mlbatch.lidar import Calibration, Evidence, SensorModel
+from mlbatch.median import median
+from mlbatch.sensors.base import TurningLidar, content_keys
+from mlbatch.sensors.hesai import models as rows
+from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
+from mlbatch.sensors.hesai.at128 import at128_projection
+from mlbatch.sensors.hesai.identify import hesai, identify
+from mlbatch.sensors.hesai.layout import Layout
+from mlbatch.sensors.hesai.models import Model
+from mlbatch.sensors.hesai.optics import OffAxis, off_axis
+from mlbatch.sensors.hesai.packets import PacketReader
+from mlbatch.sensors.options import check_options
+from mlbatch.types import F64Array, Heads, I64Array, Pixels, U8Array
+from mlbatch.units import M_PER_MM, RAD_PER_DEG
+
+MAKER = "HESAI"
+BUILT_IN: tuple[Calibration, ...] = ()
+_REAL, _TWO, _ONE = "real recording", "two sources", "one source"
+_VERIFIED: Mapping[str, str] = {
+    "Pandar20A": _ONE,
+    "Pandar20B": _ONE,
+    "Pandar40P": _REAL,
+    "Pandar40M": _TWO,
+    "Pandar64": _REAL,
+    "PandarQT64": _REAL,
+    "QT128C2X": _TWO,
+    "PandarXT-16": _REAL,
+    "PandarXT-32": _REAL,
+    "XT32M2X": _TWO,
+    "Pandar128E3X": _TWO,
+    "OT128": _TWO,
+    "AT128": _TWO,
+    "JT16": _ONE,
+    "JT128": _ONE,
+}
+# Of a Pandar40M only the angles are other than those of a Pandar40P.
+_LIKE = {"Pandar40M": rows.PANDAR40P.name}
+_ROWS: Mapping[str, Model] = {
+    row.name: row
+    for row in (
+        *(rows.PANDAR20A, rows.PANDAR20B),
+        *(rows.PANDAR40P, rows.PANDAR64, rows.PANDARQT64, rows.QT128, rows.XT16, rows.XT32),
+        *(rows.XT32M2X, rows.PANDAR128E3X, rows.OT128, rows.AT128, rows.JT16, rows.JT128),
+    )
+}
+_CSV, _DAT = "angle csv of the unit, required", "correction dat of the unit, required"
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=name,
+        maker=MAKER,
+        channels=_ROWS[_LIKE.get(name, name)].channels,
+        returns=tuple(range(1, _ROWS[_LIKE.get(name, name)].most_returns + 1)),
+        clock="free-running, GPS or PTP; date and us in every packet",
+        calibration=_DAT if name == rows.AT128.name else _CSV,
+        verified=verified,
+        like=_LIKE.get(name, ""),
+    )
+    for name, verified in _VERIFIED.items()
+)
+# Preferred is a file whose beams lie where the model's do, but for what differs between units.
+_FITS, _FITS_BEAMS = 200, 300
+_ELEVATION_TOLERANCE_DEG = 4.0
+# Evidence begins with so many; what follows them may be half a turn away.
+_PACKETS_IN_A_ROW = 16
+
+
+def read_calibration(path: Path, content: bytes) -> Calibration | None:
+    """The angles in a csv or dat file, or None if it holds something else."""
+    at128 = read_at128(path, content)
+    if at128 is not None:
+        return At128Calibration(at128)
+    angles = read_angles(path, content)
+    return None if angles is None else HesaiCalibration(angles)
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """What payloads (k, size) of an unknown stream are; None if not HESAI's."""
+    packets = np.atleast_2d(sample)
+    if not packets.size or packets.shape[1] < size:
+        return None
+    return hesai(size, packets[:, :size])
+
+
+class HesaiCalibration:
+    """An angle csv, of whatever model has as many channels; `Calibration` of lidar.py."""
+
+    __slots__ = ("_angles", "is_shared", "model", "path", "serial")
+
+    def __init__(self, angles: HesaiAngles) -> None:
+        self._angles = angles
+        self.path: Path | None = angles.path
+        self.model = f"{MAKER} of {len(angles.azimuth_rad)} channels"
+        self.serial = ""
+        self.is_shared = False
+
+    def fit(self, evidence: Evidence) -> int:
+        """How well packets fit: by channels, then by where the highest and lowest beams look."""
+        layout = _layout(evidence)
+        if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
+            return 0
+        layout = _told_by_beams(layout, self._angles)
+        if layout.model.name == rows.AT128.name:
+            return 1
+        return _FITS if _note_on_beams(self._angles, layout.model) else _FITS_BEAMS
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
+        """The sensor."""
+        check_options(options)
+        angles = self._angles
+        layout = _told_by_beams(_seen(self.path, evidence), angles)
+        model = layout.model
+        if model.name == rows.AT128.name:
+            raise RigError(
+                f"{self.path}: HESAI {model.name}: wanted its correction file (.dat), got a csv, "
+                "which leaves out the mirrors; read the file from the lidar"
+            )
+        if len(angles.azimuth_rad) != model.channels:
+            raise RigError(
+                f"{self.path}: HESAI angles: wanted {model.channels} channels for the packets of a "
+                f"{model.name}, got {len(angles.azimuth_rad)}; give the file of this lidar"
+            )
+        centre = np.array(model.centre_mm) * M_PER_MM if _is_on(options, "optical_centre") else None
+        lidar = HesaiLidar(layout, options, evidence, angles, centre)
+        note = _note_on_beams(angles, model)
+        lidar.notes = (note,) if note else ()
+        return lidar
+
+
+class At128Calibration:
+    """The correction file of an AT128; `Calibration` of lidar.py."""
+
+    __slots__ = ("_file", "is_shared", "model", "path", "serial")
+
+    def __init__(self, file: At128File) -> None:
+        self._file = file
+        self.path: Path | None = file.path
+        self.model = rows.AT128.name
+        self.serial = ""
+        self.is_shared = False
+
+    def fit(self, evidence: Evidence) -> int:
+        """How well packets fit."""
+        layout = _layout(evidence)
+        return _FITS_BEAMS if layout is not None and layout.model.name == self.model else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
+        """The sensor."""
+        check_options(options)
+        layout = _seen(self.path, evidence)
+        if layout.model.name != self.model:
+            raise RigError(
+                f"{self.path}: HESAI angles: wanted the csv of a {layout.model.name} for these "
+                f"packets, got the file of an {self.model}; give the file of this lidar"
+            )
+        return At128Lidar(layout, options, evidence, self._file)
+
+
+class HesaiLidar(TurningLidar):
+    """One sensor; `Lidar` of lidar.py, in HESAI's frame: x right, y forward, z up."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        options: Mapping[str, str],
+        evidence: Evidence | None,
+        angles: HesaiAngles | At128File,
+        centre_m: F64Array | None = None,
+    ) -> None:
+        """centre_m: (3,), from where the beams leave; None: from the axis."""
+        model = layout.model
+        self._reader = PacketReader(
+            layout,
+            follows_rotor=_is_on(options, "firing_azimuth", "on"),
+            checks_crc="crc" in options,
+        )
+        self._reader.sense = _sense(self._reader, evidence)
+        self.maker, self.model, self.mode = MAKER, model.name, layout.mode.text
+        self.channels, self.returns = model.channels, layout.mode.returns
+        self.packet_size = layout.size
+        self.columns_per_packet = layout.columns
+        self.column_period_ns = model.timing.step_ns / model.timing.divisor
+        self.records = self._reader.records
+        self.pixel_layout = (MAKER, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
+        self.pixels = self._reader.pixels()
+        self.return_types = layout.mode.types
+        self.channel = np.arange(model.channels)
+        self.firing_ns = self._reader.firing_ns
+        self.calibration = str(angles.path)
+        self.sequence_modulus = layout.sequence_modulus
+        direction = spherical(angles.azimuth_rad, angles.elevation_rad, clockwise_from="y")
+        self._on_axis = BeamTable(direction, np.zeros((3, 1, 3)), np.zeros(1))
+        self._from_centre, self._centre_m = model.from_centre, centre_m
+        self.beams = self._on_axis
+        if centre_m is not None:
+            self.beams = off_axis(self._on_axis, centre_m, from_centre=model.from_centre)
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """Index into FAULTS for each packet."""
+        return self._reader.faults(packets)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """The UDP sequence number; where there is none, a number for equal content."""
+        found = self._reader.sequence(packets)
+        return content_keys(packets) if found is None else found
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Stamps and rotor words; packets bear their date, arrival is of no use."""
+        return self._reader.heads(packets)
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of columns (n, records.size) into `out`."""
+        self._reader.read(records, which, out)
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """One of its own where ranges count from the axis, and beams leave beside it."""
+        if self._centre_m is None or self._from_centre:
+            return None
+        return OffAxis(self._on_axis, self._centre_m, body_from_sensor, self.firing_ns, columns)
+
+
+class At128Lidar(HesaiLidar):
+    """An AT128: mirrors turn its beams, once through its field of view each."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        options: Mapping[str, str],
+        evidence: Evidence | None,
+        file: At128File,
+    ) -> None:
+        super().__init__(layout, options, evidence, file)
+        self._file = file
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """What the mirrors make of the rotor's angle."""
+        return at128_projection(self._file, self.firing_ns, body_from_sensor, columns)
+
+
+def _is_on(options: Mapping[str, str], key: str, default: str = "off") -> bool:
+    return options.get(key, default) == "on"
+
+
+def _layout(evidence: Evidence) -> Layout | None:
+    found = identify(evidence.size, evidence.sample) if len(evidence.sample) else None
+    return None if found is None else found.layout
+
+
+def _seen(path: Path | None, evidence: Evidence | None) -> Layout:
+    """The layout of the packets; RigError without any, since a file does not name its model."""
+    layout = None if evidence is None else _layout(evidence)
+    if layout is None:
+        raise RigError(
+            f"{path}: HESAI angles: wanted packets of the lidar in the first 10 seconds, to "
+            "tell its model and mode, got none; check its stream in the rig file, or leave it out"
+        )
+    return layout
+
+
+def _told_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
+    """The layout, of the model whose beams the file has, where packets leave that open."""
+    is_b = layout.model is rows.PANDAR20A and not _note_on_beams(angles, rows.PANDAR20B)
+    return replace(layout, model=rows.PANDAR20B) if is_b else layout
+
+
+def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
+    """What is odd about the elevations in a file, or nothing."""
+    if model.elevation_deg is None:
+        return ""
+    got_deg = angles.elevation_rad.min() / RAD_PER_DEG, angles.elevation_rad.max() / RAD_PER_DEG
+    pairs = zip(got_deg, model.elevation_deg, strict=True)
+    if all(abs(got - wanted) <= _ELEVATION_TOLERANCE_DEG for got, wanted in pairs):
+        return ""
+    return (
+        f"{angles.path}: wanted elevations from about {model.elevation_deg[0]:g} to "
+        f"{model.elevation_deg[1]:g} deg for a {model.name}, got {got_deg[0]:.1f} to "
+        f"{got_deg[1]:.1f}; check that the file is of this lidar"
+    )
+
+
+def _sense(reader: PacketReader, evidence: Evidence | None) -> int:
+    """1 for a rotor that turns clockwise seen from above, -1 for one that turns the other way."""
+    if evidence is None or len(evidence.sample) < 2:
+        return 1
+    step = np.diff(reader.azimuth_turns(evidence.sample[:_PACKETS_IN_A_ROW]))
+    return -1 if median(step - np.rint(step)) < 0 else 1

@@ -1,0 +1,106 @@
+"""Names of Livox packets by content: lengths, data types, and stamps that step.
+
+Source: facts/others.md (Livox SDK2 and SDK1); time type 5 (NTP): Livox communication protocol of
+the Avia2, v1.0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.sensors.packet_bytes import NO_DECODER, mostly, number, usual
+from mlbatch.types import U8Array
+from mlbatch.units import NS_PER_S, NS_PER_US
+
+HEADER_SIZE, _HEADER1_SIZE = 36, 18
+_TIME_TYPES2 = (0, 1, 2, 5)
+_TIME_TYPES1 = (0, 1, 3, 4)
+_GPS_TIME = 3
+IMU, _IMU1 = 0, 6
+
+
+@dataclass(frozen=True, slots=True)
+class PointKind:
+    """What SDK2 packets of a data type hold: bytes and returns of a point, and its coordinates."""
+
+    data_type: int
+    size: int
+    returns: int
+    what: str
+
+
+KINDS: Mapping[int, PointKind] = {
+    kind.data_type: kind
+    for kind in (
+        PointKind(IMU, 24, 0, "IMU"),
+        PointKind(1, 14, 1, "Cartesian 32 bit, single return"),
+        PointKind(2, 8, 1, "Cartesian 16 bit, single return"),
+        PointKind(3, 10, 1, "spherical, single return"),
+        PointKind(0x11, 28, 2, "Cartesian 32 bit, dual return"),
+    )
+}
+# SDK1, by data type: bytes of the payload, and what they are.
+_TYPES1 = {
+    0: (1318, "Cartesian, single return"),
+    1: (918, "spherical, single return"),
+    2: (1362, "Cartesian with tags, single return"),
+    3: (978, "spherical with tags, single return"),
+    4: (1362, "Cartesian, dual return"),
+    5: (786, "spherical, dual return"),
+    _IMU1: (42, "IMU"),
+    7: (1278, "Cartesian, triple return"),
+    8: (678, "spherical, triple return"),
+}
+
+
+def livox(size: int, packets: U8Array) -> str | None:
+    """A line on Livox packets, or None."""
+    return _describe_sdk2(size, packets) or _describe_sdk1(size, packets)
+
+
+def identify(size: int, packets: U8Array) -> PointKind | None:
+    """What SDK2 packets (k, size) hold; None if they are none.
+
+    The header announces the size twice: as a length, and by points of a type.
+    """
+    if size <= HEADER_SIZE or not len(packets):
+        return None
+    data_type = usual(number(packets, 10, 1))
+    kind = KINDS.get(data_type)
+    if kind is None:
+        return None
+    good = (packets[:, 10] == data_type) & np.isin(packets[:, 11], _TIME_TYPES2)
+    good &= number(packets, 1, 2) == size
+    good &= number(packets, 5, 2) * kind.size == size - HEADER_SIZE
+    return kind if mostly(packets, good) is not None else None
+
+
+def _describe_sdk2(size: int, packets: U8Array) -> str | None:
+    kind = identify(size, packets)
+    if kind is None:
+        return None
+    return f"Livox lidar (SDK2), {kind.what}" if kind.returns else "Livox IMU packet"
+
+
+def _describe_sdk1(size: int, packets: U8Array) -> str | None:
+    """A size and a type prove little, so the stamps of a few packets have to step forward."""
+    if len(packets) < 2 or size < _HEADER1_SIZE:
+        return None
+    kind = usual(number(packets, 9, 1))
+    wanted, what = _TYPES1.get(kind, (0, ""))
+    time_type = usual(number(packets, 8, 1))
+    if size != wanted or time_type not in _TIME_TYPES1:
+        return None
+    # Version, slot, device and reserved byte, time and data type are a stream's own; the status
+    # between them is not.
+    own = packets[:, [0, 1, 2, 3, 8, 9]]
+    if mostly(packets, (own == np.median(own, axis=0)).all(axis=1)) is None:
+        return None
+    gps = time_type == _GPS_TIME
+    step_ns = np.diff(number(packets, 14, 4) * NS_PER_US if gps else number(packets, 10, 8))
+    if not ((step_ns > 0) & (step_ns < NS_PER_S)).mean() > 0.5:
+        return None
+    return "Livox IMU packet" if kind == _IMU1 else f"Livox lidar (SDK1), {what}{NO_DECODER}"

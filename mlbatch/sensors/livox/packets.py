@@ -1,0 +1,151 @@
+"""Livox SDK2 packets: the header, points that carry their own coordinates, IMU samples.
+
+Source: facts/others.md (Livox SDK2). What the CRC-32 covers, the time and the data: Livox
+communication protocol of the Avia2, v1.0.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.lidar import FAULTS
+from mlbatch.sensors.livox.identify import HEADER_SIZE, IMU, PointKind
+from mlbatch.types import F32Array, F64Array, I64Array, ImuSamples, U8Array
+from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
+
+# 1 + 2 + 2 + 2 + 2 + 1 + 1 + 1 + 12 + 4 + 8 = 36 bytes; interval: 0.1 us.
+HEADER = np.dtype(
+    [
+        ("version", "u1"),
+        ("size", "<u2"),
+        ("interval", "<u2"),
+        ("points", "<u2"),
+        ("counter", "<u2"),
+        ("frame", "u1"),
+        ("data_type", "u1"),
+        ("time_type", "u1"),
+        ("reserved", "V12"),
+        ("crc", "<u4"),
+        ("stamp_ns", "<u8"),
+    ]
+)
+Points: TypeAlias = npt.NDArray[np.void]
+_NS_PER_INTERVAL = 100
+_CRC_FROM = 28
+_BAD_HEADER, _BAD_CRC = FAULTS.index("bad_header"), FAULTS.index("bad_crc")
+_LEVEL = [("level", "u1"), ("tag", "u1")]
+_CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_LEVEL])
+_CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_LEVEL])
+# zenith: from the z axis; azimuth: from x towards y; both in 0.01 degrees.
+_SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), *_LEVEL])
+_SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
+IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
+_TURN_CDEG, _QUARTER_CDEG = 36000, 9000
+
+
+def headers(packets: U8Array) -> npt.NDArray[np.void]:
+    """(P,) records of HEADER."""
+    return np.ascontiguousarray(packets[:, :HEADER_SIZE]).view(HEADER)[:, 0]
+
+
+def faults(packets: U8Array, kind: PointKind, *, check_crc: bool) -> U8Array:
+    """Index into FAULTS for each packet: other points than these, or damaged ones."""
+    head, size = headers(packets), packets.shape[1]
+    good = (head["data_type"] == kind.data_type) & (head["size"] == size)
+    good &= head["points"] == (size - HEADER_SIZE) // kind.size
+    found = np.where(good, 0, _BAD_HEADER).astype(np.uint8)
+    if check_crc:
+        # Less than a microsecond each, a fraction of what their points take.
+        crc = [zlib.crc32(packet[_CRC_FROM:].tobytes()) for packet in packets]
+        found[good & (head["crc"] != np.array(crc, np.uint32))] = _BAD_CRC
+    return found
+
+
+def stamps_ns(packets: U8Array, points: int) -> I64Array:
+    """(P, points) times; points are spread evenly over the interval that the packet names.
+
+    The maker's driver divides it by the number of points, as here; its protocol says that it
+    lies between the first and the last.
+    """
+    head = headers(packets)
+    interval_ns = head["interval"].astype(np.int64)[:, None] * _NS_PER_INTERVAL
+    # Times of damaged packets may be beyond int64: they turn negative, and are rejected as such.
+    first_ns = head["stamp_ns"].astype(np.int64)[:, None]
+    stamp_ns: I64Array = first_ns + interval_ns * np.arange(points) // points
+    return stamp_ns
+
+
+def read_points(
+    records: U8Array, which: int, kind: PointKind
+) -> tuple[F64Array, F64Array, U8Array]:
+    """Coordinates (n, 3) and ranges (n,) in metres, and levels (n,), of one return of n points."""
+    layout, place = _RETURNS[kind.data_type]
+    begin = which * layout.itemsize
+    point = records[:, begin : begin + layout.itemsize].view(layout)[:, 0]
+    xyz_m, range_m = place(point)
+    return xyz_m, range_m, point["level"]
+
+
+def read_imu(payloads: U8Array, sensor: int) -> ImuSamples:
+    """The sample of each IMU packet; packets of points of the same size have none."""
+    head = headers(payloads)
+    is_sample = (head["data_type"] == IMU) & (head["points"] == 1)
+    chosen = np.ascontiguousarray(payloads[is_sample, HEADER_SIZE:IMU_SIZE])
+    sample = chosen.view(_SAMPLE)[:, 0]
+    # Damaged packets may hold NaN that signal.
+    with np.errstate(invalid="ignore"):
+        return ImuSamples(
+            sensor,
+            head["stamp_ns"][is_sample].astype(np.int64),
+            sample["acceleration_g"].astype(np.float64) * STANDARD_GRAVITY,
+            sample["angular_velocity"].astype(np.float64),
+        )
+
+
+def _from_millimetres(point: Points) -> tuple[F64Array, F64Array]:
+    return _cartesian(point["xyz"] / 1000.0)
+
+
+def _from_centimetres(point: Points) -> tuple[F64Array, F64Array]:
+    return _cartesian(point["xyz"] / 100.0)
+
+
+def _cartesian(xyz_m: F64Array) -> tuple[F64Array, F64Array]:
+    x, y, z = xyz_m.T
+    return xyz_m, np.sqrt(x * x + y * y + z * z)
+
+
+def _spherical(point: Points) -> tuple[F64Array, F64Array]:
+    zenith, azimuth = point["zenith"].astype(np.int64), point["azimuth"].astype(np.int64)
+    range_m = point["depth"] / 1000.0
+    flat_m, up_m = range_m * _sine(zenith), range_m * _sine(zenith + _QUARTER_CDEG)
+    forward_m, left_m = flat_m * _sine(azimuth + _QUARTER_CDEG), flat_m * _sine(azimuth)
+    return np.stack([forward_m, left_m, up_m], axis=1), range_m
+
+
+def _sine(angle_cdeg: I64Array) -> F32Array:
+    """Sine of whole hundredths of a degree."""
+    sines: F32Array = _sines().take(angle_cdeg % _TURN_CDEG)
+    return sines
+
+
+@lru_cache(maxsize=1)
+def _sines() -> F32Array:
+    """Of a turn; rounded to float32, so that they depend on no library's last digit."""
+    sines: F32Array = np.sin(np.arange(_TURN_CDEG) * (0.01 * RAD_PER_DEG)).astype(np.float32)
+    return sines
+
+
+# By data type: how a return is laid out, and what makes coordinates and range of it.
+_RETURNS: Mapping[int, tuple[np.dtype[np.void], Callable[[Points], tuple[F64Array, F64Array]]]] = {
+    1: (_CARTESIAN32, _from_millimetres),
+    2: (_CARTESIAN16, _from_centimetres),
+    3: (_SPHERICAL, _spherical),
+    0x11: (_CARTESIAN32, _from_millimetres),
+}

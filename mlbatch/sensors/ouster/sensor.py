@@ -1,0 +1,301 @@
+"""Ouster lidars: OS0, OS1, OS2, OSDome, all firmware since 1.12, described by their metadata JSON.
+
+Source: facts/ouster.md (ouster-sdk 1.0.1; Firmware User Manual, "Lidar Data"). A packet holds C
+columns with one stamp each; the pixels of a column fire together, so no firing offsets exist.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.geometry import BeamTable, Projection
+from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
+from mlbatch.sensors.options import check_options
+from mlbatch.sensors.ouster.document import read_document
+from mlbatch.sensors.ouster.identify import describe
+from mlbatch.sensors.ouster.imu import (
+    ACCEL32,
+    LEGACY_SIZE,
+    imu_size,
+    read_accel32,
+    read_legacy,
+    sample_count,
+)
+from mlbatch.sensors.ouster.metadata import Metadata, metadata
+from mlbatch.sensors.ouster.packets import (
+    Headers,
+    LegacyHeaders,
+    PacketHeaders,
+    first_measurement_ids,
+)
+from mlbatch.sensors.ouster.pixels import PixelReader, pixel_table
+from mlbatch.sensors.ouster.profiles import FUSA, LEGACY
+from mlbatch.types import BoolArray, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
+from mlbatch.units import NS_PER_S
+
+__all__ = [
+    "BUILT_IN",
+    "MAKER",
+    "MODELS",
+    "OusterCalibration",
+    "OusterLidar",
+    "describe",
+    "read_calibration",
+]
+
+MAKER = "Ouster"
+_REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
+_BEAMS = {
+    "OS0": (32, 64, 128),
+    "OS1": (16, 32, 64, 128),
+    "OS2": (32, 64, 128),
+    "OSDome": (32, 64, 128),
+}
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=f"{line}-{beams}",
+        maker=MAKER,
+        channels=beams,
+        returns=(1, 2),
+        clock="internal oscillator, sync pulse or PTP; ns in every column",
+        calibration="metadata JSON of the sensor, required",
+        verified="real recording" if f"{line}-{beams}" in _REAL else "one source",
+    )
+    for line, counts in _BEAMS.items()
+    for beams in counts
+)
+
+BUILT_IN: tuple[Calibration, ...] = ()
+
+# How sure a match is: a serial number decides, then the configuration, then the ports.
+_FITS_SERIAL = 1000
+_FITS_INIT_ID = 100
+_FITS_LIDAR_PORT = 10
+_FITS_IMU_PORT = 2
+_FITS_SIZE = 1
+_FRAME_IDS = {FUSA: 1 << 32}
+_DEFAULT_FRAME_IDS = 1 << 16
+
+
+def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
+    """The metadata in a file, or None if it holds something else."""
+    document = read_document(path, content)
+    return None if document is None else OusterCalibration(metadata(document))
+
+
+class OusterCalibration:
+    """A metadata file; `Calibration` of lidar.py."""
+
+    __slots__ = ("_headers", "is_shared", "metadata", "model", "path", "serial")
+
+    def __init__(self, described: Metadata) -> None:
+        self.metadata = described
+        self.path: Path | None = described.path
+        self.model = described.product or f"Ouster {described.layout.beams}-beam"
+        self.serial = str(described.serial) if described.serial else ""
+        self.is_shared = False
+        self._headers = _headers(described, check_crc=False)
+
+    def fit(self, evidence: Evidence) -> int:
+        """How well packets fit; a payload may have one byte more, as old ROS drivers append it."""
+        size = self.metadata.layout.packet_size
+        is_off = self.metadata.layout.profile.returns == 0
+        if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
+            return 0
+        packets = evidence.sample[:, :size]
+        good = packets[(self._headers.faults(packets) == 0) & self._headers.owns(packets)]
+        if 2 * len(good) <= len(packets):
+            return 0
+        return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> OusterLidar:
+        """The sensor."""
+        check_options(options)
+        if self.metadata.layout.profile.returns == 0:
+            raise RigError(
+                f"{self.path}: Ouster metadata, udp_profile_lidar: wanted a profile with pixels, "
+                f"got {self.metadata.layout.profile.name}; leave the sensor out of the rig"
+            )
+        return OusterLidar(self.metadata, self.model, self.serial, "crc" in options)
+
+    def _ids_fit(self, packets: U8Array) -> int:
+        serial, init_id = self.metadata.serial, self.metadata.init_id
+        same_unit = serial != 0 and bool((self._headers.serials(packets) == serial).any())
+        same_init = init_id != 0 and bool((self._headers.init_ids(packets) == init_id).any())
+        return _FITS_SERIAL * same_unit + _FITS_INIT_ID * same_init
+
+    def _ports_fit(self, evidence: Evidence) -> int:
+        on_port = evidence.stream.port != 0 and evidence.stream.port == self.metadata.lidar_port
+        imu_seen = any(
+            port == self.metadata.imu_port and _is_imu(self.metadata, size)
+            for port, size in ((one.stream.port, one.size) for one in evidence.beside)
+        )
+        return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
+
+
+class OusterLidar:
+    """One sensor; `Lidar` of lidar.py.
+
+    Beyond the protocol: `lidar_port`, `init_id`. `sequence` is negative for packets outside the
+    column window of the metadata: they stand outside the sensor's count, whose modulus is frames x
+    packets per frame.
+    """
+
+    def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:
+        layout = described.layout
+        self.maker = MAKER
+        self.model = model
+        self.serial = serial
+        # LEGACY packets have no header, and so name nobody.
+        self.carries_serial = layout.profile.name != LEGACY and bool(serial)
+        self.mode = f"{described.lidar_mode or described.columns_per_frame} {layout.profile.name}"
+        self.channels = layout.beams
+        self.returns = layout.profile.returns
+        self.has_reflectivity = True
+        self.packet_size = layout.packet_size
+        self.columns_per_packet = layout.columns
+        self.column_period_ns = _column_period_ns(described)
+        self.records = Records(layout.record_start, layout.record_size, layout.record_size)
+        self.pixel_layout = (MAKER, layout.profile.name, layout.beams, described.strongest_first)
+        # Which of two returns is the strongest depends on their order: the decoder sorts them out.
+        self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
+        self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""
+        self.sends_twice = False
+        self.channel = np.arange(self.channels)
+        # The pixels of a column fire together.
+        self.firing_ns = np.zeros((1, self.channels), np.int64)
+        self.beams = beam_table(described)
+        self.extrinsics = described.extrinsics
+        self.sensor_from_lidar: F64Array | None = described.lidar_to_sensor
+        self.timestamp_mode = described.timestamp_mode
+        self.clock_period_ns = 0
+        self.calibration = str(described.path)
+        self.notes = described.notes
+        self.lidar_port = described.lidar_port
+        self.imu_port = described.imu_port
+        self.init_id = described.init_id
+        self._metadata = described
+        self._headers = _headers(described, check_crc)
+        self._pixels = PixelReader(layout)
+        self.pixels = pixel_table(layout)
+        self._rank, in_window = _packet_ranks(described)
+        self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
+        self._packets_per_frame = in_window
+        self.sequence_modulus = self._frame_ids * in_window
+
+    def owns(self, packets: U8Array) -> BoolArray:
+        """Which packets carry this sensor's serial number, or none."""
+        return self._headers.owns(packets)
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """Index into FAULTS for each packet."""
+        return self._headers.faults(packets)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """Frame id and rank within the frame as one number."""
+        frame = self._headers.frame_ids(packets) % self._frame_ids
+        first = first_measurement_ids(packets, self._metadata.layout)
+        block = first // self.columns_per_packet
+        rank = self._rank.take(block, mode="clip")
+        inside = frame * self._packets_per_frame + rank
+        is_inside = rank >= 0
+        if is_inside.all():
+            return inside
+        return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Stamps, measurement ids and validity of all columns."""
+        return self._headers.heads(packets)
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of columns (n, record_size) into `out`, whose arrays may stride."""
+        self._pixels.read(records, which, out)
+
+    def is_imu(self, size: int) -> bool:
+        """Whether a payload of this size is an IMU packet (perhaps with a driver's extra byte)."""
+        return size != self.packet_size and _is_imu(self._metadata, size)
+
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """Samples of IMU packets (P, size)."""
+        read = read_accel32 if self._metadata.imu_profile == ACCEL32 else read_legacy
+        return read(payloads, sensor)
+
+    def sensor_from_imu(self) -> F64Array:
+        """Pose of the IMU in the sensor frame, metres."""
+        pose: F64Array = self._metadata.imu_to_sensor.copy()
+        return pose
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """The vectors of the beams suffice."""
+        return None
+
+
+def beam_table(described: Metadata) -> BeamTable:
+    """Section 6 as vectors per beam, in the sensor frame, metres.
+
+    The angle of a column falls while measurement ids rise: the sensor turns clockwise.
+    """
+    azimuth, altitude = -described.azimuth_rad, described.altitude_rad
+    forward = np.cos(azimuth) * np.cos(altitude)
+    side = np.sin(azimuth) * np.cos(altitude)
+    zero = np.zeros_like(forward)
+    direction = np.stack(
+        [
+            np.stack([forward, side, zero], axis=1),
+            np.stack([-side, forward, zero], axis=1),
+            np.stack([zero, zero, np.sin(altitude)], axis=1),
+        ]
+    )
+    offset_x, offset_z = described.beam_offset_m
+    origin = np.array([[[offset_x, 0.0, 0.0]], [[0.0, offset_x, 0.0]], [[0.0, 0.0, offset_z]]])
+    # Ranges count from the front of the rotor, which lies this far from its axis.
+    reach_m = -(math.hypot(offset_x, offset_z) if offset_z else offset_x)
+    column = np.arange(described.columns_per_frame)
+    angle_rad = 2 * math.pi * (1 - column / described.columns_per_frame)
+    return BeamTable(direction, origin, np.array([reach_m]), angle_rad).moved(
+        described.lidar_to_sensor
+    )
+
+
+def _headers(described: Metadata, check_crc: bool) -> Headers:
+    layout, columns = described.layout, described.columns_per_frame
+    if layout.legacy:
+        return LegacyHeaders(layout, columns)
+    return PacketHeaders(layout, columns, described.header, described.serial, check_crc)
+
+
+def _column_period_ns(described: Metadata) -> float:
+    """By the mode, as 1024x10; 0 where the metadata name none."""
+    turns_per_s = described.lidar_mode.rpartition("x")[2]
+    if not turns_per_s.isdigit() or not int(turns_per_s):
+        return 0.0
+    return NS_PER_S / (described.columns_per_frame * int(turns_per_s))
+
+
+def _packet_ranks(described: Metadata) -> tuple[I64Array, int]:
+    """Rank of every packet of a full frame among those that are sent (-1: not sent), and how many.
+
+    A window that spans encoder zero gives frames that begin at column 0 with its second part.
+    """
+    size = described.layout.columns
+    blocks = np.arange(described.columns_per_frame // size)
+    first, last = (column // size for column in described.column_window)
+    wraps = described.column_window[0] > described.column_window[1]
+    sent = (blocks >= first) | (blocks <= last) if wraps else (blocks >= first) & (blocks <= last)
+    rank = np.where(sent, np.cumsum(sent) - 1, -1)
+    return rank.astype(np.int64), int(sent.sum())
+
+
+def _is_imu(described: Metadata, size: int) -> bool:
+    if described.imu_profile == LEGACY:
+        return size in (LEGACY_SIZE, LEGACY_SIZE + 1)
+    if described.imu_profile != ACCEL32:
+        return False
+    if described.imu_samples:
+        return size in (imu_size(described.imu_samples), imu_size(described.imu_samples) + 1)
+    return sample_count(size) > 0

@@ -1,0 +1,176 @@
+"""What ROBOSENSE units say of themselves: DIFOP (device) packets, and csv files of angles.
+
+Source: facts/robosense.md sections 4, 6 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.lidar import Evidence
+from mlbatch.sensors.packet_bytes import number, starts
+from mlbatch.sensors.robosense.identify import is_difop
+from mlbatch.sensors.robosense.models import ROWS, Model
+from mlbatch.types import F64Array, U8Array
+
+_SIZE, _TAIL_AT, _TAIL = 1248, 1246, b"\x0f\xf0"
+_PORTS_AT, _PORTS = 24, 4
+_FIRMWARE = slice(41, 44)
+_INSTALLATION_AT, _SERIAL, _MODE_AT, _SYNC_AT, _REVERSED_AT = 289, slice(292, 298), 300, 302, 337
+_SYNC_STATES = {0: "not synchronised", 1: "GPS", 2: "PTP"}
+# What the counts of channels of all models are; a csv file has as many lines.
+_CHANNELS = tuple(sorted({row.channels for row in ROWS}))
+_MOST_DEG = 90.0
+
+
+@dataclass(frozen=True, slots=True)
+class Angles:
+    """Of each channel, degrees: elevation, and azimuth correction, clockwise; (channels,) each."""
+
+    elevation_deg: F64Array
+    azimuth_deg: F64Array
+
+
+@dataclass(frozen=True, slots=True)
+class Difop:
+    """A device packet; mode: DIFOP byte 300; installation: of an Airy (0 normal, 1 side, 2 M).
+
+    firmware: bytes 41 to 43, which are 0 in the first years' units; sync: state in words.
+    """
+
+    payload: U8Array
+    serial: str
+    mode: int
+    sync: str
+    installation: int
+    is_reversed: bool
+    firmware: int
+
+    def angles(self, model: Model) -> Angles | None:
+        """Angles of the channels, or None where the unit was never given any."""
+        places, count = model.angles, model.channels
+        elevation = self._angles(places.elevation_at, count, signed=places.signed)
+        azimuth: F64Array | None = np.zeros(count)
+        if places.azimuth_at:
+            azimuth = self._angles(places.azimuth_at, count, signed=True)
+        if elevation is None or azimuth is None:
+            return None
+        elevation, azimuth = elevation * places.unit_deg, azimuth * places.unit_deg
+        if not places.signed:
+            elevation[: count // 2] *= -1.0
+        usable = (np.abs(elevation) <= _MOST_DEG).all() and len(np.unique(elevation)) > 1
+        return Angles(elevation, azimuth) if usable else None
+
+    def _angles(self, at: int, count: int, *, signed: bool) -> F64Array | None:
+        """Three bytes a channel: sign and size, or size alone; None where one is not written."""
+        fields = self.payload[at : at + 3 * count].reshape(count, 3)
+        if not signed:
+            return number(fields, 0, 3, ">").astype(np.float64)
+        if (fields[:, 0] > 1).any():
+            return None
+        return np.where(fields[:, 0] == 1, -1.0, 1.0) * number(fields, 1, 2, ">")
+
+
+def find_difop(evidence: Evidence) -> Difop | None:
+    """The device packet of the unit that sent the point packets; RigError if several may be.
+
+    On topics it comes between the point packets, else from the same source to another port.
+    """
+    own = _whole(evidence.sample)
+    for packets in (own, np.concatenate([own, *(_whole(one.sample) for one in evidence.beside)])):
+        units = np.unique(packets[:, _SERIAL], axis=0)
+        if len(units) > 1:
+            packets = _of_port(packets, evidence.stream.port)
+            units = np.unique(packets[:, _SERIAL], axis=0)
+        if len(units) > 1:
+            names = ", ".join(unit.tobytes().hex() for unit in units)
+            raise RigError(
+                f"{evidence.stream}: ROBOSENSE: wanted the device packets of one sensor beside "
+                f"its point packets, got those of {len(units)} (serial numbers {names}); give "
+                "the sensor a csv of its angles as metadata"
+            )
+        if len(packets):
+            return _difop(packets)
+    return None
+
+
+def _whole(packets: U8Array) -> U8Array:
+    if packets.shape[1] < _SIZE:
+        return np.empty((0, _SIZE), np.uint8)
+    return packets[is_difop(packets) & starts(packets, _TAIL, _TAIL_AT)][:, :_SIZE]
+
+
+def _of_port(packets: U8Array, port: int) -> U8Array:
+    """Those of units that send to this port, if that is what tells units apart."""
+    at = _PORTS_AT + 2 * np.arange(_PORTS)
+    ports = packets[:, at].astype(np.int64) << 8 | packets[:, at + 1]
+    named = (ports == port).any(axis=1)
+    return packets[named] if named.any() else packets
+
+
+def _difop(packets: U8Array) -> Difop:
+    """What most of the packets (k, 1248) say: damage of a few does no harm."""
+    said = np.sort(packets, axis=0)[len(packets) // 2]
+    serial = said[_SERIAL].tobytes()
+    return Difop(
+        payload=said,
+        serial=serial.hex() if any(serial) else "",
+        mode=int(said[_MODE_AT]),
+        sync=_SYNC_STATES.get(int(said[_SYNC_AT]), ""),
+        installation=int(said[_INSTALLATION_AT]),
+        is_reversed=bool(said[_REVERSED_AT] == 1),
+        firmware=int.from_bytes(said[_FIRMWARE].tobytes(), "big"),
+    )
+
+
+def read_angles(path: Path, content: bytes) -> Angles | None:
+    """The maker's csv of angles: "elevation,azimuth" in degrees, a line a channel.
+
+    None if it is no table of two columns; RigError if its numbers cannot be a lidar's.
+    """
+    lines = _lines(content)
+    cells = [line.split(",") for line in lines]
+    if not cells or any(len(row) != 2 for row in cells):
+        return None
+    if [cell.strip().lower()[:4] for cell in cells[0]] == ["elev", "azim"]:
+        cells = cells[1:]
+    pairs = [(_number(first), _number(second)) for first, second in cells]
+    if not any(math.isfinite(value) for pair in pairs for value in pair):
+        return None
+    wanted = f"{path}: ROBOSENSE angles: wanted "
+    if len(pairs) not in _CHANNELS:
+        raise RigError(
+            f"{wanted}{', '.join(map(str, _CHANNELS[:-1]))} or {_CHANNELS[-1]} lines "
+            f"`elevation,azimuth`, got {len(pairs)}; give a line for each channel of the sensor"
+        )
+    for line, (elevation, azimuth) in enumerate(pairs, start=1):
+        if not (abs(elevation) <= _MOST_DEG and abs(azimuth) <= 2 * _MOST_DEG):
+            raise RigError(
+                f"{wanted}degrees up to 90 and 180 in line {line + len(lines) - len(pairs)}, got "
+                f"{','.join(cells[line - 1])!r}; correct the file"
+            )
+    table = np.array(pairs)
+    return Angles(table[:, 0].copy(), table[:, 1].copy())
+
+
+def _lines(content: bytes) -> list[str]:
+    """Lines of a short text that are not empty; none if it is something else."""
+    if len(content) > 100_000:
+        return []
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return []
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

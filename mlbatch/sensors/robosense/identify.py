@@ -1,0 +1,183 @@
+"""What ROBOSENSE packets are, by content: magic bytes, type bytes, block ids, return modes.
+
+Source: facts/robosense.md sections 1 to 4 and 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.sensors.packet_bytes import (
+    NO_DECODER,
+    block_azimuths,
+    block_time_us,
+    in_pairs,
+    mostly,
+    number,
+    starts,
+    usual,
+)
+from mlbatch.sensors.robosense import models as rows
+from mlbatch.sensors.robosense.models import MAKER, SECOND_KIND, Layout, Model
+from mlbatch.types import BoolArray, I64Array, U8Array
+
+_SOLID_STATE = bytes.fromhex("55aa5aa5")
+DIFOP = bytes.fromhex("a5ff005a11115555")
+_IMU = bytes.fromhex("aa555a05")
+_IMU_SIZE = 51
+_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT = 30, 31, 32
+_MINUTE_US = 60_000_000
+_PACE_TOLERANCE = 0.1
+_SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812: "EM"}
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What point packets say they are.
+
+    name: in words; model: its row, None where there is no decoder; other: a model that the bytes
+    do not surely tell from it.
+    """
+
+    name: str
+    model: Model | None
+    other: Model | None = None
+
+
+_OLD_TYPES = {
+    1: Identity("RS-LiDAR-16", rows.RS16),
+    2: Identity("RS-LiDAR-32", rows.RS32),
+    3: Identity("RS-Bpearl v3", rows.BPEARL_V3),
+}
+_BPEARL_V4 = Identity("RS-Bpearl v4", rows.BPEARL_V4)
+_BPEARL_V4_TYPE, _BPEARL_V4_MODELS = 3, (0, 4)
+# Second kind, by type and model; None: whatever the model.
+_TYPES: Mapping[tuple[int, int | None], Identity] = {
+    (6, 1): Identity("Helios 32, 70 degrees", rows.HELIOS_32),
+    (6, 2): Identity("Helios 32, 31 degrees", rows.HELIOS_32),
+    (6, 3): Identity("Helios 16", rows.HELIOS_16),
+    (6, 4): Identity("Helios 32, 26 degrees", rows.HELIOS_32),
+    (7, None): Identity("Helios 16", rows.HELIOS_16),
+    (0x31, 1): Identity("Airy 48", rows.AIRY_48),
+    (0x31, 2): Identity("Airy 96", rows.AIRY_96),
+    (0x31, 3): Identity("Airy 192", None),
+}
+# Ruby: by the readings of a block.
+_RUBIES = {
+    128: (rows.RUBY_128, rows.RUBY_PLUS_128),
+    80: (rows.RUBY_80, rows.RUBY_PLUS_80),
+    48: (rows.RUBY_48, rows.RUBY_PLUS_48),
+}
+_RUBY_PLUS_TYPE = 5
+MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
+
+
+def robosense(size: int, packets: U8Array) -> str | None:
+    """A line on ROBOSENSE packets, or None."""
+    packets = packets[:, :size]
+    points = point_packets(packets)
+    found = identify(points)
+    if found is not None and found.model is not None:
+        return _lidar(found.name, MODE_WORDS[returns_of(points, found.model)])
+    if found is not None:
+        return _lidar(found.name) + NO_DECODER
+    if 2 * len(points) < len(packets):
+        return f"{MAKER} DIFOP packet"
+    if size == _IMU_SIZE and mostly(packets, starts(packets, _IMU)) is not None:
+        return f"{MAKER} IMU packet, Airy"
+    if size in _SOLID_SIZES and mostly(packets, starts(packets, _SOLID_STATE)) is not None:
+        return _lidar(_SOLID_SIZES[size]) + NO_DECODER
+    return None
+
+
+def is_difop(packets: U8Array) -> BoolArray:
+    """Which of the packets (P, size) are device packets."""
+    return starts(packets, DIFOP)
+
+
+def point_packets(packets: U8Array) -> U8Array:
+    """Those that are no device packets, which come between them on topics."""
+    return packets[~is_difop(packets)]
+
+
+def fits(packets: U8Array, layout: Layout) -> BoolArray:
+    """Which packets have the magic bytes and the first two blocks of a layout."""
+    if packets.shape[1] < layout.end:
+        return np.zeros(len(packets), bool)
+    good = starts(packets, layout.magic) & starts(packets, layout.block_id, layout.header)
+    return good & starts(packets, layout.block_id, layout.header + layout.stride)
+
+
+def identify(packets: U8Array) -> Identity | None:
+    """What point packets (k, size) say they are; None if they are none of ROBOSENSE's."""
+    for layout in rows.LAYOUTS:
+        chosen = mostly(packets, fits(packets, layout))
+        if chosen is not None:
+            return _identity(chosen, layout)
+    return None
+
+
+def _identity(packets: U8Array, layout: Layout) -> Identity:
+    old, kind, model = (usual(number(packets, at, 1)) for at in (_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT))
+    rubies = _RUBIES.get(layout.per_block) if layout.block_id == b"\xfe" else None
+    if rubies is not None:
+        name = f"{rubies[0].name} or {rubies[1].name}"
+        own, other = rubies[::-1] if kind == _RUBY_PLUS_TYPE else rubies
+        return Identity(name, own, other)
+    if layout.magic == SECOND_KIND:
+        found = _TYPES.get((kind, model)) or _TYPES.get((kind, None))
+        shown = f"{kind:02X} {model:02X}"
+    else:
+        is_v4 = kind == _BPEARL_V4_TYPE and model in _BPEARL_V4_MODELS
+        found = _BPEARL_V4 if is_v4 else _OLD_TYPES.get(old)
+        shown = f"{old:02X} {kind:02X}"
+    if found is None or (found.model is not None and found.model.layout != layout):
+        return Identity(f"of unknown model (type bytes {shown})", None)
+    return found
+
+
+def returns_of(packets: U8Array, model: Model) -> int:
+    """Returns of a shot: by a byte that tells, by azimuths, or by their pace; 0: not told."""
+    layout = model.layout
+    chosen = mostly(packets, fits(packets, layout))
+    if chosen is None:
+        return 0
+    if layout.modes is not None:
+        told = layout.modes.get(usual(number(chosen, layout.mode_at, 1)), layout.other_modes)
+        if told:
+            return told
+    azimuth = block_azimuths(chosen, layout.header, layout.stride, layout.blocks, ">")
+    if model.rounds_per_block == 1:
+        turning = bool((azimuth[:, 0] != azimuth[:, -1]).all())
+        is_dual = in_pairs(azimuth) if layout.blocks % 2 == 0 else _repeats(azimuth)
+        return 1 + is_dual if turning else 0
+    # A block holds one round of two returns, or two rounds of one.
+    took_us = block_time_us(_stamp_us(chosen, model), azimuth, _MINUTE_US)
+    for returns in (1, 2):
+        wanted_us = model.rounds_per_block / returns * model.round_ns / 1000
+        if took_us is not None and abs(took_us - wanted_us) < _PACE_TOLERANCE * wanted_us:
+            return returns
+    return 0
+
+
+def _repeats(azimuth: I64Array) -> bool:
+    """Whether most packets hold two blocks of one azimuth, though they cannot all come in pairs."""
+    return float((azimuth[:, 1:] == azimuth[:, :-1]).any(axis=1).mean()) > 0.75
+
+
+def _stamp_us(packets: U8Array, model: Model) -> I64Array:
+    """(k,) time within the minute, us."""
+    at = model.layout.time_at
+    if model.is_calendar:
+        second = number(packets, at + 5, 1)
+        milli, micro = (number(packets, at + offset, 2, ">") for offset in (6, 8))
+        return second * 1_000_000 + milli * 1000 + micro
+    second, micro = number(packets, at, 6, ">"), number(packets, at + 6, 4, ">")
+    return np.asarray((second % 60) * 1_000_000 + micro, np.int64)
+
+
+def _lidar(model: str, mode: str = "") -> str:
+    return f"{MAKER} lidar {model}{', ' if mode else ''}{mode}"

@@ -1,0 +1,283 @@
+"""ROBOSENSE models as rows: where their bytes lie, when their channels fire, where their lens is.
+
+Source: facts/robosense.md sections 1 to 6 (rs_driver of the maker and his manuals).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from mlbatch.sensors.robosense import firing
+
+MAKER = "ROBOSENSE"
+FIRST_KIND, SECOND_KIND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
+# Numbers of return types, facts/outputs.md section 3; the nearest return has none of its own.
+STRONGEST, LAST, OTHER = 1, 2, 0
+READING = 3  # bytes: distance u16, reflectivity u8
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where blocks lie: `header` bytes, then `blocks` of `per_block` readings behind four bytes.
+
+    mode_at: byte that tells one return from two (0: none); modes: returns by its values, else
+    `other_modes` (0: not told); point_at: byte that is 0 in point packets (0: none).
+    """
+
+    magic: bytes
+    header: int
+    block_id: bytes
+    blocks: int
+    per_block: int
+    time_at: int = 20
+    mode_at: int = 0
+    modes: Mapping[int, int] | None = None
+    other_modes: int = 0
+    point_at: int = 0
+
+    @property
+    def stride(self) -> int:
+        """From block to block."""
+        return 4 + READING * self.per_block
+
+    @property
+    def end(self) -> int:
+        """Bytes that a packet has at least."""
+        return self.header + self.blocks * self.stride
+
+
+@dataclass(frozen=True, slots=True)
+class AnglePlaces:
+    """Where a DIFOP packet holds angles; azimuth_at 0: nowhere.
+
+    Without a sign byte (not `signed`) the lower half of the channels looks down.
+    """
+
+    elevation_at: int
+    azimuth_at: int
+    unit_deg: float
+    signed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnMode:
+    """A value of DIFOP byte 300: returns of a shot, and the type of a single one."""
+
+    returns: int
+    type: int
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model.
+
+    round_ns: from column to column; firing_ns: of each channel after its round begins, several
+    where the packets choose; units_per_m: raw distances in a metre; range_mask: their bits;
+    lens_m: radius and height of the lens; nominal_deg: elevations good enough without the unit's;
+    mirrors: a rotor told to turn the other way counts its azimuth backwards; has_sync: DIFOP bytes
+    301 and 302 tell of synchronisation.
+    """
+
+    name: str
+    layout: Layout
+    channels: int
+    round_ns: int
+    firing_ns: tuple[tuple[int, ...], ...]
+    units_per_m: int
+    lens_m: tuple[float, float]
+    angles: AnglePlaces
+    modes: Mapping[int, ReturnMode]
+    verified: str = "one source"
+    is_calendar: bool = False
+    range_mask: int = 0xFFFF
+    nominal_deg: tuple[float, ...] = ()
+    counter_at: int = 0
+    mirrors: bool = False
+    has_sync: bool = True
+
+    @property
+    def rounds_per_block(self) -> int:
+        """Rounds that fit into a block: two of 16-line models."""
+        return max(1, self.layout.per_block // self.channels)
+
+    @property
+    def blocks_per_round(self) -> int:
+        """Blocks that a round takes: two of 96-line models."""
+        return max(1, self.channels // self.layout.per_block)
+
+
+_BPEARL_V4_DEG = (
+    *(2.19, 47.29, 5.01, 50.12, 7.84, 52.94, 10.66, 55.75, 13.47, 58.57, 16.29, 61.39),
+    *(19.11, 64.20, 21.92, 67.01, 24.74, 69.82, 27.56, 72.63, 30.37, 75.44, 33.20, 78.26),
+    *(36.02, 81.07, 38.84, 83.89, 41.66, 86.71, 44.47, 89.55),
+)
+_DUAL = ReturnMode(2, OTHER)
+_STRONGEST, _LAST = ReturnMode(1, STRONGEST, "strongest"), ReturnMode(1, LAST, "last")
+_FIRST = ReturnMode(1, OTHER, "first")
+_OLD_MODES = {0: _DUAL, 1: _STRONGEST, 2: _LAST}
+_NEW_MODES = {0: _DUAL, 4: _STRONGEST, 5: _LAST, 6: _FIRST}
+_RUBY_MODES = {3: _DUAL, 1: _STRONGEST, 2: _LAST}
+_PLUS_MODES = {0: _STRONGEST, 1: _LAST, 2: _FIRST, 3: _DUAL, 4: _DUAL, 5: _DUAL}
+# The manual knows no dual mode; that the point packets tell (byte 17).
+_AIRY_MODES = {0: _STRONGEST, 1: _FIRST, 2: _LAST}
+
+FIRST_LAYOUT = Layout(FIRST_KIND, 42, b"\xff\xee", 12, 32)
+HELIOS_LAYOUT = replace(FIRST_LAYOUT, magic=SECOND_KIND)
+AIRY_LAYOUT = Layout(
+    SECOND_KIND, 42, b"\xff\xee", 8, 48, mode_at=17, modes={3: 2}, other_modes=1, point_at=16
+)
+RUBY_128_LAYOUT = Layout(
+    SECOND_KIND, 80, b"\xfe", 3, 128, time_at=10, mode_at=7, modes={1: 1, 3: 2}
+)
+RUBY_80_LAYOUT = replace(RUBY_128_LAYOUT, blocks=4, per_block=80)
+RUBY_48_LAYOUT = replace(RUBY_128_LAYOUT, blocks=8, per_block=48)
+LAYOUTS = (
+    FIRST_LAYOUT,
+    HELIOS_LAYOUT,
+    AIRY_LAYOUT,
+    RUBY_128_LAYOUT,
+    RUBY_80_LAYOUT,
+    RUBY_48_LAYOUT,
+)
+
+RS16 = Model(
+    "RS-LiDAR-16",
+    FIRST_LAYOUT,
+    channels=16,
+    round_ns=55_500,
+    firing_ns=(tuple(2800 * k for k in range(16)),),
+    units_per_m=200,
+    lens_m=(0.03825, 0.0),
+    angles=AnglePlaces(1165, 0, 0.0001, signed=False),
+    modes=_OLD_MODES,
+    verified="two sources",
+    is_calendar=True,
+    has_sync=False,
+)
+RS32 = replace(
+    RS16,
+    name="RS-LiDAR-32",
+    channels=32,
+    round_ns=55_520,
+    # The sheet counts from 1 and divides k by 16, so that channels 16 and 32 fire later.
+    firing_ns=(tuple(2880 * ((k - 1) % 16) + 1440 * (k // 16) for k in range(1, 33)),),
+    lens_m=(0.03997, 0.0),
+    angles=AnglePlaces(468, 564, 0.001),
+)
+BPEARL_V3 = replace(
+    RS32,
+    name="RS-Bpearl v3",
+    firing_ns=(
+        tuple(2560 * (k % 16) + 1280 * (k // 16) + 5200 * (k % 16 // 8) for k in range(32)),
+    ),
+    lens_m=(0.01473, 0.09427),
+    angles=AnglePlaces(468, 564, 0.01),
+    counter_at=12,
+    has_sync=True,
+)
+BPEARL_V4 = replace(
+    BPEARL_V3,
+    name="RS-Bpearl v4",
+    round_ns=55_560,
+    firing_ns=(firing.BPEARL_V4,),
+    units_per_m=400,
+    lens_m=(0.01619, 0.09571),
+    modes=_NEW_MODES,
+    is_calendar=False,
+    nominal_deg=_BPEARL_V4_DEG,
+    mirrors=True,
+)
+HELIOS_32 = Model(
+    "Helios 32",
+    HELIOS_LAYOUT,
+    channels=32,
+    round_ns=55_560,
+    firing_ns=(tuple(1730 * k for k in range(32)),),
+    units_per_m=400,
+    lens_m=(0.03498, 0.0),
+    angles=AnglePlaces(468, 564, 0.01),
+    modes=_NEW_MODES,
+    verified="two sources",
+)
+HELIOS_16 = replace(
+    HELIOS_32,
+    name="Helios 16",
+    channels=16,
+    # By the manual: the upper half of a 32-line round. The driver begins at 0.
+    firing_ns=(tuple(27_680 + 1730 * k for k in range(16)),),
+    verified="one source",
+)
+AIRY_96 = Model(
+    "Airy 96",
+    AIRY_LAYOUT,
+    channels=96,
+    round_ns=111_080,
+    # In the order of DIFOP byte 289: normal, on its side, M.
+    firing_ns=firing.AIRY_96,
+    units_per_m=200,
+    lens_m=(0.01002, 0.04532),
+    angles=AnglePlaces(468, 756, 0.01),
+    modes=_AIRY_MODES,
+    verified="two sources",
+    range_mask=0x3FFF,
+)
+AIRY_48 = replace(
+    AIRY_96,
+    name="Airy 48",
+    channels=48,
+    firing_ns=(firing.AIRY_48,),
+    verified="one source",
+)
+RUBY_128 = Model(
+    "Ruby 128",
+    RUBY_128_LAYOUT,
+    channels=128,
+    round_ns=55_550,
+    firing_ns=(tuple(3236 * (k % 64 // 4) for k in range(128)),),
+    units_per_m=200,
+    lens_m=(0.03615, 0.0),
+    angles=AnglePlaces(468, 852, 0.01),
+    modes=_RUBY_MODES,
+)
+RUBY_80 = replace(
+    RUBY_128,
+    name="Ruby 80",
+    layout=RUBY_80_LAYOUT,
+    channels=80,
+    round_ns=55_552,
+    firing_ns=(firing.RUBY_80,),
+)
+RUBY_48 = replace(
+    RUBY_80, name="Ruby 48", layout=RUBY_48_LAYOUT, channels=48, firing_ns=(firing.RUBY_48,)
+)
+RUBY_PLUS_128 = replace(
+    RUBY_128,
+    name="Ruby Plus 128",
+    round_ns=55_560,
+    firing_ns=(firing.RUBY_PLUS_128,),
+    lens_m=(0.02892, 0.0),
+    modes=_PLUS_MODES,
+    verified="two sources",
+)
+RUBY_PLUS_80 = replace(
+    RUBY_PLUS_128,
+    name="Ruby Plus 80",
+    layout=RUBY_80_LAYOUT,
+    channels=80,
+    # The second for the 80v, whose model byte is 3.
+    firing_ns=(firing.RUBY_PLUS_80, firing.RUBY_PLUS_80V),
+    verified="one source",
+)
+RUBY_PLUS_48 = replace(
+    RUBY_PLUS_80,
+    name="Ruby Plus 48",
+    layout=RUBY_48_LAYOUT,
+    channels=48,
+    firing_ns=(firing.RUBY_PLUS_48,),
+)
+ROWS = (
+    *(RS16, RS32, BPEARL_V3, BPEARL_V4, HELIOS_16, HELIOS_32, AIRY_48, AIRY_96),
+    *(RUBY_48, RUBY_80, RUBY_128, RUBY_PLUS_48, RUBY_PLUS_80, RUBY_PLUS_128),
+)

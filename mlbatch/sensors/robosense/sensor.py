@@ -1,0 +1,296 @@
+"""ROBOSENSE turning lidars: RS-LiDAR-16 and -32, Bpearl, Helios, Ruby, Ruby Plus, Airy.
+
+Source: facts/robosense.md (rs_driver of the maker, his manuals). Point packets (MSOP) name the
+model; device packets (DIFOP, another port or the same topic) hold the unit's angles and its return
+mode. Without them a csv of angles is needed, and the mode comes from the point packets alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.geometry import BeamTable, spherical
+from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.sensors.base import TurningLidar
+from mlbatch.sensors.options import check_options
+from mlbatch.sensors.packet_bytes import mostly, number
+from mlbatch.sensors.robosense.difop import Angles, Difop, find_difop, read_angles
+from mlbatch.sensors.robosense.evidence import (
+    COUNTER_MODULUS,
+    doubts,
+    firing_ns,
+    is_counted,
+    mode,
+    units_per_m,
+)
+from mlbatch.sensors.robosense.identify import (
+    MODE_WORDS,
+    fits,
+    identify,
+    is_difop,
+    point_packets,
+    robosense,
+)
+from mlbatch.sensors.robosense.models import MAKER, ROWS, Model
+from mlbatch.sensors.robosense.packets import PacketReader, shape_of, times_ns
+from mlbatch.types import BoolArray, Heads, I64Array, Pixels, U8Array
+from mlbatch.units import RAD_PER_DEG
+
+__all__ = ["BUILT_IN", "MAKER", "MODELS", "RobosenseLidar", "describe", "read_calibration"]
+
+# The bytes name the model; a file that was given is wanted before what is built in.
+_FITS_MODEL, _FITS_FILE = 100, 200
+_DIFOP_PORT = 7788
+
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=row.name,
+        maker=MAKER,
+        channels=row.channels,
+        returns=(1, 2),
+        clock="internal oscillator, GPS or PTP; us in every packet",
+        calibration="DIFOP packets of the recording, or csv of angles",
+        verified=row.verified,
+    )
+    for row in ROWS
+)
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """Model and mode of payloads (k, size), or None where no bytes prove them."""
+    packets = np.atleast_2d(sample)
+    if not packets.size or packets.shape[1] < size:
+        return None
+    return robosense(size, packets)
+
+
+def read_calibration(path: Path, content: bytes) -> AnglesFile | None:
+    """The angles in a csv file, or None if it holds something else."""
+    angles = read_angles(path, content)
+    return None if angles is None else AnglesFile(path, angles)
+
+
+class BuiltIn:
+    """A model whose units tell their angles themselves; `Calibration` of lidar.py."""
+
+    __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
+
+    def __init__(self, row: Model, *, is_named: bool = False) -> None:
+        """is_named: the rig says that it is this model."""
+        self._row = row
+        self._is_named = is_named
+        self.path: Path | None = None
+        self.model = row.name
+        self.serial = ""
+        self.is_shared = True
+
+    def for_model(self, name: str) -> BuiltIn | None:
+        """The same where the rig names this model: packets may leave open which of two it is."""
+        return BuiltIn(self._row, is_named=True) if name == self.model else None
+
+    def fit(self, evidence: Evidence) -> int:
+        """Whether the point packets name this model, or at least could be read as its."""
+        points = point_packets(evidence.sample)
+        found = identify(points)
+        if found is not None and found.model is self._row:
+            return _FITS_MODEL
+        if found is not None and found.other is self._row and self._is_named:
+            return _FITS_MODEL
+        chosen = mostly(points, fits(points, self._row.layout))
+        if chosen is None:
+            return 0
+        return READABLE if mostly(chosen, times_ns(chosen, self._row)[1]) is not None else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
+        """The sensor, with the angles of its device packets."""
+        check_options(options)
+        if evidence is None:
+            raise _silent(f"{MAKER} {self.model}")
+        difop = find_difop(evidence)
+        angles = None if difop is None else difop.angles(self._row)
+        notes: tuple[str, ...] = ()
+        origin = f"DIFOP packets of {difop.serial}" if difop and difop.serial else "DIFOP packets"
+        if angles is None and self._row.nominal_deg:
+            elevation = np.array(self._row.nominal_deg)
+            angles, origin = Angles(elevation, np.zeros_like(elevation)), "nominal angles"
+            notes = (
+                f"no DIFOP packet with the angles of this {self.model}: nominal ones are taken; "
+                f"record its device port ({_DIFOP_PORT}) as well, or give a csv with --metadata",
+            )
+        if angles is None:
+            got = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
+            raise RigError(
+                f"{MAKER} {self.model}: wanted the angles of its channels, got "
+                f"{got} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
+                "or give a csv of `elevation,azimuth` lines with --metadata"
+            )
+        lidar = RobosenseLidar(self._row, angles, options, evidence, difop, is_named=self._is_named)
+        lidar.calibration = origin
+        lidar.notes += notes
+        return lidar
+
+
+class AnglesFile:
+    """A csv file with the angles of one unit; `Calibration` of lidar.py.
+
+    named: the model, where the rig says it.
+    """
+
+    __slots__ = ("_angles", "_named", "is_shared", "model", "path", "serial")
+
+    def __init__(self, path: Path, angles: Angles, named: Model | None = None) -> None:
+        self._angles = angles
+        self._named = named
+        self.path: Path | None = path
+        lines = f"{MAKER} {len(angles.elevation_deg)}-line"
+        self.model = lines if named is None else named.name
+        self.serial = ""
+        self.is_shared = False
+
+    def for_model(self, name: str) -> AnglesFile | None:
+        """The same for a model of as many channels; packets may not tell which one it is."""
+        count = len(self._angles.elevation_deg)
+        rows = [row for row in ROWS if row.name == name and row.channels == count]
+        return AnglesFile(self.path or Path(), self._angles, rows[0]) if rows else None
+
+    def fit(self, evidence: Evidence) -> int:
+        """Whether the point packets name a model of as many channels, or can be read as it."""
+        if self._named is not None:
+            score = BuiltIn(self._named, is_named=True).fit(evidence)
+            return _FITS_FILE if score == _FITS_MODEL else score
+        return _FITS_FILE if self._row(evidence) is not None else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
+        """The sensor, of the model that the packets name."""
+        check_options(options)
+        if evidence is None:
+            raise _silent(f"{self.path}: {self.model}")
+        row = self._row(evidence)
+        if row is None:
+            raise RigError(
+                f"{self.path}: wanted packets of a {self.model} lidar from {evidence.stream}, got "
+                f"{describe(evidence.size, evidence.sample) or 'others'}; give the csv of its unit"
+            )
+        difop, is_named = find_difop(evidence), self._named is not None
+        lidar = RobosenseLidar(row, self._angles, options, evidence, difop, is_named=is_named)
+        lidar.calibration = str(self.path)
+        return lidar
+
+    def _row(self, evidence: Evidence) -> Model | None:
+        if self._named is not None:
+            return self._named if BuiltIn(self._named).fit(evidence) else None
+        found = identify(point_packets(evidence.sample))
+        row = None if found is None else found.model
+        return row if row and row.channels == len(self._angles.elevation_deg) else None
+
+
+BUILT_IN: tuple[Calibration, ...] = tuple(BuiltIn(row) for row in ROWS)
+
+
+class RobosenseLidar(TurningLidar):
+    """One sensor; `Lidar` of lidar.py.
+
+    Dual mode of 128-line models: three blocks a packet do not divide by two, so that each return
+    is a column of its own (`returns` 1) and the return types stay unknown; the two returns of a
+    shot may lie in two packets. Columns of equal azimuth have equal stamps.
+    """
+
+    def __init__(
+        self,
+        row: Model,
+        angles: Angles,
+        options: Mapping[str, str],
+        evidence: Evidence,
+        difop: Difop | None,
+        *,
+        is_named: bool = False,
+    ) -> None:
+        """is_named: the rig says which model it is."""
+        points = point_packets(evidence.sample)
+        points = points[fits(points, row.layout)]
+        returned, mode_notes = mode(points, row, difop)
+        steps_per_m, unit_notes = units_per_m(points, row)
+        shape = shape_of(row, returned.returns)
+        mirrored = row.mirrors and difop is not None and difop.is_reversed
+        self.maker = MAKER
+        self.model = row.name
+        self.serial = "" if difop is None else difop.serial
+        self.mode = ", ".join(
+            word for word in (MODE_WORDS[returned.returns], returned.name) if word
+        )
+        if shape.is_split:
+            self.mode += ", a column each"
+        self.channels = row.channels
+        self.returns = shape.returns
+        self.packet_size = evidence.size
+        self.columns_per_packet = shape.rows * shape.columns
+        self.column_period_ns = float(row.round_ns)
+        self.records = shape.records
+        self.return_types = (returned.type,) * shape.returns
+        self.channel = np.arange(row.channels)
+        self.firing_ns = firing_ns(points, row, difop)
+        self.beams = beam_table(row, angles, mirrored=mirrored)
+        self.sequence_modulus = COUNTER_MODULUS if is_counted(points, row) else 0
+        self.timestamp_mode = difop.sync if difop is not None and row.has_sync else ""
+        self.pixel_layout = (
+            *(MAKER, row.channels, row.layout.stride, shape.return_step),
+            *(steps_per_m, row.range_mask, shape.returns),
+        )
+        self.calibration = ""
+        doubtful = doubts(points, row, difop, is_named=is_named)
+        self.notes = (*mode_notes, *unit_notes, *doubtful)
+        self._row = row
+        moving = options.get("firing_azimuth") != "off"
+        self._packets = PacketReader(row, shape, steps_per_m, mirrored=mirrored, moving=moving)
+        self._packets.learn_speed(points)
+        self.pixels = self._packets.pixels()
+
+    def owns(self, packets: U8Array) -> BoolArray:
+        """All point packets: device packets, which topics hold too, are nobody's."""
+        own = ~is_difop(packets)
+        at = self._row.layout.point_at
+        return own & (packets[:, at] == 0) if at else own
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """Index into FAULTS for each packet."""
+        return self._packets.faults(packets)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """The packets' own count, else a number that only packets of equal content share."""
+        if not self.sequence_modulus:
+            return super().sequence(packets)
+        return number(packets, self._row.counter_at, 4, ">")
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Stamps, rotor words and validity of all columns."""
+        return self._packets.heads(packets)
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of columns (n, record size) into `out`."""
+        self._packets.read(records, which, out)
+
+
+def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
+    """Section 6 as vectors, sensor frame (x forward, y left, z up), metres.
+
+    The lens turns with the rotor, without the correction of the channel. Each channel has an
+    origin of its own, since it fires where the rotor has got to by then. mirrored: the unit counts
+    azimuths the other way, corrections included.
+    """
+    azimuth_rad = angles.azimuth_deg * (-RAD_PER_DEG if mirrored else RAD_PER_DEG)
+    direction = spherical(azimuth_rad, angles.elevation_deg * RAD_PER_DEG)
+    radius, height = row.lens_m
+    lens = np.array([[radius, 0.0, 0.0], [0.0, -radius, 0.0], [0.0, 0.0, height]])
+    origin = np.repeat(lens[:, None, :], row.channels, axis=1)
+    return BeamTable(direction, origin, np.zeros(1))
+
+
+def _silent(what: str) -> RigError:
+    return RigError(
+        f"{what}: wanted a packet of it in the first 10 seconds to tell its return mode, got none; "
+        "correct its stream, or leave it out of the rig"
+    )

@@ -1,0 +1,156 @@
+"""What the first packets of a Velodyne tell of time: the hour, the rotor's speed, its sequences.
+
+Source: facts/velodyne.md sections 2, 7 and 8. Data packets count microseconds from the top of the
+hour; which hour comes from NMEA sentences in position packets, else from the recorder's clock.
+"""
+
+from __future__ import annotations
+
+import calendar
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from mlbatch.lidar import Beside
+from mlbatch.median import median
+from mlbatch.sensors.packet_bytes import usual
+from mlbatch.sensors.velodyne.identify import (
+    NMEA_AT,
+    NMEA_SIZE,
+    POSITION_SIZE,
+    POSITION_STAMP_AT,
+    PPS_AT,
+    STAMP_AT,
+    TURN_CDEG,
+    are_positions,
+)
+from mlbatch.types import F64Array, I64Array, U8Array
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+HOUR_NS = 3600 * NS_PER_S
+_PPS = ("no PPS", "PPS synchronising", "PPS locked", "PPS error")
+_SENTENCE = re.compile(rb"\$(G.RMC,[^*$]*)\*([0-9A-Fa-f]{2})")
+_TIME, _STATUS, _DATE = 1, 2, 9
+# Packets this near follow each other; the rotor turns by less than half a turn.
+_NEAR_NS, _FAR_NS = 15 * NS_PER_MS, 600 * NS_PER_MS
+# VLS-128: no firmware known leaves this range; a lost packet doubles the step.
+_SEQUENCE_NS = (50_000, 62_000)
+_ENOUGH_STEPS = 4
+# Evidence begins with so many; what follows them is chosen by arrival.
+_IN_A_ROW = 16
+
+
+def top_of_hour_ns(packets: U8Array, at: int = STAMP_AT) -> I64Array:
+    """(P,) ns since the top of the hour."""
+    stamp_us = np.ascontiguousarray(packets[:, at : at + 4]).view("<u4")[:, 0]
+    return stamp_us.astype(np.int64) * NS_PER_US
+
+
+def absolute_ns(toh_ns: I64Array, near_ns: I64Array) -> I64Array:
+    """The times that lie this long after the top of an hour, nearest to `near_ns`."""
+    return toh_ns + (near_ns - toh_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
+
+
+def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside]) -> int:
+    """True time minus the recorder's; with it, arrival times tell the hour of all packets.
+
+    Fixed once, so that packets around a hard limit of half an hour all get the same hour.
+    """
+    if not len(packets):
+        return 0
+    away_ns = top_of_hour_ns(packets) - host_ns
+    # They lie around a circle of one hour.
+    spread_ns = (away_ns - away_ns[0] + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+    offset_ns = int(away_ns[0]) + round(median(spread_ns))
+    offset_ns = (offset_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+    told_ns = [value for one in beside for value in _position_offsets_ns(one)]
+    if told_ns:
+        aim_ns = round(median(np.array(told_ns)))
+        offset_ns += (aim_ns - offset_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
+    if int(host_ns.min()) + offset_ns < 0:
+        offset_ns += HOUR_NS
+    return offset_ns
+
+
+def pulse(beside: Sequence[Beside]) -> str:
+    """What position packets say of the pulse per second; "" without them."""
+    rows = [_positions(one)[0] for one in beside]
+    states = np.concatenate([np.zeros(0, np.int64), *(row[:, PPS_AT] for row in rows if len(row))])
+    return _PPS[usual(states)] if len(states) else ""
+
+
+def rmc_ns(text: bytes) -> int | None:
+    """UTC of an RMC sentence that is valid and whole, ns since 1970; else None."""
+    found = _SENTENCE.search(text)
+    if found is None:
+        return None
+    body, fields = found[1], found[1].split(b",")
+    checksum = int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8)))
+    if checksum != int(found[2], 16) or len(fields) <= _DATE or fields[_STATUS] != b"A":
+        return None
+    time = re.fullmatch(rb"(\d\d)(\d\d)(\d\d)(?:\.(\d{1,9}))?\d*", fields[_TIME])
+    date = re.fullmatch(rb"(\d\d)(\d\d)(\d\d)", fields[_DATE])
+    if time is None or date is None:
+        return None
+    hour, minute, second = (int(part) for part in time.groups()[:3])
+    day, month, year = (int(part) for part in date.groups())
+    if not (1 <= month <= 12 and 1 <= day <= 31 and hour < 24 and minute < 60 and second <= 60):
+        return None
+    seconds = calendar.timegm((2000 + year, month, day, hour, minute, second))
+    return seconds * NS_PER_S + int((time[4] or b"").ljust(9, b"0"))
+
+
+def rotor_speed(stamp_ns: I64Array, azimuth: I64Array, rough: float | None) -> float | None:
+    """Mean speed in 0.01 degree/ns over packets with these first azimuths; None if they rest.
+
+    rough: the speed within packets, where there is one; stamps are within the hour.
+    """
+    step_ns = np.diff(stamp_ns) % HOUR_NS
+    turned = (np.diff(azimuth) % TURN_CDEG).astype(np.float64)
+    near = (step_ns > 0) & (step_ns < _NEAR_NS)
+    if near.any():
+        rough = median(turned[near] / step_ns[near])
+    if not rough or rough < 0:
+        return None
+    # Whole turns between packets follow from the rough speed; over all, roundings cancel.
+    far = (step_ns > 0) & (step_ns < _FAR_NS)
+    if not far.any():
+        return rough
+    step_ns, turned = step_ns[far], turned[far]
+    whole: F64Array = np.rint((rough * step_ns - turned) / TURN_CDEG) * TURN_CDEG
+    return float((turned + whole).sum() / step_ns.sum())
+
+
+def measured_sequence_ns(stamp_ns: I64Array, sequences: int) -> float | None:
+    """Length of a firing sequence of a VLS-128 by the steps between its packets; None: too few.
+
+    The first packets suffice: they follow each other, so that the rounding of their stamps to us
+    cancels, and which ones they are does not depend on when they arrive.
+    """
+    low, high = (limit * sequences for limit in _SEQUENCE_NS)
+    for count in (_IN_A_ROW, len(stamp_ns)):
+        step_ns = np.diff(stamp_ns[:count]) % HOUR_NS
+        good = step_ns[(step_ns > low) & (step_ns < high)]
+        if len(good) >= _ENOUGH_STEPS:
+            return float(good.mean()) / sequences
+    return None
+
+
+def _positions(one: Beside) -> tuple[U8Array, I64Array]:
+    if one.size != POSITION_SIZE:
+        return one.sample[:0], one.host_ns[:0]
+    good = are_positions(one.sample)
+    return one.sample[good], one.host_ns[good]
+
+
+def _position_offsets_ns(one: Beside) -> list[int]:
+    packets, host_ns = _positions(one)
+    if not len(packets):
+        return []
+    toh_ns = top_of_hour_ns(packets, POSITION_STAMP_AT)
+    told = [rmc_ns(packet[NMEA_AT : NMEA_AT + NMEA_SIZE].tobytes()) for packet in packets]
+    good = [row for row, value in enumerate(told) if value is not None]
+    utc_ns = np.array([value for value in told if value is not None], np.int64)
+    offsets: list[int] = (absolute_ns(toh_ns[good], utc_ns) - host_ns[good]).tolist()
+    return offsets

@@ -1,0 +1,220 @@
+"""Velodyne lidars: VLP-16, Puck LITE, Puck Hi-Res, VLP-32C, HDL-32E, HDL-64E, VLS-128.
+
+Source: facts/velodyne.md. Their beams hardly differ from unit to unit, so that tables serve for
+all but the HDL-64E; a file of angles (YAML or db.xml) takes their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.median import median
+from mlbatch.sensors.options import check_options
+from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
+from mlbatch.sensors.velodyne.clock import (
+    clock_offset_ns,
+    measured_sequence_ns,
+    pulse,
+    rotor_speed,
+    top_of_hour_ns,
+)
+from mlbatch.sensors.velodyne.identify import BLOCK_LASERS, Identity, identify, takes, velodyne
+from mlbatch.sensors.velodyne.models import ALL, Model, layout
+from mlbatch.sensors.velodyne.packets import (
+    MAKER,
+    Measured,
+    Options,
+    VelodyneLidar,
+    are_good,
+    first_azimuths,
+    mean_step,
+    steps,
+)
+from mlbatch.types import U8Array
+from mlbatch.units import NS_PER_US, RAD_PER_DEG
+
+__all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]
+
+_FITS_BYTES, _FITS_FILE = 100, 200
+# A file whose angles are further from those of all models is of none of them.
+_ANGLE_TOLERANCE_DEG = 3.0
+_UNIT_TOLERANCE = 1e-6
+_OPTIONS = {"firing_azimuth": "on", "vertical_offset": "on", "packet_stamp": "start"}
+
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=model.name,
+        maker=MAKER,
+        channels=model.lasers,
+        returns=(1, 2),
+        clock="us past the hour, GPS or free; hour from NMEA or arrival",
+        calibration="YAML or db.xml, required" if model.needs_file else "built in; YAML or db.xml",
+        verified=model.verified,
+    )
+    for model in ALL
+)
+
+
+class VelodyneCalibration:
+    """A model's table, or a file in its place; `Calibration` of lidar.py.
+
+    is_guessed: packets and file leave open which of several models it is; is_named: the rig says
+    that it is this one.
+    """
+
+    __slots__ = ("file", "is_guessed", "is_named", "is_shared", "model", "path", "row", "serial")
+
+    def __init__(
+        self,
+        row: Model,
+        file: VelodyneFile | None = None,
+        *,
+        is_guessed: bool = False,
+        is_named: bool = False,
+    ) -> None:
+        self.row = row
+        self.file = file
+        self.is_guessed = is_guessed
+        self.is_named = is_named
+        self.path: Path | None = None if file is None else file.path
+        self.model = row.name
+        # Neither packets nor files name a unit.
+        self.serial = ""
+        self.is_shared = True
+
+    def for_model(self, name: str) -> VelodyneCalibration | None:
+        """The same for a model with as many beams that the rig names; None if it cannot be one."""
+        rows = [row for row in ALL if row.name == name and row.lasers == self.row.lasers]
+        return VelodyneCalibration(rows[0], self.file, is_named=True) if rows else None
+
+    def fit(self, evidence: Evidence) -> int:
+        """How well packets fit: by what they name, or only by how they are laid out."""
+        seen = identify(evidence.size, evidence.sample)
+        if seen is None or seen.banks != self.row.banks:
+            return 0
+        # Models that packets do not name (Puck LITE, series of the HDL-64E) are named by the rig.
+        first = next((row for row in ALL if row.seen_as == seen.model), None)
+        if first is None or first.seen_as != self.row.seen_as:
+            return READABLE if _is_paced(self.row, seen) else 0
+        if self.file is not None:
+            return _FITS_FILE
+        return _FITS_BYTES if first is self.row or self.is_named else READABLE
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> VelodyneLidar:
+        """The sensor."""
+        check_options(options)
+        chosen = {**_OPTIONS, **options}
+        if self.row.needs_file and self.file is None:
+            raise RigError(
+                f"{self.row.seen_as}: wanted its calibration, got none; give the unit's YAML or "
+                "db.xml with --metadata or as `metadata:` in the rig"
+            )
+        measured, notes = _measure(self.row, evidence)
+        if self.file is not None:
+            notes += [*self.file.notes, *_file_notes(self)]
+        return VelodyneLidar(
+            self.row,
+            self.file,
+            measured,
+            Options(
+                firing_azimuth=chosen["firing_azimuth"] == "on",
+                vertical_offset=chosen["vertical_offset"] == "on",
+                stamp_is_end=chosen["packet_stamp"] == "end",
+            ),
+            tuple(notes),
+        )
+
+
+# The HDL-64E is among them to say what it lacks.
+BUILT_IN: tuple[Calibration, ...] = tuple(VelodyneCalibration(model) for model in ALL)
+
+
+def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
+    """The angles in a file, for the model that they are nearest to; None if it holds none."""
+    file = read_velodyne(path, content)
+    if file is None:
+        return None
+    rows = [row for row in ALL if row.lasers == file.lasers]
+    away_deg, row = min(((_away_deg(row, file), row) for row in rows), key=lambda pair: pair[0])
+    if away_deg > _ANGLE_TOLERANCE_DEG:
+        raise RigError(
+            f"{path}: Velodyne calibration: wanted vertical angles of {row.name} or another model "
+            f"with {file.lasers} lasers, got some {away_deg:.1f} degrees off; give the file of a "
+            "supported model"
+        )
+    return VelodyneCalibration(row, file, is_guessed=row.needs_file)
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """What payloads (k, size) are, or None."""
+    packets = np.atleast_2d(sample)
+    if not packets.size or packets.shape[1] < size:
+        return None
+    return velodyne(size, packets[:, :size])
+
+
+def _away_deg(row: Model, file: VelodyneFile) -> float:
+    """How far the beams of a file are from a model's, on average; 0 where the model has none."""
+    if row.needs_file:
+        return 0.0
+    away = np.abs(file.elevation_rad / RAD_PER_DEG - np.array(row.elevation_deg))
+    return float(away.mean())
+
+
+def _is_paced(row: Model, seen: Identity) -> bool:
+    """Whether packets come as fast as the model's: a wrong name is possible, a wrong pace not."""
+    block_us = row.sequence_ns * BLOCK_LASERS / row.lasers / NS_PER_US
+    return seen.block_us is None or takes(block_us, seen.block_us)
+
+
+def _file_notes(calibration: VelodyneCalibration) -> list[str]:
+    notes, file, row = [], calibration.file, calibration.row
+    if calibration.is_guessed:
+        others = ", ".join(one.name for one in ALL if one.seen_as == row.seen_as and one != row)
+        notes.append(f"taken for an {row.name}; if it is an {others}, name its model in the rig")
+    if file is not None and file.unit_m is not None:
+        unit_m = 1 / row.units_per_m
+        if abs(file.unit_m - unit_m) > _UNIT_TOLERANCE:
+            notes.append(
+                f"{file.path}: distance_resolution is {file.unit_m:g} m, but a {row.name} counts "
+                f"in {unit_m:g} m, which is used"
+            )
+    return notes
+
+
+def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]]:
+    seen = None if evidence is None else identify(evidence.size, evidence.sample)
+    if evidence is None or seen is None:
+        note = "no packet seen at first: taken for one that sends a single return"
+        return Measured("single return", row.sequence_ns), [note]
+    notes = _identity_notes(row, seen)
+    where = layout(row, seen.returns)
+    packets, host_ns = evidence.sample, evidence.host_ns
+    good = are_good(packets, row, seen.returns)
+    packets, host_ns = packets[good], host_ns[good]
+    stamp_ns, azimuth = top_of_hour_ns(packets), first_azimuths(packets, where)
+    sequence_ns = float(row.sequence_ns)
+    if row.banks == 4:
+        told_ns = measured_sequence_ns(stamp_ns, where.sequences)
+        sequence_ns = told_ns or sequence_ns
+        if told_ns is None:
+            notes.append(
+                f"too few packets to measure its firing sequence: {sequence_ns:g} ns taken"
+            )
+    within = None
+    if where.sequences > 1 and len(packets):
+        within = median(mean_step(*steps(azimuth))) / (sequence_ns * row.halves)
+    speed = rotor_speed(stamp_ns, azimuth[:, 0], within) or 0.0
+    offset_ns = clock_offset_ns(packets, host_ns, evidence.beside)
+    return Measured(seen.mode, sequence_ns, offset_ns, speed, pulse(evidence.beside)), notes
+
+
+def _identity_notes(row: Model, seen: Identity) -> list[str]:
+    if seen.model == row.seen_as and seen.label:
+        return [f"by the pace of its packets it is a {seen.model}, though {seen.label}"]
+    return []
