@@ -1,8 +1,9 @@
 """HESAI packets to stamps, rotor positions and ranges, whatever the model.
 
-Source: facts/hesai.md sections 2 to 5 and 7. A column is a firing group: one block for each return,
-all of one azimuth. Azimuth and time of a block are those of firing offset 0; some models count
-offsets back from there, so a column is stamped, and its angle told, at its earliest firing.
+Source: facts/hesai.md sections 2 to 5 (dates: 4) and 7. A column is a firing group: one block for
+each return, all of one azimuth. Azimuth and time of a block are those of firing offset 0; some
+models count offsets back from there, so a column is stamped, and its angle told, at its earliest
+firing.
 """
 
 from __future__ import annotations
@@ -12,14 +13,49 @@ import numpy as np
 from mlbatch.geometry import rotor_words
 from mlbatch.lidar import FAULTS, Records
 from mlbatch.pixels import PixelTable, readings
-from mlbatch.sensors.hesai.crc import crc32
+from mlbatch.sensors.crc import crc32
 from mlbatch.sensors.hesai.firing import NEVER
 from mlbatch.sensors.hesai.layout import CRC_SIZE, RETURN_MODES, SAFETY, SAFETY_SIZE, Layout
 from mlbatch.sensors.hesai.models import OPERATIONS
-from mlbatch.sensors.hesai.time import packet_times
 from mlbatch.sensors.packet_bytes import number
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
-from mlbatch.units import MM_PER_M
+from mlbatch.units import MM_PER_M, NS_PER_S, NS_PER_US
+
+_CENTURY = 70  # Years below are of this century, others of the last.
+_US_PER_S = 1_000_000
+_S_PER_DAY = 86400
+# What int64 ns since 1970 can hold, in seconds: beyond, a date is damaged.
+_MOST_S = 9_000_000_000
+
+
+def packet_times(packets: U8Array, date_at: int, us_at: int) -> tuple[I64Array, BoolArray]:
+    """(P,) ns since 1970 of packets, and whether their date and time can be."""
+    date = packets[:, date_at : date_at + 6].astype(np.int64)
+    us = number(packets, us_at, 4)
+    calendar_s, is_date = _calendar(date)
+    counted_s = number(packets, date_at + 1, 5, ">")
+    is_counted = date[:, 0] == 0
+    seconds = np.where(is_counted, counted_s, calendar_s)
+    valid = np.where(is_counted, counted_s <= _MOST_S, is_date) & (us <= _US_PER_S)
+    return np.where(valid, seconds, 0) * NS_PER_S + us * NS_PER_US, valid
+
+
+def _calendar(date: I64Array) -> tuple[I64Array, BoolArray]:
+    """Seconds since 1970 of (P, 6) year, month, day, hour, minute, second; and their validity."""
+    year, month, day, hour, minute, second = date.T
+    months = (np.where(year < _CENTURY, year + 30, year - _CENTURY)) * 12 + month - 1
+    first_day, next_month = _days(months), _days(months + 1)
+    valid = (month >= 1) & (month <= 12) & (day >= 1) & (day <= next_month - first_day)
+    valid &= (hour < 24) & (minute < 60) & (second < 60)
+    days = first_day + day - 1
+    return days * _S_PER_DAY + hour * 3600 + minute * 60 + second, valid
+
+
+def _days(months: I64Array) -> I64Array:
+    """Days from 1970 to the first of a month counted from January 1970."""
+    days: I64Array = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64)
+    return days
+
 
 _BAD_HEADER, _BAD_CRC = np.uint8(FAULTS.index("bad_header")), np.uint8(FAULTS.index("bad_crc"))
 _BLOCK_FLAG = (0xFF, 0xEE)

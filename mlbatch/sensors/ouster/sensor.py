@@ -16,7 +16,6 @@ from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
 from mlbatch.sensors.options import check_options
-from mlbatch.sensors.ouster.document import read_document
 from mlbatch.sensors.ouster.identify import describe
 from mlbatch.sensors.ouster.imu import (
     ACCEL32,
@@ -26,7 +25,7 @@ from mlbatch.sensors.ouster.imu import (
     read_legacy,
     sample_count,
 )
-from mlbatch.sensors.ouster.metadata import Metadata, metadata
+from mlbatch.sensors.ouster.metadata import Metadata, metadata, read_document
 from mlbatch.sensors.ouster.packets import (
     Headers,
     LegacyHeaders,

@@ -18,13 +18,16 @@ from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
 from mlbatch.sensors.base import TurningLidar
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import mostly, number
-from mlbatch.sensors.robosense.difop import Angles, Difop, find_difop, read_angles
-from mlbatch.sensors.robosense.evidence import (
+from mlbatch.sensors.robosense.difop import (
     COUNTER_MODULUS,
+    Angles,
+    Difop,
     doubts,
+    find_difop,
     firing_ns,
     is_counted,
     mode,
+    read_angles,
     units_per_m,
 )
 from mlbatch.sensors.robosense.identify import (

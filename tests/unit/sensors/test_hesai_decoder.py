@@ -11,7 +11,7 @@ import pytest
 from mlbatch.errors import MlbatchError, RigError, UsageError
 from mlbatch.geometry import Turning
 from mlbatch.lidar import FAULTS
-from mlbatch.sensors.hesai import crc
+from mlbatch.sensors import crc
 from mlbatch.sensors.hesai import sensor as hesai
 from mlbatch.types import F64Array, I64Array, U8Array
 from tests.builders import hesai as builder

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.sensors.hesai.time import packet_times
+from mlbatch.sensors.hesai.packets import packet_times
 from tests.builders.hesai import date_field
 from tests.builders.hesai_models import EPOCH, SINCE_1900
 
