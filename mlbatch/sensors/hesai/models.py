@@ -79,7 +79,8 @@ class Model:
     unit_mm_at: where the header tells the distance unit (None: 4 mm); crc: of the body, before the
     tail; tail_at: None behind the body and its checks. `firing_ns` has a row for every table and
     `tables` the row by operation mode and azimuth state. silent: raw distances up to this one mean
-    no return. elevation_deg: lowest and highest beam as the data sheet has them, None: not used.
+    no return. elevation_deg: lowest and highest beam as the data sheet has them, None: not used;
+    like: the model under whose name packets of this one are found.
     """
 
     name: str
@@ -90,6 +91,8 @@ class Model:
     firing_ns: I64Array
     centre_mm: tuple[float, float, float]
     elevation_deg: tuple[float, float] | None
+    verified: str
+    like: str = ""
     header: int = 12
     lead: int = 2
     azimuth_at: int = 0
@@ -145,12 +148,15 @@ PANDAR40P = Model(
     firing_ns=firing.P40[None],
     centre_mm=(-12.0, 38.73, 0.0),
     elevation_deg=_TO_15_DEG,
+    verified="real recording",
     header=0,
     lead=4,
     azimuth_at=2,
     unit=3,
     unit_mm_at=None,
 )
+# Only its angles differ from those of a Pandar40P.
+PANDAR40M = replace(PANDAR40P, name="Pandar40M", verified="two sources", like="Pandar40P")
 PANDAR64 = Model(
     "Pandar64",
     channels=64,
@@ -160,6 +166,7 @@ PANDAR64 = Model(
     firing_ns=firing.P64[None],
     centre_mm=(-12.0, 38.73, 0.0),
     elevation_deg=_TO_15_DEG,
+    verified="real recording",
     header=8,
     unit=3,
     unit_mm_at=5,
@@ -174,6 +181,7 @@ PANDAR20A = replace(
     firing_ns=firing.P20A[None],
     centre_mm=(0.0, 0.0, 0.0),
     elevation_deg=(-25.0, 8.0),
+    verified="one source",
 )
 PANDAR20B = replace(
     PANDAR20A, name="Pandar20B", firing_ns=firing.P20B[None], elevation_deg=(-18.9, 3.1)
@@ -187,6 +195,7 @@ PANDARQT64 = Model(
     firing_ns=firing.QT64[None],
     centre_mm=(-7.2, 29.8, 0.0),
     elevation_deg=(-52.1, 52.1),
+    verified="real recording",
 )
 QT128 = Model(
     "QT128C2X",
@@ -197,6 +206,7 @@ QT128 = Model(
     firing_ns=firing.QT128,
     centre_mm=(7.2, 35.4, 0.0),
     elevation_deg=(-52.6, 52.6),
+    verified="two sources",
     has_checks=True,
 )
 XT16 = Model(
@@ -208,6 +218,7 @@ XT16 = Model(
     firing_ns=firing.XT16[None],
     centre_mm=(-13.0, 31.5, 0.0),
     elevation_deg=(-15.0, 15.0),
+    verified="real recording",
 )
 XT32 = replace(
     XT16,
@@ -223,6 +234,7 @@ XT32M2X = replace(
     firing_ns=firing.XT32M2X[None],
     centre_mm=(-13.0, 30.5, 0.0),
     elevation_deg=(-20.8, 19.5),
+    verified="two sources",
     most_returns=3,
 )
 _e128_ns, _e128_tables = _by_state(firing.E128)
@@ -236,6 +248,7 @@ PANDAR128E3X = Model(
     tables=_e128_tables,
     centre_mm=(-12.0, 43.56, 0.0),
     elevation_deg=_TO_15_DEG,
+    verified="two sources",
     unit=3,
     has_flagged_units=True,
     has_checks=True,
@@ -259,6 +272,7 @@ JT128 = replace(
     tables=np.zeros_like(_e128_tables),
     centre_mm=(-7.6, 13.67, 12.74),
     elevation_deg=None,
+    verified="one source",
     from_centre=True,
 )
 AT128 = Model(
@@ -270,6 +284,7 @@ AT128 = Model(
     firing_ns=firing.AT128[None],
     centre_mm=(0.0, 0.0, 0.0),
     elevation_deg=None,
+    verified="two sources",
     lead=3,
     ticks=360 * 25600,
     has_checks=True,
@@ -283,10 +298,28 @@ JT16 = Model(
     firing_ns=np.zeros((1, 16), np.int64),
     centre_mm=(-6.25, 10.955, 3.911),
     elevation_deg=None,
+    verified="one source",
     header=16,
     unit=3,
     unit_mm_at=None,
     tail_at=0,
     most_returns=1,
     from_centre=True,
+)
+ALL = (
+    PANDAR20A,
+    PANDAR20B,
+    PANDAR40P,
+    PANDAR40M,
+    PANDAR64,
+    PANDARQT64,
+    QT128,
+    XT16,
+    XT32,
+    XT32M2X,
+    PANDAR128E3X,
+    OT128,
+    AT128,
+    JT16,
+    JT128,
 )

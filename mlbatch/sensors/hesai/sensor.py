@@ -32,47 +32,19 @@ from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 MAKER = "HESAI"
 BUILT_IN: tuple[Calibration, ...] = ()
-_REAL, _TWO, _ONE = "real recording", "two sources", "one source"
-_VERIFIED: Mapping[str, str] = {
-    "Pandar20A": _ONE,
-    "Pandar20B": _ONE,
-    "Pandar40P": _REAL,
-    "Pandar40M": _TWO,
-    "Pandar64": _REAL,
-    "PandarQT64": _REAL,
-    "QT128C2X": _TWO,
-    "PandarXT-16": _REAL,
-    "PandarXT-32": _REAL,
-    "XT32M2X": _TWO,
-    "Pandar128E3X": _TWO,
-    "OT128": _TWO,
-    "AT128": _TWO,
-    "JT16": _ONE,
-    "JT128": _ONE,
-}
-# Of a Pandar40M only the angles are other than those of a Pandar40P.
-_LIKE = {"Pandar40M": rows.PANDAR40P.name}
-_ROWS: Mapping[str, Model] = {
-    row.name: row
-    for row in (
-        *(rows.PANDAR20A, rows.PANDAR20B),
-        *(rows.PANDAR40P, rows.PANDAR64, rows.PANDARQT64, rows.QT128, rows.XT16, rows.XT32),
-        *(rows.XT32M2X, rows.PANDAR128E3X, rows.OT128, rows.AT128, rows.JT16, rows.JT128),
-    )
-}
 _CSV, _DAT = "angle csv of the unit, required", "correction dat of the unit, required"
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
-        name=name,
+        name=row.name,
         maker=MAKER,
-        channels=_ROWS[_LIKE.get(name, name)].channels,
-        returns=tuple(range(1, _ROWS[_LIKE.get(name, name)].most_returns + 1)),
+        channels=row.channels,
+        returns=tuple(range(1, row.most_returns + 1)),
         clock="free-running, GPS or PTP; date and us in every packet",
-        calibration=_DAT if name == rows.AT128.name else _CSV,
-        verified=verified,
-        like=_LIKE.get(name, ""),
+        calibration=_DAT if row is rows.AT128 else _CSV,
+        verified=row.verified,
+        like=row.like,
     )
-    for name, verified in _VERIFIED.items()
+    for row in rows.ALL
 )
 # Preferred is a file whose beams lie where the model's do, but for what differs between units.
 _FITS, _FITS_BEAMS = 200, 300

@@ -6,42 +6,20 @@ the Avia2, v1.0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import numpy as np
 
+from mlbatch.sensors.livox.packets import HEADER_SIZE, KINDS, PointKind
 from mlbatch.sensors.packet_bytes import NO_DECODER, mostly, number, usual
 from mlbatch.types import U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
-HEADER_SIZE, _HEADER1_SIZE = 36, 18
+_HEADER1_SIZE = 18
 _TIME_TYPES2 = (0, 1, 2, 5)
 _TIME_TYPES1 = (0, 1, 3, 4)
 _GPS_TIME = 3
-IMU, _IMU1 = 0, 6
+_IMU1 = 6
 
 
-@dataclass(frozen=True, slots=True)
-class PointKind:
-    """What SDK2 packets of a data type hold: bytes and returns of a point, and its coordinates."""
-
-    data_type: int
-    size: int
-    returns: int
-    what: str
-
-
-KINDS: Mapping[int, PointKind] = {
-    kind.data_type: kind
-    for kind in (
-        PointKind(IMU, 24, 0, "IMU"),
-        PointKind(1, 14, 1, "Cartesian 32 bit, single return"),
-        PointKind(2, 8, 1, "Cartesian 16 bit, single return"),
-        PointKind(3, 10, 1, "spherical, single return"),
-        PointKind(0x11, 28, 2, "Cartesian 32 bit, dual return"),
-    )
-}
 # SDK1, by data type: bytes of the payload, and what they are.
 _TYPES1 = {
     0: (1318, "Cartesian, single return"),

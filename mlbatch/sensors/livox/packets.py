@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -15,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.lidar import FAULTS
-from mlbatch.sensors.livox.identify import HEADER_SIZE, IMU, PointKind
 from mlbatch.types import F32Array, F64Array, I64Array, ImuSamples, U8Array
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
+HEADER_SIZE = 36
+IMU = 0
 # 1 + 2 + 2 + 2 + 2 + 1 + 1 + 1 + 12 + 4 + 8 = 36 bytes; interval: 0.1 us.
 HEADER = np.dtype(
     [
@@ -47,6 +49,28 @@ _SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), 
 _SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
 IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
 _TURN_CDEG, _QUARTER_CDEG = 36000, 9000
+
+
+@dataclass(frozen=True, slots=True)
+class PointKind:
+    """What SDK2 packets of a data type hold: bytes and returns of a point, and its coordinates."""
+
+    data_type: int
+    size: int
+    returns: int
+    what: str
+
+
+KINDS: Mapping[int, PointKind] = {
+    kind.data_type: kind
+    for kind in (
+        PointKind(IMU, 24, 0, "IMU"),
+        PointKind(1, 14, 1, "Cartesian 32 bit, single return"),
+        PointKind(2, 8, 1, "Cartesian 16 bit, single return"),
+        PointKind(3, 10, 1, "spherical, single return"),
+        PointKind(0x11, 28, 2, "Cartesian 32 bit, dual return"),
+    )
+}
 
 
 def headers(packets: U8Array) -> npt.NDArray[np.void]:

@@ -18,9 +18,11 @@ from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
 from mlbatch.median import median
 from mlbatch.sensors.base import TurningLidar, content_keys
-from mlbatch.sensors.livox.identify import HEADER_SIZE, PointKind, identify, livox
+from mlbatch.sensors.livox.identify import identify, livox
 from mlbatch.sensors.livox.packets import (
+    HEADER_SIZE,
     IMU_SIZE,
+    PointKind,
     faults,
     headers,
     read_imu,

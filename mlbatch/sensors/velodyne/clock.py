@@ -14,21 +14,19 @@ import numpy as np
 
 from mlbatch.lidar import Beside
 from mlbatch.median import median
-from mlbatch.sensors.packet_bytes import usual
-from mlbatch.sensors.velodyne.identify import (
-    NMEA_AT,
-    NMEA_SIZE,
-    POSITION_SIZE,
-    POSITION_STAMP_AT,
-    PPS_AT,
-    STAMP_AT,
-    TURN_CDEG,
-    are_positions,
-)
-from mlbatch.types import F64Array, I64Array, U8Array
+from mlbatch.sensors.packet_bytes import number, starts, usual
+from mlbatch.sensors.velodyne.models import STAMP_AT, TURN_CDEG
+from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 HOUR_NS = 3600 * NS_PER_S
+HOUR_US = HOUR_NS // NS_PER_US
+# A position packet: where its stamp, the state of its pulse and its NMEA sentence begin.
+POSITION_SIZE = 512
+_POSITION_STAMP_AT = 198
+_PPS_AT = 202
+_NMEA_AT = 206
+_NMEA_SIZE = 128
 _PPS = ("no PPS", "PPS synchronising", "PPS locked", "PPS error")
 _SENTENCE = re.compile(rb"\$(G.RMC,[^*$]*)\*([0-9A-Fa-f]{2})")
 _TIME, _STATUS, _DATE = 1, 2, 9
@@ -76,7 +74,7 @@ def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside
 def pulse(beside: Sequence[Beside]) -> str:
     """What position packets say of the pulse per second; "" without them."""
     rows = [_positions(one)[0] for one in beside]
-    states = np.concatenate([np.zeros(0, np.int64), *(row[:, PPS_AT] for row in rows if len(row))])
+    states = np.concatenate([np.zeros(0, np.int64), *(row[:, _PPS_AT] for row in rows if len(row))])
     return _PPS[usual(states)] if len(states) else ""
 
 
@@ -137,6 +135,15 @@ def measured_sequence_ns(stamp_ns: I64Array, sequences: int) -> float | None:
     return None
 
 
+def are_positions(packets: U8Array) -> BoolArray:
+    """Which packets (k, 512) hold an NMEA sentence, or none yet, and a stamp within the hour."""
+    nmea = packets[:, _NMEA_AT : _NMEA_AT + _NMEA_SIZE]
+    stamp_us = number(packets, _POSITION_STAMP_AT, 4)
+    silent = (nmea == 0).all(axis=1) & (packets[:, :14] == 0).all(axis=1) & (stamp_us > 0)
+    good = (starts(packets, b"$GP", _NMEA_AT) | silent) & (stamp_us < HOUR_US)
+    return np.asarray(good & (packets[:, _PPS_AT] <= 3))
+
+
 def _positions(one: Beside) -> tuple[U8Array, I64Array]:
     if one.size != POSITION_SIZE:
         return one.sample[:0], one.host_ns[:0]
@@ -148,8 +155,8 @@ def _position_offsets_ns(one: Beside) -> list[int]:
     packets, host_ns = _positions(one)
     if not len(packets):
         return []
-    toh_ns = top_of_hour_ns(packets, POSITION_STAMP_AT)
-    told = [rmc_ns(packet[NMEA_AT : NMEA_AT + NMEA_SIZE].tobytes()) for packet in packets]
+    toh_ns = top_of_hour_ns(packets, _POSITION_STAMP_AT)
+    told = [rmc_ns(packet[_NMEA_AT : _NMEA_AT + _NMEA_SIZE].tobytes()) for packet in packets]
     good = [row for row, value in enumerate(told) if value is not None]
     utc_ns = np.array([value for value in told if value is not None], np.int64)
     offsets: list[int] = (absolute_ns(toh_ns[good], utc_ns) - host_ns[good]).tolist()

@@ -6,7 +6,6 @@ Source: facts/velodyne.md sections 1, 2 and 8; facts/others.md (LSLIDAR).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -20,44 +19,36 @@ from mlbatch.sensors.packet_bytes import (
     starts,
     usual,
 )
+from mlbatch.sensors.velodyne.clock import HOUR_US, POSITION_SIZE, are_positions
+from mlbatch.sensors.velodyne.models import (
+    ALL,
+    BANK_FLAGS,
+    BLOCKS,
+    DUAL,
+    HDL_32E,
+    HDL_64E,
+    MODE_AT,
+    MODES,
+    PACKET_SIZE,
+    STAMP_AT,
+    STRIDE,
+    TURN_CDEG,
+    UNSET_MODES,
+    VLP_16,
+    VLS_128,
+    expected_flags,
+)
 from mlbatch.types import BoolArray, I64Array, U8Array
 
-BLOCKS, STRIDE, BLOCK_LASERS = 12, 100, 32
-PACKET_SIZE, POSITION_SIZE = 1206, 512
-STAMP_AT, MODE_AT = 1200, 1204
-NMEA_AT, NMEA_SIZE, PPS_AT, POSITION_STAMP_AT = 206, 128, 202, 198
-HOUR_US = 3_600_000_000
-TURN_CDEG = 36000
-# Block flags as numbers; a sequence takes a block of each bank.
-BANK_FLAGS = {1: (0xEEFF,), 2: (0xEEFF, 0xDDFF), 4: (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)}
-DUAL = "dual return"
-UNSET_MODES = ("single return", DUAL)
-MODES = {0x37: "strongest return", 0x38: "last return", 0x39: DUAL}
-HDL_64E, VLS_128 = "HDL-64E", "VLS-128"
 _LSLIDAR_SIZE = 1212
 _TIME_TOLERANCE = 0.05
 _DEVICE_MAGIC = bytes.fromhex("a5ff005a")
 
 
-@dataclass(frozen=True, slots=True)
-class _Product:
-    """A model by its product byte; block_us: time from block to block, 0 where it varies."""
-
-    name: str
-    block_us: float = 0.0
-    is_decoded: bool = True
-
-
-_PRODUCTS = {
-    0x21: _Product("HDL-32E", 46.080),
-    0x22: _Product("VLP-16", 110.592),
-    0x23: _Product("VLP-32A/B", is_decoded=False),
-    0x24: _Product("Puck Hi-Res", 110.592),
-    0x28: _Product("VLP-32C", 55.296),
-    0x31: _Product("Velarray", is_decoded=False),
-}
+_PRODUCTS = {row.product: row.seen_as for row in ALL if row.product is not None}
+_UNDECODED = {0x23: "VLP-32A/B", 0x31: "Velarray"}
 # What a product byte may hide: only seen, or said of, the oldest models.
-_OLDEST = (0x22, 0x21)
+_OLDEST = (VLP_16, HDL_32E)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,29 +109,9 @@ def velodyne(size: int, packets: U8Array) -> str | None:
     return f"Velodyne lidar {name}, {seen.mode}{'' if seen.is_decoded else NO_DECODER}"
 
 
-def are_positions(packets: U8Array) -> BoolArray:
-    """Which packets (k, 512) hold an NMEA sentence, or none yet, and a stamp within the hour."""
-    nmea = packets[:, NMEA_AT : NMEA_AT + NMEA_SIZE]
-    stamp_us = number(packets, POSITION_STAMP_AT, 4)
-    silent = (nmea == 0).all(axis=1) & (packets[:, :14] == 0).all(axis=1) & (stamp_us > 0)
-    good = (starts(packets, b"$GP", NMEA_AT) | silent) & (stamp_us < HOUR_US)
-    return np.asarray(good & (packets[:, PPS_AT] <= 3))
-
-
 def block_flags(packets: U8Array) -> I64Array:
     """(k, blocks) flags of the blocks."""
     return np.stack([number(packets, STRIDE * n, 2) for n in range(BLOCKS)], axis=1)
-
-
-@lru_cache(maxsize=8)
-def expected_flags(banks: int, returns: int) -> I64Array:
-    """Flags of the blocks that a packet uses, which may be fewer than it has.
-
-    HDL-64E sends the second return after both banks of the first; VLS-128 bank by bank.
-    """
-    flags = np.array(BANK_FLAGS[banks], np.int64)
-    group = flags.repeat(returns) if banks == 4 else np.tile(flags, returns)
-    return np.tile(group, BLOCKS // len(group))
 
 
 def _within_the_hour(packets: U8Array) -> BoolArray:
@@ -178,19 +149,20 @@ def _one_bank(packets: U8Array | None) -> Identity | None:
     factory = usual(number(packets, MODE_AT, 2))
     azimuth = block_azimuths(packets, 0, STRIDE, BLOCKS, "<")
     took_us = block_time_us(number(packets, STAMP_AT, 4), azimuth, HOUR_US)
-    told = _PRODUCTS.get(factory >> 8)
+    product = factory >> 8
+    told = _PRODUCTS.get(product) or _UNDECODED.get(product)
     mode = MODES.get(factory & 0xFF, UNSET_MODES[in_pairs(azimuth)])
-    seen = next((n for n in _OLDEST if takes(_PRODUCTS[n].block_us, took_us)), None)
+    seen = next((row for row in _OLDEST if takes(row.block_us, took_us)), None)
     if factory == 0 and seen is not None:
         unset = "its factory bytes are not set"
-        return Identity(_PRODUCTS[seen].name, mode, 1, unset, block_us=took_us)
+        return Identity(seen.seen_as, mode, 1, unset, block_us=took_us)
     if told is None or factory & 0xFF not in MODES:
-        label = f"factory bytes {factory & 0xFF:02X} {factory >> 8:02X}"
+        label = f"factory bytes {factory & 0xFF:02X} {product:02X}"
         return Identity("", mode, 1, label, is_decoded=False, block_us=took_us)
-    if factory >> 8 in _OLDEST and seen is not None and seen != factory >> 8:
-        belied = f"its product byte says {told.name}"
-        return Identity(_PRODUCTS[seen].name, mode, 1, belied, block_us=took_us)
-    return Identity(told.name, mode, 1, is_decoded=told.is_decoded, block_us=took_us)
+    if seen is not None and seen.product != product in {row.product for row in _OLDEST}:
+        belied = f"its product byte says {told}"
+        return Identity(seen.seen_as, mode, 1, belied, block_us=took_us)
+    return Identity(told, mode, 1, is_decoded=product in _PRODUCTS, block_us=took_us)
 
 
 def takes(block_us: float, took_us: float | None) -> bool:

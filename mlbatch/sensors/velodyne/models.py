@@ -7,17 +7,33 @@ the wire; angles in degrees, as the manuals print them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from mlbatch.geometry import BeamTable, spherical
 from mlbatch.lidar import Records
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
-from mlbatch.sensors.velodyne.identify import BLOCKS, HDL_64E, STRIDE, VLS_128
 from mlbatch.types import F64Array, I64Array
-from mlbatch.units import M_PER_MM, RAD_PER_DEG
+from mlbatch.units import M_PER_MM, NS_PER_US, RAD_PER_DEG
 
-_BLOCK_HEAD, _READING, _READINGS = 4, 3, 32
+# A data packet: 12 x (2 + 2 + 32 x 3) + 4 + 2 = 1206 bytes.
+PACKET_SIZE = 1206
+BLOCKS = 12
+STRIDE = 100
+BLOCK_LASERS = 32
+STAMP_AT = 1200
+MODE_AT = 1204
+_BLOCK_HEAD = 4
+_READING = 3
+TURN_CDEG = 36000
+# Block flags as numbers; a sequence takes a block of each bank.
+BANK_FLAGS = {1: (0xEEFF,), 2: (0xEEFF, 0xDDFF), 4: (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)}
+DUAL = "dual return"
+UNSET_MODES = ("single return", DUAL)
+MODES = {0x37: "strongest return", 0x38: "last return", 0x39: DUAL}
+HDL_64E = "HDL-64E"
+VLS_128 = "VLS-128"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +43,8 @@ class Model:
     seen_as: what packets of this model name; banks: blocks of a firing sequence; halves: firing
     sequences of a block; sequence_ns, slots: a firing sequence and the slots of its timetable;
     slot: (lasers,) in which each laser fires; stamp_ns: first firing minus the packet's stamp;
-    clockwise_deg, elevation_deg, height_mm: of each beam, empty where only a file has them.
+    clockwise_deg, elevation_deg, height_mm: of each beam, empty where only a file has them;
+    product: the byte that names the model in its packets, None where they have none.
     """
 
     name: str
@@ -44,12 +61,18 @@ class Model:
     halves: int = 1
     stamp_ns: int = 0
     stamp_may_end: bool = False
+    product: int | None = None
     verified: str = "two sources"
 
     def firing_ns(self, sequence_ns: float) -> I64Array:
         """(1, lasers) times after the first firing of a sequence, to the nearest ns."""
         slot_ns = sequence_ns / self.slots
         return np.rint(np.array([self.slot], np.float64) * slot_ns).astype(np.int64)
+
+    @property
+    def block_us(self) -> float:
+        """Time from block to block of one bank, with a single return."""
+        return self.sequence_ns * BLOCK_LASERS / self.lasers / NS_PER_US
 
     @property
     def needs_file(self) -> bool:
@@ -85,9 +108,20 @@ def layout(model: Model, returns: int) -> Layout:
         tuple(STRIDE * (which * return_step + bank * bank_step) for bank in range(model.banks))
         for which in range(returns)
     )
-    step = _READING * _READINGS // model.halves
+    step = _READING * BLOCK_LASERS // model.halves
     records = Records(_BLOCK_HEAD, STRIDE * blocks, size, model.halves, step)
     return Layout(blocks, sequences, sequences * model.halves, records, per_bank, first_byte)
+
+
+@lru_cache(maxsize=8)
+def expected_flags(banks: int, returns: int) -> I64Array:
+    """Flags of the blocks that a packet uses, which may be fewer than it has.
+
+    HDL-64E sends the second return after both banks of the first; VLS-128 bank by bank.
+    """
+    flags = np.array(BANK_FLAGS[banks], np.int64)
+    group = flags.repeat(returns) if banks == 4 else np.tile(flags, returns)
+    return np.tile(group, BLOCKS // len(group))
 
 
 def beam_table(model: Model, file: VelodyneFile | None, *, raised: bool) -> BeamTable:
@@ -129,7 +163,7 @@ def _woven(even: tuple[float, ...], odd: tuple[float, ...]) -> tuple[float, ...]
 # fmt: off
 VLP_16 = Model(
     name="VLP-16", seen_as="VLP-16", lasers=16, units_per_m=500, sequence_ns=55_296, slots=24,
-    slot=tuple(range(16)), halves=2, verified="real recording",
+    slot=tuple(range(16)), halves=2, product=0x22, verified="real recording",
     elevation_deg=(-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15),
     clockwise_deg=(0.0,) * 16,
     height_mm=(11.23, -0.73, 9.68, -2.20, 8.15, -3.67, 6.64, -5.15,
@@ -137,7 +171,7 @@ VLP_16 = Model(
 )
 PUCK_LITE = replace(VLP_16, name="Puck LITE", verified="one source")
 PUCK_HI_RES = replace(
-    VLP_16, name="Puck Hi-Res", seen_as="Puck Hi-Res", verified="two sources",
+    VLP_16, name="Puck Hi-Res", seen_as="Puck Hi-Res", product=0x24, verified="two sources",
     elevation_deg=(-10, 0.667, -8.667, 2, -7.333, 3.333, -6, 4.667,
                    -4.667, 6, -3.333, 7.333, -2, 8.667, -0.667, 10),
     height_mm=(7.4, -0.9, 6.5, -1.8, 5.5, -2.7, 4.6, -3.7,
@@ -145,7 +179,7 @@ PUCK_HI_RES = replace(
 )
 HDL_32E = Model(
     name="HDL-32E", seen_as="HDL-32E", lasers=32, units_per_m=500, sequence_ns=46_080, slots=40,
-    slot=tuple(range(32)), stamp_may_end=True, verified="real recording",
+    slot=tuple(range(32)), stamp_may_end=True, product=0x21, verified="real recording",
     elevation_deg=_woven(
         (-30.67, -29.33, -28, -26.67, -25.33, -24, -22.67, -21.33,
          -20, -18.67, -17.33, -16, -14.67, -13.33, -12, -10.67),
@@ -164,7 +198,7 @@ _VLP_32C_DEG = (
 )
 VLP_32C = Model(
     name="VLP-32C", seen_as="VLP-32C", lasers=32, units_per_m=250, sequence_ns=55_296, slots=24,
-    slot=tuple(laser // 2 for laser in range(32)), verified="real recording",
+    slot=tuple(laser // 2 for laser in range(32)), product=0x28, verified="real recording",
     elevation_deg=_VLP_32C_DEG,
     clockwise_deg=(1.4, -4.2, 1.4, -1.4, 1.4, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -1.4,
                    4.2, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -4.2, 4.2, -1.4, 1.4, -1.4,

@@ -17,16 +17,20 @@ from mlbatch.sensors.base import TurningLidar
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
-from mlbatch.sensors.velodyne.identify import (
+from mlbatch.sensors.velodyne.models import (
     DUAL,
     MODE_AT,
     MODES,
     PACKET_SIZE,
     STRIDE,
     TURN_CDEG,
+    Layout,
+    Model,
+    beam_table,
     expected_flags,
+    layout,
+    ranks,
 )
-from mlbatch.sensors.velodyne.models import Layout, Model, beam_table, layout, ranks
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S
 

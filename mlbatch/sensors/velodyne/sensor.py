@@ -23,7 +23,7 @@ from mlbatch.sensors.velodyne.clock import (
     rotor_speed,
     top_of_hour_ns,
 )
-from mlbatch.sensors.velodyne.identify import BLOCK_LASERS, Identity, identify, takes, velodyne
+from mlbatch.sensors.velodyne.identify import Identity, identify, takes, velodyne
 from mlbatch.sensors.velodyne.models import ALL, Model, layout
 from mlbatch.sensors.velodyne.packets import (
     MAKER,
@@ -36,7 +36,7 @@ from mlbatch.sensors.velodyne.packets import (
     steps,
 )
 from mlbatch.types import U8Array
-from mlbatch.units import NS_PER_US, RAD_PER_DEG
+from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]
 
@@ -168,8 +168,7 @@ def _away_deg(row: Model, file: VelodyneFile) -> float:
 
 def _is_paced(row: Model, seen: Identity) -> bool:
     """Whether packets come as fast as the model's: a wrong name is possible, a wrong pace not."""
-    block_us = row.sequence_ns * BLOCK_LASERS / row.lasers / NS_PER_US
-    return seen.block_us is None or takes(block_us, seen.block_us)
+    return seen.block_us is None or takes(row.block_us, seen.block_us)
 
 
 def _file_notes(calibration: VelodyneCalibration) -> list[str]:
