@@ -75,7 +75,8 @@ _ROWS = 256
 def crc32(messages: U8Array) -> U32Array:
     """Checksums (P,) of messages (P, bytes) of one size, four bytes or more."""
     count, size = messages.shape
-    table, place = _contributions(size), np.arange(size) << 8
+    table = _contributions(size)
+    place = np.arange(size) << 8
     sums = np.empty(count, np.uint32)
     # A few rows at a time, so that what is looked up stays in the caches.
     for begin in range(0, count, _ROWS):

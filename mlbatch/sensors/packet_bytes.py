@@ -55,7 +55,8 @@ def block_azimuths(packets: U8Array, begin: int, stride: int, count: int, order:
 
 def in_pairs(azimuth: I64Array) -> bool:
     """Whether blocks come in pairs of one azimuth, which is how two returns are sent."""
-    even, odd = azimuth[:, 0::2], azimuth[:, 1::2]
+    even = azimuth[:, 0::2]
+    odd = azimuth[:, 1::2]
     width = min(even.shape[1], odd.shape[1])
     if width < 2:
         return False

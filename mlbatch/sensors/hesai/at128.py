@@ -51,7 +51,8 @@ class _Mirrors:
         more += np.float32(2) * turned
         cosine, sine = _turned(*_sum(cosine, sine, *self._azimuth), more)
         flat, up = _turned(*self._elevation, self._elevation_adjust.at(cell, part))
-        right, forward = flat * sine, flat * cosine
+        right = flat * sine
+        forward = flat * cosine
         for axis, (from_right, from_forward, from_up) in enumerate(self._rotation):
             towards = np.multiply(right, from_right, out=self._towards[: len(encoder), axis])
             towards += from_forward * forward

@@ -20,7 +20,9 @@ import numpy as np
 from mlbatch.types import I64Array
 
 NEVER = -1
-HIGH, STANDARD, SAVING = "high", "standard", "saving"
+HIGH = "high"
+STANDARD = "standard"
+SAVING = "saving"
 
 # In the texts below a row holds 16 channels (8 or 10 in the first five), `-` is a silent one.
 _P20A = """
@@ -254,10 +256,12 @@ XT16 = _even(368, 3024, 16)
 XT32 = _even(368, 1512, 32)
 XT32M2X = _even(368, 2888, 32, together=2)
 
-_ot128_high, _ot128_standard = _tables(_OT128_HIGH, 128), _tables(_OT128_STANDARD, 128)
+_ot128_high = _tables(_OT128_HIGH, 128)
+_ot128_standard = _tables(_OT128_STANDARD, 128)
 OT128 = _by_state({HIGH: (*_ot128_high, _ot128_high[1]), STANDARD: tuple(_ot128_standard)})
 
-_e128_high, _e128_standard = _tables(_E128_HIGH, 128), _tables(_E128_STANDARD, 128)
+_e128_high = _tables(_E128_HIGH, 128)
+_e128_standard = _tables(_E128_STANDARD, 128)
 _near_standard = tuple(_near(_e128_standard, _E128_NEAR_STANDARD))
 # Pandar128E3X; the near-field times hold below 2.85 m, where few channels differ.
 E128 = _by_state(

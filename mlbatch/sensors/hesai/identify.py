@@ -42,16 +42,19 @@ _SEQUENCE_SIZE = 4
 _FIXED = (0, 1, 2, 3, 6, 7, 9, 11)
 _FIXED_64 = (0, 1, 2, 3, 5)
 _FIXED_JT16 = (0, 1, 2, 3, 5)
-_PANDAR40_BLOCKS, _PANDAR40_STRIDE = 10, 124
+_PANDAR40_BLOCKS = 10
+_PANDAR40_STRIDE = 124
 # Models whose header has lasers and blocks: payloads without and with a sequence number.
 _SIZED: tuple[tuple[Model, int, tuple[int, ...]], ...] = (
     (rows.PANDAR64, 6, (1194, 1198)),
     (rows.PANDAR64, 7, (1388, 1392)),
     (rows.PANDAR20A, 20, (1270,)),
 )
-_PANDAR40_SIZE, _PANDAR40_UNDATED_SIZE = 1262, 1256
+_PANDAR40_SIZE = 1262
+_PANDAR40_UNDATED_SIZE = 1256
 _PANDAR20_MAGIC = _SOP + bytes((20, 20))
-_JT16_IMU_SIZE, _JT16_SIZE = 34, 80
+_JT16_IMU_SIZE = 34
+_JT16_SIZE = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +182,16 @@ def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | No
         return None
     if not family.models:
         return Identity(family.name)
-    lasers, blocks, flags = head[6], head[7], head[11]
+    lasers = head[6]
+    blocks = head[7]
+    flags = head[11]
     fixed: tuple[int, ...] = _FIXED
     if family.models == (rows.JT16,):
         # It has no lasers, blocks or flags in its header, but always a sequence number.
-        lasers, blocks, flags, fixed = rows.JT16.channels, 1, SEQUENCE, _FIXED_JT16
+        lasers = rows.JT16.channels
+        blocks = 1
+        flags = SEQUENCE
+        fixed = _FIXED_JT16
         if size != _JT16_SIZE or head[5] != 0:
             return None
     return _identity(_model(family, lasers, blocks), size, prefix, same, blocks, flags, fixed)
@@ -201,7 +209,8 @@ def _model(family: _Family, lasers: int, blocks: int) -> Model:
     for model in family.models:
         if model.channels == lasers and blocks in model.blocks:
             return model
-    first, name = family.models[0], family.name.format(lasers)
+    first = family.models[0]
+    name = family.name.format(lasers)
     return replace(first, name=name, channels=lasers, blocks=(), most_returns=0)
 
 

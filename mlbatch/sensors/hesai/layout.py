@@ -11,11 +11,17 @@ from dataclasses import dataclass
 from mlbatch.sensors.hesai.models import Model
 
 # Flags of the header: what is sent beyond the least.
-SEQUENCE, _IMU, SAFETY = 0x01, 0x02, 0x04
+SEQUENCE = 0x01
+_IMU = 0x02
+SAFETY = 0x04
 # In the 128-channel family one more byte a channel for each; of a QT128 the last one means that
 # it sends channels of its own choice.
-_CONFIDENCE, _WEIGHT, AMBIENT = 0x10, 0x20, 0x40
-_IMU_SIZE, CRC_SIZE, SAFETY_SIZE = 22, 4, 17
+_CONFIDENCE = 0x10
+_WEIGHT = 0x20
+AMBIENT = 0x40
+_IMU_SIZE = 22
+CRC_SIZE = 4
+SAFETY_SIZE = 17
 PREFIX_SIZE = 21
 _DEFAULT_UNIT_MM = 4
 

@@ -44,7 +44,8 @@ def _calendar(date: I64Array) -> tuple[I64Array, BoolArray]:
     """Seconds since 1970 of (P, 6) year, month, day, hour, minute, second; and their validity."""
     year, month, day, hour, minute, second = date.T
     months = (np.where(year < _CENTURY, year + 30, year - _CENTURY)) * 12 + month - 1
-    first_day, next_month = _days(months), _days(months + 1)
+    first_day = _days(months)
+    next_month = _days(months + 1)
     valid = (month >= 1) & (month <= 12) & (day >= 1) & (day <= next_month - first_day)
     valid &= (hour < 24) & (minute < 60) & (second < 60)
     days = first_day + day - 1
@@ -57,7 +58,8 @@ def _days(months: I64Array) -> I64Array:
     return days
 
 
-_BAD_HEADER, _BAD_CRC = np.uint8(FAULTS.index("bad_header")), np.uint8(FAULTS.index("bad_crc"))
+_BAD_HEADER = np.uint8(FAULTS.index("bad_header"))
+_BAD_CRC = np.uint8(FAULTS.index("bad_crc"))
 _BLOCK_FLAG = (0xFF, 0xEE)
 _S_PER_MINUTE = 60
 _S_PER_NS = 1e-9
@@ -91,7 +93,8 @@ class PacketReader:
 
     def heads(self, packets: U8Array) -> Heads:
         """Stamps, rotor words and validity of all columns."""
-        layout, timing = self.layout, self.layout.model.timing
+        layout = self.layout
+        timing = self.layout.model.timing
         body = packets[:, layout.prefix :]
         packet_ns, _ = self._times(body)
         operation = self._operation(body)
@@ -158,7 +161,8 @@ class PacketReader:
 
     def pixels(self) -> PixelTable:
         """The same for compiled loops."""
-        layout, unit_mm = self.layout, self.layout.unit_mm
+        layout = self.layout
+        unit_mm = self.layout.unit_mm
         firsts = tuple(
             (which * layout.stride + layout.model.lead,) for which in range(layout.mode.returns)
         )
@@ -191,7 +195,8 @@ class PacketReader:
         return azimuth
 
     def _times(self, body: U8Array) -> tuple[I64Array, BoolArray]:
-        tail, at = self.layout.model.tail, self.layout.tail_at
+        tail = self.layout.model.tail
+        at = self.layout.tail_at
         return packet_times(body, at + tail.date_at, at + tail.us_at)
 
     def _turns_per_s(self, body: U8Array) -> F64Array:
@@ -212,7 +217,8 @@ class PacketReader:
 
     def _tables(self, body: U8Array, operation: I64Array) -> I64Array:
         """(P, columns) firing table of every column."""
-        layout, tail = self.layout, self.layout.model.tail
+        layout = self.layout
+        tail = self.layout.model.tail
         group = np.arange(layout.columns)
         if tail.loop_at is not None:
             flag = number(body, layout.tail_at + tail.loop_at, 1)

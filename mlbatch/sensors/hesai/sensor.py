@@ -32,7 +32,8 @@ from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 MAKER = "HESAI"
 BUILT_IN: tuple[Calibration, ...] = ()
-_CSV, _DAT = "angle csv of the unit, required", "correction dat of the unit, required"
+_CSV = "angle csv of the unit, required"
+_DAT = "correction dat of the unit, required"
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=row.name,
@@ -47,7 +48,8 @@ MODELS: tuple[SensorModel, ...] = tuple(
     for row in rows.ALL
 )
 # Preferred is a file whose beams lie where the model's do, but for what differs between units.
-_FITS, _FITS_BEAMS = 200, 300
+_FITS = 200
+_FITS_BEAMS = 300
 _ELEVATION_TOLERANCE_DEG = 4.0
 # Evidence begins with so many; what follows them may be half a turn away.
 _PACKETS_IN_A_ROW = 16
@@ -163,8 +165,11 @@ class HesaiLidar(TurningLidar):
             checks_crc="crc" in options,
         )
         self._reader.sense = _sense(self._reader, evidence)
-        self.maker, self.model, self.mode = MAKER, model.name, layout.mode.text
-        self.channels, self.returns = model.channels, layout.mode.returns
+        self.maker = MAKER
+        self.model = model.name
+        self.mode = layout.mode.text
+        self.channels = model.channels
+        self.returns = layout.mode.returns
         self.packet_size = layout.size
         self.columns_per_packet = layout.columns
         self.column_period_ns = model.timing.step_ns / model.timing.divisor
@@ -178,7 +183,8 @@ class HesaiLidar(TurningLidar):
         self.sequence_modulus = layout.sequence_modulus
         direction = spherical(angles.azimuth_rad, angles.elevation_rad, clockwise_from="y")
         self._on_axis = BeamTable(direction, np.zeros((3, 1, 3)), np.zeros(1))
-        self._from_centre, self._centre_m = model.from_centre, centre_m
+        self._from_centre = model.from_centre
+        self._centre_m = centre_m
         self.beams = self._on_axis
         if centre_m is not None:
             self.beams = off_axis(self._on_axis, centre_m, from_centre=model.from_centre)

@@ -40,7 +40,8 @@ HEADER = np.dtype(
 Points: TypeAlias = npt.NDArray[np.void]
 _NS_PER_INTERVAL = 100
 _CRC_FROM = 28
-_BAD_HEADER, _BAD_CRC = FAULTS.index("bad_header"), FAULTS.index("bad_crc")
+_BAD_HEADER = FAULTS.index("bad_header")
+_BAD_CRC = FAULTS.index("bad_crc")
 _LEVEL = [("level", "u1"), ("tag", "u1")]
 _CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_LEVEL])
 _CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_LEVEL])
@@ -48,7 +49,8 @@ _CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_LEVEL])
 _SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), *_LEVEL])
 _SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
 IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
-_TURN_CDEG, _QUARTER_CDEG = 36000, 9000
+_TURN_CDEG = 36000
+_QUARTER_CDEG = 9000
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,8 @@ def headers(packets: U8Array) -> npt.NDArray[np.void]:
 
 def faults(packets: U8Array, kind: PointKind, *, check_crc: bool) -> U8Array:
     """Index into FAULTS for each packet: other points than these, or damaged ones."""
-    head, size = headers(packets), packets.shape[1]
+    head = headers(packets)
+    size = packets.shape[1]
     good = (head["data_type"] == kind.data_type) & (head["size"] == size)
     good &= head["points"] == (size - HEADER_SIZE) // kind.size
     found = np.where(good, 0, _BAD_HEADER).astype(np.uint8)
@@ -146,10 +149,13 @@ def _cartesian(xyz_m: F64Array) -> tuple[F64Array, F64Array]:
 
 
 def _spherical(point: Points) -> tuple[F64Array, F64Array]:
-    zenith, azimuth = point["zenith"].astype(np.int64), point["azimuth"].astype(np.int64)
+    zenith = point["zenith"].astype(np.int64)
+    azimuth = point["azimuth"].astype(np.int64)
     range_m = point["depth"] / 1000.0
-    flat_m, up_m = range_m * _sine(zenith), range_m * _sine(zenith + _QUARTER_CDEG)
-    forward_m, left_m = flat_m * _sine(azimuth + _QUARTER_CDEG), flat_m * _sine(azimuth)
+    flat_m = range_m * _sine(zenith)
+    up_m = range_m * _sine(zenith + _QUARTER_CDEG)
+    forward_m = flat_m * _sine(azimuth + _QUARTER_CDEG)
+    left_m = flat_m * _sine(azimuth)
     return np.stack([forward_m, left_m, up_m], axis=1), range_m
 
 

@@ -54,7 +54,8 @@ _CLOCKS = {0: "time since power-on", 1: "gPTP or PTP", 2: "GPS", 5: "NTP"}
 _IMU_PORTS = {56301: 56401, 57000: 58000}
 _COUNTER_MODULUS = 1 << 16
 # How far counter and time may differ: a share of the packets since the first, and so many.
-_COUNTER_SHARE, _COUNTER_SLACK = 0.1, 2
+_COUNTER_SHARE = 0.1
+_COUNTER_SLACK = 2
 _SHARED_STAMP = (
     "many of its packets share one time, as those of a frame of the Avia2 do: the times of their "
     "points are no finer than that"
@@ -193,8 +194,10 @@ def _counts_on(packets: U8Array) -> bool:
     soon, and would be taken for packets that came twice.
     """
     head = headers(packets)
-    counter, stamp_ns = head["counter"].astype(np.int64), head["stamp_ns"].astype(np.int64)
-    steps, steps_ns = np.diff(counter) % _COUNTER_MODULUS, np.diff(stamp_ns)
+    counter = head["counter"].astype(np.int64)
+    stamp_ns = head["stamp_ns"].astype(np.int64)
+    steps = np.diff(counter) % _COUNTER_MODULUS
+    steps_ns = np.diff(stamp_ns)
     next_ns = steps_ns[(steps == 1) & (steps_ns > 0)]
     if not len(next_ns):
         return False

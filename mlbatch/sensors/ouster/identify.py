@@ -45,7 +45,8 @@ _PIXELS_SIZES = {
     beams * profile.pixel_size for beams in _BEAMS for profile in PROFILES.values()
 } - {0}
 # What a machine that carries a lidar feels, in g.
-_LEAST_G, _MOST_G = 0.05, 100.0
+_LEAST_G = 0.05
+_MOST_G = 100.0
 
 
 def describe(size: int, sample: U8Array) -> str | None:
@@ -109,7 +110,8 @@ def _describe_lidar(size: int, packets: U8Array) -> str | None:
 
 def _describe_other(size: int, packets: U8Array) -> str | None:
     if sample_count(size):
-        name, packet_type = "IMU", IMU_PACKET
+        name = "IMU"
+        packet_type = IMU_PACKET
         raw = packets[:, SAMPLES_START : size - FOOTER_SIZE].reshape(
             len(packets), -1, SAMPLE.itemsize
         )
@@ -119,7 +121,8 @@ def _describe_other(size: int, packets: U8Array) -> str | None:
         felt_g = float64(samples["acceleration"]) / STANDARD_GRAVITY
         proven = in_order and _feels(felt_g)
     else:
-        name, packet_type = "zone monitor", ZONE_PACKET
+        name = "zone monitor"
+        packet_type = ZONE_PACKET
         proven = size == _ZONE_SIZE
     header = _header_type(packets, packet_type) if proven else None
     return None if header is None else f"Ouster {name}, {_serial(packets, header)}{size} bytes"

@@ -321,7 +321,8 @@ def _header(document: Document, layout: PacketLayout) -> str:
 
 
 def _window(document: Document, columns_per_frame: int) -> tuple[int, int]:
-    key, last = "column_window", columns_per_frame - 1
+    key = "column_window"
+    last = columns_per_frame - 1
     wanted = f"first and last column, 0 to {last}"
     window = document.numbers(key, 2, wanted)
     if window is None:

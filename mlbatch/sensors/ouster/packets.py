@@ -29,7 +29,8 @@ from mlbatch.types import BoolArray, Heads, I64Array, U8Array
 BAD_HEADER = FAULTS.index("bad_header")
 BAD_CRC = FAULTS.index("bad_crc")
 # The measurement id follows the stamp in the columns of all layouts.
-_ID_OFFSET, _ID_BYTES = 8, 2
+_ID_OFFSET = 8
+_ID_BYTES = 2
 # Firmware before 2.3 leaves the footer empty, 2.3 and 2.4 write DE C0 00 00 EF BE AD DE.
 _NO_CRC = (0, 0xDEADBEEF0000C0DE)
 # The smallest number of the machine that holds one of so many bytes.
@@ -82,7 +83,8 @@ class LegacyHeaders:
 
     def faults(self, packets: U8Array) -> U8Array:
         """Valid columns of a packet stand side by side in one frame; else it is no such packet."""
-        columns, measured = self._columns(packets), self._measured(packets)
+        columns = self._columns(packets)
+        measured = self._measured(packets)
         frame = columns["frame_id"].astype(np.int64)
         block = columns["measurement_id"].astype(np.int64) // self.layout.columns
         first = measured.argmax(axis=1)[:, None]

@@ -110,7 +110,8 @@ class PixelReader:
 
 def pixel_table(layout: PacketLayout) -> PixelTable:
     """The same for compiled loops, as numbers in words."""
-    fields, returns = layout.profile.fields, layout.profile.returns
+    fields = layout.profile.fields
+    returns = layout.profile.returns
     runs = (Run(layout.column_header_size, 0, layout.beams),)
     echoes = []
     for suffix in ("", "2")[:returns]:

@@ -123,7 +123,8 @@ class OusterCalibration:
         return OusterLidar(self.metadata, self.model, self.serial, "crc" in options)
 
     def _ids_fit(self, packets: U8Array) -> int:
-        serial, init_id = self.metadata.serial, self.metadata.init_id
+        serial = self.metadata.serial
+        init_id = self.metadata.init_id
         same_unit = serial != 0 and bool((self._headers.serials(packets) == serial).any())
         same_init = init_id != 0 and bool((self._headers.init_ids(packets) == init_id).any())
         return _FITS_SERIAL * same_unit + _FITS_INIT_ID * same_init
@@ -239,7 +240,8 @@ def beam_table(described: Metadata) -> BeamTable:
 
     The angle of a column falls while measurement ids rise: the sensor turns clockwise.
     """
-    azimuth, altitude = -described.azimuth_rad, described.altitude_rad
+    azimuth = -described.azimuth_rad
+    altitude = described.altitude_rad
     forward = np.cos(azimuth) * np.cos(altitude)
     side = np.sin(azimuth) * np.cos(altitude)
     zero = np.zeros_like(forward)
@@ -262,7 +264,8 @@ def beam_table(described: Metadata) -> BeamTable:
 
 
 def _headers(described: Metadata, check_crc: bool) -> Headers:
-    layout, columns = described.layout, described.columns_per_frame
+    layout = described.layout
+    columns = described.columns_per_frame
     if layout.legacy:
         return LegacyHeaders(layout, columns)
     return PacketHeaders(layout, columns, described.header, described.serial, check_crc)

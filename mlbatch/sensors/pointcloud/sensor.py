@@ -54,7 +54,8 @@ def _layout(sample: U8Array) -> Layout | None:
     usual = heads[words == words[0]][0]
     if 2 * int(np.count_nonzero(words == words[0])) <= len(words):
         return None
-    kind, slots = int(usual["kind"]), int(usual["slots"])
+    kind = int(usual["kind"])
+    slots = int(usual["slots"])
     if (int(usual["magic"]), int(usual["version"])) != (MAGIC, VERSION):
         return None
     layout = Layout(kind, slots, bool(usual["by_ring"]))
@@ -116,7 +117,9 @@ class PointsLidar(TurningLidar):
         # What a sensor is named after where nothing else tells its place.
         self.maker = "Cloud"
         self.mode = str(layout)
-        self.channels, self.returns, self.return_types = slots, 1, (0,)
+        self.channels = slots
+        self.returns = 1
+        self.return_types = (0,)
         self.packet_size = layout.size
         self.columns_per_packet = 1
         self.records = Records(0, layout.size, layout.size)

@@ -30,10 +30,17 @@ from mlbatch.sensors.robosense.models import (
 )
 from mlbatch.types import F64Array, I64Array, U8Array
 
-_SIZE, _TAIL_AT, _TAIL = 1248, 1246, b"\x0f\xf0"
-_PORTS_AT, _PORTS = 24, 4
+_SIZE = 1248
+_TAIL_AT = 1246
+_TAIL = b"\x0f\xf0"
+_PORTS_AT = 24
+_PORTS = 4
 _FIRMWARE = slice(41, 44)
-_INSTALLATION_AT, _SERIAL, _MODE_AT, _SYNC_AT, _REVERSED_AT = 289, slice(292, 298), 300, 302, 337
+_INSTALLATION_AT = 289
+_SERIAL = slice(292, 298)
+_MODE_AT = 300
+_SYNC_AT = 302
+_REVERSED_AT = 337
 _SYNC_STATES = {0: "not synchronised", 1: "GPS", 2: "PTP"}
 # What the counts of channels of all models are; a csv file has as many lines.
 _CHANNELS = tuple(sorted({row.channels for row in ROWS}))
@@ -65,14 +72,16 @@ class Difop:
 
     def angles(self, model: Model) -> Angles | None:
         """Angles of the channels, or None where the unit was never given any."""
-        places, count = model.angles, model.channels
+        places = model.angles
+        count = model.channels
         elevation = self._angles(places.elevation_at, count, signed=places.signed)
         azimuth: F64Array | None = np.zeros(count)
         if places.azimuth_at:
             azimuth = self._angles(places.azimuth_at, count, signed=True)
         if elevation is None or azimuth is None:
             return None
-        elevation, azimuth = elevation * places.unit_deg, azimuth * places.unit_deg
+        elevation = elevation * places.unit_deg
+        azimuth = azimuth * places.unit_deg
         if not places.signed:
             elevation[: count // 2] *= -1.0
         usable = (np.abs(elevation) <= _MOST_DEG).all() and len(np.unique(elevation)) > 1
@@ -191,9 +200,11 @@ def _number(text: str) -> float:
 COUNTER_MODULUS = 1 << 32
 _COUNTED_PACKETS = 16
 # Helios, byte 17: step of distances, here as steps in a metre.
-_STEP_AT, _STEPS_PER_M = 17, {0: 200, 1: 400}
+_STEP_AT = 17
+_STEPS_PER_M = {0: 200, 1: 400}
 # Ruby Plus 80: the model byte, which sources put at either place.
-_VARIANT_BYTES, _PLUS_80V = (31, 32), 3
+_VARIANT_BYTES = (31, 32)
+_PLUS_80V = 3
 
 
 def mode(points: U8Array, row: Model, difop: Difop | None) -> tuple[ReturnMode, tuple[str, ...]]:

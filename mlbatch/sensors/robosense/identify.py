@@ -28,7 +28,9 @@ _SOLID_STATE = bytes.fromhex("55aa5aa5")
 DIFOP = bytes.fromhex("a5ff005a11115555")
 _IMU = bytes.fromhex("aa555a05")
 _IMU_SIZE = 51
-_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT = 30, 31, 32
+_OLD_TYPE_AT = 30
+_TYPE_AT = 31
+_MODEL_AT = 32
 _MINUTE_US = 60_000_000
 _PACE_TOLERANCE = 0.1
 _SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812: "EM"}
@@ -53,7 +55,8 @@ _OLD_TYPES = {
     3: Identity("RS-Bpearl v3", rows.BPEARL_V3),
 }
 _BPEARL_V4 = Identity("RS-Bpearl v4", rows.BPEARL_V4)
-_BPEARL_V4_TYPE, _BPEARL_V4_MODELS = 3, (0, 4)
+_BPEARL_V4_TYPE = 3
+_BPEARL_V4_MODELS = (0, 4)
 # Second kind, by type and model; None: whatever the model.
 _TYPES: Mapping[tuple[int, int | None], Identity] = {
     (6, 1): Identity("Helios 32, 70 degrees", rows.HELIOS_32),
@@ -175,7 +178,8 @@ def _stamp_us(packets: U8Array, model: Model) -> I64Array:
         second = number(packets, at + 5, 1)
         milli, micro = (number(packets, at + offset, 2, ">") for offset in (6, 8))
         return second * 1_000_000 + milli * 1000 + micro
-    second, micro = number(packets, at, 6, ">"), number(packets, at + 6, 4, ">")
+    second = number(packets, at, 6, ">")
+    micro = number(packets, at + 6, 4, ">")
     return np.asarray((second % 60) * 1_000_000 + micro, np.int64)
 
 

@@ -62,9 +62,12 @@ _RUBY_PLUS_48_NS = _each(_RUBY_PLUS_LONG, 2)
 
 
 MAKER = "ROBOSENSE"
-FIRST_KIND, SECOND_KIND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
+FIRST_KIND = bytes.fromhex("55aa050a5aa550a0")
+SECOND_KIND = bytes.fromhex("55aa055a")
 # Numbers of return types, facts/outputs.md section 3; the nearest return has none of its own.
-STRONGEST, LAST, OTHER = 1, 2, 0
+STRONGEST = 1
+LAST = 2
+OTHER = 0
 READING = 3  # bytes: distance u16, reflectivity u8
 
 
@@ -159,13 +162,16 @@ class Model:
         return max(1, self.channels // self.layout.per_block)
 
 
+# fmt: off
 _BPEARL_V4_DEG = (
-    *(2.19, 47.29, 5.01, 50.12, 7.84, 52.94, 10.66, 55.75, 13.47, 58.57, 16.29, 61.39),
-    *(19.11, 64.20, 21.92, 67.01, 24.74, 69.82, 27.56, 72.63, 30.37, 75.44, 33.20, 78.26),
-    *(36.02, 81.07, 38.84, 83.89, 41.66, 86.71, 44.47, 89.55),
+    2.19, 47.29, 5.01, 50.12, 7.84, 52.94, 10.66, 55.75, 13.47, 58.57, 16.29, 61.39,
+    19.11, 64.20, 21.92, 67.01, 24.74, 69.82, 27.56, 72.63, 30.37, 75.44, 33.20, 78.26,
+    36.02, 81.07, 38.84, 83.89, 41.66, 86.71, 44.47, 89.55,
 )
+# fmt: on
 _DUAL = ReturnMode(2, OTHER)
-_STRONGEST, _LAST = ReturnMode(1, STRONGEST, "strongest"), ReturnMode(1, LAST, "last")
+_STRONGEST = ReturnMode(1, STRONGEST, "strongest")
+_LAST = ReturnMode(1, LAST, "last")
 _FIRST = ReturnMode(1, OTHER, "first")
 _OLD_MODES = {0: _DUAL, 1: _STRONGEST, 2: _LAST}
 _NEW_MODES = {0: _DUAL, 4: _STRONGEST, 5: _LAST, 6: _FIRST}
@@ -329,6 +335,18 @@ RUBY_PLUS_48 = replace(
     firing_ns=(_RUBY_PLUS_48_NS,),
 )
 ROWS = (
-    *(RS16, RS32, BPEARL_V3, BPEARL_V4, HELIOS_16, HELIOS_32, AIRY_48, AIRY_96),
-    *(RUBY_48, RUBY_80, RUBY_128, RUBY_PLUS_48, RUBY_PLUS_80, RUBY_PLUS_128),
+    RS16,
+    RS32,
+    BPEARL_V3,
+    BPEARL_V4,
+    HELIOS_16,
+    HELIOS_32,
+    AIRY_48,
+    AIRY_96,
+    RUBY_48,
+    RUBY_80,
+    RUBY_128,
+    RUBY_PLUS_48,
+    RUBY_PLUS_80,
+    RUBY_PLUS_128,
 )

@@ -57,7 +57,8 @@ def shape_of(model: Model, returns: int) -> Shape:
     blocks. The returns of other models fill blocks one after the other; three blocks of 128 lines
     do not divide by two, so that each return is a column there, and a shot may span two packets.
     """
-    layout, column = model.layout, READING * model.channels
+    layout = model.layout
+    column = READING * model.channels
     start = layout.header + 4
     if model.rounds_per_block > 1:
         single = Records(start, layout.stride, column, model.rounds_per_block, column)
@@ -78,11 +79,13 @@ def times_ns(packets: U8Array, model: Model) -> tuple[I64Array, BoolArray]:
     """Stamps of packets (P, size), and which are times at all; calendar times are UTC."""
     at = model.layout.time_at
     if not model.is_calendar:
-        second, micro = number(packets, at, 6, ">"), number(packets, at + 6, 4, ">")
+        second = number(packets, at, 6, ">")
+        micro = number(packets, at + 6, 4, ">")
         good = (second < _MOST_SECONDS) & (micro < 1_000_000)
         return second % _MOST_SECONDS * NS_PER_S + micro * NS_PER_US, good
     fields = packets[:, at : at + 6].astype(np.int64)
-    milli, micro = number(packets, at + 6, 2, ">"), number(packets, at + 8, 2, ">")
+    milli = number(packets, at + 6, 2, ">")
+    micro = number(packets, at + 8, 2, ">")
     good = (milli < 1000) & (micro < 1000)
     for field, (least, most) in zip(fields[:, 1:].T, _CALENDAR_LIMITS, strict=True):
         good &= (field >= least) & (field <= most)
@@ -112,7 +115,8 @@ class PacketReader:
         """Take the rotor's usual speed from packets of some seconds; it bridges gaps."""
         stamp_ns, _ = times_ns(packets, self._model)
         azimuth, good = self._azimuths(packets)
-        took_ns, turned = np.diff(stamp_ns), _signed(np.diff(azimuth[:, 0]))
+        took_ns = np.diff(stamp_ns)
+        turned = _signed(np.diff(azimuth[:, 0]))
         near = (took_ns > 0) & (took_ns < _NEIGHBOURS_NS) & good[1:, 0] & good[:-1, 0]
         if near.any():
             self._cdeg_per_s = float(turned[near].sum() / took_ns[near].sum() * NS_PER_S)
@@ -128,7 +132,8 @@ class PacketReader:
 
     def heads(self, packets: U8Array) -> Heads:
         """Stamps, rotor words and validity of all columns."""
-        model, shape = self._model, self._shape
+        model = self._model
+        shape = self._shape
         stamp_ns, _ = times_ns(packets, model)
         azimuth, good = self._azimuths(packets)
         speed, row_ns = self._steps(azimuth, good)
@@ -159,7 +164,8 @@ class PacketReader:
 
     def pixels(self) -> PixelTable:
         """The same for compiled loops."""
-        model, shape = self._model, self._shape
+        model = self._model
+        shape = self._shape
         firsts = tuple(
             tuple(
                 which * shape.return_step + part * model.layout.stride
@@ -172,7 +178,8 @@ class PacketReader:
 
     def _azimuths(self, packets: U8Array) -> tuple[I64Array, BoolArray]:
         """Azimuths of the rows (P, rows), 0.01 degree, and which rows are blocks at all."""
-        layout, shape = self._model.layout, self._shape
+        layout = self._model.layout
+        shape = self._shape
         at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
         azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
         return azimuth, (azimuth < _CDEG_PER_TURN) & _has_ids(packets, at, layout)

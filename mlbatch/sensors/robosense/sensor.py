@@ -46,7 +46,8 @@ from mlbatch.units import RAD_PER_DEG
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "RobosenseLidar", "describe", "read_calibration"]
 
 # The bytes name the model; a file that was given is wanted before what is built in.
-_FITS_MODEL, _FITS_FILE = 100, 200
+_FITS_MODEL = 100
+_FITS_FILE = 200
 _DIFOP_PORT = 7788
 
 MODELS: tuple[SensorModel, ...] = tuple(
@@ -119,7 +120,8 @@ class BuiltIn:
         origin = f"DIFOP packets of {difop.serial}" if difop and difop.serial else "DIFOP packets"
         if angles is None and self._row.nominal_deg:
             elevation = np.array(self._row.nominal_deg)
-            angles, origin = Angles(elevation, np.zeros_like(elevation)), "nominal angles"
+            angles = Angles(elevation, np.zeros_like(elevation))
+            origin = "nominal angles"
             notes = (
                 f"no DIFOP packet with the angles of this {self.model}: nominal ones are taken; "
                 f"record its device port ({_DIFOP_PORT}) as well, or give a csv with --metadata",
@@ -178,7 +180,8 @@ class AnglesFile:
                 f"{self.path}: wanted packets of a {self.model} lidar from {evidence.stream}, got "
                 f"{describe(evidence.size, evidence.sample) or 'others'}; give the csv of its unit"
             )
-        difop, is_named = find_difop(evidence), self._named is not None
+        difop = find_difop(evidence)
+        is_named = self._named is not None
         lidar = RobosenseLidar(row, self._angles, options, evidence, difop, is_named=is_named)
         lidar.calibration = str(self.path)
         return lidar
@@ -240,8 +243,13 @@ class RobosenseLidar(TurningLidar):
         self.sequence_modulus = COUNTER_MODULUS if is_counted(points, row) else 0
         self.timestamp_mode = difop.sync if difop is not None and row.has_sync else ""
         self.pixel_layout = (
-            *(MAKER, row.channels, row.layout.stride, shape.return_step),
-            *(steps_per_m, row.range_mask, shape.returns),
+            MAKER,
+            row.channels,
+            row.layout.stride,
+            shape.return_step,
+            steps_per_m,
+            row.range_mask,
+            shape.returns,
         )
         self.calibration = ""
         doubtful = doubts(points, row, difop, is_named=is_named)

@@ -267,7 +267,8 @@ def _by_id(path: Path, form: _Form, entries: list[_Entry]) -> dict[int, _Entry]:
 
 def _value(path: Path, form: _Form, entry: _Entry, name: str) -> float:
     """A correction in SI."""
-    quantity, key = _QUANTITIES[name], form.keys[name]
+    quantity = _QUANTITIES[name]
+    key = form.keys[name]
     place = f"{entry.place}.{key}"
     text = entry.texts.get(key, "" if quantity.required else "0")
     unit, factor = (form.angle_unit, form.rad) if quantity.is_angle else (form.length_unit, form.m)

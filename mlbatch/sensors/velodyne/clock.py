@@ -29,9 +29,12 @@ _NMEA_AT = 206
 _NMEA_SIZE = 128
 _PPS = ("no PPS", "PPS synchronising", "PPS locked", "PPS error")
 _SENTENCE = re.compile(rb"\$(G.RMC,[^*$]*)\*([0-9A-Fa-f]{2})")
-_TIME, _STATUS, _DATE = 1, 2, 9
+_TIME = 1
+_STATUS = 2
+_DATE = 9
 # Packets this near follow each other; the rotor turns by less than half a turn.
-_NEAR_NS, _FAR_NS = 15 * NS_PER_MS, 600 * NS_PER_MS
+_NEAR_NS = 15 * NS_PER_MS
+_FAR_NS = 600 * NS_PER_MS
 # VLS-128: no firmware known leaves this range; a lost packet doubles the step.
 _SEQUENCE_NS = (50_000, 62_000)
 _ENOUGH_STEPS = 4
@@ -83,7 +86,8 @@ def rmc_ns(text: bytes) -> int | None:
     found = _SENTENCE.search(text)
     if found is None:
         return None
-    body, fields = found[1], found[1].split(b",")
+    body = found[1]
+    fields = found[1].split(b",")
     checksum = int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8)))
     if checksum != int(found[2], 16) or len(fields) <= _DATE or fields[_STATUS] != b"A":
         return None
@@ -115,7 +119,8 @@ def rotor_speed(stamp_ns: I64Array, azimuth: I64Array, rough: float | None) -> f
     far = (step_ns > 0) & (step_ns < _FAR_NS)
     if not far.any():
         return rough
-    step_ns, turned = step_ns[far], turned[far]
+    step_ns = step_ns[far]
+    turned = turned[far]
     whole: F64Array = np.rint((rough * step_ns - turned) / TURN_CDEG) * TURN_CDEG
     return float((turned + whole).sum() / step_ns.sum())
 

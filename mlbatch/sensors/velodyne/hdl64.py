@@ -68,7 +68,8 @@ class _Corrected:
     def points(self, range_m: F32Array, out: F32Array) -> None:
         """Corrected along right, forward and up, then moved into the body frame."""
         count = len(range_m)
-        cosine, sine = self._cosine[:count], self._sine[:count]
+        cosine = self._cosine[:count]
+        sine = self._sine[:count]
         to_right, to_forward, to_up = self._reached_m(range_m, cosine, sine)
         right = to_right * self._flat * sine - self._aside_m * cosine
         forward = to_forward * self._flat * cosine + self._aside_m * sine

@@ -133,14 +133,19 @@ def beam_table(model: Model, file: VelodyneFile | None, *, raised: bool) -> Beam
         side_m: F64Array = np.zeros(model.lasers)
         reach_m: F64Array = np.zeros(1)
     else:
-        azimuth_rad, elevation_rad = -file.azimuth_rad, file.elevation_rad
-        height_m, side_m = file.vert_offset_m, file.horiz_offset_m
+        azimuth_rad = -file.azimuth_rad
+        elevation_rad = file.elevation_rad
+        height_m = file.vert_offset_m
+        side_m = file.horiz_offset_m
         reach_m = file.dist_correction_m
     origin = np.zeros((3, model.lasers, 3))
     # Section 10: forward += h sin(alpha), right -= h cos(alpha), alpha = rotor + azimuth.
-    sine, cosine = side_m * np.sin(azimuth_rad), side_m * np.cos(azimuth_rad)
-    origin[0, :, 0], origin[0, :, 1] = sine, cosine
-    origin[1, :, 0], origin[1, :, 1] = cosine, -sine
+    sine = side_m * np.sin(azimuth_rad)
+    cosine = side_m * np.cos(azimuth_rad)
+    origin[0, :, 0] = sine
+    origin[0, :, 1] = cosine
+    origin[1, :, 0] = cosine
+    origin[1, :, 1] = -sine
     if raised:
         origin[2, :, 2] = height_m
     return BeamTable(spherical(azimuth_rad, elevation_rad), origin, reach_m)

@@ -39,7 +39,8 @@ _AZIMUTH_AT = 2
 _BAD_HEADER = FAULTS.index("bad_header")
 _RETURN_TYPES = {"strongest return": (1,), "last return": (2,), DUAL: (0, 0)}
 # Section 4: a step of the azimuth this much wider than others is a blind sector.
-_GAP_FACTOR, _GAP_CDEG = 3, 100
+_GAP_FACTOR = 3
+_GAP_CDEG = 100
 # Manuals: 300 rpm and more. Below, no time can be told from an angle.
 _SLOWEST = 4 * TURN_CDEG / NS_PER_S
 _SPEED_TOLERANCE = 0.05
@@ -86,7 +87,9 @@ class VelodyneLidar(TurningLidar):
         notes: tuple[str, ...],
     ) -> None:
         returns = 2 if measured.mode == DUAL else 1
-        self._model, self._measured, self._options = model, measured, options
+        self._model = model
+        self._measured = measured
+        self._options = options
         self._file = file
         self._layout = layout(model, returns)
         self.maker = MAKER
@@ -131,7 +134,8 @@ class VelodyneLidar(TurningLidar):
         speed, delay_ns = self._motion(azimuth)
         toh_ns = top_of_hour_ns(packets)
         packet_ns = absolute_ns(toh_ns, host_ns + self._measured.clock_offset_ns)
-        halves, shape = self._model.halves, (len(packets), self._layout.columns)
+        halves = self._model.halves
+        shape = (len(packets), self._layout.columns)
         stamp_ns = packet_ns[:, None] + delay_ns.repeat(halves, axis=1) + self._start_ns
         turns = (azimuth.repeat(halves, axis=1) + speed[:, None] * self._ahead_ns) / TURN_CDEG
         turning = speed if self._options.firing_azimuth else np.zeros_like(speed)
@@ -140,7 +144,8 @@ class VelodyneLidar(TurningLidar):
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, records.size) into `out`; its arrays may stride."""
-        count, lasers = len(records), self._layout.lasers_per_bank
+        count = len(records)
+        lasers = self._layout.lasers_per_bank
         for bank, byte in enumerate(self._layout.first_byte[which]):
             place = slice(bank * lasers, (bank + 1) * lasers)
             raw: U16Array = np.ndarray(
@@ -162,7 +167,8 @@ class VelodyneLidar(TurningLidar):
 
     def _timetable(self) -> tuple[I64Array, F64Array]:
         """Of each column: its first firing after the packet's stamp, and after its block's."""
-        model, sequence_ns = self._model, self._measured.sequence_ns
+        model = self._model
+        sequence_ns = self._measured.sequence_ns
         number = np.arange(self._layout.columns)
         start_ns = np.rint(number * sequence_ns).astype(np.int64) + model.stamp_ns
         if self._options.stamp_is_end and model.stamp_may_end:

@@ -40,7 +40,8 @@ from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]
 
-_FITS_BYTES, _FITS_FILE = 100, 200
+_FITS_BYTES = 100
+_FITS_FILE = 200
 # A file whose angles are further from those of all models is of none of them.
 _ANGLE_TOLERANCE_DEG = 3.0
 _UNIT_TOLERANCE = 1e-6
@@ -172,7 +173,9 @@ def _is_paced(row: Model, seen: Identity) -> bool:
 
 
 def _file_notes(calibration: VelodyneCalibration) -> list[str]:
-    notes, file, row = [], calibration.file, calibration.row
+    notes = []
+    file = calibration.file
+    row = calibration.row
     if calibration.is_guessed:
         others = ", ".join(one.name for one in ALL if one.seen_as == row.seen_as and one != row)
         notes.append(f"taken for an {row.name}; if it is an {others}, name its model in the rig")
@@ -193,10 +196,13 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
         return Measured("single return", row.sequence_ns), [note]
     notes = _identity_notes(row, seen)
     where = layout(row, seen.returns)
-    packets, host_ns = evidence.sample, evidence.host_ns
+    packets = evidence.sample
+    host_ns = evidence.host_ns
     good = are_good(packets, row, seen.returns)
-    packets, host_ns = packets[good], host_ns[good]
-    stamp_ns, azimuth = top_of_hour_ns(packets), first_azimuths(packets, where)
+    packets = packets[good]
+    host_ns = host_ns[good]
+    stamp_ns = top_of_hour_ns(packets)
+    azimuth = first_azimuths(packets, where)
     sequence_ns = float(row.sequence_ns)
     if row.banks == 4:
         told_ns = measured_sequence_ns(stamp_ns, where.sequences)
