@@ -46,7 +46,7 @@ def match_rig(sampler: Sampler, wanted: Sequence[Wanted], origin: Path) -> Match
 
 def is_model(wanted: str, got: str) -> bool:
     """Whether a lidar is of the model that the rig names."""
-    alike = {model.like for model in sensors.models() if model.name == wanted}
+    alike = {model.same_packets_as for model in sensors.models() if model.name == wanted}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
     return got in alike or got.replace("-", "").startswith(wanted.replace("-", ""))
 

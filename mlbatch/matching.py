@@ -70,7 +70,7 @@ def _name_all(table: StreamTable, found: Sequence[Found]) -> None:
     """After the namespace of its topics if that tells a place, else maker and serial number."""
     counts: dict[str, int] = {}
     for sensor in found:
-        maker = sensor.lidar.maker.lower()
+        maker = sensor.lidar.vendor.lower()
         counts[maker] = counts.get(maker, 0) + 1
         topic = min((table.streams[stream].topic for stream, _ in sensor.kinds), default="")
         place = "_".join(part for part in namespace(topic) if part not in GENERIC)

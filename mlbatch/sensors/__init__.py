@@ -39,7 +39,7 @@ MAX_CALIBRATION_BYTES = 16_000_000
 class Plugin(Protocol):
     """What a maker's module offers."""
 
-    MAKER: str
+    VENDOR: str
     MODELS: tuple[SensorModel, ...]
     # Calibrations that need no file: of models whose beams do not differ from unit to unit.
     BUILT_IN: tuple[Calibration, ...]

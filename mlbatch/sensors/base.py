@@ -13,13 +13,13 @@ from mlbatch.pixels import PixelTable
 from mlbatch.types import BoolArray, F64Array, I64Array, ImuSamples, U8Array
 
 
-class TurningLidar:
+class BaseLidar:
     """Base of the makers' lidars: no serial number in the packets, no IMU, no mounting known.
 
     A maker's class sets what is only declared here, and gives `faults`, `heads` and `read`.
     """
 
-    maker: str
+    vendor: str
     model: str
     mode: str
     channels: int

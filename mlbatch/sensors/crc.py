@@ -38,28 +38,28 @@ def crc64(messages: U8Array) -> U64Array:
     folded: U64Array = padded.view("<u8").astype(np.uint64, copy=False)
     level = 0
     while folded.shape[1] > 1:
-        folded = _moved(folded[:, 0::2], _mover(level)) ^ folded[:, 1::2]
+        folded = _shifted(folded[:, 0::2], _shift_tables(level)) ^ folded[:, 1::2]
         level += 1
-    result: U64Array = _moved(folded[:, 0], _mover(0)) ^ _ONES
+    result: U64Array = _shifted(folded[:, 0], _shift_tables(0)) ^ _ONES
     return result
 
 
 @lru_cache(maxsize=32)
-def _mover(level: int) -> U64Array:
+def _shift_tables(level: int) -> U64Array:
     """Tables (8, 256) that move a register over 2**level words: one table for each of its bytes."""
     values = np.arange(256, dtype=np.uint64)[None, :]
     positions = np.arange(_WORD, dtype=np.uint64)[:, None] * np.uint64(8)
     table: U64Array = values << positions
     if level:
-        half = _mover(level - 1)
-        return _moved(_moved(table, half), half)
+        half = _shift_tables(level - 1)
+        return _shifted(_shifted(table, half), half)
     one = np.uint64(1)
     for _ in range(_WORD * 8):
         table = (table >> one) ^ ((table & one) * _POLYNOMIAL64)
     return table
 
 
-def _moved(registers: U64Array, tables: U64Array) -> U64Array:
+def _shifted(registers: U64Array, tables: U64Array) -> U64Array:
     moved: U64Array = tables[0][registers & np.uint64(0xFF)]
     for byte in range(1, _WORD):
         moved ^= tables[byte][(registers >> np.uint64(8 * byte)) & np.uint64(0xFF)]

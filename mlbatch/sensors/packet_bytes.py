@@ -20,6 +20,14 @@ _MOST_LOST_TURN = _TICKS_PER_TURN // 2
 Order = Literal["<", ">"]
 
 
+def payload_rows(size: int, sample: U8Array) -> U8Array | None:
+    """Payloads (k, size) of a sample (k, >= size) or of a single one; None without any."""
+    packets = np.atleast_2d(sample)
+    if not packets.size or packets.shape[1] < size:
+        return None
+    return packets[:, :size]
+
+
 def number(packets: U8Array, at: int, width: int, order: Order = "<") -> I64Array:
     """(k,) unsigned numbers of `width` bytes at byte `at`; the bytes must be there."""
     places = np.arange(width) if order == "<" else np.arange(width)[::-1]
@@ -27,7 +35,7 @@ def number(packets: U8Array, at: int, width: int, order: Order = "<") -> I64Arra
     return np.asarray(shifted.sum(axis=1), np.int64)
 
 
-def starts(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
+def has_bytes(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
     """(k,) which payloads hold these bytes at byte `at`."""
     if packets.shape[1] < at + len(magic):
         return np.zeros(len(packets), bool)
@@ -35,12 +43,12 @@ def starts(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
     return np.asarray(same.all(axis=1))
 
 
-def mostly(packets: U8Array, good: BoolArray) -> U8Array | None:
+def majority(packets: U8Array, good: BoolArray) -> U8Array | None:
     """The good payloads if they are the majority: one damaged packet must not hide a stream."""
     return packets[good] if 2 * int(good.sum()) > len(packets) else None
 
 
-def usual(values: I64Array) -> int:
+def most_common(values: I64Array) -> int:
     """The value that occurs most often."""
     found, counts = np.unique(values, return_counts=True)
     return int(found[counts.argmax()])

@@ -19,7 +19,7 @@ from mlbatch.types import F32Array, F64Array, I64Array
 _TURN_RAD = 2 * np.pi
 
 
-class _Mirrors:
+class _At128Projection:
     """The projection of one AT128; its frame is HESAI's: x right, y forward, z up."""
 
     def __init__(
@@ -32,8 +32,8 @@ class _Mirrors:
         self._firing_ns = np.maximum(firing_ns, 0).astype(np.float32)
         self._azimuth = _cosine_and_sine(-file.azimuth_rad)
         self._elevation = _cosine_and_sine(file.elevation_rad)
-        self._azimuth_adjust = _Adjust(file.azimuth_adjust_rad)
-        self._elevation_adjust = _Adjust(file.elevation_adjust_rad)
+        self._azimuth_adjust = _AngleCorrection(file.azimuth_adjust_rad)
+        self._elevation_adjust = _AngleCorrection(file.elevation_adjust_rad)
         self._beam = np.arange(beams)
         self._rotation = body_from_sensor[:3, :3].astype(np.float32)
         self._origin = body_from_sensor[:3, 3].astype(np.float32)[:, None]
@@ -66,7 +66,7 @@ class _Mirrors:
         np.add(moved, self._origin, out=out.transpose(0, 2, 1))
 
     def _place(self, angle: F64Array, turned: F32Array) -> tuple[I64Array, F32Array]:
-        """Cells of `_Adjust` and how far in them the beams (n, B) are."""
+        """Cells of `_AngleCorrection` and how far in them the beams (n, B) are."""
         place = angle * self._steps_per_rad
         step = np.floor(place)
         part = turned * np.float32(self._steps_per_rad)
@@ -81,7 +81,7 @@ class _Mirrors:
         return cell, part
 
 
-class _Adjust:
+class _AngleCorrection:
     """Corrections over the rotor angle, (channels, steps) rad, as straight pieces.
 
     Cell step * channels + channel holds the piece from that step to the next one.
@@ -130,4 +130,4 @@ def at128_projection(
 
     Columns carry rotor words. firing_ns: (T, 128), as in `Lidar`; columns: the most aimed at once.
     """
-    return _Mirrors(file, firing_ns, body_from_sensor, columns)
+    return _At128Projection(file, firing_ns, body_from_sensor, columns)

@@ -26,7 +26,14 @@ from mlbatch.sensors.hesai.layout import (
     unit_mm,
 )
 from mlbatch.sensors.hesai.models import Model
-from mlbatch.sensors.packet_bytes import NO_DECODER, mostly, number, starts, usual
+from mlbatch.sensors.packet_bytes import (
+    NO_DECODER,
+    has_bytes,
+    majority,
+    most_common,
+    number,
+    payload_rows,
+)
 from mlbatch.types import BoolArray, U8Array
 
 _SOP = b"\xee\xff"
@@ -112,15 +119,19 @@ _STATUS_VERSION = (1, 4)
 _STATUS_VERSIONS = ((137, rows.JT128), (128, rows.OT128), (0, rows.PANDAR128E3X))
 
 
-def hesai(size: int, packets: U8Array) -> str | None:
+def describe(size: int, sample: U8Array) -> str | None:
     """A line on HESAI packets, or None."""
+    packets = payload_rows(size, sample)
+    if packets is None:
+        return None
     for wanted, magic, name in _OTHERS:
-        good = starts(packets, magic)
+        good = has_bytes(packets, magic)
         if name == "GPS packet":
             good &= _digits(packets, 2, 14)
-        if wanted in (0, size) and mostly(packets, good) is not None:
+        if wanted in (0, size) and majority(packets, good) is not None:
             return f"HESAI {name}"
-    if size == _JT16_IMU_SIZE and mostly(packets, starts(packets, _SOP + b"\x01\x08")) is not None:
+    are_imu = has_bytes(packets, _SOP + b"\x01\x08")
+    if size == _JT16_IMU_SIZE and majority(packets, are_imu) is not None:
         return "HESAI IMU packet, JT16"
     found = identify(size, packets)
     if found is None:
@@ -149,20 +160,20 @@ def _identify_sized(size: int, packets: U8Array) -> Identity | None:
     """Models whose headers bear no protocol version."""
     flagged = np.ones(len(packets), np.bool_)
     for block in range(_PANDAR40_BLOCKS):
-        flagged &= starts(packets, _BLOCK_FLAG, _PANDAR40_STRIDE * block)
-    chosen = mostly(packets, flagged)
+        flagged &= has_bytes(packets, _BLOCK_FLAG, _PANDAR40_STRIDE * block)
+    chosen = majority(packets, flagged)
     if chosen is not None:
         if size == _PANDAR40_UNDATED_SIZE:
-            return Identity("Pandar40", RETURN_MODES.get(usual(number(chosen, 1254, 1))))
+            return Identity("Pandar40", RETURN_MODES.get(most_common(number(chosen, 1254, 1))))
         if size in (_PANDAR40_SIZE, _PANDAR40_SIZE + _SEQUENCE_SIZE):
             flags = SEQUENCE if size > _PANDAR40_SIZE else 0
             return _identity(rows.PANDAR40P, size, 0, chosen, _PANDAR40_BLOCKS, flags, ())
     for model, blocks, sizes in _SIZED:
-        chosen = mostly(packets, starts(packets, _SOP + bytes((model.channels, blocks))))
+        chosen = majority(packets, has_bytes(packets, _SOP + bytes((model.channels, blocks))))
         if chosen is not None and size in sizes:
             flags = SEQUENCE if size > sizes[0] else 0
             return _identity(model, size, 0, chosen, blocks, flags, _FIXED_64)
-    if mostly(packets, starts(packets, _PANDAR20_MAGIC)) is not None:
+    if majority(packets, has_bytes(packets, _PANDAR20_MAGIC)) is not None:
         return Identity("Pandar20")
     return None
 
@@ -171,12 +182,12 @@ def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | No
     """Models whose header has a protocol version; their size must hold the blocks announced."""
     if packets.shape[1] < _HEADER_SIZE:
         return None
-    chosen = mostly(packets, starts(packets, _SOP))
+    chosen = majority(packets, has_bytes(packets, _SOP))
     if chosen is None:
         return None
-    head = [usual(number(chosen, at, 1)) for at in range(_HEADER_SIZE)]
+    head = [most_common(number(chosen, at, 1)) for at in range(_HEADER_SIZE)]
     version = head[2], head[3]
-    same = mostly(packets, starts(packets, bytes((*_SOP, *version))))
+    same = majority(packets, has_bytes(packets, bytes((*_SOP, *version))))
     family = _family(version, head[4])
     if family is None or same is None or (prefix and family.turns):
         return None
@@ -229,9 +240,9 @@ def _identity(
         return None
     mode: ReturnMode | None = ONLY_RETURN
     if model.tail.mode_at is not None:
-        mode = RETURN_MODES.get(usual(number(packets, tail + model.tail.mode_at, 1)))
+        mode = RETURN_MODES.get(most_common(number(packets, tail + model.tail.mode_at, 1)))
     # What a header says once may be damaged: the usual value counts.
-    head = {at: usual(number(packets, at, 1)) for at in fixed}
+    head = {at: most_common(number(packets, at, 1)) for at in fixed}
     chooses = model is rows.QT128 and bool(flags & AMBIENT)
     millimetres = unit_mm(model, head)
     if (

@@ -80,7 +80,7 @@ class Model:
     tail; tail_at: None behind the body and its checks. `firing_ns` has a row for every table and
     `tables` the row by operation mode and azimuth state. silent: raw distances up to this one mean
     no return. elevation_deg: lowest and highest beam as the data sheet has them, None: not used;
-    like: the model under whose name packets of this one are found.
+    same_packets_as: the model under whose name packets of this one are found.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Model:
     centre_mm: tuple[float, float, float]
     elevation_deg: tuple[float, float] | None
     verified: str
-    like: str = ""
+    same_packets_as: str = ""
     header: int = 12
     lead: int = 2
     azimuth_at: int = 0
@@ -156,7 +156,9 @@ PANDAR40P = Model(
     unit_mm_at=None,
 )
 # Only its angles differ from those of a Pandar40P.
-PANDAR40M = replace(PANDAR40P, name="Pandar40M", verified="two sources", like="Pandar40P")
+PANDAR40M = replace(
+    PANDAR40P, name="Pandar40M", verified="two sources", same_packets_as="Pandar40P"
+)
 PANDAR64 = Model(
     "Pandar64",
     channels=64,

@@ -17,11 +17,11 @@ from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar import Calibration, Evidence, SensorModel
 from mlbatch.median import median
-from mlbatch.sensors.base import TurningLidar, content_keys
+from mlbatch.sensors.base import BaseLidar, content_keys
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
 from mlbatch.sensors.hesai.at128 import at128_projection
-from mlbatch.sensors.hesai.identify import hesai, identify
+from mlbatch.sensors.hesai.identify import describe, identify
 from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.hesai.optics import OffAxis, off_axis
@@ -30,20 +30,22 @@ from mlbatch.sensors.options import check_options
 from mlbatch.types import F64Array, Heads, I64Array, Pixels, U8Array
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
-MAKER = "HESAI"
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
+
+VENDOR = "HESAI"
 BUILT_IN: tuple[Calibration, ...] = ()
 _CSV = "angle csv of the unit, required"
 _DAT = "correction dat of the unit, required"
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=row.name,
-        maker=MAKER,
+        vendor=VENDOR,
         channels=row.channels,
         returns=tuple(range(1, row.most_returns + 1)),
         clock="free-running, GPS or PTP; date and us in every packet",
         calibration=_DAT if row is rows.AT128 else _CSV,
         verified=row.verified,
-        like=row.like,
+        same_packets_as=row.same_packets_as,
     )
     for row in rows.ALL
 )
@@ -64,14 +66,6 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
     return None if angles is None else HesaiCalibration(angles)
 
 
-def describe(size: int, sample: U8Array) -> str | None:
-    """What payloads (k, size) of an unknown stream are; None if not HESAI's."""
-    packets = np.atleast_2d(sample)
-    if not packets.size or packets.shape[1] < size:
-        return None
-    return hesai(size, packets[:, :size])
-
-
 class HesaiCalibration:
     """An angle csv, of whatever model has as many channels; `Calibration` of lidar.py."""
 
@@ -80,7 +74,7 @@ class HesaiCalibration:
     def __init__(self, angles: HesaiAngles) -> None:
         self._angles = angles
         self.path: Path | None = angles.path
-        self.model = f"{MAKER} of {len(angles.azimuth_rad)} channels"
+        self.model = f"{VENDOR} of {len(angles.azimuth_rad)} channels"
         self.serial = ""
         self.is_shared = False
 
@@ -89,7 +83,7 @@ class HesaiCalibration:
         layout = _layout(evidence)
         if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
             return 0
-        layout = _told_by_beams(layout, self._angles)
+        layout = _model_by_beams(layout, self._angles)
         if layout.model.name == rows.AT128.name:
             return 1
         return _FITS if _note_on_beams(self._angles, layout.model) else _FITS_BEAMS
@@ -98,7 +92,7 @@ class HesaiCalibration:
         """The sensor."""
         check_options(options)
         angles = self._angles
-        layout = _told_by_beams(_seen(self.path, evidence), angles)
+        layout = _model_by_beams(_require_layout(self.path, evidence), angles)
         model = layout.model
         if model.name == rows.AT128.name:
             raise RigError(
@@ -137,7 +131,7 @@ class At128Calibration:
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
         """The sensor."""
         check_options(options)
-        layout = _seen(self.path, evidence)
+        layout = _require_layout(self.path, evidence)
         if layout.model.name != self.model:
             raise RigError(
                 f"{self.path}: HESAI angles: wanted the csv of a {layout.model.name} for these "
@@ -146,7 +140,7 @@ class At128Calibration:
         return At128Lidar(layout, options, evidence, self._file)
 
 
-class HesaiLidar(TurningLidar):
+class HesaiLidar(BaseLidar):
     """One sensor; `Lidar` of lidar.py, in HESAI's frame: x right, y forward, z up."""
 
     def __init__(
@@ -165,7 +159,7 @@ class HesaiLidar(TurningLidar):
             checks_crc="crc" in options,
         )
         self._reader.sense = _sense(self._reader, evidence)
-        self.maker = MAKER
+        self.vendor = VENDOR
         self.model = model.name
         self.mode = layout.mode.text
         self.channels = model.channels
@@ -174,7 +168,7 @@ class HesaiLidar(TurningLidar):
         self.columns_per_packet = layout.columns
         self.column_period_ns = model.timing.step_ns / model.timing.divisor
         self.records = self._reader.records
-        self.pixel_layout = (MAKER, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
+        self.pixel_layout = (VENDOR, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
         self.pixels = self._reader.pixels()
         self.return_types = layout.mode.types
         self.channel = np.arange(model.channels)
@@ -240,7 +234,7 @@ def _layout(evidence: Evidence) -> Layout | None:
     return None if found is None else found.layout
 
 
-def _seen(path: Path | None, evidence: Evidence | None) -> Layout:
+def _require_layout(path: Path | None, evidence: Evidence | None) -> Layout:
     """The layout of the packets; RigError without any, since a file does not name its model."""
     layout = None if evidence is None else _layout(evidence)
     if layout is None:
@@ -251,7 +245,7 @@ def _seen(path: Path | None, evidence: Evidence | None) -> Layout:
     return layout
 
 
-def _told_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
+def _model_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
     """The layout, of the model whose beams the file has, where packets leave that open."""
     is_b = layout.model is rows.PANDAR20A and not _note_on_beams(angles, rows.PANDAR20B)
     return replace(layout, model=rows.PANDAR20B) if is_b else layout

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.sensors.livox.packets import HEADER_SIZE, KINDS, PointKind
-from mlbatch.sensors.packet_bytes import NO_DECODER, mostly, number, usual
+from mlbatch.sensors.packet_bytes import NO_DECODER, majority, most_common, number, payload_rows
 from mlbatch.types import U8Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
@@ -34,8 +34,11 @@ _TYPES1 = {
 }
 
 
-def livox(size: int, packets: U8Array) -> str | None:
+def describe(size: int, sample: U8Array) -> str | None:
     """A line on Livox packets, or None."""
+    packets = payload_rows(size, sample)
+    if packets is None:
+        return None
     return _describe_sdk2(size, packets) or _describe_sdk1(size, packets)
 
 
@@ -46,14 +49,14 @@ def identify(size: int, packets: U8Array) -> PointKind | None:
     """
     if size <= HEADER_SIZE or not len(packets):
         return None
-    data_type = usual(number(packets, 10, 1))
+    data_type = most_common(number(packets, 10, 1))
     kind = KINDS.get(data_type)
     if kind is None:
         return None
     good = (packets[:, 10] == data_type) & np.isin(packets[:, 11], _TIME_TYPES2)
     good &= number(packets, 1, 2) == size
     good &= number(packets, 5, 2) * kind.size == size - HEADER_SIZE
-    return kind if mostly(packets, good) is not None else None
+    return kind if majority(packets, good) is not None else None
 
 
 def _describe_sdk2(size: int, packets: U8Array) -> str | None:
@@ -67,15 +70,15 @@ def _describe_sdk1(size: int, packets: U8Array) -> str | None:
     """A size and a type prove little, so the stamps of a few packets have to step forward."""
     if len(packets) < 2 or size < _HEADER1_SIZE:
         return None
-    kind = usual(number(packets, 9, 1))
+    kind = most_common(number(packets, 9, 1))
     wanted, what = _TYPES1.get(kind, (0, ""))
-    time_type = usual(number(packets, 8, 1))
+    time_type = most_common(number(packets, 8, 1))
     if size != wanted or time_type not in _TIME_TYPES1:
         return None
     # Version, slot, device and reserved byte, time and data type are a stream's own; the status
     # between them is not.
     own = packets[:, [0, 1, 2, 3, 8, 9]]
-    if mostly(packets, (own == np.median(own, axis=0)).all(axis=1)) is None:
+    if majority(packets, (own == np.median(own, axis=0)).all(axis=1)) is None:
         return None
     gps = time_type == _GPS_TIME
     step_ns = np.diff(number(packets, 14, 4) * NS_PER_US if gps else number(packets, 10, 8))

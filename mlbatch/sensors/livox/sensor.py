@@ -17,8 +17,8 @@ from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection
 from mlbatch.lidar import Calibration, Evidence, Records, SensorModel
 from mlbatch.median import median
-from mlbatch.sensors.base import TurningLidar, content_keys
-from mlbatch.sensors.livox.identify import identify, livox
+from mlbatch.sensors.base import BaseLidar, content_keys
+from mlbatch.sensors.livox.identify import describe, identify
 from mlbatch.sensors.livox.packets import (
     HEADER_SIZE,
     IMU_SIZE,
@@ -30,17 +30,17 @@ from mlbatch.sensors.livox.packets import (
     stamps_ns,
 )
 from mlbatch.sensors.options import check_options
-from mlbatch.sensors.packet_bytes import usual
+from mlbatch.sensors.packet_bytes import most_common
 from mlbatch.types import F32Array, F64Array, Heads, I64Array, ImuSamples, Pixels, U8Array
 
-__all__ = ["BUILT_IN", "MAKER", "MODELS", "LivoxCalibration", "LivoxLidar", "describe"]
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
 
-MAKER = "Livox"
+VENDOR = "Livox"
 SDK2 = "Livox SDK2"
 MODELS: tuple[SensorModel, ...] = (
     SensorModel(
         name=SDK2,
-        maker=MAKER,
+        vendor=VENDOR,
         channels=1,
         returns=(1, 2),
         clock="power-on, gPTP, PTP, GPS or NTP; ns in every packet",
@@ -97,15 +97,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
     return None
 
 
-def describe(size: int, sample: U8Array) -> str | None:
-    """What payloads (k, size) are; SDK1 (Mid-40, Horizon, Avia, ...) is only known by name."""
-    packets = np.atleast_2d(sample)
-    if not packets.size or packets.shape[1] < size:
-        return None
-    return livox(size, packets[:, :size])
-
-
-class LivoxLidar(TurningLidar):
+class LivoxLidar(BaseLidar):
     """One sensor; `Lidar` of lidar.py.
 
     Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the points that were read last.
@@ -113,7 +105,7 @@ class LivoxLidar(TurningLidar):
 
     def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
         packets = evidence.sample[faults(evidence.sample, kind, check_crc=False) == 0]
-        self.maker = MAKER
+        self.vendor = VENDOR
         self.model = SDK2
         self.mode = kind.what
         self.channels = 1
@@ -121,7 +113,7 @@ class LivoxLidar(TurningLidar):
         self.packet_size = evidence.size
         self.columns_per_packet = (evidence.size - HEADER_SIZE) // kind.size
         self.records = Records(HEADER_SIZE, kind.size, kind.size)
-        self.pixel_layout = (MAKER, kind.data_type)
+        self.pixel_layout = (VENDOR, kind.data_type)
         self.return_types = (0,) * kind.returns
         self.sends_twice = False
         self.channel = np.zeros(1, np.int64)
@@ -129,7 +121,7 @@ class LivoxLidar(TurningLidar):
         self.beams = BeamTable(np.zeros((3, 1, 3)), np.zeros((3, 1, 3)), np.zeros(1))
         self.calibration = ""
         self.imu_port = _IMU_PORTS.get(evidence.stream.port, 0)
-        self.timestamp_mode = _CLOCKS.get(usual(headers(packets)["time_type"]), "")
+        self.timestamp_mode = _CLOCKS.get(most_common(headers(packets)["time_type"]), "")
         self.sequence_modulus = _COUNTER_MODULUS if _counts_on(packets) else 0
         self.notes = (_SHARED_STAMP,) if _share_stamps(packets) else ()
         self.last_xyz_m: F64Array = np.empty((0, 3))
@@ -167,10 +159,10 @@ class LivoxLidar(TurningLidar):
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
         """Moves the points that were read last into the body frame."""
-        return Carried(self, body_from_sensor)
+        return MovedPoints(self, body_from_sensor)
 
 
-class Carried:
+class MovedPoints:
     """Points whose coordinates come with their ranges; `Projection` of geometry.py."""
 
     def __init__(self, lidar: LivoxLidar, body_from_sensor: F64Array) -> None:

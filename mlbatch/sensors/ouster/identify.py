@@ -33,6 +33,7 @@ from mlbatch.sensors.ouster.profiles import (
     ZONE_PACKET,
     PacketLayout,
 )
+from mlbatch.sensors.packet_bytes import payload_rows
 from mlbatch.types import F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
 
@@ -51,8 +52,8 @@ _MOST_G = 100.0
 
 def describe(size: int, sample: U8Array) -> str | None:
     """A line on what payloads (k, size) of one stream are, or None if nothing proves them ours."""
-    packets = np.atleast_2d(sample)
-    if not packets.size or packets.shape[1] < size:
+    packets = payload_rows(size, sample)
+    if packets is None:
         return None
     for length in (size, size - 1):  # old ROS drivers append a byte
         text = (

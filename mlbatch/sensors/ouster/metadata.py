@@ -224,7 +224,7 @@ class Metadata:
     notes: tuple[str, ...]
 
 
-def metadata(document: Document) -> Metadata:
+def parse_metadata(document: Document) -> Metadata:
     """All fields of a document, checked; RigError says which of them cannot be used."""
     altitude_deg, azimuth_deg = _angles_deg(document)
     layout = _layout(document, len(altitude_deg))

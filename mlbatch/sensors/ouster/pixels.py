@@ -24,7 +24,7 @@ _WORD_BYTES = 4
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _BitField:
     """A field as a word of a pixel: (word >> shift) & mask; None where the step is not needed."""
 
     word: int
@@ -33,7 +33,7 @@ class _Part:
 
 
 @dataclass(frozen=True, slots=True)
-class _Whole:
+class _ByteField:
     """A field that is whole bytes of a pixel, and so is read where it stands."""
 
     first: int
@@ -44,10 +44,10 @@ class _Whole:
 class _Return:
     """The fields of one return; `per_metre`: units of the raw range in a metre."""
 
-    range: _Part
+    range: _BitField
     per_metre: np.float32
-    reflectivity: _Whole
-    signal: _Whole | None
+    reflectivity: _ByteField
+    signal: _ByteField | None
 
 
 class PixelReader:
@@ -81,7 +81,7 @@ class PixelReader:
         signal = fields.signal
         np.copyto(out.intensity, reflectivity if signal is None else self._whole(records, signal))
 
-    def _take(self, words: U32Array, part: _Part) -> I32Array:
+    def _take(self, words: U32Array, part: _BitField) -> I32Array:
         """A field of all pixels (n, H), in scratch: signed, as CPUs turn those into floats fast."""
         taken = self._words[: len(words)]
         end = self._first + self._beams * self._step
@@ -93,7 +93,7 @@ class PixelReader:
             source = np.bitwise_and(source, part.mask, out=taken)
         return source[:, pixels].view(np.int32)
 
-    def _whole(self, records: U8Array, field: _Whole) -> npt.NDArray[np.unsignedinteger[Any]]:
+    def _whole(self, records: U8Array, field: _ByteField) -> npt.NDArray[np.unsignedinteger[Any]]:
         """A field of all pixels (n, H), where it stands in the records."""
         first = self._first * _WORD_BYTES
         size = self._step * _WORD_BYTES
@@ -146,13 +146,13 @@ def _fields_of(profile: Profile, suffix: str) -> _Return:
     )
 
 
-def _whole(field: Field) -> _Whole:
-    return _Whole(field.first_bit // 8, np.dtype(f"<u{field.width // 8}"))
+def _whole(field: Field) -> _ByteField:
+    return _ByteField(field.first_bit // 8, np.dtype(f"<u{field.width // 8}"))
 
 
-def _part(field: Field) -> _Part:
+def _part(field: Field) -> _BitField:
     word, shift = divmod(field.first_bit, _WORD_BITS)
-    return _Part(
+    return _BitField(
         word,
         np.uint32(shift) if shift else None,
         np.uint32((1 << field.width) - 1) if shift + field.width < _WORD_BITS else None,

@@ -25,7 +25,7 @@ from mlbatch.sensors.ouster.imu import (
     read_legacy,
     sample_count,
 )
-from mlbatch.sensors.ouster.metadata import Metadata, metadata, read_document
+from mlbatch.sensors.ouster.metadata import Metadata, parse_metadata, read_document
 from mlbatch.sensors.ouster.packets import (
     Headers,
     LegacyHeaders,
@@ -39,15 +39,15 @@ from mlbatch.units import NS_PER_S
 
 __all__ = [
     "BUILT_IN",
-    "MAKER",
     "MODELS",
+    "VENDOR",
     "OusterCalibration",
     "OusterLidar",
     "describe",
     "read_calibration",
 ]
 
-MAKER = "Ouster"
+VENDOR = "Ouster"
 _REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
 _BEAMS = {
     "OS0": (32, 64, 128),
@@ -58,7 +58,7 @@ _BEAMS = {
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=f"{line}-{beams}",
-        maker=MAKER,
+        vendor=VENDOR,
         channels=beams,
         returns=(1, 2),
         clock="internal oscillator, sync pulse or PTP; ns in every column",
@@ -84,7 +84,7 @@ _DEFAULT_FRAME_IDS = 1 << 16
 def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
     """The metadata in a file, or None if it holds something else."""
     document = read_document(path, content)
-    return None if document is None else OusterCalibration(metadata(document))
+    return None if document is None else OusterCalibration(parse_metadata(document))
 
 
 class OusterCalibration:
@@ -148,7 +148,7 @@ class OusterLidar:
 
     def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:
         layout = described.layout
-        self.maker = MAKER
+        self.vendor = VENDOR
         self.model = model
         self.serial = serial
         # LEGACY packets have no header, and so name nobody.
@@ -161,7 +161,7 @@ class OusterLidar:
         self.columns_per_packet = layout.columns
         self.column_period_ns = _column_period_ns(described)
         self.records = Records(layout.record_start, layout.record_size, layout.record_size)
-        self.pixel_layout = (MAKER, layout.profile.name, layout.beams, described.strongest_first)
+        self.pixel_layout = (VENDOR, layout.profile.name, layout.beams, described.strongest_first)
         # Which of two returns is the strongest depends on their order: the decoder sorts them out.
         self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
         self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""

@@ -19,23 +19,23 @@ from mlbatch.clouds import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layou
 from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, Projection, rotor_words
 from mlbatch.lidar import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
-from mlbatch.sensors.base import TurningLidar
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 from mlbatch.types import F32Array, F64Array, Heads, I64Array, Pixels, U8Array
 
-MAKER = "any"
+VENDOR = "any"
 # In the order of KINDS.
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=name,
-        maker=maker,
+        vendor=maker,
         channels=MOST_SLOTS,
         returns=(1,),
         clock="a time for every point",
         calibration="none: points have a place already",
         verified="two sources",
     )
-    for name, maker in zip(KINDS, (MAKER, "Livox"), strict=True)
+    for name, maker in zip(KINDS, (VENDOR, "Livox"), strict=True)
 )
 _FITS = 100
 _BAD_HEADER = FAULTS.index("bad_header")
@@ -63,7 +63,7 @@ def _layout(sample: U8Array) -> Layout | None:
     return layout if known else None
 
 
-class PointsCalibration:
+class CloudCalibration:
     """That nothing needs to be known of a topic of clouds; `Calibration` of lidar.py."""
 
     path: Path | None = None
@@ -88,10 +88,10 @@ class PointsCalibration:
                 f"{self.model}: wanted a cloud of the topic in the first 10 seconds, which tells "
                 "how its points share times, got none; correct the topic, or leave it out"
             )
-        return PointsLidar(layout, evidence.stream.topic)
+        return CloudLidar(layout, evidence.stream.topic)
 
 
-BUILT_IN: tuple[Calibration, ...] = tuple(PointsCalibration(kind) for kind in range(len(KINDS)))
+BUILT_IN: tuple[Calibration, ...] = tuple(CloudCalibration(kind) for kind in range(len(KINDS)))
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:
@@ -105,7 +105,7 @@ def describe(size: int, sample: U8Array) -> str | None:
     return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {layout}"
 
 
-class PointsLidar(TurningLidar):
+class CloudLidar(BaseLidar):
     """A topic of clouds; `Lidar` of lidar.py."""
 
     sends_twice = False
@@ -115,7 +115,7 @@ class PointsLidar(TurningLidar):
         slots = layout.slots
         self.model = KINDS[layout.kind]
         # What a sensor is named after where nothing else tells its place.
-        self.maker = "Cloud"
+        self.vendor = "Cloud"
         self.mode = str(layout)
         self.channels = slots
         self.returns = 1
@@ -136,7 +136,7 @@ class PointsLidar(TurningLidar):
         self.calibration = "none"
         self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
         self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
-        self._scratch = _Places(np.empty((0, REALS, slots), np.float32))
+        self._scratch = _LastRead(np.empty((0, REALS, slots), np.float32))
 
     def faults(self, packets: U8Array) -> U8Array:
         """Packets of another layout."""
@@ -172,20 +172,20 @@ class PointsLidar(TurningLidar):
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
         """Points are moved, not made."""
-        return _Moved(self._scratch, body_from_sensor)
+        return _MovedPoints(self._scratch, body_from_sensor)
 
 
 @dataclass(slots=True)
-class _Places:
+class _LastRead:
     """The columns that were read last, (n, REALS, slots), where they lie in their records."""
 
     reals: F32Array
 
 
-class _Moved:
+class _MovedPoints:
     """The places of the columns read last, in the body frame; `Projection` of geometry.py."""
 
-    def __init__(self, places: _Places, body_from_sensor: F64Array) -> None:
+    def __init__(self, places: _LastRead, body_from_sensor: F64Array) -> None:
         self._places = places
         self._rotation = body_from_sensor[:3, :3].astype(np.float32)
         self._translation_m = body_from_sensor[:3, 3].astype(np.float32)

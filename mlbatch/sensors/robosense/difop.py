@@ -1,7 +1,7 @@
 """What ROBOSENSE units say of themselves beyond their model: DIFOP (device) packets, csv of angles.
 
 Source: facts/robosense.md sections 1 to 7. What both kinds of packets say together: mode, steps,
-firing times, doubts.
+firing times, notes_on_model.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch.errors import RigError
 from mlbatch.lidar import Evidence
 from mlbatch.median import median
-from mlbatch.sensors.packet_bytes import number, starts, usual
+from mlbatch.sensors.packet_bytes import has_bytes, most_common, number
 from mlbatch.sensors.robosense.identify import identify, is_difop, returns_of
 from mlbatch.sensors.robosense.models import (
     AIRY_LAYOUT,
@@ -123,7 +123,7 @@ def find_difop(evidence: Evidence) -> Difop | None:
 def _whole(packets: U8Array) -> U8Array:
     if packets.shape[1] < _SIZE:
         return np.empty((0, _SIZE), np.uint8)
-    return packets[is_difop(packets) & starts(packets, _TAIL, _TAIL_AT)][:, :_SIZE]
+    return packets[is_difop(packets) & has_bytes(packets, _TAIL, _TAIL_AT)][:, :_SIZE]
 
 
 def _of_port(packets: U8Array, port: int) -> U8Array:
@@ -207,7 +207,9 @@ _VARIANT_BYTES = (31, 32)
 _PLUS_80V = 3
 
 
-def mode(points: U8Array, row: Model, difop: Difop | None) -> tuple[ReturnMode, tuple[str, ...]]:
+def return_mode(
+    points: U8Array, row: Model, difop: Difop | None
+) -> tuple[ReturnMode, tuple[str, ...]]:
     """Return mode: how many returns by the point packets, which one by the device packet."""
     told = None if difop is None else row.modes.get(difop.mode)
     seen = returns_of(points, row)
@@ -223,7 +225,7 @@ def units_per_m(points: U8Array, row: Model) -> tuple[int, tuple[str, ...]]:
     """Steps of a raw distance in a metre."""
     if row.layout is not HELIOS_LAYOUT or not len(points):
         return row.units_per_m, ()
-    code = usual(number(points, _STEP_AT, 1))
+    code = most_common(number(points, _STEP_AT, 1))
     found = _STEPS_PER_M.get(code, row.units_per_m)
     if found == row.units_per_m:
         return found, ()
@@ -237,7 +239,7 @@ def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
     if row.layout is AIRY_LAYOUT and difop is not None:
         chosen = difop.installation
     elif row is RUBY_PLUS_80 and len(points):
-        chosen = int(_PLUS_80V in {usual(number(points, at, 1)) for at in _VARIANT_BYTES})
+        chosen = int(_PLUS_80V in {most_common(number(points, at, 1)) for at in _VARIANT_BYTES})
     known = row.firing_ns[chosen] if chosen < len(row.firing_ns) else row.firing_ns[0]
     return np.array([known], np.int64) - min(known)
 
@@ -251,7 +253,9 @@ def is_counted(points: U8Array, row: Model) -> bool:
     return len(steps) > 0 and median(steps) == 1.0
 
 
-def doubts(points: U8Array, row: Model, difop: Difop | None, *, is_named: bool) -> tuple[str, ...]:
+def notes_on_model(
+    points: U8Array, row: Model, difop: Difop | None, *, is_named: bool
+) -> tuple[str, ...]:
     """What the packets leave open and the user may know, or has said: is_named."""
     texts = []
     found = identify(points)

@@ -14,14 +14,15 @@ from mlbatch.sensors.packet_bytes import (
     NO_DECODER,
     block_azimuths,
     block_time_us,
+    has_bytes,
     in_pairs,
-    mostly,
+    majority,
+    most_common,
     number,
-    starts,
-    usual,
+    payload_rows,
 )
 from mlbatch.sensors.robosense import models as rows
-from mlbatch.sensors.robosense.models import MAKER, SECOND_KIND, Layout, Model
+from mlbatch.sensors.robosense.models import SECOND_KIND, VENDOR, Layout, Model
 from mlbatch.types import BoolArray, I64Array, U8Array
 
 _SOLID_STATE = bytes.fromhex("55aa5aa5")
@@ -78,9 +79,11 @@ _RUBY_PLUS_TYPE = 5
 MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
 
 
-def robosense(size: int, packets: U8Array) -> str | None:
+def describe(size: int, sample: U8Array) -> str | None:
     """A line on ROBOSENSE packets, or None."""
-    packets = packets[:, :size]
+    packets = payload_rows(size, sample)
+    if packets is None:
+        return None
     points = point_packets(packets)
     found = identify(points)
     if found is not None and found.model is not None:
@@ -88,17 +91,17 @@ def robosense(size: int, packets: U8Array) -> str | None:
     if found is not None:
         return _lidar(found.name) + NO_DECODER
     if 2 * len(points) < len(packets):
-        return f"{MAKER} DIFOP packet"
-    if size == _IMU_SIZE and mostly(packets, starts(packets, _IMU)) is not None:
-        return f"{MAKER} IMU packet, Airy"
-    if size in _SOLID_SIZES and mostly(packets, starts(packets, _SOLID_STATE)) is not None:
+        return f"{VENDOR} DIFOP packet"
+    if size == _IMU_SIZE and majority(packets, has_bytes(packets, _IMU)) is not None:
+        return f"{VENDOR} IMU packet, Airy"
+    if size in _SOLID_SIZES and majority(packets, has_bytes(packets, _SOLID_STATE)) is not None:
         return _lidar(_SOLID_SIZES[size]) + NO_DECODER
     return None
 
 
 def is_difop(packets: U8Array) -> BoolArray:
     """Which of the packets (P, size) are device packets."""
-    return starts(packets, DIFOP)
+    return has_bytes(packets, DIFOP)
 
 
 def point_packets(packets: U8Array) -> U8Array:
@@ -110,21 +113,23 @@ def fits(packets: U8Array, layout: Layout) -> BoolArray:
     """Which packets have the magic bytes and the first two blocks of a layout."""
     if packets.shape[1] < layout.end:
         return np.zeros(len(packets), bool)
-    good = starts(packets, layout.magic) & starts(packets, layout.block_id, layout.header)
-    return good & starts(packets, layout.block_id, layout.header + layout.stride)
+    good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
+    return good & has_bytes(packets, layout.block_id, layout.header + layout.stride)
 
 
 def identify(packets: U8Array) -> Identity | None:
     """What point packets (k, size) say they are; None if they are none of ROBOSENSE's."""
     for layout in rows.LAYOUTS:
-        chosen = mostly(packets, fits(packets, layout))
+        chosen = majority(packets, fits(packets, layout))
         if chosen is not None:
             return _identity(chosen, layout)
     return None
 
 
 def _identity(packets: U8Array, layout: Layout) -> Identity:
-    old, kind, model = (usual(number(packets, at, 1)) for at in (_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT))
+    old, kind, model = (
+        most_common(number(packets, at, 1)) for at in (_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT)
+    )
     rubies = _RUBIES.get(layout.per_block) if layout.block_id == b"\xfe" else None
     if rubies is not None:
         name = f"{rubies[0].name} or {rubies[1].name}"
@@ -145,11 +150,11 @@ def _identity(packets: U8Array, layout: Layout) -> Identity:
 def returns_of(packets: U8Array, model: Model) -> int:
     """Returns of a shot: by a byte that tells, by azimuths, or by their pace; 0: not told."""
     layout = model.layout
-    chosen = mostly(packets, fits(packets, layout))
+    chosen = majority(packets, fits(packets, layout))
     if chosen is None:
         return 0
     if layout.modes is not None:
-        told = layout.modes.get(usual(number(chosen, layout.mode_at, 1)), layout.other_modes)
+        told = layout.modes.get(most_common(number(chosen, layout.mode_at, 1)), layout.other_modes)
         if told:
             return told
     azimuth = block_azimuths(chosen, layout.header, layout.stride, layout.blocks, ">")
@@ -184,4 +189,4 @@ def _stamp_us(packets: U8Array, model: Model) -> I64Array:
 
 
 def _lidar(model: str, mode: str = "") -> str:
-    return f"{MAKER} lidar {model}{', ' if mode else ''}{mode}"
+    return f"{VENDOR} lidar {model}{', ' if mode else ''}{mode}"

@@ -61,7 +61,7 @@ _RUBY_PLUS_80V_NS = _each(_RUBY_PLUS, 4)
 _RUBY_PLUS_48_NS = _each(_RUBY_PLUS_LONG, 2)
 
 
-MAKER = "ROBOSENSE"
+VENDOR = "ROBOSENSE"
 FIRST_KIND = bytes.fromhex("55aa050a5aa550a0")
 SECOND_KIND = bytes.fromhex("55aa055a")
 # Numbers of return types, facts/outputs.md section 3; the nearest return has none of its own.

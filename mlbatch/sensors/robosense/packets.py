@@ -14,7 +14,7 @@ from mlbatch.geometry import rotor_words
 from mlbatch.lidar import FAULTS, Records
 from mlbatch.median import median
 from mlbatch.pixels import PixelTable, readings
-from mlbatch.sensors.packet_bytes import number, starts
+from mlbatch.sensors.packet_bytes import has_bytes, number
 from mlbatch.sensors.robosense.models import READING, Layout, Model
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S, NS_PER_US
@@ -126,7 +126,7 @@ class PacketReader:
     def faults(self, packets: U8Array) -> U8Array:
         """Index into FAULTS for each packet."""
         layout = self._model.layout
-        good = starts(packets, layout.magic) & starts(packets, layout.block_id, layout.header)
+        good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
         good &= times_ns(packets, self._model)[1]
         return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
 

@@ -15,35 +15,35 @@ import numpy as np
 from mlbatch.errors import RigError
 from mlbatch.geometry import BeamTable, spherical
 from mlbatch.lidar import READABLE, Calibration, Evidence, SensorModel
-from mlbatch.sensors.base import TurningLidar
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
-from mlbatch.sensors.packet_bytes import mostly, number
+from mlbatch.sensors.packet_bytes import majority, number
 from mlbatch.sensors.robosense.difop import (
     COUNTER_MODULUS,
     Angles,
     Difop,
-    doubts,
     find_difop,
     firing_ns,
     is_counted,
-    mode,
+    notes_on_model,
     read_angles,
+    return_mode,
     units_per_m,
 )
 from mlbatch.sensors.robosense.identify import (
     MODE_WORDS,
+    describe,
     fits,
     identify,
     is_difop,
     point_packets,
-    robosense,
 )
-from mlbatch.sensors.robosense.models import MAKER, ROWS, Model
+from mlbatch.sensors.robosense.models import ROWS, VENDOR, Model
 from mlbatch.sensors.robosense.packets import PacketReader, shape_of, times_ns
 from mlbatch.types import BoolArray, Heads, I64Array, Pixels, U8Array
 from mlbatch.units import RAD_PER_DEG
 
-__all__ = ["BUILT_IN", "MAKER", "MODELS", "RobosenseLidar", "describe", "read_calibration"]
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
 
 # The bytes name the model; a file that was given is wanted before what is built in.
 _FITS_MODEL = 100
@@ -53,7 +53,7 @@ _DIFOP_PORT = 7788
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=row.name,
-        maker=MAKER,
+        vendor=VENDOR,
         channels=row.channels,
         returns=(1, 2),
         clock="internal oscillator, GPS or PTP; us in every packet",
@@ -64,21 +64,13 @@ MODELS: tuple[SensorModel, ...] = tuple(
 )
 
 
-def describe(size: int, sample: U8Array) -> str | None:
-    """Model and mode of payloads (k, size), or None where no bytes prove them."""
-    packets = np.atleast_2d(sample)
-    if not packets.size or packets.shape[1] < size:
-        return None
-    return robosense(size, packets)
-
-
-def read_calibration(path: Path, content: bytes) -> AnglesFile | None:
+def read_calibration(path: Path, content: bytes) -> CsvCalibration | None:
     """The angles in a csv file, or None if it holds something else."""
     angles = read_angles(path, content)
-    return None if angles is None else AnglesFile(path, angles)
+    return None if angles is None else CsvCalibration(path, angles)
 
 
-class BuiltIn:
+class DifopCalibration:
     """A model whose units tell their angles themselves; `Calibration` of lidar.py."""
 
     __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
@@ -92,9 +84,9 @@ class BuiltIn:
         self.serial = ""
         self.is_shared = True
 
-    def for_model(self, name: str) -> BuiltIn | None:
+    def for_model(self, name: str) -> DifopCalibration | None:
         """The same where the rig names this model: packets may leave open which of two it is."""
-        return BuiltIn(self._row, is_named=True) if name == self.model else None
+        return DifopCalibration(self._row, is_named=True) if name == self.model else None
 
     def fit(self, evidence: Evidence) -> int:
         """Whether the point packets name this model, or at least could be read as its."""
@@ -104,16 +96,16 @@ class BuiltIn:
             return _FITS_MODEL
         if found is not None and found.other is self._row and self._is_named:
             return _FITS_MODEL
-        chosen = mostly(points, fits(points, self._row.layout))
+        chosen = majority(points, fits(points, self._row.layout))
         if chosen is None:
             return 0
-        return READABLE if mostly(chosen, times_ns(chosen, self._row)[1]) is not None else 0
+        return READABLE if majority(chosen, times_ns(chosen, self._row)[1]) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
         """The sensor, with the angles of its device packets."""
         check_options(options)
         if evidence is None:
-            raise _silent(f"{MAKER} {self.model}")
+            raise _no_packets(f"{VENDOR} {self.model}")
         difop = find_difop(evidence)
         angles = None if difop is None else difop.angles(self._row)
         notes: tuple[str, ...] = ()
@@ -129,7 +121,7 @@ class BuiltIn:
         if angles is None:
             got = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
             raise RigError(
-                f"{MAKER} {self.model}: wanted the angles of its channels, got "
+                f"{VENDOR} {self.model}: wanted the angles of its channels, got "
                 f"{got} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
                 "or give a csv of `elevation,azimuth` lines with --metadata"
             )
@@ -139,7 +131,7 @@ class BuiltIn:
         return lidar
 
 
-class AnglesFile:
+class CsvCalibration:
     """A csv file with the angles of one unit; `Calibration` of lidar.py.
 
     named: the model, where the rig says it.
@@ -151,21 +143,21 @@ class AnglesFile:
         self._angles = angles
         self._named = named
         self.path: Path | None = path
-        lines = f"{MAKER} {len(angles.elevation_deg)}-line"
+        lines = f"{VENDOR} {len(angles.elevation_deg)}-line"
         self.model = lines if named is None else named.name
         self.serial = ""
         self.is_shared = False
 
-    def for_model(self, name: str) -> AnglesFile | None:
+    def for_model(self, name: str) -> CsvCalibration | None:
         """The same for a model of as many channels; packets may not tell which one it is."""
         count = len(self._angles.elevation_deg)
         rows = [row for row in ROWS if row.name == name and row.channels == count]
-        return AnglesFile(self.path or Path(), self._angles, rows[0]) if rows else None
+        return CsvCalibration(self.path or Path(), self._angles, rows[0]) if rows else None
 
     def fit(self, evidence: Evidence) -> int:
         """Whether the point packets name a model of as many channels, or can be read as it."""
         if self._named is not None:
-            score = BuiltIn(self._named, is_named=True).fit(evidence)
+            score = DifopCalibration(self._named, is_named=True).fit(evidence)
             return _FITS_FILE if score == _FITS_MODEL else score
         return _FITS_FILE if self._row(evidence) is not None else 0
 
@@ -173,7 +165,7 @@ class AnglesFile:
         """The sensor, of the model that the packets name."""
         check_options(options)
         if evidence is None:
-            raise _silent(f"{self.path}: {self.model}")
+            raise _no_packets(f"{self.path}: {self.model}")
         row = self._row(evidence)
         if row is None:
             raise RigError(
@@ -188,16 +180,16 @@ class AnglesFile:
 
     def _row(self, evidence: Evidence) -> Model | None:
         if self._named is not None:
-            return self._named if BuiltIn(self._named).fit(evidence) else None
+            return self._named if DifopCalibration(self._named).fit(evidence) else None
         found = identify(point_packets(evidence.sample))
         row = None if found is None else found.model
         return row if row and row.channels == len(self._angles.elevation_deg) else None
 
 
-BUILT_IN: tuple[Calibration, ...] = tuple(BuiltIn(row) for row in ROWS)
+BUILT_IN: tuple[Calibration, ...] = tuple(DifopCalibration(row) for row in ROWS)
 
 
-class RobosenseLidar(TurningLidar):
+class RobosenseLidar(BaseLidar):
     """One sensor; `Lidar` of lidar.py.
 
     Dual mode of 128-line models: three blocks a packet do not divide by two, so that each return
@@ -218,11 +210,11 @@ class RobosenseLidar(TurningLidar):
         """is_named: the rig says which model it is."""
         points = point_packets(evidence.sample)
         points = points[fits(points, row.layout)]
-        returned, mode_notes = mode(points, row, difop)
+        returned, mode_notes = return_mode(points, row, difop)
         steps_per_m, unit_notes = units_per_m(points, row)
         shape = shape_of(row, returned.returns)
         mirrored = row.mirrors and difop is not None and difop.is_reversed
-        self.maker = MAKER
+        self.vendor = VENDOR
         self.model = row.name
         self.serial = "" if difop is None else difop.serial
         self.mode = ", ".join(
@@ -243,7 +235,7 @@ class RobosenseLidar(TurningLidar):
         self.sequence_modulus = COUNTER_MODULUS if is_counted(points, row) else 0
         self.timestamp_mode = difop.sync if difop is not None and row.has_sync else ""
         self.pixel_layout = (
-            MAKER,
+            VENDOR,
             row.channels,
             row.layout.stride,
             shape.return_step,
@@ -252,7 +244,7 @@ class RobosenseLidar(TurningLidar):
             shape.returns,
         )
         self.calibration = ""
-        doubtful = doubts(points, row, difop, is_named=is_named)
+        doubtful = notes_on_model(points, row, difop, is_named=is_named)
         self.notes = (*mode_notes, *unit_notes, *doubtful)
         self._row = row
         moving = options.get("firing_azimuth") != "off"
@@ -300,7 +292,7 @@ def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
     return BeamTable(direction, origin, np.zeros(1))
 
 
-def _silent(what: str) -> RigError:
+def _no_packets(what: str) -> RigError:
     return RigError(
         f"{what}: wanted a packet of it in the first 10 seconds to tell its return mode, got none; "
         "correct its stream, or leave it out of the rig"

@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch.lidar import Beside
 from mlbatch.median import median
-from mlbatch.sensors.packet_bytes import number, starts, usual
+from mlbatch.sensors.packet_bytes import has_bytes, most_common, number
 from mlbatch.sensors.velodyne.models import STAMP_AT, TURN_CDEG
 from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -78,7 +78,7 @@ def pulse(beside: Sequence[Beside]) -> str:
     """What position packets say of the pulse per second; "" without them."""
     rows = [_positions(one)[0] for one in beside]
     states = np.concatenate([np.zeros(0, np.int64), *(row[:, _PPS_AT] for row in rows if len(row))])
-    return _PPS[usual(states)] if len(states) else ""
+    return _PPS[most_common(states)] if len(states) else ""
 
 
 def rmc_ns(text: bytes) -> int | None:
@@ -145,7 +145,7 @@ def are_positions(packets: U8Array) -> BoolArray:
     nmea = packets[:, _NMEA_AT : _NMEA_AT + _NMEA_SIZE]
     stamp_us = number(packets, _POSITION_STAMP_AT, 4)
     silent = (nmea == 0).all(axis=1) & (packets[:, :14] == 0).all(axis=1) & (stamp_us > 0)
-    good = (starts(packets, b"$GP", _NMEA_AT) | silent) & (stamp_us < HOUR_US)
+    good = (has_bytes(packets, b"$GP", _NMEA_AT) | silent) & (stamp_us < HOUR_US)
     return np.asarray(good & (packets[:, _PPS_AT] <= 3))
 
 

@@ -3,7 +3,7 @@
 Source: facts/velodyne.md section 10, the first variant (velodyne_decoder). A laser is calibrated
 at 25.04 m, and once more near by: along the side at 2.40 m (x) and ahead at 1.93 m (y). Nearer
 than 25.04 m its correction goes straight from one value to the other, along each axis of its own;
-height takes the mean of both.
+height is_pace the mean of both.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _NEAR_RIGHT_M = 2.40
 _NEAR_FORWARD_M = 1.93
 
 
-class _Corrected:
+class _Hdl64Projection:
     """The projection of one HDL-64E; arrays (n, 64), float32."""
 
     def __init__(
@@ -109,7 +109,7 @@ def hdl64_projection(
 
     Columns carry rotor words. firing_ns: (T, 64), as in `Lidar`; columns: the most aimed at once.
     """
-    return _Corrected(file, firing_ns, body_from_sensor, columns)
+    return _Hdl64Projection(file, firing_ns, body_from_sensor, columns)
 
 
 def _line(

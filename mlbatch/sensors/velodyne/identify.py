@@ -13,11 +13,12 @@ from mlbatch.sensors.packet_bytes import (
     NO_DECODER,
     block_azimuths,
     block_time_us,
+    has_bytes,
     in_pairs,
-    mostly,
+    majority,
+    most_common,
     number,
-    starts,
-    usual,
+    payload_rows,
 )
 from mlbatch.sensors.velodyne.clock import HOUR_US, POSITION_SIZE, are_positions
 from mlbatch.sensors.velodyne.models import (
@@ -45,7 +46,7 @@ _TIME_TOLERANCE = 0.05
 _DEVICE_MAGIC = bytes.fromhex("a5ff005a")
 
 
-_PRODUCTS = {row.product: row.seen_as for row in ALL if row.product is not None}
+_PRODUCTS = {row.product: row.reported_as for row in ALL if row.product is not None}
 _UNDECODED = {0x23: "VLP-32A/B", 0x31: "Velarray"}
 # What a product byte may hide: only seen, or said of, the oldest models.
 _OLDEST = (VLP_16, HDL_32E)
@@ -55,7 +56,7 @@ _OLDEST = (VLP_16, HDL_32E)
 class Identity:
     """What data packets are by their bytes and by their pace.
 
-    model: "" where they do not say; banks: blocks that a firing sequence takes; label: the model
+    model: "" where they do not say; banks: blocks that a firing sequence is_pace; label: the model
     that a wrong product byte names, or what else is odd about the factory bytes; block_us: time
     from block to block, None where it was not measured.
     """
@@ -83,22 +84,25 @@ def identify(size: int, packets: U8Array) -> Identity | None:
     return (
         _four_banks(packets, flags, azimuth)
         or _two_banks(packets, flags, azimuth)
-        or _one_bank(mostly(packets, one_bank & _within_the_hour(packets)))
+        or _one_bank(majority(packets, one_bank & _within_the_hour(packets)))
     )
 
 
-def velodyne(size: int, packets: U8Array) -> str | None:
+def describe(size: int, sample: U8Array) -> str | None:
     """A line on Velodyne packets and their look-alikes, or None."""
-    if size == POSITION_SIZE and mostly(packets, are_positions(packets)) is not None:
+    packets = payload_rows(size, sample)
+    if packets is None:
+        return None
+    if size == POSITION_SIZE and majority(packets, are_positions(packets)) is not None:
         return "Velodyne position packet"
     if size not in (PACKET_SIZE, _LSLIDAR_SIZE):
         return None
-    if mostly(packets, starts(packets, _DEVICE_MAGIC)) is not None:
+    if majority(packets, has_bytes(packets, _DEVICE_MAGIC)) is not None:
         return "LSLIDAR device packet"
     if size == _LSLIDAR_SIZE:
         azimuth = block_azimuths(packets, 0, STRIDE, BLOCKS, "<")
         alike = (block_flags(packets) == BANK_FLAGS[1][0]) & (azimuth < TURN_CDEG)
-        look_alike = mostly(packets, alike.all(axis=1)) is not None
+        look_alike = majority(packets, alike.all(axis=1)) is not None
         return f"LSLIDAR-like, {size} bytes: not supported" if look_alike else None
     seen = identify(size, packets)
     if seen is None:
@@ -125,9 +129,9 @@ def _four_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identit
         used = len(wanted)
         good = (flags[:, :used] == wanted).all(axis=1)
         good &= (azimuth[:, :used] < TURN_CDEG).all(axis=1) & _within_the_hour(packets)
-        chosen = mostly(packets, good)
+        chosen = majority(packets, good)
         if chosen is not None:
-            mode = MODES.get(usual(number(chosen, MODE_AT, 1)), "")
+            mode = MODES.get(most_common(number(chosen, MODE_AT, 1)), "")
             is_told = mode != "" and (mode == DUAL) == (returns == 2)
             return Identity(VLS_128, mode if is_told else UNSET_MODES[returns - 1], banks=4)
     return None
@@ -137,7 +141,7 @@ def _two_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identity
     """HDL-64E: upper and lower block in turn; two returns are told by four equal azimuths."""
     good = (flags == expected_flags(2, 1)).all(axis=1)
     good &= (azimuth < TURN_CDEG).all(axis=1)
-    if mostly(packets, good) is None:
+    if majority(packets, good) is None:
         return None
     return Identity(HDL_64E, UNSET_MODES[in_pairs(azimuth[good][:, 0::2])], banks=2)
 
@@ -146,25 +150,25 @@ def _one_bank(packets: U8Array | None) -> Identity | None:
     """Models whose blocks all bear one flag: by the factory bytes, and by what belies them."""
     if packets is None:
         return None
-    factory = usual(number(packets, MODE_AT, 2))
+    factory = most_common(number(packets, MODE_AT, 2))
     azimuth = block_azimuths(packets, 0, STRIDE, BLOCKS, "<")
     took_us = block_time_us(number(packets, STAMP_AT, 4), azimuth, HOUR_US)
     product = factory >> 8
     told = _PRODUCTS.get(product) or _UNDECODED.get(product)
     mode = MODES.get(factory & 0xFF, UNSET_MODES[in_pairs(azimuth)])
-    seen = next((row for row in _OLDEST if takes(row.block_us, took_us)), None)
+    seen = next((row for row in _OLDEST if is_pace(row.block_us, took_us)), None)
     if factory == 0 and seen is not None:
         unset = "its factory bytes are not set"
-        return Identity(seen.seen_as, mode, 1, unset, block_us=took_us)
+        return Identity(seen.reported_as, mode, 1, unset, block_us=took_us)
     if told is None or factory & 0xFF not in MODES:
         label = f"factory bytes {factory & 0xFF:02X} {product:02X}"
         return Identity("", mode, 1, label, is_decoded=False, block_us=took_us)
     if seen is not None and seen.product != product in {row.product for row in _OLDEST}:
         belied = f"its product byte says {told}"
-        return Identity(seen.seen_as, mode, 1, belied, block_us=took_us)
+        return Identity(seen.reported_as, mode, 1, belied, block_us=took_us)
     return Identity(told, mode, 1, is_decoded=product in _PRODUCTS, block_us=took_us)
 
 
-def takes(block_us: float, took_us: float | None) -> bool:
+def is_pace(block_us: float, took_us: float | None) -> bool:
     """Whether a block took as long as those of a model do, as far as that was measured."""
     return took_us is not None and abs(took_us - block_us) < _TIME_TOLERANCE * block_us

@@ -27,7 +27,7 @@ MODE_AT = 1204
 _BLOCK_HEAD = 4
 _READING = 3
 TURN_CDEG = 36000
-# Block flags as numbers; a sequence takes a block of each bank.
+# Block flags as numbers; a sequence is_pace a block of each bank.
 BANK_FLAGS = {1: (0xEEFF,), 2: (0xEEFF, 0xDDFF), 4: (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)}
 DUAL = "dual return"
 UNSET_MODES = ("single return", DUAL)
@@ -40,7 +40,7 @@ VLS_128 = "VLS-128"
 class Model:
     """A row.
 
-    seen_as: what packets of this model name; banks: blocks of a firing sequence; halves: firing
+    reported_as: what packets of this model name; banks: blocks of a firing sequence; halves: firing
     sequences of a block; sequence_ns, slots: a firing sequence and the slots of its timetable;
     slot: (lasers,) in which each laser fires; stamp_ns: first firing minus the packet's stamp;
     clockwise_deg, elevation_deg, height_mm: of each beam, empty where only a file has them;
@@ -48,7 +48,7 @@ class Model:
     """
 
     name: str
-    seen_as: str
+    reported_as: str
     lasers: int
     units_per_m: int
     sequence_ns: int
@@ -167,7 +167,7 @@ def _woven(even: tuple[float, ...], odd: tuple[float, ...]) -> tuple[float, ...]
 
 # fmt: off
 VLP_16 = Model(
-    name="VLP-16", seen_as="VLP-16", lasers=16, units_per_m=500, sequence_ns=55_296, slots=24,
+    name="VLP-16", reported_as="VLP-16", lasers=16, units_per_m=500, sequence_ns=55_296, slots=24,
     slot=tuple(range(16)), halves=2, product=0x22, verified="real recording",
     elevation_deg=(-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15),
     clockwise_deg=(0.0,) * 16,
@@ -176,14 +176,14 @@ VLP_16 = Model(
 )
 PUCK_LITE = replace(VLP_16, name="Puck LITE", verified="one source")
 PUCK_HI_RES = replace(
-    VLP_16, name="Puck Hi-Res", seen_as="Puck Hi-Res", product=0x24, verified="two sources",
+    VLP_16, name="Puck Hi-Res", reported_as="Puck Hi-Res", product=0x24, verified="two sources",
     elevation_deg=(-10, 0.667, -8.667, 2, -7.333, 3.333, -6, 4.667,
                    -4.667, 6, -3.333, 7.333, -2, 8.667, -0.667, 10),
     height_mm=(7.4, -0.9, 6.5, -1.8, 5.5, -2.7, 4.6, -3.7,
                3.7, -4.6, 2.7, -5.5, 1.8, -6.5, 0.9, -7.4),
 )
 HDL_32E = Model(
-    name="HDL-32E", seen_as="HDL-32E", lasers=32, units_per_m=500, sequence_ns=46_080, slots=40,
+    name="HDL-32E", reported_as="HDL-32E", lasers=32, units_per_m=500, sequence_ns=46_080, slots=40,
     slot=tuple(range(32)), stamp_may_end=True, product=0x21, verified="real recording",
     elevation_deg=_woven(
         (-30.67, -29.33, -28, -26.67, -25.33, -24, -22.67, -21.33,
@@ -202,7 +202,7 @@ _VLP_32C_DEG = (
     -3, 7, 4.667, -2.333, -2, 15, 10.333, -1.333,
 )
 VLP_32C = Model(
-    name="VLP-32C", seen_as="VLP-32C", lasers=32, units_per_m=250, sequence_ns=55_296, slots=24,
+    name="VLP-32C", reported_as="VLP-32C", lasers=32, units_per_m=250, sequence_ns=55_296, slots=24,
     slot=tuple(laser // 2 for laser in range(32)), product=0x28, verified="real recording",
     elevation_deg=_VLP_32C_DEG,
     clockwise_deg=(1.4, -4.2, 1.4, -1.4, 1.4, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -1.4,
@@ -231,14 +231,15 @@ _VLS_128_DEG = (
 # sequence_ns: as measured on the one recording known; a stream's own is measured from its packets.
 # The stamp is that of the fourth group of eight lasers.
 ALPHA_PRIME = Model(
-    name="VLS-128", seen_as=VLS_128, lasers=128, units_per_m=250, sequence_ns=55_277, slots=20,
+    name="VLS-128", reported_as=VLS_128, lasers=128, units_per_m=250, sequence_ns=55_277, slots=20,
     slot=tuple(laser // 8 + (laser >= 64) for laser in range(128)), banks=4, stamp_ns=-8_700,
     elevation_deg=_VLS_128_DEG,
     clockwise_deg=(6.354, 4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354) * 16,
     height_mm=_focal(58.63, _VLS_128_DEG),
 )
 HDL_64E_S2 = Model(
-    name="HDL-64E S2", seen_as=HDL_64E, lasers=64, units_per_m=500, sequence_ns=48_000, slots=800,
+    name="HDL-64E S2", reported_as=HDL_64E, lasers=64, units_per_m=500, sequence_ns=48_000,
+    slots=800,
     slot=tuple(100 * (laser % 32 // 4) + (0, 21, 41, 61)[laser % 4] for laser in range(64)),
     banks=2, verified="one source",
 )

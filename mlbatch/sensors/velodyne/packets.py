@@ -13,7 +13,7 @@ import numpy as np
 from mlbatch.geometry import Projection, rotor_words
 from mlbatch.lidar import FAULTS
 from mlbatch.pixels import PixelTable, readings
-from mlbatch.sensors.base import TurningLidar
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
@@ -34,7 +34,7 @@ from mlbatch.sensors.velodyne.models import (
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S
 
-MAKER = "Velodyne"
+VENDOR = "Velodyne"
 _AZIMUTH_AT = 2
 _BAD_HEADER = FAULTS.index("bad_header")
 _RETURN_TYPES = {"strongest return": (1,), "last return": (2,), DUAL: (0, 0)}
@@ -75,7 +75,7 @@ class Options:
     stamp_is_end: bool = False
 
 
-class VelodyneLidar(TurningLidar):
+class VelodyneLidar(BaseLidar):
     """One sensor; `Lidar` of lidar.py."""
 
     def __init__(
@@ -92,7 +92,7 @@ class VelodyneLidar(TurningLidar):
         self._options = options
         self._file = file
         self._layout = layout(model, returns)
-        self.maker = MAKER
+        self.vendor = VENDOR
         self.model = model.name
         self.mode = measured.mode
         self.channels = model.lasers
@@ -103,7 +103,7 @@ class VelodyneLidar(TurningLidar):
         self.records = self._layout.records
         self._dark = np.zeros(0, np.int64) if file is None else (~file.enabled).nonzero()[0]
         dark = str(self._dark.tolist())
-        kind = (MAKER, model.lasers, model.banks, model.units_per_m, returns, dark)
+        kind = (VENDOR, model.lasers, model.banks, model.units_per_m, returns, dark)
         self.pixel_layout: tuple[str | int | bool, ...] = kind
         self.pixels = PixelTable(
             3,

@@ -1,7 +1,7 @@
 """Velodyne lidars: VLP-16, Puck LITE, Puck Hi-Res, VLP-32C, HDL-32E, HDL-64E, VLS-128.
 
 Source: facts/velodyne.md. Their beams hardly differ from unit to unit, so that tables serve for
-all but the HDL-64E; a file of angles (YAML or db.xml) takes their place.
+all but the HDL-64E; a file of angles (YAML or db.xml) is_pace their place.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mlbatch.sensors.velodyne.clock import (
     rotor_speed,
     top_of_hour_ns,
 )
-from mlbatch.sensors.velodyne.identify import Identity, identify, takes, velodyne
+from mlbatch.sensors.velodyne.identify import Identity, describe, identify, is_pace
 from mlbatch.sensors.velodyne.models import ALL, Model, layout
 from mlbatch.sensors.velodyne.packets import (
-    MAKER,
+    VENDOR,
     Measured,
     Options,
     VelodyneLidar,
@@ -35,10 +35,9 @@ from mlbatch.sensors.velodyne.packets import (
     mean_step,
     steps,
 )
-from mlbatch.types import U8Array
 from mlbatch.units import RAD_PER_DEG
 
-__all__ = ["BUILT_IN", "MAKER", "MODELS", "VelodyneCalibration", "describe", "read_calibration"]
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "VelodyneCalibration", "describe", "read_calibration"]
 
 _FITS_BYTES = 100
 _FITS_FILE = 200
@@ -50,7 +49,7 @@ _OPTIONS = {"firing_azimuth": "on", "vertical_offset": "on", "packet_stamp": "st
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=model.name,
-        maker=MAKER,
+        vendor=VENDOR,
         channels=model.lasers,
         returns=(1, 2),
         clock="us past the hour, GPS or free; hour from NMEA or arrival",
@@ -99,8 +98,8 @@ class VelodyneCalibration:
         if seen is None or seen.banks != self.row.banks:
             return 0
         # Models that packets do not name (Puck LITE, series of the HDL-64E) are named by the rig.
-        first = next((row for row in ALL if row.seen_as == seen.model), None)
-        if first is None or first.seen_as != self.row.seen_as:
+        first = next((row for row in ALL if row.reported_as == seen.model), None)
+        if first is None or first.reported_as != self.row.reported_as:
             return READABLE if _is_paced(self.row, seen) else 0
         if self.file is not None:
             return _FITS_FILE
@@ -112,7 +111,7 @@ class VelodyneCalibration:
         chosen = {**_OPTIONS, **options}
         if self.row.needs_file and self.file is None:
             raise RigError(
-                f"{self.row.seen_as}: wanted its calibration, got none; give the unit's YAML or "
+                f"{self.row.reported_as}: wanted its calibration, got none; give the unit's YAML or "
                 "db.xml with --metadata or as `metadata:` in the rig"
             )
         measured, notes = _measure(self.row, evidence)
@@ -151,14 +150,6 @@ def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
     return VelodyneCalibration(row, file, is_guessed=row.needs_file)
 
 
-def describe(size: int, sample: U8Array) -> str | None:
-    """What payloads (k, size) are, or None."""
-    packets = np.atleast_2d(sample)
-    if not packets.size or packets.shape[1] < size:
-        return None
-    return velodyne(size, packets[:, :size])
-
-
 def _away_deg(row: Model, file: VelodyneFile) -> float:
     """How far the beams of a file are from a model's, on average; 0 where the model has none."""
     if row.needs_file:
@@ -169,7 +160,7 @@ def _away_deg(row: Model, file: VelodyneFile) -> float:
 
 def _is_paced(row: Model, seen: Identity) -> bool:
     """Whether packets come as fast as the model's: a wrong name is possible, a wrong pace not."""
-    return seen.block_us is None or takes(row.block_us, seen.block_us)
+    return seen.block_us is None or is_pace(row.block_us, seen.block_us)
 
 
 def _file_notes(calibration: VelodyneCalibration) -> list[str]:
@@ -177,7 +168,9 @@ def _file_notes(calibration: VelodyneCalibration) -> list[str]:
     file = calibration.file
     row = calibration.row
     if calibration.is_guessed:
-        others = ", ".join(one.name for one in ALL if one.seen_as == row.seen_as and one != row)
+        others = ", ".join(
+            one.name for one in ALL if one.reported_as == row.reported_as and one != row
+        )
         notes.append(f"taken for an {row.name}; if it is an {others}, name its model in the rig")
     if file is not None and file.unit_m is not None:
         unit_m = 1 / row.units_per_m
@@ -220,6 +213,6 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
 
 
 def _identity_notes(row: Model, seen: Identity) -> list[str]:
-    if seen.model == row.seen_as and seen.label:
+    if seen.model == row.reported_as and seen.label:
         return [f"by the pace of its packets it is a {seen.model}, though {seen.label}"]
     return []

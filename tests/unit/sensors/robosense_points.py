@@ -29,10 +29,10 @@ def evidence_of(
     return Evidence(MSOP, sample.shape[1], sample, arrival_ns, beside)
 
 
-def built_in(evidence: Evidence) -> robosense.BuiltIn:
+def built_in(evidence: Evidence) -> robosense.DifopCalibration:
     """The calibration that the packets name."""
     (best,) = [one for one in robosense.BUILT_IN if one.fit(evidence) == 100]
-    assert isinstance(best, robosense.BuiltIn)
+    assert isinstance(best, robosense.DifopCalibration)
     return best
 
 

@@ -176,7 +176,7 @@ def test_times_that_points_do_not_divide_are_cut() -> None:
 def test_what_a_lidar_says_of_itself() -> None:
     _, _, packets = random_packets(LivoxSpec(DUAL, points=48, time_type=0))
     lidar = sensor(packets)
-    assert (lidar.maker, lidar.model) == ("Livox", "Livox SDK2")
+    assert (lidar.vendor, lidar.model) == ("Livox", "Livox SDK2")
     assert lidar.mode == "Cartesian 32 bit, dual return"
     assert (lidar.channels, lidar.returns, lidar.columns_per_packet) == (1, 2, 48)
     assert (lidar.packet_size, lidar.records.start, lidar.records.size) == (1380, 36, 28)

@@ -46,7 +46,7 @@ def _difop_angles(parts: dict[int, bytes], row: Model) -> Angles | None:
 
 def test_every_model_is_listed_and_built_in() -> None:
     names = [one.model for one in robosense.BUILT_IN]
-    assert names == [one.name for one in models() if one.maker == "ROBOSENSE"]
+    assert names == [one.name for one in models() if one.vendor == "ROBOSENSE"]
     assert len(set(names)) == 14
     assert all(one.is_shared and one.path is None for one in robosense.BUILT_IN)
     assert {one.verified for one in robosense.MODELS} == {"two sources", "one source"}

@@ -16,8 +16,8 @@ from tests.builders.ouster import OusterSpec, metadata_json
 def test_every_model_has_its_own_name_and_a_maker() -> None:
     names = [model.name for model in sensors.models()]
     assert len(set(names)) == len(names)
-    assert {model.maker for model in sensors.models()} == {
-        plugin.MAKER for plugin in sensors.plugins() if plugin.MODELS
+    assert {model.vendor for model in sensors.models()} == {
+        plugin.VENDOR for plugin in sensors.plugins() if plugin.MODELS
     }
 
 
@@ -27,7 +27,7 @@ def test_every_model_says_how_it_was_verified() -> None:
 
 
 def test_the_models_of_ouster() -> None:
-    rows = {model.name: model for model in sensors.models() if model.maker == "Ouster"}
+    rows = {model.name: model for model in sensors.models() if model.vendor == "Ouster"}
     real = {name for name, model in rows.items() if model.verified == "real recording"}
     assert real == {"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"}
     assert rows["OS1-16"].channels == 16

@@ -175,7 +175,7 @@ def test_behind_blind_sectors_the_angle_still_follows_time() -> None:
     turns += np.rint(past_ns * 10e-9 - (turns - turns[0]))
     slope, start = np.polyfit(past_ns, turns, 1)
     assert slope * 1e9 == pytest.approx(10.0, abs=0.01)
-    # 0.01 degree takes 28 us.
+    # 0.01 degree is_pace 28 us.
     assert np.abs((turns - start) / slope - past_ns).max() < 20_000
 
 
