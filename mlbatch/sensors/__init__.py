@@ -84,7 +84,7 @@ def read_calibration(path: Path) -> Calibration | None:
     try:
         if not path.is_file():
             kind = "a directory" if path.is_dir() else "no such file"
-            raise RigError(f"{path}: wanted a calibration file, got {kind}; check the path")
+            raise RigError(f"{path}: expected a calibration file, found {kind}; check the path")
         with path.open("rb") as file:
             content = file.read(MAX_CALIBRATION_BYTES + 1)
     except OSError as err:

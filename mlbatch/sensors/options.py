@@ -22,7 +22,7 @@ def check_options(options: Mapping[str, str]) -> None:
     for key, value in options.items():
         if key not in DECODE_OPTIONS:
             known = ", ".join(DECODE_OPTIONS)
-            raise UsageError(f"--decode {key}={value}: wanted one of {known}, got {key}")
+            raise UsageError(f"--decode {key}={value}: expected one of {known}, found {key}")
         if value not in DECODE_OPTIONS[key]:
-            wanted = " or ".join(f"{key}={choice}" for choice in DECODE_OPTIONS[key])
-            raise UsageError(f"--decode {key}={value}: wanted {wanted}, got {value}")
+            expected = " or ".join(f"{key}={choice}" for choice in DECODE_OPTIONS[key])
+            raise UsageError(f"--decode {key}={value}: expected {expected}, found {value}")

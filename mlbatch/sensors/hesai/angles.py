@@ -126,10 +126,10 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
     if not content.startswith(_AT128_MAGIC) or len(content) < _AT128_HEAD.itemsize:
         return None
     head = np.frombuffer(content, _AT128_HEAD, 1)[0]
-    for name, wanted in _AT128_EXPECTED.items():
-        got = np.ravel(head[name]).tolist()
-        if got != wanted:
-            _fail_at128(path, f"{name} {_dotted(wanted)}", _dotted(got))
+    for name, expected in _AT128_EXPECTED.items():
+        found = np.ravel(head[name]).tolist()
+        if found != expected:
+            _fail_at128(path, f"{name} {_dotted(expected)}", _dotted(found))
     low, high = _RESOLUTIONS
     resolution = int(head["resolution"])
     if not low <= resolution <= high:
@@ -218,15 +218,15 @@ def _check_complete(path: Path, lines: int, angles_deg: dict[int, tuple[float, f
         _fail(path, lines, f"{counts} or {_CHANNELS[-1]} channels in all", str(last))
 
 
-def _fail(path: Path, number: int, wanted: str, got: str) -> NoReturn:
-    shown = got if len(got) <= _SHOWN_CHARS else got[: _SHOWN_CHARS - 3] + "..."
+def _fail(path: Path, number: int, expected: str, found: str) -> NoReturn:
+    shown = found if len(found) <= _SHOWN_CHARS else found[: _SHOWN_CHARS - 3] + "..."
     raise RigError(
-        f"{path}: HESAI angles, line {number}: wanted {wanted}, got {shown or 'nothing'}; {_REMEDY}"
+        f"{path}: HESAI angles, line {number}: expected {expected}, found {shown or 'nothing'}; {_REMEDY}"
     )
 
 
-def _fail_at128(path: Path, wanted: str, got: str) -> NoReturn:
-    raise RigError(f"{path}: HESAI AT128 angles: wanted {wanted}, got {got}; {_REMEDY}")
+def _fail_at128(path: Path, expected: str, found: str) -> NoReturn:
+    raise RigError(f"{path}: HESAI AT128 angles: expected {expected}, found {found}; {_REMEDY}")
 
 
 def _dotted(numbers: list[int]) -> str:

@@ -124,11 +124,11 @@ def describe(size: int, sample: U8Array) -> str | None:
     packets = payload_rows(size, sample)
     if packets is None:
         return None
-    for wanted, magic, name in _OTHERS:
+    for expected, magic, name in _OTHERS:
         good = has_bytes(packets, magic)
         if name == "GPS packet":
             good &= _digits(packets, 2, 14)
-        if wanted in (0, size) and majority(packets, good) is not None:
+        if expected in (0, size) and majority(packets, good) is not None:
             return f"HESAI {name}"
     are_imu = has_bytes(packets, _SOP + b"\x01\x08")
     if size == _JT16_IMU_SIZE and majority(packets, are_imu) is not None:

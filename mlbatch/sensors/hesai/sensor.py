@@ -96,13 +96,13 @@ class HesaiCalibration:
         model = layout.model
         if model.name == rows.AT128.name:
             raise RigError(
-                f"{self.path}: HESAI {model.name}: wanted its correction file (.dat), got a csv, "
+                f"{self.path}: HESAI {model.name}: expected its correction file (.dat), found a csv, "
                 "which leaves out the mirrors; read the file from the lidar"
             )
         if len(angles.azimuth_rad) != model.channels:
             raise RigError(
-                f"{self.path}: HESAI angles: wanted {model.channels} channels for the packets of a "
-                f"{model.name}, got {len(angles.azimuth_rad)}; give the file of this lidar"
+                f"{self.path}: HESAI angles: expected {model.channels} channels for the packets of a "
+                f"{model.name}, found {len(angles.azimuth_rad)}; give the file of this lidar"
             )
         centre = np.array(model.centre_mm) * M_PER_MM if _is_on(options, "optical_centre") else None
         lidar = HesaiLidar(layout, options, evidence, angles, centre)
@@ -134,8 +134,8 @@ class At128Calibration:
         layout = _require_layout(self.path, evidence)
         if layout.model.name != self.model:
             raise RigError(
-                f"{self.path}: HESAI angles: wanted the csv of a {layout.model.name} for these "
-                f"packets, got the file of an {self.model}; give the file of this lidar"
+                f"{self.path}: HESAI angles: expected the csv of a {layout.model.name} for these "
+                f"packets, found the file of an {self.model}; give the file of this lidar"
             )
         return At128Lidar(layout, options, evidence, self._file)
 
@@ -239,8 +239,8 @@ def _require_layout(path: Path | None, evidence: Evidence | None) -> Layout:
     layout = None if evidence is None else _layout(evidence)
     if layout is None:
         raise RigError(
-            f"{path}: HESAI angles: wanted packets of the lidar in the first 10 seconds, to "
-            "tell its model and mode, got none; check its stream in the rig file, or leave it out"
+            f"{path}: HESAI angles: expected packets of the lidar in the first 10 seconds, to "
+            "tell its model and mode, found none; check its stream in the rig file, or leave it out"
         )
     return layout
 
@@ -257,11 +257,11 @@ def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
         return ""
     got_deg = angles.elevation_rad.min() / RAD_PER_DEG, angles.elevation_rad.max() / RAD_PER_DEG
     pairs = zip(got_deg, model.elevation_deg, strict=True)
-    if all(abs(got - wanted) <= _ELEVATION_TOLERANCE_DEG for got, wanted in pairs):
+    if all(abs(found - expected) <= _ELEVATION_TOLERANCE_DEG for found, expected in pairs):
         return ""
     return (
-        f"{angles.path}: wanted elevations from about {model.elevation_deg[0]:g} to "
-        f"{model.elevation_deg[1]:g} deg for a {model.name}, got {got_deg[0]:.1f} to "
+        f"{angles.path}: expected elevations from about {model.elevation_deg[0]:g} to "
+        f"{model.elevation_deg[1]:g} deg for a {model.name}, found {got_deg[0]:.1f} to "
         f"{got_deg[1]:.1f}; check that the file is of this lidar"
     )
 

@@ -71,9 +71,9 @@ def _describe_sdk1(size: int, packets: U8Array) -> str | None:
     if len(packets) < 2 or size < _HEADER1_SIZE:
         return None
     kind = most_common(number(packets, 9, 1))
-    wanted, what = _TYPES1.get(kind, (0, ""))
+    expected, what = _TYPES1.get(kind, (0, ""))
     time_type = most_common(number(packets, 8, 1))
-    if size != wanted or time_type not in _TIME_TYPES1:
+    if size != expected or time_type not in _TIME_TYPES1:
         return None
     # Version, slot, device and reserved byte, time and data type are a stream's own; the status
     # between them is not.

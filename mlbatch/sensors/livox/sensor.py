@@ -83,8 +83,8 @@ class LivoxCalibration:
         kind = None if evidence is None else identify(evidence.size, evidence.sample)
         if evidence is None or kind is None or not kind.returns:
             raise RigError(
-                f"{SDK2}: wanted packets of points in the first 10 seconds, to tell their kind, "
-                "got none; check the sensor's stream in the rig file, or leave it out"
+                f"{SDK2}: expected packets of points in the first 10 seconds, to tell their kind, "
+                "found none; check the sensor's stream in the rig file, or leave it out"
             )
         return LivoxLidar(kind, evidence, check_crc="crc" in options)
 
@@ -193,9 +193,9 @@ def _counts_on(packets: U8Array) -> bool:
     next_ns = steps_ns[(steps == 1) & (steps_ns > 0)]
     if not len(next_ns):
         return False
-    wanted = np.cumsum(steps_ns) / median(next_ns)
-    away = np.abs(np.cumsum(steps) - wanted)
-    return bool((away <= _COUNTER_SHARE * np.abs(wanted) + _COUNTER_SLACK).all())
+    expected = np.cumsum(steps_ns) / median(next_ns)
+    away = np.abs(np.cumsum(steps) - expected)
+    return bool((away <= _COUNTER_SHARE * np.abs(expected) + _COUNTER_SLACK).all())
 
 
 def _share_stamps(packets: U8Array) -> bool:

@@ -54,13 +54,13 @@ class Document:
     path: Path
     values: dict[str, object]
 
-    def fail(self, key: str, wanted: str, got: object) -> NoReturn:
+    def fail(self, key: str, expected: str, found: object) -> NoReturn:
         """Raise the error of a value that cannot be used."""
-        text = got if isinstance(got, str) else json.dumps(got, default=str)
+        text = found if isinstance(found, str) else json.dumps(found, default=str)
         shown = text if len(text) <= _SHOWN_CHARS else text[: _SHOWN_CHARS - 3] + "..."
         shown = " ".join(shown.split()) or "nothing"
         raise RigError(
-            f"{self.path}: Ouster metadata, {key}: wanted {wanted}, got {shown}; {_REMEDY}"
+            f"{self.path}: Ouster metadata, {key}: expected {expected}, found {shown}; {_REMEDY}"
         )
 
     def text(self, key: str) -> str:
@@ -77,11 +77,11 @@ class Document:
         value = self.values.get(key)
         if value is None:
             return None
-        wanted = f"a whole number from {low} to {high}"
+        expected = f"a whole number from {low} to {high}"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.fail(key, wanted, value)
+            self.fail(key, expected, value)
         if value != value or not low <= value <= high or value != int(value):
-            self.fail(key, wanted, value)
+            self.fail(key, expected, value)
         return int(value)
 
     def number(self, key: str) -> float | None:
@@ -89,16 +89,16 @@ class Document:
         value = self.values.get(key)
         return None if value is None else float(self._finite(key, "a finite number", [value])[0])
 
-    def numbers(self, key: str, count: int | None, wanted: str) -> F64Array | None:
+    def numbers(self, key: str, count: int | None, expected: str) -> F64Array | None:
         """A list of finite numbers, of `count` entries if given, or None where absent."""
         value = self.values.get(key)
         if value is None:
             return None
         if not isinstance(value, list):
-            self.fail(key, wanted, value)
+            self.fail(key, expected, value)
         if count is not None and len(value) != count:
-            self.fail(key, wanted, f"{len(value)} entries")
-        return self._finite(key, wanted, value)
+            self.fail(key, expected, f"{len(value)} entries")
+        return self._finite(key, expected, value)
 
     def pose_mm(self, key: str) -> F64Array | None:
         """A rigid (4, 4) transform, millimetres in the file, metres here; None where absent."""
@@ -112,8 +112,8 @@ class Document:
         return self._pose(key)
 
     def _pose(self, key: str) -> F64Array | None:
-        wanted = "16 finite numbers, a rigid transform row by row"
-        values = self.numbers(key, 16, wanted)
+        expected = "16 finite numbers, a rigid transform row by row"
+        values = self.numbers(key, 16, expected)
         if values is None:
             return None
         pose = values.reshape(4, 4)
@@ -126,19 +126,19 @@ class Document:
             and bool(np.all(pose[3] == (0.0, 0.0, 0.0, 1.0)))
         )
         if not rigid:
-            self.fail(key, wanted, self.values[key])
+            self.fail(key, expected, self.values[key])
         return pose
 
-    def _finite(self, key: str, wanted: str, values: list[object]) -> F64Array:
+    def _finite(self, key: str, expected: str, values: list[object]) -> F64Array:
         for value in values:
             if isinstance(value, bool) or not isinstance(value, int | float):
-                self.fail(key, wanted, value)
+                self.fail(key, expected, value)
         try:
             numbers = np.array(values, np.float64)
         except OverflowError:
-            self.fail(key, wanted, "a number beyond all bounds")
+            self.fail(key, expected, "a number beyond all bounds")
         if not np.isfinite(numbers).all():
-            self.fail(key, wanted, str(numbers[~np.isfinite(numbers)][0]))
+            self.fail(key, expected, str(numbers[~np.isfinite(numbers)][0]))
         return numbers
 
 
@@ -153,7 +153,7 @@ def read_document(path: Path, content: bytes) -> Document | None:
             return None
         text = str(err).splitlines()[0][:200]
         raise RigError(
-            f"{path}: Ouster metadata: wanted a JSON document, got {text}; {_REMEDY}"
+            f"{path}: Ouster metadata: expected a JSON document, found {text}; {_REMEDY}"
         ) from err
     if not isinstance(top, dict) or not _is_ours(top):
         return None
@@ -270,12 +270,12 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
         value = document.values.get(key)
         if isinstance(value, list) and any(isinstance(entry, list) for entry in value):
             document.fail(key, "one angle per beam", "a list per column: the unit does not spin")
-        wanted = "angles in degrees" if count is None else f"{count} angles in degrees"
-        angles = document.numbers(key, count, wanted)
+        expected = "angles in degrees" if count is None else f"{count} angles in degrees"
+        angles = document.numbers(key, count, expected)
         if angles is None or not len(angles):
-            document.fail(key, wanted, "nothing")
+            document.fail(key, expected, "nothing")
         if np.abs(angles).max() > 360:
-            document.fail(key, wanted, str(angles[np.abs(angles).argmax()]))
+            document.fail(key, expected, str(angles[np.abs(angles).argmax()]))
         found.append(angles)
         count = len(angles)
     return found[0], found[1]
@@ -292,8 +292,8 @@ def _layout(document: Document, beams: int) -> PacketLayout:
     columns = document.integer("columns_per_packet", 1, _U16) or _DEFAULT_COLUMNS_PER_PACKET
     layout = PacketLayout(PROFILES[name], beams, columns)
     if layout.packet_size > MAX_UDP_PAYLOAD:
-        wanted = f"packets up to {MAX_UDP_PAYLOAD} bytes"
-        document.fail("columns_per_packet", wanted, f"{layout.packet_size} bytes")
+        expected = f"packets up to {MAX_UDP_PAYLOAD} bytes"
+        document.fail("columns_per_packet", expected, f"{layout.packet_size} bytes")
     return layout
 
 
@@ -305,11 +305,11 @@ def _frame(document: Document, columns_per_packet: int) -> tuple[int, str]:
     if columns is None:
         columns = int(match[1]) if match else None
     if not columns:
-        wanted = "columns x rate such as 1024x10 where columns_per_frame is absent"
-        document.fail("lidar_mode", wanted, mode)
+        expected = "columns x rate such as 1024x10 where columns_per_frame is absent"
+        document.fail("lidar_mode", expected, mode)
     if columns % columns_per_packet:
-        wanted = f"a multiple of columns_per_packet, {columns_per_packet}"
-        document.fail("columns_per_frame", wanted, columns)
+        expected = f"a multiple of columns_per_packet, {columns_per_packet}"
+        document.fail("columns_per_frame", expected, columns)
     return columns, match[0] if match else mode
 
 
@@ -323,12 +323,12 @@ def _header(document: Document, layout: PacketLayout) -> str:
 def _window(document: Document, columns_per_frame: int) -> tuple[int, int]:
     key = "column_window"
     last = columns_per_frame - 1
-    wanted = f"first and last column, 0 to {last}"
-    window = document.numbers(key, 2, wanted)
+    expected = f"first and last column, 0 to {last}"
+    window = document.numbers(key, 2, expected)
     if window is None:
         return 0, last
     if (window != np.floor(window)).any() or window.min() < 0 or window.max() > last:
-        document.fail(key, wanted, document.values[key])
+        document.fail(key, expected, document.values[key])
     return int(window[0]), int(window[1])
 
 

@@ -117,8 +117,8 @@ class OusterCalibration:
         check_options(options)
         if self.metadata.layout.profile.returns == 0:
             raise RigError(
-                f"{self.path}: Ouster metadata, udp_profile_lidar: wanted a profile with pixels, "
-                f"got {self.metadata.layout.profile.name}; leave the sensor out of the rig"
+                f"{self.path}: Ouster metadata, udp_profile_lidar: expected a profile with pixels, "
+                f"found {self.metadata.layout.profile.name}; leave the sensor out of the rig"
             )
         return OusterLidar(self.metadata, self.model, self.serial, "crc" in options)
 

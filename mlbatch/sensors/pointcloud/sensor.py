@@ -85,8 +85,8 @@ class CloudCalibration:
         layout = None if evidence is None else _layout(evidence.sample)
         if evidence is None or layout is None:
             raise RigError(
-                f"{self.model}: wanted a cloud of the topic in the first 10 seconds, which tells "
-                "how its points share times, got none; correct the topic, or leave it out"
+                f"{self.model}: expected a cloud of the topic in the first 10 seconds, which tells "
+                "how its points share times, found none; correct the topic, or leave it out"
             )
         return CloudLidar(layout, evidence.stream.topic)
 

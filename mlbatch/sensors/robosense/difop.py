@@ -111,8 +111,8 @@ def find_difop(evidence: Evidence) -> Difop | None:
         if len(units) > 1:
             names = ", ".join(unit.tobytes().hex() for unit in units)
             raise RigError(
-                f"{evidence.stream}: ROBOSENSE: wanted the device packets of one sensor beside "
-                f"its point packets, got those of {len(units)} (serial numbers {names}); give "
+                f"{evidence.stream}: ROBOSENSE: expected the device packets of one sensor beside "
+                f"its point packets, found those of {len(units)} (serial numbers {names}); give "
                 "the sensor a csv of its angles as metadata"
             )
         if len(packets):
@@ -163,16 +163,16 @@ def read_angles(path: Path, content: bytes) -> Angles | None:
     pairs = [(_number(first), _number(second)) for first, second in cells]
     if not any(math.isfinite(value) for pair in pairs for value in pair):
         return None
-    wanted = f"{path}: ROBOSENSE angles: wanted "
+    expected = f"{path}: ROBOSENSE angles: expected "
     if len(pairs) not in _CHANNELS:
         raise RigError(
-            f"{wanted}{', '.join(map(str, _CHANNELS[:-1]))} or {_CHANNELS[-1]} lines "
-            f"`elevation,azimuth`, got {len(pairs)}; give a line for each channel of the sensor"
+            f"{expected}{', '.join(map(str, _CHANNELS[:-1]))} or {_CHANNELS[-1]} lines "
+            f"`elevation,azimuth`, found {len(pairs)}; give a line for each channel of the sensor"
         )
     for line, (elevation, azimuth) in enumerate(pairs, start=1):
         if not (abs(elevation) <= _MOST_DEG and abs(azimuth) <= 2 * _MOST_DEG):
             raise RigError(
-                f"{wanted}degrees up to 90 and 180 in line {line + len(lines) - len(pairs)}, got "
+                f"{expected}degrees up to 90 and 180 in line {line + len(lines) - len(pairs)}, found "
                 f"{','.join(cells[line - 1])!r}; correct the file"
             )
     table = np.array(pairs)

@@ -45,7 +45,7 @@ from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
 
-# The bytes name the model; a file that was given is wanted before what is built in.
+# The bytes name the model; a file that was given is expected before what is built in.
 _FITS_MODEL = 100
 _FITS_FILE = 200
 _DIFOP_PORT = 7788
@@ -119,10 +119,10 @@ class DifopCalibration:
                 f"record its device port ({_DIFOP_PORT}) as well, or give a csv with --metadata",
             )
         if angles is None:
-            got = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
+            found = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
             raise RigError(
-                f"{VENDOR} {self.model}: wanted the angles of its channels, got "
-                f"{got} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
+                f"{VENDOR} {self.model}: expected the angles of its channels, found "
+                f"{found} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
                 "or give a csv of `elevation,azimuth` lines with --metadata"
             )
         lidar = RobosenseLidar(self._row, angles, options, evidence, difop, is_named=self._is_named)
@@ -169,7 +169,7 @@ class CsvCalibration:
         row = self._row(evidence)
         if row is None:
             raise RigError(
-                f"{self.path}: wanted packets of a {self.model} lidar from {evidence.stream}, got "
+                f"{self.path}: expected packets of a {self.model} lidar from {evidence.stream}, found "
                 f"{describe(evidence.size, evidence.sample) or 'others'}; give the csv of its unit"
             )
         difop = find_difop(evidence)
@@ -281,7 +281,7 @@ def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
     """Section 6 as vectors, sensor frame (x forward, y left, z up), metres.
 
     The lens turns with the rotor, without the correction of the channel. Each channel has an
-    origin of its own, since it fires where the rotor has got to by then. mirrored: the unit counts
+    origin of its own, since it fires at a later rotor angle. mirrored: the unit counts
     azimuths the other way, corrections included.
     """
     azimuth_rad = angles.azimuth_deg * (-RAD_PER_DEG if mirrored else RAD_PER_DEG)
@@ -294,6 +294,6 @@ def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
 
 def _no_packets(what: str) -> RigError:
     return RigError(
-        f"{what}: wanted a packet of it in the first 10 seconds to tell its return mode, got none; "
+        f"{what}: expected a packet of it in the first 10 seconds to tell its return mode, found none; "
         "correct its stream, or leave it out of the rig"
     )

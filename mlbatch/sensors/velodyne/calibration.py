@@ -145,8 +145,8 @@ def _read_yaml(path: Path, text: str) -> VelodyneFile:
     if not isinstance(items, list) or not items:
         raise _error(path, "lasers", "a list of lasers", "none")
     if len(items) not in _SIZES:
-        wanted = f"{', '.join(map(str, _SIZES))} lasers"
-        raise _error(path, "lasers", wanted, str(len(items)))
+        expected = f"{', '.join(map(str, _SIZES))} lasers"
+        raise _error(path, "lasers", expected, str(len(items)))
     entries = []
     for index, item in enumerate(items):
         place = f"lasers[{index}]"
@@ -200,8 +200,8 @@ def _read_xml(path: Path, text: str) -> VelodyneFile | None:
         return None
     points = table.findall("points_/item")
     if not points or len(points) > max(_SIZES):
-        wanted = f"1 to {max(_SIZES)} lasers"
-        raise _error(path, "DB.points_", wanted, str(len(points)) if points else "none")
+        expected = f"1 to {max(_SIZES)} lasers"
+        raise _error(path, "DB.points_", expected, str(len(points)) if points else "none")
     entries = list(_xml_entries(points))
     flags = [(one.text or "").strip() for one in table.findall("enabled_/item")]
     enabled = _enabled(path, flags) if flags else np.ones(len(entries), np.bool_)
@@ -274,8 +274,8 @@ def _value(path: Path, form: _Form, entry: _Entry, name: str) -> float:
     unit, factor = (form.angle_unit, form.rad) if quantity.is_angle else (form.length_unit, form.m)
     value = _number(path, place, text) * factor
     if abs(value) > quantity.limit:
-        wanted = f"at most {quantity.limit / factor:.6g} {unit} either way"
-        raise _error(path, place, wanted, text, _UNIT_REMEDY)
+        expected = f"at most {quantity.limit / factor:.6g} {unit} either way"
+        raise _error(path, place, expected, text, _UNIT_REMEDY)
     return value
 
 
@@ -283,8 +283,8 @@ def _unit_m(path: Path, place: str, text: str, unit: str, factor: float) -> floa
     unit_m = _number(path, place, text) * factor
     low, high = _UNIT_RANGE_M
     if not low <= unit_m <= high:
-        wanted = f"{low / factor:g} to {high / factor:g} {unit}"
-        raise _error(path, place, wanted, text, _UNIT_REMEDY)
+        expected = f"{low / factor:g} to {high / factor:g} {unit}"
+        raise _error(path, place, expected, text, _UNIT_REMEDY)
     return unit_m
 
 
@@ -298,8 +298,8 @@ def _number(path: Path, place: str, text: str) -> float:
     return value
 
 
-def _error(path: Path, place: str, wanted: str, got: str, remedy: str = _REMEDY) -> RigError:
-    shown = " ".join(got.split())
+def _error(path: Path, place: str, expected: str, found: str, remedy: str = _REMEDY) -> RigError:
+    shown = " ".join(found.split())
     shown = shown if len(shown) <= 60 else shown[:57] + "..."
     where = f"{path}: {place}: " if place else f"{path}: "
-    return RigError(f"{where}wanted {wanted}, got {shown} (Velodyne calibration); {remedy}")
+    return RigError(f"{where}expected {expected}, found {shown} (Velodyne calibration); {remedy}")

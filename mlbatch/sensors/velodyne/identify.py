@@ -125,9 +125,9 @@ def _within_the_hour(packets: U8Array) -> BoolArray:
 def _four_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identity | None:
     """VLS-128: four banks a sequence, each twice (and four blocks unused) with two returns."""
     for returns in (1, 2):
-        wanted = expected_flags(4, returns)
-        used = len(wanted)
-        good = (flags[:, :used] == wanted).all(axis=1)
+        expected = expected_flags(4, returns)
+        used = len(expected)
+        good = (flags[:, :used] == expected).all(axis=1)
         good &= (azimuth[:, :used] < TURN_CDEG).all(axis=1) & _within_the_hour(packets)
         chosen = majority(packets, good)
         if chosen is not None:

@@ -111,7 +111,7 @@ class VelodyneCalibration:
         chosen = {**_OPTIONS, **options}
         if self.row.needs_file and self.file is None:
             raise RigError(
-                f"{self.row.reported_as}: wanted its calibration, got none; give the unit's YAML or "
+                f"{self.row.reported_as}: expected its calibration, found none; give the unit's YAML or "
                 "db.xml with --metadata or as `metadata:` in the rig"
             )
         measured, notes = _measure(self.row, evidence)
@@ -143,8 +143,8 @@ def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
     away_deg, row = min(((_away_deg(row, file), row) for row in rows), key=lambda pair: pair[0])
     if away_deg > _ANGLE_TOLERANCE_DEG:
         raise RigError(
-            f"{path}: Velodyne calibration: wanted vertical angles of {row.name} or another model "
-            f"with {file.lasers} lasers, got some {away_deg:.1f} degrees off; give the file of a "
+            f"{path}: Velodyne calibration: expected vertical angles of {row.name} or another model "
+            f"with {file.lasers} lasers, found some {away_deg:.1f} degrees off; give the file of a "
             "supported model"
         )
     return VelodyneCalibration(row, file, is_guessed=row.needs_file)

@@ -88,12 +88,12 @@ def test_points_worked_by_hand(
     rotor: float, channel: int, azimuth: float, elevation: float
 ) -> None:
     flat = 10 * math.cos(elevation * DEG)
-    wanted = [
+    expected = [
         flat * math.sin(azimuth * DEG),
         flat * math.cos(azimuth * DEG),
         10 * math.sin(elevation * DEG),
     ]
-    assert point(rotor, channel) == pytest.approx(wanted, abs=2e-6)
+    assert point(rotor, channel) == pytest.approx(expected, abs=2e-6)
 
 
 def test_beam_to_the_right_lies_on_x_and_behind_on_y() -> None:
@@ -193,8 +193,8 @@ def test_real_file_against_plain_loops() -> None:
         for channel in range(CHANNELS):
             rotor = angle[column] + speed[column] * firing_ns[table[column], channel]
             vector = np.array(by_the_sheet(file, float(rotor), channel))
-            wanted = vector * float(range_m[column, channel])
-            worst_m = max(worst_m, float(np.abs(found[column, channel] - wanted).max()))
+            expected = vector * float(range_m[column, channel])
+            worst_m = max(worst_m, float(np.abs(found[column, channel] - expected).max()))
     # Single precision, at up to 180 m: 3e-7 of it.
     assert worst_m < 6e-5
 

@@ -133,19 +133,19 @@ def test_other_files_are_left_to_others(content: bytes) -> None:
 
 
 BROKEN = {
-    "twice": (2, ["1,0,0"], "line 3: wanted every channel once, got channel 1 again"),
-    "missing": (9, [], "line 16: wanted channels 1 to 16, got no channel 9"),
-    "nan": (4, ["4,nan,0"], "line 5: wanted elevation from -90 to 90 deg, got nan"),
-    "high": (4, ["4,90.5,0"], "line 5: wanted elevation from -90 to 90 deg, got 90.5"),
-    "far": (4, ["4,0,-361"], "line 5: wanted azimuth from -360 to 360 deg, got -361"),
-    "infinite": (4, ["4,0,inf"], "line 5: wanted azimuth from -360 to 360 deg, got inf"),
-    "word": (4, ["4,abc,0"], "line 5: wanted elevation from -90 to 90 deg, got abc"),
-    "zero": (1, ["0,0,0"], "line 2: wanted a channel from 1 to 128, got 0"),
-    "many": (1, ["129,0,0"], "line 2: wanted a channel from 1 to 128, got 129"),
-    "name": (1, ["one,0,0"], "line 2: wanted a channel from 1 to 128, got one"),
-    "two cells": (16, ["16,8.0"], "line 17: wanted channel, elevation, azimuth, got 16, 8.0"),
-    "empty cell": (16, ["16,,3"], "line 17: wanted elevation from -90 to 90 deg, got nothing"),
-    "long": (1, ["1" + "x" * 99], "line 2: wanted channel, elevation, azimuth, got 1" + "x" * 56),
+    "twice": (2, ["1,0,0"], "line 3: expected every channel once, found channel 1 again"),
+    "missing": (9, [], "line 16: expected channels 1 to 16, found no channel 9"),
+    "nan": (4, ["4,nan,0"], "line 5: expected elevation from -90 to 90 deg, found nan"),
+    "high": (4, ["4,90.5,0"], "line 5: expected elevation from -90 to 90 deg, found 90.5"),
+    "far": (4, ["4,0,-361"], "line 5: expected azimuth from -360 to 360 deg, found -361"),
+    "infinite": (4, ["4,0,inf"], "line 5: expected azimuth from -360 to 360 deg, found inf"),
+    "word": (4, ["4,abc,0"], "line 5: expected elevation from -90 to 90 deg, found abc"),
+    "zero": (1, ["0,0,0"], "line 2: expected a channel from 1 to 128, found 0"),
+    "many": (1, ["129,0,0"], "line 2: expected a channel from 1 to 128, found 129"),
+    "name": (1, ["one,0,0"], "line 2: expected a channel from 1 to 128, found one"),
+    "two cells": (16, ["16,8.0"], "line 17: expected channel, elevation, azimuth, found 16, 8.0"),
+    "empty cell": (16, ["16,,3"], "line 17: expected elevation from -90 to 90 deg, found nothing"),
+    "long": (1, ["1" + "x" * 99], "line 2: expected channel, elevation, azimuth, found 1" + "x" * 56),
 }
 
 
@@ -158,9 +158,9 @@ def test_broken_rows_are_refused(name: str) -> None:
 
 
 def test_files_that_end_early_are_refused() -> None:
-    wanted = "16, 20, 32, 40, 64, 90 or 128 channels in all"
-    assert refusal(rows()[:12]) == f"line 12: wanted {wanted}, got 11"
-    assert refusal(rows()[:1]) == f"line 1: wanted {wanted}, got 0"
+    expected = "16, 20, 32, 40, 64, 90 or 128 channels in all"
+    assert refusal(rows()[:12]) == f"line 12: expected {expected}, found 11"
+    assert refusal(rows()[:1]) == f"line 1: expected {expected}, found 0"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
@@ -175,8 +175,8 @@ def test_digest_finds_a_changed_angle() -> None:
     digest = hashlib.sha256(text(rows(), "\r\n")).hexdigest()
     lines = [*rows(), f"{digest},,"]
     lines[3] = "3,1.6,-3"
-    wanted = "wanted lines that agree with this SHA-256, got lines that were changed"
-    assert refusal(lines) == f"line 18: {wanted}"
+    expected = "expected lines that agree with this SHA-256, found lines that were changed"
+    assert refusal(lines) == f"line 18: {expected}"
 
 
 def at128_content(resolution: int = 2) -> bytes:
@@ -233,12 +233,12 @@ def test_files_that_are_no_at128_files(content: bytes) -> None:
 @pytest.mark.parametrize(
     ("at", "value", "message"),
     [
-        (3, 3, "wanted version 1.5, got 1.3"),
-        (4, 64, "wanted channels 128, got 64"),
-        (5, 4, "wanted mirrors 3, got 4"),
-        (6, 1, "wanted frames 3, got 1"),
-        (15, 0, "wanted a resolution from 1 to 8, got 0"),
-        (9000, 1, "wanted content that agrees with its SHA-256, got content that was changed"),
+        (3, 3, "expected version 1.5, found 1.3"),
+        (4, 64, "expected channels 128, found 64"),
+        (5, 4, "expected mirrors 3, found 4"),
+        (6, 1, "expected frames 3, found 1"),
+        (15, 0, "expected a resolution from 1 to 8, found 0"),
+        (9000, 1, "expected content that agrees with its SHA-256, found content that was changed"),
     ],
 )
 def test_damaged_at128_files_are_refused(at: int, value: int, message: str) -> None:
@@ -252,5 +252,5 @@ def test_damaged_at128_files_are_refused(at: int, value: int, message: str) -> N
 
 
 def test_at128_file_that_ends_early_is_refused() -> None:
-    with pytest.raises(RigError, match="wanted 47176 bytes, got 400 bytes"):
+    with pytest.raises(RigError, match="expected 47176 bytes, found 400 bytes"):
         read_at128(Path("at.dat"), at128_content()[:400])

@@ -70,9 +70,9 @@ def test_what_was_sent_comes_back(model: str, mode: int) -> None:
     first_ns = np.where(fired, wanted_ns, wanted_ns.max()).min(axis=1)
     assert (found.stamp_ns == first_ns).all()
     direction = builder.directions(spec, beams, count, turning=model != "JT16")
-    wanted = found.range_m[..., None] * direction[:, :, None, :]
+    expected = found.range_m[..., None] * direction[:, :, None, :]
     # float32 at up to 120 m, and what the series of the rotor's motion leaves out.
-    assert np.abs(found.xyz() - wanted)[fired].max() < 1e-4
+    assert np.abs(found.xyz() - expected)[fired].max() < 1e-4
 
 
 @pytest.mark.parametrize("mode", [0x37, DUAL])
@@ -99,10 +99,10 @@ def test_a_rotor_that_turns_the_other_way(model: str) -> None:
     beams, content = _beams(spec.row.channels)
     found = decode(packets, content)
     fired = builder.fires(spec, len(found.stamp_ns))
-    wanted = found.range_m[..., None] * builder.directions(spec, beams, len(fired))[:, :, None, :]
+    expected = found.range_m[..., None] * builder.directions(spec, beams, len(fired))[:, :, None, :]
     if model == "QT128C2X":  # Its checksums no longer hold, which nobody asked for.
         assert calibration(content).lidar({"crc": "check"}, evidence(packets)).faults(packets).all()
-    assert np.abs(found.xyz() - wanted)[fired].max() < 1e-4
+    assert np.abs(found.xyz() - expected)[fired].max() < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -255,19 +255,19 @@ def test_optical_centre(body: F64Array | None) -> None:
         axis=1,
     )
     rotor = np.radians(builder.azimuths_deg(spec, 18)[column])
-    wanted = []
+    expected = []
     for one, range_one in zip(unit, range_m.astype(np.float64), strict=True):
         along = float((one * centre).sum())
         behind = np.sqrt(along**2 - (centre**2).sum() + range_one**2) - along
         x, y, z = behind * one + centre if range_one > 0.09 else range_one * one
         turned = (x * np.cos(rotor) + y * np.sin(rotor), y * np.cos(rotor) - x * np.sin(rotor), z)
-        wanted.append(body[:3, :3] @ turned + body[:3, 3])
+        expected.append(body[:3, :3] @ turned + body[:3, 3])
     projection = found.lidar.projection(body, 1)
     assert projection is not None
     points = np.empty((1, 64, 3), np.float32)
     projection.aim(np.zeros(1, np.int64), found.encoder[column : column + 1])
     projection.points(range_m[None], points)
-    assert np.abs(points[0] - wanted).max() < 1e-5
+    assert np.abs(points[0] - expected).max() < 1e-5
     plain = decode(packets, content, {"firing_azimuth": "off"}).lidar
     assert plain.projection(body, 1) is None
 
@@ -304,7 +304,7 @@ def test_fit_is_by_channels_then_by_where_beams_look() -> None:
     assert own.lidar({}, seen).notes == ()
     (note,) = qt64.lidar({}, seen).notes
     assert note == (
-        "unit.csv: wanted elevations from about -25 to 15 deg for a Pandar64, got -52.1 to 52.1; "
+        "unit.csv: expected elevations from about -25 to 15 deg for a Pandar64, found -52.1 to 52.1; "
         "check that the file is of this lidar"
     )
 
@@ -320,9 +320,9 @@ def test_packets_without_a_decoder_fit_nothing() -> None:
 @pytest.mark.parametrize(
     ("model", "file", "text"),
     [
-        ("Pandar64", "Pandar40P", "wanted 64 channels for the packets of a Pandar64, got 40; give"),
-        ("Pandar64", "AT128", "wanted the csv of a Pandar64 for these packets, got the file of"),
-        ("AT128", "OT128", "HESAI AT128: wanted its correction file (.dat), got a csv"),
+        ("Pandar64", "Pandar40P", "expected 64 channels for the packets of a Pandar64, found 40; give"),
+        ("Pandar64", "AT128", "expected the csv of a Pandar64 for these packets, found the file of"),
+        ("AT128", "OT128", "HESAI AT128: expected its correction file (.dat), found a csv"),
     ],
 )
 def test_a_file_of_another_lidar_is_refused(model: str, file: str, text: str) -> None:
@@ -338,7 +338,7 @@ def test_a_file_of_another_lidar_is_refused(model: str, file: str, text: str) ->
 def test_a_lidar_that_was_not_seen_is_refused(file: str) -> None:
     content = _beams(HesaiSpec(file).row.channels, file)[1]
     with pytest.raises(
-        RigError, match=r"wanted packets of the lidar in the first 10 seconds.*got none"
+        RigError, match=r"expected packets of the lidar in the first 10 seconds.*found none"
     ):
         calibration(content).lidar({}, None)
 

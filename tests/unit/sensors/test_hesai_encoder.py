@@ -216,8 +216,8 @@ def test_date_forms() -> None:
 
 
 def test_angle_file() -> None:
-    wanted = b"Laser id,Elevation,Azimuth\n1,15.5,-1.042\n2,0.0,3.0\n"
-    assert angles_csv([15.5, 0.0], [-1.042, 3.0]) == wanted
+    expected = b"Laser id,Elevation,Azimuth\n1,15.5,-1.042\n2,0.0,3.0\n"
+    assert angles_csv([15.5, 0.0], [-1.042, 3.0]) == expected
 
 
 def test_columns_must_fill_packets() -> None:

@@ -298,8 +298,8 @@ def test_hand_worked_points(case: Case, turning: bool) -> None:
         assert found.time_ns[place[:2]] == PACKET_NS + shot.block_ns + shot.firing_ns
         block_deg = 40 + 10 * shot.column
         turned_deg = DEG_PER_NS * shot.firing_ns if turning and case.model != "JT16" else 0.0
-        wanted = _point(block_deg + 1 + turned_deg, range_m)
-        assert points[place].tolist() == pytest.approx(wanted, abs=2e-6)
+        expected = _point(block_deg + 1 + turned_deg, range_m)
+        assert points[place].tolist() == pytest.approx(expected, abs=2e-6)
 
 
 def test_a_column_is_stamped_at_its_earliest_firing() -> None:
@@ -360,14 +360,14 @@ def test_hand_worked_points_of_an_at128() -> None:
     packets = _at128(0x37, [(12 + 3 + 8, 2501, 1), (12 + 515 + 3, 2502, 2), (530 + 508, 2503, 3)])
     found = decode(packets, dat)
     assert (found.lidar.model, found.lidar.channels) == ("AT128", 128)
-    wanted = [
+    expected = [
         # column, channel, block, firing: -9249 - 41666 x (2 - b), then the table.
         (0, 2, -92581, 8240),
         (1, 0, -50915, 0),
         (1, 127, -50915, 8264),
     ]
     points = found.xyz()
-    for number, (column, channel, block_ns, firing_ns) in enumerate(wanted):
+    for number, (column, channel, block_ns, firing_ns) in enumerate(expected):
         range_m = (2501 + number) * 0.004
         assert found.range_m[column, channel, 0] == np.float32(range_m)
         assert found.intensity[column, channel, 0] == number + 1

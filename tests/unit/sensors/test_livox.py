@@ -226,10 +226,10 @@ def test_damaged_packets_are_rejected() -> None:
     packets[2, 5] ^= 1
     packets[3, 100] ^= 1
     packets[4, 30] ^= 1
-    wanted = ["bad_header"] * 3 + ["", "", ""]
-    assert [FAULTS[fault] for fault in lidar.faults(packets)] == wanted
-    wanted[3:5] = ["bad_crc"] * 2
-    assert [FAULTS[fault] for fault in checking.faults(packets)] == wanted
+    expected = ["bad_header"] * 3 + ["", "", ""]
+    assert [FAULTS[fault] for fault in lidar.faults(packets)] == expected
+    expected[3:5] = ["bad_crc"] * 2
+    assert [FAULTS[fault] for fault in checking.faults(packets)] == expected
 
 
 def test_times_beyond_all_clocks_do_not_raise() -> None:
@@ -274,7 +274,7 @@ def test_fit() -> None:
 
 @pytest.mark.parametrize("seen", [None, evidence(livox1_packets(2, 1362))])
 def test_a_sensor_that_was_not_seen_is_refused(seen: Evidence | None) -> None:
-    with pytest.raises(RigError, match="Livox SDK2: wanted packets of points in the first 10 sec"):
+    with pytest.raises(RigError, match="Livox SDK2: expected packets of points in the first 10 sec"):
         CALIBRATION.lidar({}, seen)
 
 

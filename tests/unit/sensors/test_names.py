@@ -119,10 +119,10 @@ def test_a_damaged_packet_does_not_hide_a_stream() -> None:
     ]
     for packets in streams:
         whole = np.concatenate([packets, packets[-1:]])
-        wanted = named(whole)
-        assert wanted is not None
+        expected = named(whole)
+        assert expected is not None
         whole[1] = np.random.default_rng(5).integers(0, 256, packets.shape[1], np.uint8)
-        assert named(whole) == wanted
+        assert named(whole) == expected
 
 
 @pytest.mark.parametrize("profile", [name for name, one in PROFILES.items() if one.fields])

@@ -137,7 +137,7 @@ def test_a_lidar_that_was_off_is_noted_and_the_file_stays_usable() -> None:
 def test_the_profile_off_has_no_packets() -> None:
     document = metadata_json(SPEC)
     document["lidar_data_format"]["udp_profile_lidar"] = "OFF"
-    with pytest.raises(RigError, match=r"front\.json: .*udp_profile_lidar: wanted .*got OFF"):
+    with pytest.raises(RigError, match=r"front\.json: .*udp_profile_lidar: expected .*found OFF"):
         read(document).lidar({}, None)
 
 
@@ -191,9 +191,9 @@ def test_options_of_this_and_other_makers() -> None:
         None,
     )
     known = "crc, firing_azimuth, optical_centre, packet_stamp, vertical_offset"
-    with pytest.raises(UsageError, match=f"--decode colour=red: wanted one of {known}, got colour"):
+    with pytest.raises(UsageError, match=f"--decode colour=red: expected one of {known}, found colour"):
         calibration.lidar({"colour": "red"}, None)
-    with pytest.raises(UsageError, match="wanted crc=check, got never"):
+    with pytest.raises(UsageError, match="expected crc=check, found never"):
         calibration.lidar({"crc": "never"}, None)
 
 

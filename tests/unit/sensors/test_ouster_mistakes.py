@@ -37,57 +37,57 @@ BEAMS = ("beam_intrinsics", "beam_altitude_angles")
 AZIMUTHS = ("beam_intrinsics", "beam_azimuth_angles")
 FORMAT = "lidar_data_format"
 MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
-    (BEAMS, None, "beam_altitude_angles: wanted angles in degrees, got nothing"),
-    (BEAMS, [], "beam_altitude_angles: wanted angles in degrees, got nothing"),
-    (BEAMS, "many", "beam_altitude_angles: wanted angles in degrees, got many"),
-    (BEAMS, [1.0] * 63 + ["2"], "beam_altitude_angles: wanted angles in degrees, got 2"),
-    (BEAMS, [1.0] * 63 + [True], "beam_altitude_angles: wanted angles in degrees, got true"),
-    (BEAMS, [1.0] * 63 + [float("nan")], "beam_altitude_angles: wanted angles .*, got nan"),
-    (BEAMS, [1.0] * 63 + [float("-inf")], "beam_altitude_angles: wanted angles .*, got -inf"),
-    (BEAMS, [1.0] * 63 + [10**400], "beam_altitude_angles: .*got a number beyond all bounds"),
-    (BEAMS, [1.0] * 63 + [1e5], "beam_altitude_angles: wanted angles in degrees, got 100000"),
+    (BEAMS, None, "beam_altitude_angles: expected angles in degrees, found nothing"),
+    (BEAMS, [], "beam_altitude_angles: expected angles in degrees, found nothing"),
+    (BEAMS, "many", "beam_altitude_angles: expected angles in degrees, found many"),
+    (BEAMS, [1.0] * 63 + ["2"], "beam_altitude_angles: expected angles in degrees, found 2"),
+    (BEAMS, [1.0] * 63 + [True], "beam_altitude_angles: expected angles in degrees, found true"),
+    (BEAMS, [1.0] * 63 + [float("nan")], "beam_altitude_angles: expected angles .*, found nan"),
+    (BEAMS, [1.0] * 63 + [float("-inf")], "beam_altitude_angles: expected angles .*, found -inf"),
+    (BEAMS, [1.0] * 63 + [10**400], "beam_altitude_angles: .*found a number beyond all bounds"),
+    (BEAMS, [1.0] * 63 + [1e5], "beam_altitude_angles: expected angles in degrees, found 100000"),
     (BEAMS, [[1.0] * 64] * 4, "beam_altitude_angles: .*the unit does not spin"),
-    (AZIMUTHS, [1.0] * 63, "beam_azimuth_angles: wanted 64 angles in degrees, got 63 entries"),
-    (AZIMUTHS, None, "beam_azimuth_angles: wanted 64 angles in degrees, got nothing"),
-    ((FORMAT, "pixels_per_column"), 128, "pixels_per_column: wanted 64 .*, got 128"),
-    ((FORMAT, "columns_per_packet"), 0, "columns_per_packet: wanted a whole number .*, got 0"),
-    ((FORMAT, "columns_per_packet"), 1024, "columns_per_packet: wanted packets up to 65507 bytes"),
-    ((FORMAT, "columns_per_packet"), 15, "columns_per_frame: wanted a multiple .*, got 1024"),
-    ((FORMAT, "columns_per_frame"), "1024", "columns_per_frame: wanted a whole number .*got 1024"),
-    ((FORMAT, "columns_per_frame"), 10.5, "columns_per_frame: wanted a whole number .*, got 10.5"),
-    ((FORMAT, "columns_per_frame"), True, "columns_per_frame: wanted a whole number .*, got true"),
-    ((FORMAT, "columns_per_frame"), float("nan"), "columns_per_frame: .*got NaN"),
-    ((FORMAT, "column_window"), [0, 1024], r"column_window: wanted .*0 to 1023, got \[0, 1024\]"),
-    ((FORMAT, "column_window"), [0], "column_window: wanted .*, got 1 entries"),
-    ((FORMAT, "column_window"), [0.5, 9], "column_window: wanted"),
-    ((FORMAT, "udp_profile_lidar"), "RNG99", "udp_profile_lidar: wanted one of LEGACY, .*RNG99"),
-    ((FORMAT, "udp_profile_lidar"), 7, "udp_profile_lidar: wanted a text, got 7"),
-    ((FORMAT, "header_type"), "ODD", "header_type: wanted STANDARD or FUSA, got ODD"),
-    (("sensor_info", "prod_sn"), "12x4", "prod_sn: wanted a serial number in digits"),
-    (("sensor_info", "prod_sn"), "9" * 13, "prod_sn: wanted a serial number in digits"),
-    (("sensor_info", "initialization_id"), -1, "initialization_id: wanted .*, got -1"),
-    (("config_params", "udp_port_lidar"), 70000, "udp_port_lidar: wanted .*65535, got 70000"),
+    (AZIMUTHS, [1.0] * 63, "beam_azimuth_angles: expected 64 angles in degrees, found 63 entries"),
+    (AZIMUTHS, None, "beam_azimuth_angles: expected 64 angles in degrees, found nothing"),
+    ((FORMAT, "pixels_per_column"), 128, "pixels_per_column: expected 64 .*, found 128"),
+    ((FORMAT, "columns_per_packet"), 0, "columns_per_packet: expected a whole number .*, found 0"),
+    ((FORMAT, "columns_per_packet"), 1024, "columns_per_packet: expected packets up to 65507 bytes"),
+    ((FORMAT, "columns_per_packet"), 15, "columns_per_frame: expected a multiple .*, found 1024"),
+    ((FORMAT, "columns_per_frame"), "1024", "columns_per_frame: expected a whole number .*found 1024"),
+    ((FORMAT, "columns_per_frame"), 10.5, "columns_per_frame: expected a whole number .*, found 10.5"),
+    ((FORMAT, "columns_per_frame"), True, "columns_per_frame: expected a whole number .*, found true"),
+    ((FORMAT, "columns_per_frame"), float("nan"), "columns_per_frame: .*found NaN"),
+    ((FORMAT, "column_window"), [0, 1024], r"column_window: expected .*0 to 1023, found \[0, 1024\]"),
+    ((FORMAT, "column_window"), [0], "column_window: expected .*, found 1 entries"),
+    ((FORMAT, "column_window"), [0.5, 9], "column_window: expected"),
+    ((FORMAT, "udp_profile_lidar"), "RNG99", "udp_profile_lidar: expected one of LEGACY, .*RNG99"),
+    ((FORMAT, "udp_profile_lidar"), 7, "udp_profile_lidar: expected a text, found 7"),
+    ((FORMAT, "header_type"), "ODD", "header_type: expected STANDARD or FUSA, found ODD"),
+    (("sensor_info", "prod_sn"), "12x4", "prod_sn: expected a serial number in digits"),
+    (("sensor_info", "prod_sn"), "9" * 13, "prod_sn: expected a serial number in digits"),
+    (("sensor_info", "initialization_id"), -1, "initialization_id: expected .*, found -1"),
+    (("config_params", "udp_port_lidar"), 70000, "udp_port_lidar: expected .*65535, found 70000"),
     (
         ("lidar_intrinsics", "lidar_to_sensor_transform"),
         [0.0] * 16,
-        "lidar_to_sensor_transform: wanted 16 finite numbers, a rigid transform",
+        "lidar_to_sensor_transform: expected 16 finite numbers, a rigid transform",
     ),
     (
         ("lidar_intrinsics", "lidar_to_sensor_transform"),
         np.diag([1.0, 1.0, -1.0, 1.0]).ravel().tolist(),
-        "lidar_to_sensor_transform: wanted 16 finite numbers, a rigid transform",
+        "lidar_to_sensor_transform: expected 16 finite numbers, a rigid transform",
     ),
     (
         ("lidar_intrinsics", "lidar_to_sensor_transform"),
         [1.0] * 15,
-        "lidar_to_sensor_transform: wanted 16 .*, got 15 entries",
+        "lidar_to_sensor_transform: expected 16 .*, found 15 entries",
     ),
     (
         ("beam_intrinsics", "beam_to_lidar_transform"),
         {"x": 1},
-        "beam_to_lidar_transform: wanted 16 finite numbers, got",
+        "beam_to_lidar_transform: expected 16 finite numbers, found",
     ),
-    (("ouster-sdk",), {"extrinsic": [2.0] * 16}, "extrinsic: wanted 16 finite numbers, a rigid"),
+    (("ouster-sdk",), {"extrinsic": [2.0] * 16}, "extrinsic: expected 16 finite numbers, a rigid"),
 ]
 
 
@@ -108,13 +108,13 @@ def test_a_mode_is_needed_where_the_columns_are_not_told() -> None:
     for mode in ("", "fast", None):
         document: JsonObject = {"lidar_mode": mode}
         document |= {key: [1.0] * 64 for key in ("beam_altitude_angles", "beam_azimuth_angles")}
-        with pytest.raises(RigError, match="lidar_mode: wanted columns x rate such as 1024x10"):
+        with pytest.raises(RigError, match="lidar_mode: expected columns x rate such as 1024x10"):
             read(document)
 
 
 def test_a_file_cut_off_is_ours_but_unusable() -> None:
     content = json.dumps(metadata_json(SPEC)).encode()[:-40]
-    with pytest.raises(RigError, match=r"front\.json: Ouster metadata: wanted a JSON document"):
+    with pytest.raises(RigError, match=r"front\.json: Ouster metadata: expected a JSON document"):
         read_calibration(PATH, content)
 
 

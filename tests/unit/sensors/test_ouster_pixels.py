@@ -126,8 +126,8 @@ def test_every_coarse_range_is_rounded_correctly() -> None:
     out = blank(raw.shape)
     PixelReader(PacketLayout(PROFILES["RNG15_RFL8_NIR8"], 16, 16)).read(records, 0, out)
     # Python divides the exact integers; the second rounding cannot err, 53 bits being enough.
-    wanted = [np.float32(8 * value / 1000) for value in raw.ravel().tolist()]
-    assert out.range_m.ravel().tolist() == [float(value) for value in wanted]
+    expected = [np.float32(8 * value / 1000) for value in raw.ravel().tolist()]
+    assert out.range_m.ravel().tolist() == [float(value) for value in expected]
     assert out.range_m.max() == np.float32(262.136)
 
 

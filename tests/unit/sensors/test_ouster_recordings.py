@@ -86,11 +86,11 @@ class TestEveryRecording:
             wanted_mm = reference["range_mm"][frame, :, mid, which]
             # float64 division rounded to float32: no double rounding occurs for 20-bit integers.
             assert np.array_equal(range_m, (wanted_mm / 1000).astype(np.float32))
-            wanted = reference["reflectivity"][frame, :, mid, which]
-            assert np.array_equal(reflectivity, wanted)
+            expected = reference["reflectivity"][frame, :, mid, which]
+            assert np.array_equal(reflectivity, expected)
             if "signal" in reference:
-                wanted = reference["signal"][frame, :, mid, which]
-            assert np.array_equal(intensity, wanted.astype(np.float32))
+                expected = reference["signal"][frame, :, mid, which]
+            assert np.array_equal(intensity, expected.astype(np.float32))
 
     def test_xyz_as_the_reference_has_it(self, case: Case) -> None:
         _, lidar, _, reference = loaded(case)
@@ -98,16 +98,16 @@ class TestEveryRecording:
         range_m = reference["range_mm"][frame, :, :, which].T / 1000
         hit = range_m > 0
         xyz = projected(lidar, range_m)
-        wanted = np.moveaxis(reference["xyz_m"][frame, :, :, which], 1, 0)
+        expected = np.moveaxis(reference["xyz_m"][frame, :, :, which], 1, 0)
         assert hit.any()
-        assert np.abs(xyz - wanted)[hit].max() < MAX_XYZ_ERROR_M
+        assert np.abs(xyz - expected)[hit].max() < MAX_XYZ_ERROR_M
         assert len(angles_rad(lidar)) == range_m.shape[0]
 
     def test_the_table_equals_the_formula(self, case: Case) -> None:
         _, lidar, _, reference = loaded(case)
         range_m = np.full((len(angles_rad(lidar)), lidar.channels), 17.25)
-        wanted = formula_m(reference, range_m)
-        assert np.abs(projected(lidar, range_m) - wanted).max() < MAX_TABLE_ERROR_M
+        expected = formula_m(reference, range_m)
+        assert np.abs(projected(lidar, range_m) - expected).max() < MAX_TABLE_ERROR_M
 
     def test_calibration_as_the_reference_fills_it_in(self, case: Case) -> None:
         calibration, lidar, _, reference = loaded(case)

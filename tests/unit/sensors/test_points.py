@@ -113,7 +113,7 @@ def test_no_maker_takes_our_packets_for_its_own(by_ring: bool) -> None:
 
 
 def test_a_silent_topic_is_asked_for() -> None:
-    with pytest.raises(RigError, match="PointCloud2: wanted a cloud of the topic in the first 10"):
+    with pytest.raises(RigError, match="PointCloud2: expected a cloud of the topic in the first 10"):
         CLOUD.lidar({}, None)
     with pytest.raises(UsageError, match="--decode speed=up"):
         CLOUD.lidar({"speed": "up"}, None)
@@ -181,8 +181,8 @@ def test_points_are_turned_and_moved_into_the_body_frame() -> None:
     pose = from_quaternion((10, 20, 30), (0, 0, half, half))
     range_m, xyz, _ = _decoded(pose)
     assert range_m.tolist() == RANGES_M
-    wanted = [(10 - y, 20 + x, 30 + z) for x, y, z in PLACES]
-    np.testing.assert_allclose([*xyz[0], *xyz[1], xyz[2, 0]], wanted, atol=2e-6)
+    expected = [(10 - y, 20 + x, 30 + z) for x, y, z in PLACES]
+    np.testing.assert_allclose([*xyz[0], *xyz[1], xyz[2, 0]], expected, atol=2e-6)
 
 
 def test_topics_are_never_decoded_together() -> None:

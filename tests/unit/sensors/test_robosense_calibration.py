@@ -104,10 +104,10 @@ def test_damage_of_one_device_packet_does_no_harm() -> None:
     good = difop(spec, fan(spec))
     damaged = bytearray(good)
     damaged[470] ^= 0xFF
-    wanted = built_in(_evidence("RS-32")).lidar({}, _evidence("RS-32"))
+    expected = built_in(_evidence("RS-32")).lidar({}, _evidence("RS-32"))
     evidence = evidence_of(_sent(spec), [bytes(damaged), good, good])
     lidar = built_in(evidence).lidar({}, evidence)
-    np.testing.assert_array_equal(lidar.beams.direction, wanted.beams.direction)
+    np.testing.assert_array_equal(lidar.beams.direction, expected.beams.direction)
 
 
 def test_units_behind_one_address_are_told_by_their_ports() -> None:
@@ -119,13 +119,13 @@ def test_units_behind_one_address_are_told_by_their_ports() -> None:
     evidence = evidence_of(_sent(spec), [difop(other, fan(other)), mine])
     with pytest.raises(RigError) as caught:
         built_in(evidence).lidar({}, evidence)
-    assert "got those of 2 (serial numbers 0a1b2c3d4e5f, ffffffffffff)" in str(caught.value)
+    assert "found those of 2 (serial numbers 0a1b2c3d4e5f, ffffffffffff)" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["RS-16", "RS-32", "Helios 32", "Airy 96", "Ruby Plus 128"])
 def test_angles_are_asked_for(name: str) -> None:
-    for evidence, got in (
+    for evidence, found in (
         (_evidence(name, with_difop=False), "no DIFOP packet"),
         (
             replace(
@@ -142,7 +142,7 @@ def test_angles_are_asked_for(name: str) -> None:
         with pytest.raises(RigError) as caught:
             built_in(evidence).lidar({}, evidence)
         text = str(caught.value)
-        assert f"got {got}" in text
+        assert f"found {found}" in text
         assert "7788" in text
         assert "--metadata" in text
         assert "\n" not in text
@@ -162,7 +162,7 @@ def test_a_sensor_that_is_silent_cannot_be_made() -> None:
     file = robosense.read_calibration(Path("a.csv"), _csv("Helios 32"))
     assert file is not None
     for calibration in (robosense.BUILT_IN[0], file):
-        with pytest.raises(RigError, match="wanted a packet of it in the first 10 seconds"):
+        with pytest.raises(RigError, match="expected a packet of it in the first 10 seconds"):
             calibration.lidar({}, None)
 
 
@@ -250,7 +250,7 @@ def test_a_csv_of_angles() -> None:
         lidar, own = file.lidar({}, evidence), built_in(evidence).lidar({}, evidence)
         np.testing.assert_allclose(lidar.beams.direction, own.beams.direction, atol=1e-9)
         assert lidar.calibration == "folder/a.csv"
-        with pytest.raises(RigError, match="wanted packets of a ROBOSENSE 32-line lidar"):
+        with pytest.raises(RigError, match="expected packets of a ROBOSENSE 32-line lidar"):
             file.lidar({}, _evidence("Helios 16"))
 
 
@@ -271,17 +271,17 @@ def test_files_that_are_no_angles(content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "wanted"),
+    ("content", "expected"),
     [
-        (b"1.0,2.0\n" * 31, "wanted 16, 32, 48, 80, 96 or 128 lines `elevation,azimuth`, got 31"),
-        (b"1.0,2.0\n" * 15 + b"95,0\n", "in line 16, got '95,0'"),
-        (b"elevation,azimuth\n" + b"1,2\n" * 15 + b"1,x\n", "in line 17, got '1,x'"),
-        (b"1.0,2.0\n" * 15 + b"nan,0\n", "in line 16, got 'nan,0'"),
+        (b"1.0,2.0\n" * 31, "expected 16, 32, 48, 80, 96 or 128 lines `elevation,azimuth`, found 31"),
+        (b"1.0,2.0\n" * 15 + b"95,0\n", "in line 16, found '95,0'"),
+        (b"elevation,azimuth\n" + b"1,2\n" * 15 + b"1,x\n", "in line 17, found '1,x'"),
+        (b"1.0,2.0\n" * 15 + b"nan,0\n", "in line 16, found 'nan,0'"),
     ],
 )
-def test_angles_that_cannot_be(content: bytes, wanted: str) -> None:
+def test_angles_that_cannot_be(content: bytes, expected: str) -> None:
     with pytest.raises(RigError) as caught:
         robosense.read_calibration(Path("a.csv"), content)
     assert str(caught.value).startswith("a.csv: ROBOSENSE angles: ")
-    assert wanted in str(caught.value)
+    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)

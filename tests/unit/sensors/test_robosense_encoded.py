@@ -103,11 +103,11 @@ def test_point_packets_alone_tell_the_returns(name: str, mode: str) -> None:
     lidar = file.lidar({}, evidence)
     assert lidar.mode.startswith(f"{'dual' if mode == DUAL else 'single'} return")
     assert set(lidar.return_types) == {0}
-    wanted = directions(spec, fan(spec), np.arange(1))[0]
+    expected = directions(spec, fan(spec), np.arange(1))[0]
     cosine, sine = np.cos(np.radians(20.0)), np.sin(np.radians(20.0))
     direction = lidar.beams.direction
     found = cosine * direction[0] + sine * direction[1] + direction[2]
-    np.testing.assert_allclose(found[:, 2], wanted[:, 2], atol=1e-6)
+    np.testing.assert_allclose(found[:, 2], expected[:, 2], atol=1e-6)
 
 
 @pytest.mark.parametrize("mount", AIRY_MOUNTS)

@@ -88,8 +88,8 @@ def packets(
 def test_bytes_of_single_return_packets(model: str, size: int, places: dict[int, str]) -> None:
     (payload,) = packets(model)
     assert len(payload) == size
-    for at, wanted in places.items():
-        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+    for at, expected in places.items():
+        assert payload[at : at + len(bytes.fromhex(expected))] == bytes.fromhex(expected), at
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,8 @@ def test_bytes_of_single_return_packets(model: str, size: int, places: dict[int,
 )
 def test_bytes_of_dual_return_packets(model: str, places: dict[int, str]) -> None:
     (payload,) = packets(model, DUAL)
-    for at, wanted in places.items():
-        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+    for at, expected in places.items():
+        assert payload[at : at + len(bytes.fromhex(expected))] == bytes.fromhex(expected), at
 
 
 def test_dual_packets_of_128_lines_share_a_column() -> None:
@@ -203,15 +203,15 @@ def test_a_beam_points_where_the_formula_says() -> None:
     spec = RobosenseSpec("RS-16", start_deg=90.0)
     angles = Angles(np.full(16, 10.0), np.full(16, 3.0))
     azimuth, elevation = math.radians(93.01008), math.radians(10)
-    wanted = [
+    expected = [
         math.cos(elevation) * math.cos(azimuth),
         -math.cos(elevation) * math.sin(azimuth),
         math.sin(elevation),
     ]
-    assert directions(spec, angles, np.arange(1))[0, 1] == pytest.approx(wanted)
+    assert directions(spec, angles, np.arange(1))[0, 1] == pytest.approx(expected)
     lens = math.radians(90.01008)
-    wanted = [0.03825 * math.cos(lens), -0.03825 * math.sin(lens), 0.0]
-    assert origins(spec, np.arange(1))[0, 1] == pytest.approx(wanted)
+    expected = [0.03825 * math.cos(lens), -0.03825 * math.sin(lens), 0.0]
+    assert origins(spec, np.arange(1))[0, 1] == pytest.approx(expected)
 
 
 def test_reversed_rotor_turns_counterclockwise() -> None:
@@ -251,8 +251,8 @@ def test_angles_of_device_packets(model: str, places: dict[int, str]) -> None:
         angles.elevation_deg[2:8], angles.elevation_deg[8] = -10.0, 15.0
     angles.azimuth_deg[:2] = -3.0, 0.5
     payload = difop(RobosenseSpec(model), angles)
-    for at, wanted in places.items():
-        assert payload[at : at + len(bytes.fromhex(wanted))] == bytes.fromhex(wanted), at
+    for at, expected in places.items():
+        assert payload[at : at + len(bytes.fromhex(expected))] == bytes.fromhex(expected), at
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def fault(content: str | bytes, path: Path = PATH) -> str:
         read(content, path)
     message = str(caught.value)
     assert "\n" not in message
-    assert re.fullmatch(rf"{path}: .*wanted .+, got .+; .+", message)
+    assert re.fullmatch(rf"{path}: .*expected .+, found .+; .+", message)
     assert len(message) < 250
     return message
 
@@ -138,47 +138,47 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (yaml_of(sixteen()[:15]), "lasers: wanted 16, 32, 64, 128 lasers, got 15"),
-        (yaml_of([], "num_lasers: 16\nlaser_id: 1\n"), "lasers: wanted a list of lasers, got none"),
-        ("num_lasers: 64\ndistance_resolution: 0.002\n", "lasers: wanted a list of lasers"),
-        ("lasers: many\nnum_lasers: 1\nlaser_id: 3", "lasers: wanted a list of lasers"),
-        ("[\nlasers: 16, laser_id: 3]\n", "lasers: wanted a list of lasers, got none"),
-        ("lasers:\n" + "- laser_id\n" * 16, "lasers[0]: wanted a mapping with laser_id"),
+        (yaml_of(sixteen()[:15]), "lasers: expected 16, 32, 64, 128 lasers, found 15"),
+        (yaml_of([], "num_lasers: 16\nlaser_id: 1\n"), "lasers: expected a list of lasers, found none"),
+        ("num_lasers: 64\ndistance_resolution: 0.002\n", "lasers: expected a list of lasers"),
+        ("lasers: many\nnum_lasers: 1\nlaser_id: 3", "lasers: expected a list of lasers"),
+        ("[\nlasers: 16, laser_id: 3]\n", "lasers: expected a list of lasers, found none"),
+        ("lasers:\n" + "- laser_id\n" * 16, "lasers[0]: expected a mapping with laser_id"),
         (
             yaml_of(sixteen(laser_id=16)),
-            "lasers[3].laser_id: wanted a laser id from 0 to 15, got 16",
+            "lasers[3].laser_id: expected a laser id from 0 to 15, found 16",
         ),
-        (yaml_of(sixteen(laser_id=-1)), "lasers[3].laser_id: wanted a laser id from 0 to 15"),
-        (yaml_of(sixteen(laser_id="x")), "lasers[3].laser_id: wanted a laser id"),
-        (yaml_of(sixteen(laser_id=2)), "lasers[3].laser_id: wanted each id once, got 2 again"),
-        (yaml_of(sixteen(vert_correction=".nan")), "lasers[3].vert_correction: wanted a finite"),
-        (yaml_of(sixteen(rot_correction=".inf")), "lasers[3].rot_correction: wanted a finite"),
-        (yaml_of(sixteen(rot_correction="nan")), "got nan"),
-        (yaml_of(sixteen(vert_correction="")), "lasers[3].vert_correction: wanted a finite number"),
-        (yaml_of(sixteen(vert_correction="[1]")), "got ['1']"),
+        (yaml_of(sixteen(laser_id=-1)), "lasers[3].laser_id: expected a laser id from 0 to 15"),
+        (yaml_of(sixteen(laser_id="x")), "lasers[3].laser_id: expected a laser id"),
+        (yaml_of(sixteen(laser_id=2)), "lasers[3].laser_id: expected each id once, found 2 again"),
+        (yaml_of(sixteen(vert_correction=".nan")), "lasers[3].vert_correction: expected a finite"),
+        (yaml_of(sixteen(rot_correction=".inf")), "lasers[3].rot_correction: expected a finite"),
+        (yaml_of(sixteen(rot_correction="nan")), "found nan"),
+        (yaml_of(sixteen(vert_correction="")), "lasers[3].vert_correction: expected a finite number"),
+        (yaml_of(sixteen(vert_correction="[1]")), "found ['1']"),
         # Degrees instead of radians.
-        (yaml_of(sixteen(vert_correction=-15)), "wanted at most 1.5708 rad either way, got -15"),
-        (yaml_of(sixteen(rot_correction=1.6)), "lasers[3].rot_correction: wanted at most 1.5708"),
+        (yaml_of(sixteen(vert_correction=-15)), "expected at most 1.5708 rad either way, found -15"),
+        (yaml_of(sixteen(rot_correction=1.6)), "lasers[3].rot_correction: expected at most 1.5708"),
         # Centimetres instead of metres.
-        (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: wanted at most 5 m"),
-        (yaml_of(sixteen(vert_offset_correction=19.5)), "wanted at most 1 m either way, got 19.5"),
-        (yaml_of(sixteen(horiz_offset_correction=-2.6)), "wanted at most 1 m either way"),
+        (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: expected at most 5 m"),
+        (yaml_of(sixteen(vert_offset_correction=19.5)), "expected at most 1 m either way, found 19.5"),
+        (yaml_of(sixteen(horiz_offset_correction=-2.6)), "expected at most 1 m either way"),
         (
             yaml_of(sixteen(), "num_lasers: 32\n"),
-            "num_lasers: wanted 16, the lasers listed, got 32",
+            "num_lasers: expected 16, the lasers listed, found 32",
         ),
         (
             yaml_of(sixteen(), "distance_resolution: 2\n"),
-            "distance_resolution: wanted 0.0005 to 0.02 m",
+            "distance_resolution: expected 0.0005 to 0.02 m",
         ),
-        (yaml_of(sixteen(), "distance_resolution: fine\n"), "distance_resolution: wanted a finite"),
-        (yaml_of(sixteen())[:-30], ": wanted YAML, got did not find"),
-        (yaml_of(sixteen(), "a: &a [1]\nb: *a\n"), "wanted values written out, got the alias *a"),
-        (yaml_of(sixteen(), "a: " + "[" * 50_000), "wanted at most 8 levels, got more"),
-        (yaml_of(sixteen(), "a: \x07"), "wanted YAML, got"),
-        (yaml_of(sixteen(), "---\nb: 1\n"), "wanted YAML, got"),
-        (yaml_of(sixteen(), "#" * MAX_BYTES), f"wanted at most {MAX_BYTES} bytes, got 100"),
-        (yaml_of(sixteen()).encode() + b"# \xff", "wanted UTF-8 text, got the byte 0xff"),
+        (yaml_of(sixteen(), "distance_resolution: fine\n"), "distance_resolution: expected a finite"),
+        (yaml_of(sixteen())[:-30], ": expected YAML, found did not find"),
+        (yaml_of(sixteen(), "a: &a [1]\nb: *a\n"), "expected values written out, found the alias *a"),
+        (yaml_of(sixteen(), "a: " + "[" * 50_000), "expected at most 8 levels, found more"),
+        (yaml_of(sixteen(), "a: \x07"), "expected YAML, found"),
+        (yaml_of(sixteen(), "---\nb: 1\n"), "expected YAML, found"),
+        (yaml_of(sixteen(), "#" * MAX_BYTES), f"expected at most {MAX_BYTES} bytes, found 100"),
+        (yaml_of(sixteen()).encode() + b"# \xff", "expected UTF-8 text, found the byte 0xff"),
     ],
 )
 def test_broken_yaml(text: str | bytes, told: str) -> None:

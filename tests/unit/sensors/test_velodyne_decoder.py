@@ -261,8 +261,8 @@ def test_points_of_a_hdl_64e(model: str, mode: str) -> None:
     spec = VelodyneSpec(model, mode, start_azimuth_deg=200.0)
     seen = made_of(spec, packets=20)
     met_m = seen.counts[..., 0] * 0.002 + np.array(spec.table.dist_m)
-    wanted = origins(spec, seen.columns)
-    wanted = wanted + met_m[..., None] * directions(spec, seen.columns)
+    expected = origins(spec, seen.columns)
+    expected = expected + met_m[..., None] * directions(spec, seen.columns)
     ranges, _ = pixels(seen.lidar, seen.sent.payloads)
     heads = seen.lidar.heads(seen.sent.payloads, seen.sent.host_ns)
     for height, options in ((0.0, {}), (1.0, {"vertical_offset": "off"})):
@@ -272,7 +272,7 @@ def test_points_of_a_hdl_64e(model: str, mode: str) -> None:
         points = np.empty((*met_m.shape, 3), np.float32)
         projection.aim(np.zeros(len(ranges), np.int64), heads.encoder.reshape(-1))
         projection.points(np.ascontiguousarray(ranges[..., 0]), points)
-        lowered = wanted - [0, 0, height] * np.array(spec.table.vertical_m)[:, None]
+        lowered = expected - [0, 0, height] * np.array(spec.table.vertical_m)[:, None]
         away_m = np.linalg.norm(points - lowered, axis=-1)
         assert (away_m / met_m).max() < np.radians(ANGLE_DEG)
 

@@ -38,14 +38,14 @@ def counted(spec: VelodyneSpec, packets: int) -> U8Array:
     return encode(spec, distance, level).payloads
 
 
-def check_bytes(payload: U8Array, wanted: dict[int, str]) -> None:
-    for at, text in wanted.items():
+def check_bytes(payload: U8Array, expected: dict[int, str]) -> None:
+    for at, text in expected.items():
         found = payload[at : at + len(text) // 2].tobytes().hex()
         assert (at, found) == (at, text)
 
 
 @pytest.mark.parametrize(
-    ("spec", "wanted"),
+    ("spec", "expected"),
     [
         (
             VelodyneSpec("VLP-16"),
@@ -126,10 +126,10 @@ def check_bytes(payload: U8Array, wanted: dict[int, str]) -> None:
         ),
     ],
 )
-def test_bytes_of_a_packet(spec: VelodyneSpec, wanted: dict[int, str]) -> None:
+def test_bytes_of_a_packet(spec: VelodyneSpec, expected: dict[int, str]) -> None:
     payload = counted(spec, 1)[0]
     assert payload.shape == (1206,)
-    check_bytes(payload, wanted)
+    check_bytes(payload, expected)
 
 
 @pytest.mark.parametrize(
@@ -294,8 +294,8 @@ def test_tables_are_complete() -> None:
 
 def test_the_known_sentence() -> None:
     # The example of many NMEA texts, with its checksum.
-    wanted = b"$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\r\n"
-    assert gprmc(datetime(1994, 3, 23, 12, 35, 19)) == wanted
+    expected = b"$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\r\n"
+    assert gprmc(datetime(1994, 3, 23, 12, 35, 19)) == expected
 
 
 def test_position_packets() -> None:

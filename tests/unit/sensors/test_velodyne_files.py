@@ -76,7 +76,7 @@ def test_a_file_of_no_model() -> None:
             f"vert_correction: {math.radians(old)!r}\n",
             f"vert_correction: {math.radians(new)!r} \n",
         )
-    with pytest.raises(RigError, match=r"odd\.yaml: .*wanted vertical angles of .*got some"):
+    with pytest.raises(RigError, match=r"odd\.yaml: .*expected vertical angles of .*found some"):
         velodyne.read_calibration(Path("odd.yaml"), text.encode())
 
 
@@ -101,8 +101,8 @@ def test_a_hdl_64e_needs_one() -> None:
         "HDL-64E S3": 100,
         "HDL-64E S2": READABLE,
     }
-    wanted = "HDL-64E: wanted its calibration, got none; give the unit's YAML or db.xml with"
+    expected = "HDL-64E: expected its calibration, found none; give the unit's YAML or db.xml with"
     for one in velodyne.BUILT_IN:
         if fits[one.model]:
-            with pytest.raises(RigError, match=wanted):
+            with pytest.raises(RigError, match=expected):
                 one.lidar({}, evidence(sent))

@@ -190,6 +190,6 @@ def test_many_points_equal_the_scalar_loop(name: str) -> None:
     points = project(
         file, azimuth_deg, range_m.astype(np.float64), firing_ns[None].astype(np.int64), hz=15.0
     )
-    wanted = scalar_points(file, np.deg2rad(azimuth_deg), 15e-9, firing_ns, range_m)
+    expected = scalar_points(file, np.deg2rad(azimuth_deg), 15e-9, firing_ns, range_m)
     # Float32 at 120 m: 8e-6 m a step; a count of distance is 2e-3 m.
-    assert np.abs(points - wanted).max() < 5e-5
+    assert np.abs(points - expected).max() < 5e-5

@@ -47,9 +47,9 @@ def test_velodyne(
     product: int, row_us: float, model: str, mode: int, azimuths: int, returns: str
 ) -> None:
     packets = velodyne_packets(bytes((mode, product)), row_us, azimuths=azimuths)
-    wanted = with_lack(model, f"Velodyne lidar {model}, {returns}")
-    assert named(packets) == wanted
-    assert named(packets[:1]) == wanted
+    expected = with_lack(model, f"Velodyne lidar {model}, {returns}")
+    assert named(packets) == expected
+    assert named(packets[:1]) == expected
 
 
 @pytest.mark.parametrize(("mode", "azimuths"), [(0x37, 12), (0x39, 6)])
