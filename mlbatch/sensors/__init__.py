@@ -1,7 +1,7 @@
-"""All makers' modules behind one door: models, calibration files, names of unknown streams.
+"""Lidar vendors as plug-ins: models, calibration files, names of unknown streams.
 
-A folder of this package is a vendor. Its module `sensor` is the plug-in, found by its place; it
-offers what `Plugin` lists.
+Each folder of this package is a vendor; its module `sensor` is the plug-in (`Plugin`), found by its
+place. Vendors are asked in alphabetical order, and a vendor is imported only when it is asked.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ __all__ = [
     "read_calibration",
 ]
 
-# No calibration file comes near; what is larger is a recording or something else altogether.
+# Calibration files are far smaller; a larger file is a recording or something else.
 MAX_CALIBRATION_BYTES = 16_000_000
 
 
 class Plugin(Protocol):
-    """What a maker's module offers."""
+    """What the module `sensor` of a vendor offers."""
 
     VENDOR: str
     MODELS: tuple[SensorModel, ...]
-    # Calibrations that need no file: of models whose beams do not differ from unit to unit.
+    # Calibrations without a file: models whose beams do not differ from unit to unit.
     BUILT_IN: tuple[Calibration, ...]
 
     def read_calibration(self, path: Path, content: bytes) -> Calibration | None:
-        """The calibration in a file; None if it is not this maker's, RigError if unusable."""
+        """Parse a calibration file; None if it is another vendor's, RigError if it is damaged."""
         ...
 
     def describe(self, size: int, sample: U8Array) -> str | None:
-        """What payloads (k, size) of an unknown stream are; None if not this maker's."""
+        """Name payloads (k, size) of an unknown stream; None if they are not this vendor's."""
         ...
 
 
 def plugins() -> tuple[Plugin, ...]:
-    """The makers' modules, in the order of their names."""
-    return tuple(_one_by_one())
+    """All plug-ins, sorted by name."""
+    return tuple(_load_lazily())
 
 
-def _one_by_one() -> Iterator[Plugin]:
-    """The same; a maker's tables are loaded when it is asked, and those before could not answer."""
+def _load_lazily() -> Iterator[Plugin]:
+    """All plug-ins, sorted by name, each imported when the iterator reaches it."""
     for name in _names():
         yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
 
@@ -75,12 +75,12 @@ def models() -> tuple[SensorModel, ...]:
 
 
 def built_in() -> tuple[Calibration, ...]:
-    """Calibrations of all makers that need no file."""
+    """Calibrations of all vendors that need no file."""
     return tuple(calibration for plugin in plugins() for calibration in plugin.BUILT_IN)
 
 
 def read_calibration(path: Path) -> Calibration | None:
-    """The calibration in a file of any maker, or None if it is none; RigError if unreadable."""
+    """Read a calibration file of any vendor; None if it is none, RigError if it is unreadable."""
     try:
         if not path.is_file():
             kind = "a directory" if path.is_dir() else "no such file"
@@ -95,12 +95,12 @@ def read_calibration(path: Path) -> Calibration | None:
 
 
 def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
-    """The calibration in a text from a file or a topic (`origin`), or None if it is none."""
-    found = (plugin.read_calibration(origin, content) for plugin in _one_by_one())
+    """Parse a calibration from a file or a topic (`origin`); None if it is none."""
+    found = (plugin.read_calibration(origin, content) for plugin in _load_lazily())
     return next((calibration for calibration in found if calibration is not None), None)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """What payloads (k, size) of an unknown stream are, or None if no maker knows them."""
-    found = (plugin.describe(size, sample) for plugin in _one_by_one())
+    """Name payloads (k, size) of an unknown stream; None if no vendor knows them."""
+    found = (plugin.describe(size, sample) for plugin in _load_lazily())
     return next((text for text in found if text is not None), None)

@@ -1,4 +1,4 @@
-"""What lidars have in common whose packets carry an azimuth: defaults of the protocol `Lidar`."""
+"""Defaults of the protocol `Lidar` for lidars without serial number, IMU or known extrinsics."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from mlbatch.types import BoolArray, F64Array, I64Array, ImuSamples, U8Array
 
 
 class BaseLidar:
-    """Base of the makers' lidars: no serial number in the packets, no IMU, no mounting known.
+    """Base class of the vendors' lidars.
 
-    A maker's class sets what is only declared here, and gives `faults`, `heads` and `read`.
+    A subclass assigns the attributes that are only declared here and implements `faults`, `heads`
+    and `read`.
     """
 
     vendor: str
@@ -50,11 +51,11 @@ class BaseLidar:
     notes: tuple[str, ...] = ()
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """All: nothing in the packets tells units apart."""
+        """All packets: they carry no serial number."""
         return np.ones(len(packets), np.bool_)
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """A number that only packets of equal content share."""
+        """(P,) hash of the content, equal for equal packets."""
         return content_keys(packets)
 
     def is_imu(self, size: int) -> bool:
@@ -67,22 +68,22 @@ class BaseLidar:
         return ImuSamples(sensor, np.empty(0, np.int64), nothing, nothing)
 
     def sensor_from_imu(self) -> F64Array:
-        """Unknown: identity."""
+        """Identity: the pose is unknown."""
         return np.eye(4)
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """The vectors of the beams suffice."""
+        """None: the beam vectors suffice."""
         return None
 
 
 def content_keys(packets: U8Array) -> I64Array:
-    """(P,) numbers >= 0 that packets (P, size) of equal content share; others hardly ever do.
+    """(P,) hashes >= 0 of packets (P, size).
 
-    A sum of the packet's words times odd numbers, modulo 2**64: one wrong bit changes it.
+    The sum of the packet's words times odd numbers, modulo 2**64: a single bit changes it.
     """
     size = packets.shape[1]
     words = size // 8
-    # What is left beyond whole words stands in a last one, which may overlap the others.
+    # Bytes beyond whole words are hashed as the last eight bytes, which may overlap the words.
     if words and packets.strides[1] == 1:
         keys = np.einsum("ij,j->i", packets[:, : words * 8].view("<u8"), _odd_numbers(words))
         if size % 8:

@@ -1,13 +1,13 @@
 """CRC-64/XZ and CRC-32/MPEG-2 of many packets at once.
 
-CRC-64: facts/ouster.md section 2, "Packet footer": reflected polynomial 0xC96C5795D7870F42, start
-and final xor all ones. The checksum is linear: with the first eight bytes inverted, the register
-after words w0 .. wn is the xor of every word moved over the words behind it. So words are folded in
-pairs, a whole level of all packets in one step, and no loop runs over bytes.
+CRC-64: docs/sources/ouster.md section 2, "Packet footer": reflected polynomial 0xC96C5795D7870F42,
+start and final xor all ones. The checksum is linear: with the first eight bytes inverted, the
+register after words w0 .. wn is the xor of every word shifted over the words after it. So words are
+folded in pairs, one level of all packets a step, without a loop over bytes.
 
-CRC-32: facts/hesai.md section 7: polynomial 04C11DB7, start all ones, no reflection, no final xor.
-It is linear, too: it is the xor of what every byte alone, followed by zeros, would give; all ones
-at the start are the same as the first four bytes inverted.
+CRC-32: docs/sources/hesai.md section 7: polynomial 04C11DB7, start all ones, no reflection, no
+final xor. Also linear: the xor of the checksums of every byte alone, followed by zeros; a start of
+all ones equals inverting the first four bytes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def crc64(messages: U8Array) -> U64Array:
     """Checksums (P,) of messages (P, bytes) of one size, eight bytes or more."""
     count, size = messages.shape
     words = 1 << max(0, -(-size // _WORD) - 1).bit_length()
-    # Zero words in front move to zero, so they change nothing.
+    # Leading zero words shift to zero and change nothing.
     padded = np.zeros((count, words * _WORD), np.uint8)
     padded[:, -size:] = messages
     first = words * _WORD - size
@@ -46,7 +46,7 @@ def crc64(messages: U8Array) -> U64Array:
 
 @lru_cache(maxsize=32)
 def _shift_tables(level: int) -> U64Array:
-    """Tables (8, 256) that move a register over 2**level words: one table for each of its bytes."""
+    """Tables (8, 256), one per byte of the register, that shift it over 2**level words."""
     values = np.arange(256, dtype=np.uint64)[None, :]
     positions = np.arange(_WORD, dtype=np.uint64)[:, None] * np.uint64(8)
     table: U64Array = values << positions
@@ -78,7 +78,7 @@ def crc32(messages: U8Array) -> U32Array:
     table = _contributions(size)
     place = np.arange(size) << 8
     sums = np.empty(count, np.uint32)
-    # A few rows at a time, so that what is looked up stays in the caches.
+    # A few rows at a time, so that the lookups stay in the caches.
     for begin in range(0, count, _ROWS):
         rows = messages[begin : begin + _ROWS].astype(np.intp)
         rows[:, :_START_BYTES] ^= 0xFF
@@ -89,7 +89,7 @@ def crc32(messages: U8Array) -> U32Array:
 
 @lru_cache(maxsize=16)
 def _contributions(size: int) -> npt.NDArray[np.uint32]:
-    """What each byte value at each place of a message gives: (size * 256,)."""
+    """(size * 256,) checksum of each byte value at each position of a message."""
     table = np.empty((size, 256), np.uint32)
     last = np.arange(256, dtype=np.uint32) << np.uint32(24)
     for _ in range(8):

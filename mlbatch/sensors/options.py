@@ -1,4 +1,4 @@
-"""Options of `--decode`: what they may be, whatever makers a recording holds."""
+"""Options of `--decode`: keys and values that any vendor accepts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from mlbatch.errors import UsageError
 
 _SWITCH = ("on", "off")
-# CONTRACT.md section 2. `packet_stamp`: what a Velodyne HDL-32E stamps (facts/velodyne.md, 2).
+# packet_stamp: whether a Velodyne HDL-32E stamps the start or the end of a packet
+# (docs/sources/velodyne.md section 2).
 DECODE_OPTIONS: Mapping[str, tuple[str, ...]] = {
     "crc": ("check",),
     "firing_azimuth": _SWITCH,
@@ -18,7 +19,7 @@ DECODE_OPTIONS: Mapping[str, tuple[str, ...]] = {
 
 
 def check_options(options: Mapping[str, str]) -> None:
-    """Refuse keys and values that no maker knows."""
+    """Raise UsageError for keys and values that no vendor knows."""
     for key, value in options.items():
         if key not in DECODE_OPTIONS:
             known = ", ".join(DECODE_OPTIONS)

@@ -1,6 +1,7 @@
-"""Reading numbers out of payloads of an unknown stream, (k, size) uint8, a row each.
+"""Numbers and patterns in payloads of an unknown stream, (k, size) uint8.
 
-Source: the byte orders of facts/velodyne.md, facts/hesai.md, facts/robosense.md, facts/others.md.
+Source: the byte orders of docs/sources/velodyne.md, docs/sources/hesai.md,
+docs/sources/robosense.md, docs/sources/others.md.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import numpy as np
 from mlbatch.median import median
 from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
 
-# What `discover` and `survey` look for in a description.
+# Discovery searches descriptions for this text.
 NO_DECODER = ": no decoder in this version"
 US_PER_MINUTE = 60_000_000
-_TICKS_PER_TURN = 36000
-_MOST_LOST_TURN = _TICKS_PER_TURN // 2
+_TICKS_PER_REVOLUTION = 36000
+_MAX_LOST_ANGLE = _TICKS_PER_REVOLUTION // 2
 Order = Literal["<", ">"]
 
 
@@ -29,14 +30,14 @@ def payload_rows(size: int, sample: U8Array) -> U8Array | None:
 
 
 def number(packets: U8Array, at: int, width: int, order: Order = "<") -> I64Array:
-    """(k,) unsigned numbers of `width` bytes at byte `at`; the bytes must be there."""
-    places = np.arange(width) if order == "<" else np.arange(width)[::-1]
-    shifted: I64Array = packets[:, at : at + width].astype(np.int64) << (8 * places)
+    """(k,) unsigned numbers of `width` bytes at byte `at`, which must be within the payloads."""
+    shifts = np.arange(width) if order == "<" else np.arange(width)[::-1]
+    shifted: I64Array = packets[:, at : at + width].astype(np.int64) << (8 * shifts)
     return np.asarray(shifted.sum(axis=1), np.int64)
 
 
 def has_bytes(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
-    """(k,) which payloads hold these bytes at byte `at`."""
+    """(k,) whether payloads have these bytes at byte `at`."""
     if packets.shape[1] < at + len(magic):
         return np.zeros(len(packets), bool)
     same = packets[:, at : at + len(magic)] == np.frombuffer(magic, np.uint8)
@@ -44,12 +45,12 @@ def has_bytes(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
 
 
 def majority(packets: U8Array, good: BoolArray) -> U8Array | None:
-    """The good payloads if they are the majority: one damaged packet must not hide a stream."""
+    """The good payloads if they are more than half: a damaged packet must not hide a stream."""
     return packets[good] if 2 * int(good.sum()) > len(packets) else None
 
 
 def most_common(values: I64Array) -> int:
-    """The value that occurs most often."""
+    """The most frequent value."""
     found, counts = np.unique(values, return_counts=True)
     return int(found[counts.argmax()])
 
@@ -62,22 +63,22 @@ def block_azimuths(packets: U8Array, begin: int, stride: int, count: int, order:
 
 
 def in_pairs(azimuth: I64Array) -> bool:
-    """Whether blocks come in pairs of one azimuth, which is how two returns are sent."""
+    """Whether blocks come in pairs of equal azimuth, as dual returns are sent."""
     even = azimuth[:, 0::2]
     odd = azimuth[:, 1::2]
     width = min(even.shape[1], odd.shape[1])
     if width < 2:
         return False
-    turning = median((even[:, 1:] - even[:, :-1]) % _TICKS_PER_TURN) > 0
-    return bool(turning) and float((even[:, :width] == odd[:, :width]).mean()) > 0.75
+    step = median((even[:, 1:] - even[:, :-1]) % _TICKS_PER_REVOLUTION) > 0
+    return bool(step) and float((even[:, :width] == odd[:, :width]).mean()) > 0.75
 
 
 def block_time_us(stamp_us: I64Array, azimuth: I64Array, wrap_us: int) -> float | None:
-    """Time from azimuth to azimuth of a packet, by the rotor's speed between packets.
+    """Time from azimuth to azimuth within a packet, by the rotor speed between packets.
 
-    It tells models apart whatever the returns, and though packets are lost; stamp_us: (k,), wraps
-    at `wrap_us`; azimuth: (k, blocks), pairs taken as one. None where the rotor seems to rest, or a
-    packet has one azimuth.
+    Distinguishes models in all return modes, and in spite of lost packets. stamp_us: (k,), wraps
+    at `wrap_us`; azimuth: (k, blocks), equal pairs count once. None if the rotor rests, or if a
+    packet has a single azimuth.
     """
     if len(stamp_us) < 2:
         return None
@@ -86,10 +87,10 @@ def block_time_us(stamp_us: I64Array, azimuth: I64Array, wrap_us: int) -> float 
     if azimuth.shape[1] < 2:
         return None
     step_us = np.diff(stamp_us) % wrap_us
-    turned = np.diff(azimuth[:, 0]) % _TICKS_PER_TURN
-    usable = (step_us > 0) & (step_us < US_PER_MINUTE) & (turned > 0) & (turned < _MOST_LOST_TURN)
+    turned = np.diff(azimuth[:, 0]) % _TICKS_PER_REVOLUTION
+    usable = (step_us > 0) & (step_us < US_PER_MINUTE) & (turned > 0) & (turned < _MAX_LOST_ANGLE)
     if not usable.any():
         return None
     speed = median(turned[usable] / step_us[usable])
-    span: F64Array = ((azimuth[:, -1] - azimuth[:, 0]) % _TICKS_PER_TURN).astype(np.float64)
+    span: F64Array = ((azimuth[:, -1] - azimuth[:, 0]) % _TICKS_PER_REVOLUTION).astype(np.float64)
     return float(median(span) / (azimuth.shape[1] - 1) / speed)

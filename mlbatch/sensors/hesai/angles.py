@@ -1,9 +1,10 @@
-"""Angle files of HESAI lidars: csv of turning models, dat of the AT128 (facts/hesai.md section 6).
+"""Angle files of HESAI lidars: csv of spinning models, dat of the AT128.
 
-A csv has the columns channel (from 1), elevation and azimuth in degrees, below a line that names
-them; before it may stand a byte-order mark, comments and a line `EEFF,1,1`, behind it the SHA-256
-of all text before, taken with CRLF line ends (recomputed for the JT128 file of HesaiTechnology/
-HesaiLidar_SDK_2.0 `correction/angle_correction`). A dat is binary and ends with its SHA-256.
+Source: docs/sources/hesai.md section 6. A csv has the columns channel (from 1), elevation and
+azimuth in degrees, below a line of titles; it may begin with a byte-order mark, comments and a line
+`EEFF,1,1`, and end with the SHA-256 of all text before, taken with CRLF line ends (recomputed for
+the JT128 file of HesaiTechnology/ HesaiLidar_SDK_2.0 `correction/angle_correction`). A dat is
+binary and ends with its SHA-256.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from mlbatch.units import RAD_PER_DEG
 
 _CHANNEL_TITLES = ("laser id", "laserid", "laser", "channel", "channel id")
 _ANGLE_TITLES = ("elevation", "azimuth")
-# The line of titles comes this early, or the file is another one.
+# A file without titles in its first lines is another kind of file.
 _FIRST_LINES = 16
-# Channels of all models with such files; another number tells of a file that was cut off.
+# Channels of all models with such files; other numbers mean a truncated file.
 _CHANNELS = (16, 20, 32, 40, 64, 90, 128)
 _HIGHEST_DEG = {"elevation": 90.0, "azimuth": 360.0}
 _SHA256 = re.compile(r"[0-9a-fA-F]{64}")
 _SHOWN_CHARS = 60
 _REMEDY = "read the correction file from the lidar again"
 
-# Head of an AT128 file, and what it must say (facts/hesai.md section 6).
+# Head of an AT128 file, and its expected values (docs/sources/hesai.md section 6).
 AT128_CHANNELS = 128
 AT128_STEPS = 180
 _AT128_SIZE = 47176
@@ -60,7 +61,7 @@ _AT128_BODY = np.dtype(
     ]
 )
 _AT128_EXPECTED = {"version": [1, 5], "channels": [128], "mirrors": [3], "frames": [3]}
-# Angles count in resolution / 25600 deg; 2 in the files that are known.
+# Angles count in resolution / 25600 deg; the resolution of known files is 2.
 _RESOLUTIONS = (1, 8)
 _ANGLE_UNITS_PER_DEG = 25600
 _ADJUST_UNITS_PER_DEG = 100
@@ -68,7 +69,7 @@ _ADJUST_UNITS_PER_DEG = 100
 
 @dataclass(frozen=True, slots=True)
 class HesaiAngles:
-    """Angles of a unit's beams where its rotor is at zero, (channels,), azimuth clockwise."""
+    """Beam angles at rotor angle zero, (channels,), azimuth clockwise."""
 
     path: Path
     azimuth_rad: F64Array
@@ -77,10 +78,10 @@ class HesaiAngles:
 
 @dataclass(frozen=True, slots=True)
 class At128File:
-    """Angles of an AT128, whose rotor turns mirrors.
+    """Angles of an AT128, whose rotor carries mirrors.
 
-    start_rad, end_rad: (3,) rotor angles between which each mirror's field lies; azimuth_rad,
-    elevation_rad: (128,); adjust: (128, 180), added at rotor angles 0, 2, 4 .. 358 deg.
+    start_rad, end_rad: (3,) range of rotor angles of each mirror; azimuth_rad, elevation_rad:
+    (128,); adjust: (128, 180), added at rotor angles 0, 2, 4 .. 358 deg.
     """
 
     path: Path
@@ -93,7 +94,7 @@ class At128File:
 
 
 def read_angles(path: Path, content: bytes) -> HesaiAngles | None:
-    """Angles of a csv; None if it is no HESAI csv, RigError if it is a damaged one."""
+    """Parse a csv; None if it is no HESAI csv, RigError if it is damaged."""
     if b"\0" in content:
         return None
     text = content.decode("utf-8-sig", errors="replace")
@@ -122,7 +123,7 @@ def read_angles(path: Path, content: bytes) -> HesaiAngles | None:
 
 
 def read_at128(path: Path, content: bytes) -> At128File | None:
-    """The angles of an AT128 file; None if it is none, RigError if it is damaged."""
+    """Parse an AT128 file; None if it is none, RigError if it is damaged."""
     if not content.startswith(_AT128_MAGIC) or len(content) < _AT128_HEAD.itemsize:
         return None
     head = np.frombuffer(content, _AT128_HEAD, 1)[0]
@@ -138,7 +139,7 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
         _fail_at128(path, f"{_AT128_SIZE} bytes", f"{len(content)} bytes")
     body = content[: _AT128_BODY.itemsize]
     if _sha256(body) != content[_AT128_BODY.itemsize :]:
-        _fail_at128(path, "content that agrees with its SHA-256", "content that was changed")
+        _fail_at128(path, "content that matches its SHA-256", "changed content")
     values = np.frombuffer(body, _AT128_BODY)[0]
     angle = resolution * RAD_PER_DEG / _ANGLE_UNITS_PER_DEG
     adjust = resolution * RAD_PER_DEG / _ADJUST_UNITS_PER_DEG
@@ -154,7 +155,7 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
 
 
 def _lines(text: str) -> list[list[str]]:
-    """Cells of all lines, without the empty ones that spreadsheets add at the end."""
+    """Cells of all lines, without the empty ones that spreadsheets append."""
 
     def cells() -> Iterator[list[str]]:
         for line in text.splitlines():
@@ -173,19 +174,19 @@ def _is_title(cells: list[str]) -> bool:
 
 
 def _sha256(content: bytes) -> bytes:
-    # Its library takes longer to load than most modules here.
+    # Imported late: hashlib loads slowly.
     import hashlib
 
     return hashlib.sha256(content).digest()
 
 
 def _check_digest(path: Path, number: int, content: bytes, digest: str) -> None:
-    """The digest was made of CRLF lines; transports may have changed them, or added a mark."""
+    """Check the digest of CRLF lines; transports may have changed line ends or added a mark."""
     before = content[: content.index(digest.encode())]
     unix = before.replace(b"\r\n", b"\n").removeprefix(b"\xef\xbb\xbf")
     variants = (before, unix, unix.replace(b"\n", b"\r\n"))
     if all(_sha256(one).hex() != digest.lower() for one in variants):
-        _fail(path, number, "lines that agree with this SHA-256", "lines that were changed")
+        _fail(path, number, "lines that match this SHA-256", "changed lines")
 
 
 def _channel(path: Path, number: int, cells: list[str]) -> int:
@@ -202,7 +203,7 @@ def _angle_deg(path: Path, number: int, name: str, cell: str) -> float:
         angle_deg = float(cell)
     except ValueError:
         angle_deg = math.nan
-    # Also refuses NaN.
+    # Also true for NaN.
     if not abs(angle_deg) <= limit:
         _fail(path, number, f"{name} from -{limit:g} to {limit:g} deg", cell)
     return angle_deg
@@ -221,7 +222,8 @@ def _check_complete(path: Path, lines: int, angles_deg: dict[int, tuple[float, f
 def _fail(path: Path, number: int, expected: str, found: str) -> NoReturn:
     shown = found if len(found) <= _SHOWN_CHARS else found[: _SHOWN_CHARS - 3] + "..."
     raise RigError(
-        f"{path}: HESAI angles, line {number}: expected {expected}, found {shown or 'nothing'}; {_REMEDY}"
+        f"{path}: HESAI angles, line {number}: expected {expected}, "
+        f"found {shown or 'nothing'}; {_REMEDY}"
     )
 
 

@@ -1,11 +1,11 @@
-"""Points of the AT128, whose rotor turns three mirrors (facts/hesai.md section 6).
+"""Points of the AT128, whose rotor carries three mirrors (docs/sources/hesai.md section 6).
 
-Each mirror has a field of rotor angles that begins at its start. A beam leaves at azimuth
-2 (rotor - start) - azimuth[channel] and elevation[channel], both corrected by tables over the rotor
-angle, straight between their steps of 2 deg. So no beam lies on a cone, and directions are made for
-every beam of every column, at the rotor's angle when it fires. What that adds to the angles of the
-column and of the channel is small: no cosine is taken per pixel, see `_turned`. A column stays with
-one mirror, as fields meet far from where the mirrors look out.
+Each mirror has a range of rotor angles that begins at its start. A beam leaves at azimuth 2 (rotor
+- start) - azimuth[channel] and elevation[channel], both corrected by tables over the rotor angle,
+interpolated linearly between steps of 2 deg. So the beams follow no cones, and directions are
+computed for every beam of every column, at the rotor angle of its firing. The change of angle
+within a column is small, so no cosine is computed per pixel, see `_rotated`. All beams of a column
+belong to one mirror, since the ranges of mirrors meet outside the field of view.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TURN_RAD = 2 * np.pi
 
 
 class _At128Projection:
-    """The projection of one AT128; its frame is HESAI's: x right, y forward, z up."""
+    """Projection of one AT128; sensor frame: x right, y forward, z up."""
 
     def __init__(
         self, file: At128File, firing_ns: I64Array, body_from_sensor: F64Array, columns: int
@@ -28,7 +28,7 @@ class _At128Projection:
         beams, steps = file.azimuth_adjust_rad.shape
         self._start_rad = file.start_rad
         self._steps_per_rad = steps / _TURN_RAD
-        # Where a beam does not fire there is nothing to place.
+        # Beams that do not fire (-1) have no points.
         self._firing_ns = np.maximum(firing_ns, 0).astype(np.float32)
         self._azimuth = _cosine_and_sine(-file.azimuth_rad)
         self._elevation = _cosine_and_sine(file.elevation_rad)
@@ -43,14 +43,14 @@ class _At128Projection:
     def aim(self, member: I64Array, encoder: I64Array) -> None:
         """Directions of all beams; `member` is always 0."""
         angle, speed, table = read_rotor_words(encoder)
-        turned = speed.astype(np.float32)[:, None] * self._firing_ns[table]
-        cell, part = self._place(angle, turned)
+        rotated = speed.astype(np.float32)[:, None] * self._firing_ns[table]
+        cell, part = self._cell(angle, rotated)
         past = np.minimum.reduce([(angle - start) % _TURN_RAD for start in self._start_rad])
         cosine, sine = (values[:, None] for values in _cosine_and_sine(2 * past))
         more = self._azimuth_adjust.at(cell, part)
-        more += np.float32(2) * turned
-        cosine, sine = _turned(*_sum(cosine, sine, *self._azimuth), more)
-        flat, up = _turned(*self._elevation, self._elevation_adjust.at(cell, part))
+        more += np.float32(2) * rotated
+        cosine, sine = _rotated(*_sum(cosine, sine, *self._azimuth), more)
+        flat, up = _rotated(*self._elevation, self._elevation_adjust.at(cell, part))
         right = flat * sine
         forward = flat * cosine
         for axis, (from_right, from_forward, from_up) in enumerate(self._rotation):
@@ -65,13 +65,13 @@ class _At128Projection:
         np.multiply(range_m[:, None, :], self._towards[:count], out=moved)
         np.add(moved, self._origin, out=out.transpose(0, 2, 1))
 
-    def _place(self, angle: F64Array, turned: F32Array) -> tuple[I64Array, F32Array]:
-        """Cells of `_AngleCorrection` and how far in them the beams (n, B) are."""
-        place = angle * self._steps_per_rad
-        step = np.floor(place)
-        part = turned * np.float32(self._steps_per_rad)
-        part += (place - step).astype(np.float32)[:, None]
-        # While the beams of a column fire, some may enter the next cell, or the one before.
+    def _cell(self, angle: F64Array, rotated: F32Array) -> tuple[I64Array, F32Array]:
+        """Cells of `_AngleCorrection` and the fractions within them, for beams (n, B)."""
+        steps = angle * self._steps_per_rad
+        step = np.floor(steps)
+        part = rotated * np.float32(self._steps_per_rad)
+        part += (steps - step).astype(np.float32)[:, None]
+        # During the firing of a column, beams may enter the next or the previous cell.
         further = np.floor(part)
         part -= further
         cell = further.astype(np.int64)
@@ -82,19 +82,19 @@ class _At128Projection:
 
 
 class _AngleCorrection:
-    """Corrections over the rotor angle, (channels, steps) rad, as straight pieces.
+    """Corrections over the rotor angle, (channels, steps) rad, piecewise linear.
 
-    Cell step * channels + channel holds the piece from that step to the next one.
+    Cell step * channels + channel is the piece from that step to the next one.
     """
 
     def __init__(self, adjust_rad: F64Array) -> None:
-        # A row a step, so that the beams of a column lie side by side; behind the last, the first.
+        # One row per step, so that the beams of a column are contiguous; wraps after the last step.
         rows = adjust_rad.T
         self._value = rows.astype(np.float32).ravel()
         self._slope = (np.roll(rows, -1, axis=0) - rows).astype(np.float32).ravel()
 
     def at(self, cell: I64Array, part: F32Array) -> F32Array:
-        """Values in cells (n, B), the part of the way to the next step."""
+        """Values in cells (n, B), at the given fraction of the way to the next step."""
         found: F32Array = self._slope.take(cell, mode="wrap")
         found *= part
         found += self._value.take(cell, mode="wrap")
@@ -115,8 +115,8 @@ def _sum(
     )
 
 
-def _turned(cosine: F32Array, sine: F32Array, more_rad: F32Array) -> tuple[F32Array, F32Array]:
-    """Cosine and sine after a small angle, below 0.05 rad: the next terms are d**5 / 120."""
+def _rotated(cosine: F32Array, sine: F32Array, more_rad: F32Array) -> tuple[F32Array, F32Array]:
+    """Rotate by a small angle, below 0.05 rad: the next terms are d**5 / 120."""
     square = more_rad * more_rad
     by_sine = (square * np.float32(-1 / 6) + np.float32(1)) * more_rad
     by_cosine = (square * np.float32(1 / 24) - np.float32(0.5)) * square + np.float32(1)
@@ -128,6 +128,6 @@ def at128_projection(
 ) -> Projection:
     """Ranges to points of a sensor at `body_from_sensor` (4, 4), m.
 
-    Columns carry rotor words. firing_ns: (T, 128), as in `Lidar`; columns: the most aimed at once.
+    Columns carry rotor words. firing_ns: (T, 128), as in `Lidar`; columns: largest batch.
     """
     return _At128Projection(file, firing_ns, body_from_sensor, columns)

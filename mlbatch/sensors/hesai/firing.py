@@ -1,14 +1,13 @@
-"""When the beams of HESAI lidars fire, in ns after the time of their block (facts/hesai.md 5, 12).
+"""Firing times of HESAI beams, ns after the time of their block.
 
-That of the JT128: HesaiTechnology/HesaiLidar_SDK_2.0 `correction/firetime_correction`. Those of the
-Pandar20: HesaiTechnology/HesaiLidar_General_SDK `pandarGeneral_internal.cc`, -3620 - 1304 a
-- 1968 b ns with whole numbers a and b of each channel.
+Source: docs/sources/hesai.md sections 5 and 12. JT128: HesaiTechnology/HesaiLidar_SDK_2.0
+`correction/firetime_correction`. Pandar20: HesaiTechnology/HesaiLidar_General_SDK
+`pandarGeneral_internal.cc`, -3620 - 1304 a - 1968 b ns with whole numbers a and b of each channel.
 
-Tables are (channels,) int64 in wire order, as the maker's firing-time files and manuals print them:
+Tables are (channels,) int64 in packet order, as in the vendor's firing-time files and manuals:
 those of Pandar20, Pandar40P and Pandar64 count back from the block's end and are negative (`P20A`,
-`P20B`, `P40`, `P64`), all others are 0 or later. NEVER marks a channel that does not fire in that
-table. Tables of the 128-channel families are chosen by operation mode (HIGH, STANDARD, SAVING) and
-azimuth state.
+`P20B`, `P40`, `P64`), all others are 0 or later. NEVER marks a channel that does not fire. Tables
+of the 128-channel families are chosen by operation mode (HIGH, STANDARD, SAVING) and azimuth state.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ HIGH = "high"
 STANDARD = "standard"
 SAVING = "saving"
 
-# In the texts below a row holds 16 channels (8 or 10 in the first five), `-` is a silent one.
+# In the texts below a row has 16 channels (8 or 10 in the first five); `-` does not fire.
 _P20A = """
 -16044 -3620 -45492 -31740 -47460 -20620 -40916 -20620 -50732 -36980
 -23892 -11468 -48764 -35012 -9500 -29772 -4924 -28468 -16044 -3620
@@ -212,7 +211,7 @@ _E128_NEAR_STANDARD = """
 
 
 def _tables(text: str, channels: int) -> I64Array:
-    """The tables in a text, (tables, channels), never to be written to."""
+    """(tables, channels) tables of a text, read-only."""
     table = np.array([NEVER if word == "-" else int(word) for word in text.split()], np.int64)
     table = table.reshape(-1, channels)
     table.setflags(write=False)
@@ -226,7 +225,7 @@ def _by_state(modes: Mapping[str, tuple[I64Array, ...]]) -> dict[tuple[str, int]
 
 
 def _near(far: I64Array, text: str) -> I64Array:
-    """Tables `far` (T, 128) with the changes of one text each, `channel:ns`, channels from 1."""
+    """Tables `far` (T, 128) with the changes of a text, `channel:ns`, channels from 1."""
     near: I64Array = far.copy()
     for table, changes in zip(near, text.split("/"), strict=True):
         for change in changes.split():
@@ -237,9 +236,9 @@ def _near(far: I64Array, text: str) -> I64Array:
 
 
 def _even(first_ns: int, step_ns: int, channels: int, together: int = 1) -> I64Array:
-    """Channels that fire one after the other; `together` groups of them do so at once."""
-    turn = np.arange(channels, dtype=np.int64) % (channels // together)
-    table: I64Array = first_ns + step_ns * turn
+    """Channels that fire at equal steps; `together` groups of them fire at once."""
+    number = np.arange(channels, dtype=np.int64) % (channels // together)
+    table: I64Array = first_ns + step_ns * number
     table.setflags(write=False)
     return table
 
@@ -263,7 +262,7 @@ OT128 = _by_state({HIGH: (*_ot128_high, _ot128_high[1]), STANDARD: tuple(_ot128_
 _e128_high = _tables(_E128_HIGH, 128)
 _e128_standard = _tables(_E128_STANDARD, 128)
 _near_standard = tuple(_near(_e128_standard, _E128_NEAR_STANDARD))
-# Pandar128E3X; the near-field times hold below 2.85 m, where few channels differ.
+# Pandar128E3X; the near-field times apply below 2.85 m, where few channels differ.
 E128 = _by_state(
     {HIGH: tuple(_e128_high), STANDARD: tuple(_e128_standard), SAVING: tuple(_e128_standard)}
 )

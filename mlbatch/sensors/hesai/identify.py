@@ -1,8 +1,8 @@
-"""What HESAI packets are, by their content: lengths, header versions, return modes in the tail.
+"""Names of HESAI packets by content: sizes, header versions, return modes in the tail.
 
-Source: facts/hesai.md sections 1 to 4; facts/messages.md section 2 (correction); HesaiTechnology/
-HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC), HesaiLidar_General_SDK
-(Pandar20: 8 + 20 x 62 + 22 = 1270 bytes, never a sequence number).
+Source: docs/sources/hesai.md sections 1 to 4; docs/sources/messages.md section 2 (correction);
+HesaiTechnology/ HesaiLidar_SDK_2.0 `libhesai` (fault messages of 99 bytes begin with CD DC),
+HesaiLidar_General_SDK (Pandar20: 8 + 20 x 62 + 22 = 1270 bytes, never a sequence number).
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ _JT16_SIZE = 80
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What packets of a stream are; layout: None where no decoder can read them.
+    """Model and mode of packets of a stream.
 
-    mode: None where the packets do not say how many returns they hold.
+    mode: None if unknown; layout: None without a decoder.
     """
 
     name: str
@@ -78,18 +78,18 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class _Family:
-    """Models of a protocol version, told apart by lasers and blocks; the first one stands for all.
+    """Models of a protocol version, distinguished by lasers and blocks.
 
-    name: of those that are not in the list; turns: all but automotive models, which alone may
-    have a prefix.
+    name: of models that are not in the list; spins: False for automotive models, which may have a
+    prefix.
     """
 
     name: str
     models: tuple[Model, ...] = ()
-    turns: bool = True
+    spins: bool = True
 
 
-# Early firmware, known by the manual's text alone: named, not decoded.
+# Early firmware, known only from the manual: named, not decoded.
 _PANDAR128 = replace(
     rows.PANDAR128E3X,
     name="Pandar128",
@@ -102,14 +102,14 @@ _FAMILIES: Mapping[tuple[int, int], _Family] = {
     (1, 8): _Family("JT16", (rows.JT16,)),
     (3, 1): _Family("PandarQT{}", (rows.PANDARQT64,)),
     (3, 2): _Family("QT128C2X", (rows.QT128,)),
-    (4, 1): _Family("AT128", (rows.AT128,), turns=False),
-    (4, 3): _Family("AT128", (rows.AT128,), turns=False),
-    (4, 7): _Family("ATX", turns=False),
+    (4, 1): _Family("AT128", (rows.AT128,), spins=False),
+    (4, 3): _Family("AT128", (rows.AT128,), spins=False),
+    (4, 7): _Family("ATX", spins=False),
     (6, 1): _Family("PandarXT of {} channels", (rows.XT16, rows.XT32, rows.XT32M2X)),
-    (7, 2): _Family("FT120", turns=False),
+    (7, 2): _Family("FT120", spins=False),
 }
 _UNDECODED = frozenset({"Pandar128"})
-# Packets that several models send.
+# Packets sent by several models.
 _ALIKE = {
     rows.PANDAR40P.name: "Pandar40P or Pandar40M",
     rows.PANDAR20A.name: "Pandar20A or Pandar20B",
@@ -120,7 +120,7 @@ _STATUS_VERSIONS = ((137, rows.JT128), (128, rows.OT128), (0, rows.PANDAR128E3X)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """A line on HESAI packets, or None."""
+    """Name payloads (k, size); None if they are not HESAI's."""
     packets = payload_rows(size, sample)
     if packets is None:
         return None
@@ -142,7 +142,7 @@ def describe(size: int, sample: U8Array) -> str | None:
 
 
 def identify(size: int, packets: U8Array) -> Identity | None:
-    """What payloads (k, size) of a stream are, or None where they are not of a HESAI lidar."""
+    """Identify payloads (k, size) of a stream; None if they are not of a HESAI lidar."""
     return (
         _identify_sized(size, packets)
         or _identify_version(size, 0, packets)
@@ -157,7 +157,7 @@ def _digits(packets: U8Array, begin: int, end: int) -> BoolArray:
 
 
 def _identify_sized(size: int, packets: U8Array) -> Identity | None:
-    """Models whose headers bear no protocol version."""
+    """Models whose headers have no protocol version."""
     flagged = np.ones(len(packets), np.bool_)
     for block in range(_PANDAR40_BLOCKS):
         flagged &= has_bytes(packets, _BLOCK_FLAG, _PANDAR40_STRIDE * block)
@@ -179,7 +179,7 @@ def _identify_sized(size: int, packets: U8Array) -> Identity | None:
 
 
 def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | None:
-    """Models whose header has a protocol version; their size must hold the blocks announced."""
+    """Models whose header has a protocol version; the size must suffice for its blocks."""
     if packets.shape[1] < _HEADER_SIZE:
         return None
     chosen = majority(packets, has_bytes(packets, _SOP))
@@ -189,7 +189,7 @@ def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | No
     version = head[2], head[3]
     same = majority(packets, has_bytes(packets, bytes((*_SOP, *version))))
     family = _family(version, head[4])
-    if family is None or same is None or (prefix and family.turns):
+    if family is None or same is None or (prefix and family.spins):
         return None
     if not family.models:
         return Identity(family.name)
@@ -198,7 +198,7 @@ def _identify_version(size: int, prefix: int, packets: U8Array) -> Identity | No
     flags = head[11]
     fixed: tuple[int, ...] = _FIXED
     if family.models == (rows.JT16,):
-        # It has no lasers, blocks or flags in its header, but always a sequence number.
+        # Its header has no lasers, blocks or flags, but it always has a sequence number.
         lasers = rows.JT16.channels
         blocks = 1
         flags = SEQUENCE
@@ -216,7 +216,7 @@ def _family(version: tuple[int, int], status: int) -> _Family | None:
 
 
 def _model(family: _Family, lasers: int, blocks: int) -> Model:
-    """The row with these lasers and blocks, or one that is like the family's, to be named only."""
+    """Model with these lasers and blocks; if there is none, a model without decoder to name."""
     for model in family.models:
         if model.channels == lasers and blocks in model.blocks:
             return model
@@ -234,21 +234,21 @@ def _identity(
     flags: int,
     fixed: tuple[int, ...],
 ) -> Identity | None:
-    """What packets of a model are; packets: without their prefix."""
+    """Identify packets of a model; packets: without their prefix."""
     tail = tail_at(model, blocks, flags)
     if prefix + least_size(model, blocks, flags) > size:
         return None
     mode: ReturnMode | None = ONLY_RETURN
     if model.tail.mode_at is not None:
         mode = RETURN_MODES.get(most_common(number(packets, tail + model.tail.mode_at, 1)))
-    # What a header says once may be damaged: the usual value counts.
+    # Use the most frequent value, since single headers may be damaged.
     head = {at: most_common(number(packets, at, 1)) for at in fixed}
-    chooses = model is rows.QT128 and bool(flags & AMBIENT)
+    is_selection = model is rows.QT128 and bool(flags & AMBIENT)
     millimetres = unit_mm(model, head)
     if (
         mode is None
         or model.name in _UNDECODED
-        or chooses
+        or is_selection
         or not millimetres
         or mode.returns > model.most_returns
         or blocks % mode.returns

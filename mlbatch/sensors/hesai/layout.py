@@ -1,6 +1,6 @@
-"""Where everything lies in the packets of one HESAI stream: the model's layout and its headers.
+"""Packet layout of a HESAI stream: the model's table with the values of its headers.
 
-Source: facts/hesai.md sections 2 and 3.
+Source: docs/sources/hesai.md sections 2 and 3.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 from mlbatch.sensors.hesai.models import Model
 
-# Flags of the header: what is sent beyond the least.
+# Header flags of optional fields.
 SEQUENCE = 0x01
 _IMU = 0x02
 SAFETY = 0x04
-# In the 128-channel family one more byte a channel for each; of a QT128 the last one means that
-# it sends channels of its own choice.
+# Each adds a byte per channel in the 128-channel family; AMBIENT of a QT128 means that it sends a
+# selection of channels.
 _CONFIDENCE = 0x10
 _WEIGHT = 0x20
 AMBIENT = 0x40
@@ -28,7 +28,7 @@ _DEFAULT_UNIT_MM = 4
 
 @dataclass(frozen=True, slots=True)
 class ReturnMode:
-    """What a code of the tail means; types: numbering of facts/outputs.md section 3 per return."""
+    """Meaning of a return mode code; types: see docs/sources/outputs.md section 3, per return."""
 
     text: str
     returns: int
@@ -48,16 +48,16 @@ RETURN_MODES: Mapping[int, ReturnMode] = {
     0x3D: ReturnMode("triple return, first, last and strongest", 3, (0, 0, 0)),
     0x3E: ReturnMode("dual return, strongest and second strongest", 2, _DUAL),
 }
-# Models that have no such byte send one return.
+# Models without a mode byte send one return.
 ONLY_RETURN = ReturnMode("single return", 1, (0,))
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Packets of a stream, as their headers describe them; bytes count from behind the prefix.
+    """Packets of a stream according to their headers; offsets count from the end of the prefix.
 
-    size: of the payload, with the prefix of `prefix` bytes; flags, unit_mm: of the header;
-    fixed: bytes of the header that never change, by their places.
+    size: of the payload, including `prefix` bytes; flags, unit_mm: of the header; fixed: constant
+    bytes of the header by offset.
     """
 
     model: Model
@@ -81,12 +81,12 @@ class Layout:
 
     @property
     def columns(self) -> int:
-        """Firing groups of a packet: each has a block for every return."""
+        """Firing groups of a packet, each with a block for every return."""
         return self.blocks // self.mode.returns
 
     @property
     def body_end(self) -> int:
-        """First byte behind the blocks."""
+        """First byte after the blocks."""
         return self.model.header + self.blocks * self.stride
 
     @property
@@ -96,18 +96,18 @@ class Layout:
 
     @property
     def sequence_at(self) -> int | None:
-        """Byte of the sequence number, None where there is none."""
+        """Byte of the sequence number, None without one."""
         return self.tail_at + self.model.tail.size if self.flags & SEQUENCE else None
 
     @property
     def sequence_modulus(self) -> int:
-        """Where the sequence number wraps, 0 where there is none."""
+        """Modulus of the sequence number, 0 without one."""
         bits = 8 * self.model.tail.sequence_bytes
         return 1 << bits if self.flags & SEQUENCE else 0
 
     @property
     def crc_at(self) -> int | None:
-        """Byte of the CRC over the tail, None where there is none."""
+        """Byte of the CRC over the tail, None without one."""
         if not self.model.tail.has_crc:
             return None
         imu = _IMU_SIZE if self.model.has_flagged_units and self.flags & _IMU else 0
@@ -131,11 +131,11 @@ def tail_at(model: Model, blocks: int, flags: int) -> int:
 
 
 def least_size(model: Model, blocks: int, flags: int) -> int:
-    """Bytes up to the end of the sequence number: a packet that has them can be decoded."""
+    """Bytes up to the end of the sequence number, the least that can be decoded."""
     sequence = model.tail.sequence_bytes if flags & SEQUENCE else 0
     return tail_at(model, blocks, flags) + model.tail.size + sequence
 
 
 def unit_mm(model: Model, head: Mapping[int, int]) -> int:
-    """The distance unit; head: bytes of the header by their places."""
+    """Distance unit; head: header bytes by offset."""
     return _DEFAULT_UNIT_MM if model.unit_mm_at is None else head[model.unit_mm_at]

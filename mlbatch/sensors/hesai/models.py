@@ -1,11 +1,11 @@
-"""What differs between HESAI models: where bytes lie in a packet, and when its beams fire.
+"""HESAI models as tables: packet layouts, firing times, optical centres.
 
-Source: facts/hesai.md sections 2 (layout), 3 (tails), 5 (times), 6 (optical centres), 8 (JT16) and
-12; the vertical fields of view are those of the data sheets. The Pandar128E3X fires a few of its
-channels at other times at targets nearer than 2.85 m; the times of the far field are used for all
-(up to 55 us apart, `_hesai_firing.E128_NEAR`). Pandar20A and B: HesaiTechnology/
-HesaiLidar_General_SDK. Its versions have the one table of elevations or the other; each is given
-to the model whose beams fire when those of a Pandar40P at these elevations do.
+Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 5 (times), 6 (optical centres), 8
+(JT16) and 12; the vertical fields of view are those of the data sheets. The Pandar128E3X fires a
+few of its channels at other times at targets nearer than 2.85 m; the times of the far field are
+used for all (up to 55 us apart, `firing.E128_NEAR`). Pandar20A and B:
+HesaiTechnology/HesaiLidar_General_SDK. Its versions have one of two tables of elevations; each is
+assigned to the model whose beams fire at the times of a Pandar40P at these elevations.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from mlbatch.sensors.hesai import firing
 from mlbatch.types import I64Array
 
-# Operation mode in the tail of the 128-channel families: what it fires like, and how many blocks
-# of the fast mode its block takes.
+# Operation mode in the tail of the 128-channel families: its firing table, and the duration of its
+# blocks in blocks of the fast mode.
 _HIGH, _SHUTDOWN, _STANDARD, _SAVING = range(4)
 OPERATIONS = 4
 AZIMUTH_STATES = 4
@@ -34,11 +34,11 @@ _SLOWER = (1, 2, 2, 2)
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """Bytes of a tail, from its start.
+    """Offsets in a tail.
 
-    size: its length without what flags add; rpm_step: rpm of one step of the speed field;
-    loop_at, states_at, operation_at: which firing table the packet's columns follow; crc_at: byte
-    of a CRC over the tail, counted from the end of the sequence number and the IMU block.
+    size: without optional fields; rpm_step: rpm of one step of the speed field;
+    loop_at, states_at, operation_at: fields that choose the firing table of columns; has_crc: a CRC
+    over the tail follows the sequence number and the IMU block.
     """
 
     size: int
@@ -57,10 +57,10 @@ class Tail:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """When blocks fire, ns after the packet's time: base + step * k / divisor, k by firing group.
+    """Firing times of blocks, ns after the packet's time: base + step * k / divisor.
 
-    counts_back: k is 0 for the last group and falls before it; else 0 for the first, and rises.
-    slower: what the step is multiplied by in each operation mode.
+    counts_back: k is 0 for the last firing group and negative before it; else 0 for the first.
+    slower: factor of the step in each operation mode.
     """
 
     base_ns: int
@@ -72,15 +72,15 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A model's packets, up to what their headers say.
+    """Packets of a model, apart from the values in their headers.
 
-    lead: bytes of a block before its channels; azimuth_at: in the block; ticks: of the azimuth in a
-    turn (36000, or finer with a third byte); unit: bytes per channel, without those that flags add;
-    unit_mm_at: where the header tells the distance unit (None: 4 mm); crc: of the body, before the
-    tail; tail_at: None behind the body and its checks. `firing_ns` has a row for every table and
-    `tables` the row by operation mode and azimuth state. silent: raw distances up to this one mean
-    no return. elevation_deg: lowest and highest beam as the data sheet has them, None: not used;
-    same_packets_as: the model under whose name packets of this one are found.
+    lead: bytes of a block before its channels; azimuth_at: in the block; ticks: azimuth ticks of a
+    revolution (36000, or more with a third byte); unit: bytes per channel without optional fields;
+    unit_mm_at: header byte of the distance unit (None: 4 mm); has_checks: a CRC of the body before
+    the tail; tail_at: None for after the body and its checks. `firing_ns` has a row for every
+    table, `tables` is the row by operation mode and azimuth state. silent: largest raw distance
+    that means no return. elevation_deg: lowest and highest beam of the data sheet, None: not
+    checked; same_packets_as: the model whose packets equal those of this one.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Model:
     tail_at: int | None = None
     most_returns: int = 2
     silent: int = 0
-    # A range is the distance from the optical centre, not from the axis.
+    # Ranges are measured from the optical centre, not from the axis.
     from_centre: bool = False
     tables: I64Array = field(default_factory=lambda: np.zeros((OPERATIONS, AZIMUTH_STATES), int))
 
@@ -112,15 +112,15 @@ class Model:
 def _by_state(times: Mapping[tuple[str, int], I64Array]) -> tuple[I64Array, I64Array]:
     """Firing tables of a model, (T, channels), and the row by operation mode and azimuth state.
 
-    Modes without tables of their own are like the standard one, which only knows two states.
+    Modes without own tables use the standard one, which has only two states.
     """
     names = list(times)
     rows = np.zeros((OPERATIONS, AZIMUTH_STATES), np.int64)
     for operation, mode in _MODE.items():
         known = mode if (mode, 0) in times else firing.STANDARD
         for state in range(AZIMUTH_STATES):
-            told = state if (known, state) in times else state % 2
-            rows[operation, state] = names.index((known, told))
+            used = state if (known, state) in times else state % 2
+            rows[operation, state] = names.index((known, used))
     return np.stack([times[name] for name in names]), rows
 
 
@@ -133,7 +133,7 @@ _TAIL_128 = Tail(
 )
 _TAIL_JT128 = replace(_TAIL_128, rpm_step=0.1, states_at=None, operation_at=None)
 _TAIL_AT128 = Tail(32, 26, 20, mode_at=24, rpm_at=18, rpm_is_signed=True, has_crc=True)
-# The JT16 has its date in the header, and its sequence number and CRC behind the channels.
+# The JT16 has its date in the header, and its sequence number and CRC after the channels.
 _TAIL_JT16 = Tail(74, date_at=6, us_at=12, sequence_bytes=2, has_crc=True)
 
 _TO_15_DEG = (-25.0, 15.0)

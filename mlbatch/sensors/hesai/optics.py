@@ -1,8 +1,8 @@
-"""Beams of HESAI lidars that leave beside the axis: `--decode optical_centre=on`.
+"""Off-axis optical centres of HESAI lidars: `--decode optical_centre=on`.
 
-Source: facts/hesai.md section 6, refinement 2. The centre c turns with the rotor; a beam of unit
-vector u ends k behind it, where the range r is that from the axis: k = sqrt(r^2 - p^2) - u.c with
-p^2 = |c|^2 - (u.c)^2. Where ranges count from the centre itself (JT models), k is r.
+Source: docs/sources/hesai.md section 6, refinement 2. The centre c rotates with the rotor; a beam
+of unit vector u ends k behind it, where the range r is that from the axis: k = sqrt(r^2 - p^2) -
+u.c with p^2 = |c|^2 - (u.c)^2. Where ranges count from the centre itself (JT models), k is r.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ import numpy as np
 from mlbatch.geometry import BeamTable, Turning
 from mlbatch.types import F32Array, F64Array, I64Array
 
-# Closer returns are taken to come from the axis.
+# Closer returns are projected from the axis.
 _NEAREST_M = np.float32(0.09)
 
 
 def off_axis(on_axis: BeamTable, centre_m: F64Array, *, from_centre: bool) -> BeamTable:
-    """The beams as they leave from an optical centre, (3,), x right, y forward, z up."""
+    """Beams from an optical centre (3,), x right, y forward, z up."""
     right, forward, up = centre_m
-    # As `spherical`: a clockwise turn by a takes (x, y) to (x cos a + y sin a, y cos a - x sin a).
+    # As in `spherical`: clockwise by a, (x, y) becomes (x cos a + y sin a, y cos a - x sin a).
     origin = np.array([[[right, forward, 0.0]], [[forward, -right, 0.0]], [[0.0, 0.0, up]]])
     reach_m = np.zeros(1) if from_centre else -_along(on_axis, centre_m)
     return replace(on_axis, origin=origin, reach_m=reach_m)
 
 
 class OffAxis:
-    """`Projection` of such beams whose ranges count from the axis."""
+    """`Projection` of off-axis beams whose ranges count from the axis."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class OffAxis:
         firing_ns: I64Array,
         columns: int,
     ) -> None:
-        """on_axis: in the sensor frame; centre_m: (3,); columns: the most aimed at once."""
+        """on_axis: in the sensor frame; centre_m: (3,); columns: largest batch."""
         firing_ns = np.maximum(firing_ns, 0)
         beams = off_axis(on_axis, centre_m, from_centre=False)
         self._beams = Turning(beams.moved(body_from_sensor), firing_ns, columns)
@@ -48,7 +48,7 @@ class OffAxis:
         self._aimed: tuple[I64Array, I64Array] = np.empty(0, np.int64), np.empty(0, np.int64)
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
-        """Prepare for columns."""
+        """Prepare directions of columns."""
         self._aimed = member, encoder
         self._beams.aim(member, encoder)
 
@@ -66,7 +66,7 @@ class OffAxis:
 
 
 def _along(beams: BeamTable, centre_m: F64Array) -> F64Array:
-    """(B,) u.c, m, which does not change as the rotor turns."""
+    """(B,) u.c, m, constant under rotation of the rotor."""
     at_zero = beams.direction[0] + beams.direction[2]
     along: F64Array = (at_zero * centre_m).sum(axis=1)
     return along

@@ -1,9 +1,9 @@
-"""HESAI packets to stamps, rotor positions and ranges, whatever the model.
+"""HESAI packets to timestamps, rotor positions and ranges, for all models.
 
-Source: facts/hesai.md sections 2 to 5 (dates: 4) and 7. A column is a firing group: one block for
-each return, all of one azimuth. Azimuth and time of a block are those of firing offset 0; some
-models count offsets back from there, so a column is stamped, and its angle told, at its earliest
-firing.
+Source: docs/sources/hesai.md sections 2 to 5 (dates: 4) and 7. A column is a firing group: one
+block for each return, all of one azimuth. Azimuth and time of a block are those of firing offset 0;
+some models count offsets back from there, so timestamp and angle of a column are those of its
+earliest firing.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from mlbatch.sensors.packet_bytes import number
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array
 from mlbatch.units import MM_PER_M, NS_PER_S, NS_PER_US
 
-_CENTURY = 70  # Years below are of this century, others of the last.
+_CENTURY = 70  # Years below are in this century, others in the last.
 _US_PER_S = 1_000_000
 _S_PER_DAY = 86400
-# What int64 ns since 1970 can hold, in seconds: beyond, a date is damaged.
+# Range of int64 ns since 1970, in seconds; later dates are damaged.
 _MOST_S = 9_000_000_000
 
 
 def packet_times(packets: U8Array, date_at: int, us_at: int) -> tuple[I64Array, BoolArray]:
-    """(P,) ns since 1970 of packets, and whether their date and time can be."""
+    """(P,) ns since 1970 of packets, and whether their date and time are valid."""
     date = packets[:, date_at : date_at + 6].astype(np.int64)
     us = number(packets, us_at, 4)
     calendar_s, is_date = _calendar(date)
@@ -53,7 +53,7 @@ def _calendar(date: I64Array) -> tuple[I64Array, BoolArray]:
 
 
 def _days(months: I64Array) -> I64Array:
-    """Days from 1970 to the first of a month counted from January 1970."""
+    """Days from 1970 to the first of a month, which counts from January 1970."""
     days: I64Array = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64)
     return days
 
@@ -66,10 +66,10 @@ _S_PER_NS = 1e-9
 
 
 class PacketReader:
-    """Reads the packets of one stream; all of them have its layout.
+    """Decoder of packets of one layout.
 
-    sense: 1, or -1 where the rotor turns the other way round; follows_rotor: the angle of a beam
-    is that at its own firing; checks_crc: of all parts that carry one.
+    sense: 1 for a clockwise rotor, else -1; follows_rotor: apply rotor motion during a firing;
+    checks_crc: check all parts that have a CRC.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class PacketReader:
         self._record = _record_dtype(layout)
 
     def heads(self, packets: U8Array) -> Heads:
-        """Stamps, rotor words and validity of all columns."""
+        """Timestamps, rotor words and validity of all columns."""
         layout = self.layout
         timing = self.layout.model.timing
         body = packets[:, layout.prefix :]
@@ -105,17 +105,17 @@ class PacketReader:
         table = self._tables(body, operation)
         first_ns = self._first_ns[table]
         offset_ns = timing.base_ns + step_ns[:, None] * group // timing.divisor
-        turns = self._azimuths(body)[:, :: layout.mode.returns] / layout.model.ticks
-        speed = np.broadcast_to(self._turns_per_s(body)[:, None], turns.shape)
-        turns += speed * (first_ns * _S_PER_NS)
+        revolutions = self._azimuths(body)[:, :: layout.mode.returns] / layout.model.ticks
+        speed = np.broadcast_to(self._revolutions_per_s(body)[:, None], revolutions.shape)
+        revolutions += speed * (first_ns * _S_PER_NS)
         return Heads(
             packet_ns[:, None] + offset_ns + first_ns,
-            rotor_words(turns, speed, table),
-            np.ones(turns.shape, np.bool_),
+            rotor_words(revolutions, speed, table),
+            np.ones(revolutions.shape, np.bool_),
         )
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each of the packets."""
+        """(P,) index into FAULTS."""
         layout = self.layout
         body = packets[:, layout.prefix :]
         good = np.ones(len(body), np.bool_)
@@ -136,7 +136,7 @@ class PacketReader:
         return verdict
 
     def sequence(self, packets: U8Array) -> I64Array | None:
-        """Number of each packet, None where packets carry none."""
+        """(P,) sequence number, None if packets carry none."""
         at = self.layout.sequence_at
         if at is None:
             return None
@@ -150,7 +150,7 @@ class PacketReader:
         distance = pixel["distance"]
         unit_mm = self.layout.unit_mm
         if MM_PER_M % unit_mm:
-            # Whole mm below 2**24 are exact in a float32, so that only the division rounds.
+            # Integers below 2**24 are exact in float32, so only the division rounds.
             np.multiply(distance, np.float32(unit_mm), out=out.range_m)
             np.divide(out.range_m, np.float32(MM_PER_M), out=out.range_m)
         else:
@@ -160,7 +160,7 @@ class PacketReader:
         out.intensity[...] = pixel["reflectivity"]
 
     def pixels(self) -> PixelTable:
-        """The same for compiled loops."""
+        """Pixel layout for compiled decoding."""
         layout = self.layout
         unit_mm = self.layout.unit_mm
         firsts = tuple(
@@ -175,8 +175,8 @@ class PacketReader:
             layout.model.silent,
         )
 
-    def azimuth_turns(self, packets: U8Array) -> F64Array:
-        """Azimuth of the first block of each packet, in turns."""
+    def azimuth_revolutions(self, packets: U8Array) -> F64Array:
+        """(P,) azimuth of the first block, in revolutions."""
         azimuth = self._azimuths(packets[:, self.layout.prefix :])[:, 0]
         return np.asarray(azimuth / self.layout.model.ticks, np.float64)
 
@@ -199,8 +199,8 @@ class PacketReader:
         at = self.layout.tail_at
         return packet_times(body, at + tail.date_at, at + tail.us_at)
 
-    def _turns_per_s(self, body: U8Array) -> F64Array:
-        """(P,) speed of the rotor as the packets tell it; 0 where it is not to count."""
+    def _revolutions_per_s(self, body: U8Array) -> F64Array:
+        """(P,) rotor speed stated in the packets; 0 without a field, or if it is not applied."""
         tail = self.layout.model.tail
         if tail.rpm_at is None or not self._follows_rotor:
             return np.zeros(len(body))
@@ -230,7 +230,7 @@ class PacketReader:
         return np.asarray(layout.model.tables[operation[:, None], state])
 
     def _has_mode(self, body: U8Array) -> BoolArray:
-        """(P,) whether the packets hold as many returns, of the same types, as those seen first."""
+        """(P,) whether packets have the number and types of returns of the first packets."""
         at = self.layout.model.tail.mode_at
         if at is None:
             return np.ones(len(body), np.bool_)
@@ -243,7 +243,7 @@ class PacketReader:
         return np.isin(body[:, self.layout.tail_at + at], same)
 
     def _crc_agrees(self, body: U8Array) -> BoolArray:
-        """(P,) whether all checksums do."""
+        """(P,) whether all checksums are correct."""
         layout = self.layout
         agrees = np.ones(len(body), np.bool_)
         parts = []
@@ -251,7 +251,7 @@ class PacketReader:
             parts.append((layout.model.header, layout.body_end))
             if layout.flags & SAFETY:
                 safety_at = layout.body_end + CRC_SIZE
-                # All but the version byte, and the checksum itself.
+                # Without the version byte and the checksum.
                 parts.append((safety_at + 1, safety_at + SAFETY_SIZE - CRC_SIZE))
         if layout.crc_at is not None:
             parts.append((layout.tail_at, layout.crc_at))
@@ -261,7 +261,7 @@ class PacketReader:
 
 
 def _record_dtype(layout: Layout) -> np.dtype[np.void]:
-    """A column's record: a block for every return."""
+    """Record of a column: a block for every return."""
     reading = np.dtype(
         {
             "names": ["distance", "reflectivity"],

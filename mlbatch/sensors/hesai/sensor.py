@@ -1,8 +1,8 @@
 """HESAI lidars: Pandar, XT, QT, OT128, AT128, JT, described by an angle file and their packets.
 
-Source: facts/hesai.md (HesaiLidar_SDK_2.0, HesaiLidar_General_SDK, tier4/nebula, user manuals). An
-angle file is of one unit and does not say of which model: the packets tell. Channels are numbered
-from 0 in the order of the wire.
+Source: docs/sources/hesai.md (HesaiLidar_SDK_2.0, HesaiLidar_General_SDK, tier4/nebula, user
+manuals). An angle file belongs to one unit and has no model name, so packets identify the model.
+Channels are numbered from 0 in packet order.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ MODELS: tuple[SensorModel, ...] = tuple(
     )
     for row in rows.ALL
 )
-# Preferred is a file whose beams lie where the model's do, but for what differs between units.
+# A file whose beams fit the model within the unit-to-unit tolerance is preferred.
 _FITS = 200
 _FITS_BEAMS = 300
 _ELEVATION_TOLERANCE_DEG = 4.0
-# Evidence begins with so many; what follows them may be half a turn away.
+# Number of consecutive packets at the start of a sample.
 _PACKETS_IN_A_ROW = 16
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:
-    """The angles in a csv or dat file, or None if it holds something else."""
+    """Parse the angles in a csv or dat file; None if it is something else."""
     at128 = read_at128(path, content)
     if at128 is not None:
         return At128Calibration(at128)
@@ -67,7 +67,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 
 
 class HesaiCalibration:
-    """An angle csv, of whatever model has as many channels; `Calibration` of lidar.py."""
+    """Angle csv, for any model with as many channels; `Calibration` of lidar.py."""
 
     __slots__ = ("_angles", "is_shared", "model", "path", "serial")
 
@@ -79,7 +79,7 @@ class HesaiCalibration:
         self.is_shared = False
 
     def fit(self, evidence: Evidence) -> int:
-        """How well packets fit: by channels, then by where the highest and lowest beams look."""
+        """Match score of packets: by channels, then by the elevations of the outer beams."""
         layout = _layout(evidence)
         if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
             return 0
@@ -89,20 +89,20 @@ class HesaiCalibration:
         return _FITS if _note_on_beams(self._angles, layout.model) else _FITS_BEAMS
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
-        """The sensor."""
+        """Decoder of the sensor; RigError if the file is of another model."""
         check_options(options)
         angles = self._angles
         layout = _model_by_beams(_require_layout(self.path, evidence), angles)
         model = layout.model
         if model.name == rows.AT128.name:
             raise RigError(
-                f"{self.path}: HESAI {model.name}: expected its correction file (.dat), found a csv, "
-                "which leaves out the mirrors; read the file from the lidar"
+                f"{self.path}: HESAI {model.name}: expected its correction file (.dat), found a "
+                "csv, which has no data of the mirrors; read the file from the lidar"
             )
         if len(angles.azimuth_rad) != model.channels:
             raise RigError(
-                f"{self.path}: HESAI angles: expected {model.channels} channels for the packets of a "
-                f"{model.name}, found {len(angles.azimuth_rad)}; give the file of this lidar"
+                f"{self.path}: HESAI angles: expected {model.channels} channels for the packets "
+                f"of a {model.name}, found {len(angles.azimuth_rad)}; give the file of this lidar"
             )
         centre = np.array(model.centre_mm) * M_PER_MM if _is_on(options, "optical_centre") else None
         lidar = HesaiLidar(layout, options, evidence, angles, centre)
@@ -112,7 +112,7 @@ class HesaiCalibration:
 
 
 class At128Calibration:
-    """The correction file of an AT128; `Calibration` of lidar.py."""
+    """Correction file of an AT128; `Calibration` of lidar.py."""
 
     __slots__ = ("_file", "is_shared", "model", "path", "serial")
 
@@ -124,12 +124,12 @@ class At128Calibration:
         self.is_shared = False
 
     def fit(self, evidence: Evidence) -> int:
-        """How well packets fit."""
+        """Match score of packets."""
         layout = _layout(evidence)
         return _FITS_BEAMS if layout is not None and layout.model.name == self.model else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
-        """The sensor."""
+        """Decoder of the sensor; RigError if the file is of another model."""
         check_options(options)
         layout = _require_layout(self.path, evidence)
         if layout.model.name != self.model:
@@ -141,7 +141,7 @@ class At128Calibration:
 
 
 class HesaiLidar(BaseLidar):
-    """One sensor; `Lidar` of lidar.py, in HESAI's frame: x right, y forward, z up."""
+    """Decoder of one sensor; `Lidar` of lidar.py. Frame: x right, y forward, z up."""
 
     def __init__(
         self,
@@ -151,7 +151,7 @@ class HesaiLidar(BaseLidar):
         angles: HesaiAngles | At128File,
         centre_m: F64Array | None = None,
     ) -> None:
-        """centre_m: (3,), from where the beams leave; None: from the axis."""
+        """centre_m: (3,) optical centre; None: beams leave from the axis."""
         model = layout.model
         self._reader = PacketReader(
             layout,
@@ -184,16 +184,16 @@ class HesaiLidar(BaseLidar):
             self.beams = off_axis(self._on_axis, centre_m, from_centre=model.from_centre)
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         return self._reader.faults(packets)
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """The UDP sequence number; where there is none, a number for equal content."""
+        """(P,) UDP sequence number; without one, a hash of the content."""
         found = self._reader.sequence(packets)
         return content_keys(packets) if found is None else found
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps and rotor words; packets bear their date, arrival is of no use."""
+        """Timestamps and rotor words; packets carry the date, so host_ns is not used."""
         return self._reader.heads(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
@@ -201,14 +201,14 @@ class HesaiLidar(BaseLidar):
         self._reader.read(records, which, out)
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """One of its own where ranges count from the axis, and beams leave beside it."""
+        """Projection of off-axis beams whose ranges count from the axis; else None."""
         if self._centre_m is None or self._from_centre:
             return None
         return OffAxis(self._on_axis, self._centre_m, body_from_sensor, self.firing_ns, columns)
 
 
 class At128Lidar(HesaiLidar):
-    """An AT128: mirrors turn its beams, once through its field of view each."""
+    """AT128: each of its mirrors sweeps the beams once through the field of view."""
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class At128Lidar(HesaiLidar):
         self._file = file
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """What the mirrors make of the rotor's angle."""
+        """Projection by the mirrors."""
         return at128_projection(self._file, self.firing_ns, body_from_sensor, columns)
 
 
@@ -235,24 +235,25 @@ def _layout(evidence: Evidence) -> Layout | None:
 
 
 def _require_layout(path: Path | None, evidence: Evidence | None) -> Layout:
-    """The layout of the packets; RigError without any, since a file does not name its model."""
+    """Layout of the packets; RigError without packets, since a file has no model name."""
     layout = None if evidence is None else _layout(evidence)
     if layout is None:
         raise RigError(
-            f"{path}: HESAI angles: expected packets of the lidar in the first 10 seconds, to "
-            "tell its model and mode, found none; check its stream in the rig file, or leave it out"
+            f"{path}: HESAI angles: expected packets of the lidar in the first 10 seconds, which "
+            "define its model and mode, found none; check its stream in the rig file, or leave it "
+            "out"
         )
     return layout
 
 
 def _model_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
-    """The layout, of the model whose beams the file has, where packets leave that open."""
+    """Layout with the model of the file's beams, if packets fit several models."""
     is_b = layout.model is rows.PANDAR20A and not _note_on_beams(angles, rows.PANDAR20B)
     return replace(layout, model=rows.PANDAR20B) if is_b else layout
 
 
 def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
-    """What is odd about the elevations in a file, or nothing."""
+    """Note on elevations of a file that do not fit a model, or ""."""
     if model.elevation_deg is None:
         return ""
     got_deg = angles.elevation_rad.min() / RAD_PER_DEG, angles.elevation_rad.max() / RAD_PER_DEG
@@ -267,8 +268,8 @@ def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
 
 
 def _sense(reader: PacketReader, evidence: Evidence | None) -> int:
-    """1 for a rotor that turns clockwise seen from above, -1 for one that turns the other way."""
+    """1 for a clockwise rotor, seen from above; -1 for a counter-clockwise one."""
     if evidence is None or len(evidence.sample) < 2:
         return 1
-    step = np.diff(reader.azimuth_turns(evidence.sample[:_PACKETS_IN_A_ROW]))
+    step = np.diff(reader.azimuth_revolutions(evidence.sample[:_PACKETS_IN_A_ROW]))
     return -1 if median(step - np.rint(step)) < 0 else 1

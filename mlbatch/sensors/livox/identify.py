@@ -1,7 +1,7 @@
-"""Names of Livox packets by content: lengths, data types, and stamps that step.
+"""Names of Livox packets by content: sizes, data types, increasing timestamps.
 
-Source: facts/others.md (Livox SDK2 and SDK1); time type 5 (NTP): Livox communication protocol of
-the Avia2, v1.0.
+Source: docs/sources/others.md (Livox SDK2 and SDK1); time type 5 (NTP): Livox communication
+protocol of the Avia2, v1.0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _GPS_TIME = 3
 _IMU1 = 6
 
 
-# SDK1, by data type: bytes of the payload, and what they are.
+# SDK1, by data type: payload size and description.
 _TYPES1 = {
     0: (1318, "Cartesian, single return"),
     1: (918, "spherical, single return"),
@@ -35,7 +35,10 @@ _TYPES1 = {
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """A line on Livox packets, or None."""
+    """Name payloads (k, size); None if they are not Livox's.
+
+    SDK1 (Mid-40, Horizon, Avia, ...) is named, not decoded.
+    """
     packets = payload_rows(size, sample)
     if packets is None:
         return None
@@ -43,9 +46,9 @@ def describe(size: int, sample: U8Array) -> str | None:
 
 
 def identify(size: int, packets: U8Array) -> PointKind | None:
-    """What SDK2 packets (k, size) hold; None if they are none.
+    """Kind of points of SDK2 packets (k, size); None if they are other packets.
 
-    The header announces the size twice: as a length, and by points of a type.
+    The header states the size twice: as a length, and by number and type of points.
     """
     if size <= HEADER_SIZE or not len(packets):
         return None
@@ -67,7 +70,7 @@ def _describe_sdk2(size: int, packets: U8Array) -> str | None:
 
 
 def _describe_sdk1(size: int, packets: U8Array) -> str | None:
-    """A size and a type prove little, so the stamps of a few packets have to step forward."""
+    """Size and type are weak evidence, so timestamps of a few packets must increase."""
     if len(packets) < 2 or size < _HEADER1_SIZE:
         return None
     kind = most_common(number(packets, 9, 1))
@@ -75,10 +78,10 @@ def _describe_sdk1(size: int, packets: U8Array) -> str | None:
     time_type = most_common(number(packets, 8, 1))
     if size != expected or time_type not in _TIME_TYPES1:
         return None
-    # Version, slot, device and reserved byte, time and data type are a stream's own; the status
+    # Version, slot, device, reserved byte, time and data type are constant in a stream; the status
     # between them is not.
-    own = packets[:, [0, 1, 2, 3, 8, 9]]
-    if majority(packets, (own == np.median(own, axis=0)).all(axis=1)) is None:
+    constant = packets[:, [0, 1, 2, 3, 8, 9]]
+    if majority(packets, (constant == np.median(constant, axis=0)).all(axis=1)) is None:
         return None
     gps = time_type == _GPS_TIME
     step_ns = np.diff(number(packets, 14, 4) * NS_PER_US if gps else number(packets, 10, 8))

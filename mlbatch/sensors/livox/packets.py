@@ -1,6 +1,6 @@
-"""Livox SDK2 packets: the header, points that carry their own coordinates, IMU samples.
+"""Livox SDK2 packets: header, points with coordinates, IMU samples.
 
-Source: facts/others.md (Livox SDK2). What the CRC-32 covers, the time and the data: Livox
+Source: docs/sources/others.md (Livox SDK2). Coverage of the CRC-32, time and data: Livox
 communication protocol of the Avia2, v1.0.
 """
 
@@ -42,20 +42,20 @@ _NS_PER_INTERVAL = 100
 _CRC_FROM = 28
 _BAD_HEADER = FAULTS.index("bad_header")
 _BAD_CRC = FAULTS.index("bad_crc")
-_LEVEL = [("level", "u1"), ("tag", "u1")]
-_CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_LEVEL])
-_CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_LEVEL])
+_INTENSITY = [("intensity", "u1"), ("tag", "u1")]
+_CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_INTENSITY])
+_CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_INTENSITY])
 # zenith: from the z axis; azimuth: from x towards y; both in 0.01 degrees.
-_SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), *_LEVEL])
+_SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), *_INTENSITY])
 _SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
 IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
-_TURN_CDEG = 36000
+_CIRCLE_CDEG = 36000
 _QUARTER_CDEG = 9000
 
 
 @dataclass(frozen=True, slots=True)
 class PointKind:
-    """What SDK2 packets of a data type hold: bytes and returns of a point, and its coordinates."""
+    """Points of an SDK2 data type: bytes and returns of a point, and its coordinates."""
 
     data_type: int
     size: int
@@ -81,28 +81,28 @@ def headers(packets: U8Array) -> npt.NDArray[np.void]:
 
 
 def faults(packets: U8Array, kind: PointKind, *, check_crc: bool) -> U8Array:
-    """Index into FAULTS for each packet: other points than these, or damaged ones."""
+    """(P,) index into FAULTS: `bad_header` for other kinds of points, `bad_crc` for damage."""
     head = headers(packets)
     size = packets.shape[1]
     good = (head["data_type"] == kind.data_type) & (head["size"] == size)
     good &= head["points"] == (size - HEADER_SIZE) // kind.size
     found = np.where(good, 0, _BAD_HEADER).astype(np.uint8)
     if check_crc:
-        # Less than a microsecond each, a fraction of what their points take.
+        # Less than a microsecond each, a fraction of the decoding of their points.
         crc = [zlib.crc32(packet[_CRC_FROM:].tobytes()) for packet in packets]
         found[good & (head["crc"] != np.array(crc, np.uint32))] = _BAD_CRC
     return found
 
 
 def stamps_ns(packets: U8Array, points: int) -> I64Array:
-    """(P, points) times; points are spread evenly over the interval that the packet names.
+    """(P, points) timestamps, spread evenly over the interval stated in the packet.
 
-    The maker's driver divides it by the number of points, as here; its protocol says that it
-    lies between the first and the last.
+    The interval is divided by the number of points, as in the vendor's driver; the protocol
+    defines it as the time between the first and the last point.
     """
     head = headers(packets)
     interval_ns = head["interval"].astype(np.int64)[:, None] * _NS_PER_INTERVAL
-    # Times of damaged packets may be beyond int64: they turn negative, and are rejected as such.
+    # Timestamps of damaged packets may exceed int64: they become negative and are rejected.
     first_ns = head["stamp_ns"].astype(np.int64)[:, None]
     stamp_ns: I64Array = first_ns + interval_ns * np.arange(points) // points
     return stamp_ns
@@ -111,21 +111,21 @@ def stamps_ns(packets: U8Array, points: int) -> I64Array:
 def read_points(
     records: U8Array, which: int, kind: PointKind
 ) -> tuple[F64Array, F64Array, U8Array]:
-    """Coordinates (n, 3) and ranges (n,) in metres, and levels (n,), of one return of n points."""
-    layout, place = _RETURNS[kind.data_type]
+    """Coordinates (n, 3) and ranges (n,) in metres, and intensities (n,), of one return."""
+    layout, convert = _RETURNS[kind.data_type]
     begin = which * layout.itemsize
     point = records[:, begin : begin + layout.itemsize].view(layout)[:, 0]
-    xyz_m, range_m = place(point)
-    return xyz_m, range_m, point["level"]
+    xyz_m, range_m = convert(point)
+    return xyz_m, range_m, point["intensity"]
 
 
 def read_imu(payloads: U8Array, sensor: int) -> ImuSamples:
-    """The sample of each IMU packet; packets of points of the same size have none."""
+    """The sample of each IMU packet; point packets of the same size are skipped."""
     head = headers(payloads)
     is_sample = (head["data_type"] == IMU) & (head["points"] == 1)
     chosen = np.ascontiguousarray(payloads[is_sample, HEADER_SIZE:IMU_SIZE])
     sample = chosen.view(_SAMPLE)[:, 0]
-    # Damaged packets may hold NaN that signal.
+    # Damaged packets may contain signaling NaN.
     with np.errstate(invalid="ignore"):
         return ImuSamples(
             sensor,
@@ -161,18 +161,18 @@ def _spherical(point: Points) -> tuple[F64Array, F64Array]:
 
 def _sine(angle_cdeg: I64Array) -> F32Array:
     """Sine of whole hundredths of a degree."""
-    sines: F32Array = _sines().take(angle_cdeg % _TURN_CDEG)
+    sines: F32Array = _sines().take(angle_cdeg % _CIRCLE_CDEG)
     return sines
 
 
 @lru_cache(maxsize=1)
 def _sines() -> F32Array:
-    """Of a turn; rounded to float32, so that they depend on no library's last digit."""
-    sines: F32Array = np.sin(np.arange(_TURN_CDEG) * (0.01 * RAD_PER_DEG)).astype(np.float32)
+    """Sines of a full circle; float32, so that the last digit of a library has no effect."""
+    sines: F32Array = np.sin(np.arange(_CIRCLE_CDEG) * (0.01 * RAD_PER_DEG)).astype(np.float32)
     return sines
 
 
-# By data type: how a return is laid out, and what makes coordinates and range of it.
+# By data type: layout of a return, and conversion to coordinates and range.
 _RETURNS: Mapping[int, tuple[np.dtype[np.void], Callable[[Points], tuple[F64Array, F64Array]]]] = {
     1: (_CARTESIAN32, _from_millimetres),
     2: (_CARTESIAN16, _from_centimetres),

@@ -1,9 +1,9 @@
-"""Livox lidars of SDK2 (Mid-360, Mid-360s, HAP, Avia2): points that know where they are.
+"""Livox lidars of SDK2 (Mid-360, Mid-360s, HAP, Avia2): points with coordinates.
 
-Source: facts/others.md (Livox SDK2). There is no rotor and no calibration: every point carries its
-coordinates, and its time follows from its place in the packet. So a point is a column of one
-channel; which of its lasers made it (point number modulo 4 or 6) is not kept, since points of one
-column would share a time.
+Source: docs/sources/others.md (Livox SDK2). There is no rotor and no calibration: every point has
+coordinates, and its time follows from its number in the packet. So a point is a column of one
+channel; its laser (point number modulo 4 or 6) is dropped, since the points of a column share one
+timestamp.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ MODELS: tuple[SensorModel, ...] = (
 )
 _FITS_BYTES = 100
 _CLOCKS = {0: "time since power-on", 1: "gPTP or PTP", 2: "GPS", 5: "NTP"}
-# Where points go, and IMU samples with them: Mid-360 and HAP, unless set otherwise.
+# Default IMU port by point port: Mid-360 and HAP.
 _IMU_PORTS = {56301: 56401, 57000: 58000}
 _COUNTER_MODULUS = 1 << 16
-# How far counter and time may differ: a share of the packets since the first, and so many.
+# Tolerance between counter and time: a share of the packets since the first, plus so many.
 _COUNTER_SHARE = 0.1
 _COUNTER_SLACK = 2
 _SHARED_STAMP = (
-    "many of its packets share one time, as those of a frame of the Avia2 do: the times of their "
-    "points are no finer than that"
+    "most packets repeat the timestamp of the one before, as within a frame of the Avia2; the "
+    "times of their points are no more precise than that"
 )
 
 
 class LivoxCalibration:
-    """What there is to know beforehand: nothing; `Calibration` of lidar.py."""
+    """Livox needs no calibration; `Calibration` of lidar.py."""
 
     __slots__ = ()
 
@@ -73,18 +73,18 @@ class LivoxCalibration:
     is_shared = True
 
     def fit(self, evidence: Evidence) -> int:
-        """Whether these are packets of points."""
+        """Match packets of points."""
         kind = identify(evidence.size, evidence.sample)
         return _FITS_BYTES if kind is not None and kind.returns else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> LivoxLidar:
-        """The sensor."""
+        """Decoder of the sensor; its packets define the kind of points."""
         check_options(options)
         kind = None if evidence is None else identify(evidence.size, evidence.sample)
         if evidence is None or kind is None or not kind.returns:
             raise RigError(
-                f"{SDK2}: expected packets of points in the first 10 seconds, to tell their kind, "
-                "found none; check the sensor's stream in the rig file, or leave it out"
+                f"{SDK2}: expected packets of points in the first 10 seconds, which define the "
+                "kind, found none; check the sensor's stream in the rig file, or leave it out"
             )
         return LivoxLidar(kind, evidence, check_crc="crc" in options)
 
@@ -93,14 +93,14 @@ BUILT_IN: tuple[Calibration, ...] = (LivoxCalibration(),)
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:
-    """There are no such files."""
+    """None: there are no calibration files."""
     return None
 
 
 class LivoxLidar(BaseLidar):
-    """One sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; `Lidar` of lidar.py.
 
-    Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the points that were read last.
+    Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the last points read.
     """
 
     def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
@@ -122,29 +122,29 @@ class LivoxLidar(BaseLidar):
         self.calibration = ""
         self.imu_port = _IMU_PORTS.get(evidence.stream.port, 0)
         self.timestamp_mode = _CLOCKS.get(most_common(headers(packets)["time_type"]), "")
-        self.sequence_modulus = _COUNTER_MODULUS if _counts_on(packets) else 0
+        self.sequence_modulus = _COUNTER_MODULUS if _is_continuous(packets) else 0
         self.notes = (_SHARED_STAMP,) if _share_stamps(packets) else ()
         self.last_xyz_m: F64Array = np.empty((0, 3))
         self._kind = kind
         self._check_crc = check_crc
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         return faults(packets, self._kind, check_crc=self._check_crc)
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """The packet counter, where it is one."""
+        """(P,) packet counter; without one, a hash of the content."""
         if self.sequence_modulus:
             return headers(packets)["counter"].astype(np.int64)
         return content_keys(packets)
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps of all points."""
+        """Timestamps of all points."""
         stamp_ns = stamps_ns(packets, self.columns_per_packet)
         return Heads(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n points, and keep their coordinates for the projection."""
+        """Decode return `which` of n points; keeps their coordinates for the projection."""
         self.last_xyz_m, out.range_m[:, 0], out.intensity[:, 0] = read_points(
             records, which, self._kind
         )
@@ -158,32 +158,32 @@ class LivoxLidar(BaseLidar):
         return read_imu(payloads, sensor)
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
-        """Moves the points that were read last into the body frame."""
+        """Transform of the last points read into the body frame."""
         return MovedPoints(self, body_from_sensor)
 
 
 class MovedPoints:
-    """Points whose coordinates come with their ranges; `Projection` of geometry.py."""
+    """The last points read, moved into the body frame; `Projection` of geometry.py."""
 
     def __init__(self, lidar: LivoxLidar, body_from_sensor: F64Array) -> None:
         self._lidar = lidar
         self._body_from_sensor = body_from_sensor
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
-        """Nothing turns."""
+        """No rotor: nothing to prepare."""
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
-        """The points that the lidar has just read, summed in a fixed order (see geometry.py)."""
+        """Rotate and translate, summed in a fixed order (see geometry.py)."""
         x, y, z = self._lidar.last_xyz_m.T
         for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):
             out[:, 0, axis] = x * by_x + y * by_y + z * by_z + shift
 
 
-def _counts_on(packets: U8Array) -> bool:
-    """Whether the packet counter counts all packets, or starts over with every frame.
+def _is_continuous(packets: U8Array) -> bool:
+    """Whether the packet counter counts all packets, rather than those of each frame.
 
-    One that goes on grows like the time does, lost packets or not; a frame's numbers come back
-    soon, and would be taken for packets that came twice.
+    A continuous counter grows in proportion to time, even if packets are lost. A counter that
+    restarts with every frame would make later packets look like duplicates.
     """
     head = headers(packets)
     counter = head["counter"].astype(np.int64)
@@ -199,7 +199,7 @@ def _counts_on(packets: U8Array) -> bool:
 
 
 def _share_stamps(packets: U8Array) -> bool:
-    """Whether most packets that follow each other have one time."""
+    """Whether most consecutive packets have equal timestamps."""
     head = headers(packets)
     is_next = np.diff(head["counter"].astype(np.int64)) == 1
     is_same = head["stamp_ns"][1:] == head["stamp_ns"][:-1]

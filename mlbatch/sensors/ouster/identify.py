@@ -1,7 +1,7 @@
-"""What an unknown stream of payloads looks like, as far as Ouster goes.
+"""Names of Ouster packets by content.
 
-Source: facts/ouster.md sections 2, 4, 8 and 9. Only what the packets prove: columns in order for
-lidar packets, near stamps for IMU packets; a size alone is no proof.
+Source: docs/sources/ouster.md sections 2, 4, 8 and 9. A size alone identifies nothing: lidar
+packets need columns in order, IMU packets need timestamps close together.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ _ONE_WORD = PROFILES["RNG15_RFL8_NIR8"]
 _PIXELS_SIZES = {
     beams * profile.pixel_size for beams in _BEAMS for profile in PROFILES.values()
 } - {0}
-# What a machine that carries a lidar feels, in g.
+# Plausible accelerations of a vehicle, in g.
 _LEAST_G = 0.05
 _MOST_G = 100.0
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """A line on what payloads (k, size) of one stream are, or None if nothing proves them ours."""
+    """Name payloads (k, size) of one stream; None if they are not Ouster's."""
     packets = payload_rows(size, sample)
     if packets is None:
         return None
@@ -91,11 +91,11 @@ def _describe_imu(size: int, packets: U8Array) -> str | None:
         bool((stamp > 0).all()) and bool((np.abs(stamp - stamps[0]) < NS_PER_S).all())
         for stamp in stamps
     )
-    return "Ouster IMU" if near and _feels(float64(sample["acceleration_g"])) else None
+    return "Ouster IMU" if near and _like_gravity(float64(sample["acceleration_g"])) else None
 
 
 def _describe_lidar(size: int, packets: U8Array) -> str | None:
-    """Columns tell of themselves whatever the profile: their size follows from the packet's."""
+    """Lidar packets of any profile: the size of a column follows from that of the packet."""
     column_size, rest = divmod(size - HEADER_SIZE - FOOTER_SIZE, _COLUMNS)
     pixels_size = column_size - COLUMN.itemsize
     if rest or pixels_size not in _PIXELS_SIZES:
@@ -119,20 +119,20 @@ def _describe_other(size: int, packets: U8Array) -> str | None:
         samples = np.ascontiguousarray(raw).view(SAMPLE)[..., 0]
         step_ns = np.diff(samples["stamp_ns"], axis=1)
         in_order = bool(((step_ns > 0) & (step_ns < NS_PER_S)).all())
-        felt_g = float64(samples["acceleration"]) / STANDARD_GRAVITY
-        proven = in_order and _feels(felt_g)
+        norm_g = float64(samples["acceleration"]) / STANDARD_GRAVITY
+        is_plausible = in_order and _like_gravity(norm_g)
     else:
         name = "zone monitor"
         packet_type = ZONE_PACKET
-        proven = size == _ZONE_SIZE
-    header = _header_type(packets, packet_type) if proven else None
+        is_plausible = size == _ZONE_SIZE
+    header = _header_type(packets, packet_type) if is_plausible else None
     return None if header is None else f"Ouster {name}, {_serial(packets, header)}{size} bytes"
 
 
-def _feels(acceleration_g: F64Array) -> bool:
-    """Whether every packet (k, ..., 3) has a sample like gravity, and no sample is absurd."""
-    felt_g = np.linalg.norm(acceleration_g, axis=-1).reshape(len(acceleration_g), -1)
-    return bool((felt_g.max(axis=1) > _LEAST_G).all()) and bool((felt_g < _MOST_G).all())
+def _like_gravity(acceleration_g: F64Array) -> bool:
+    """Whether every packet (k, ..., 3) has a sample near gravity, and all samples are plausible."""
+    norm_g = np.linalg.norm(acceleration_g, axis=-1).reshape(len(acceleration_g), -1)
+    return bool((norm_g.max(axis=1) > _LEAST_G).all()) and bool((norm_g < _MOST_G).all())
 
 
 def _header_type(packets: U8Array, packet_type: int) -> str | None:

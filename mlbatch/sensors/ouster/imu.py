@@ -1,6 +1,6 @@
 """Ouster IMU packets, both kinds.
 
-Source: facts/ouster.md section 8 (ouster-sdk 1.0.1 `parsing.cpp`).
+Source: docs/sources/ouster.md section 8 (ouster-sdk 1.0.1 `parsing.cpp`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SAMPLE = np.dtype(
 SAMPLES_START = 132
 LEGACY_SIZE = LEGACY_IMU.itemsize
 ACCEL32 = "ACCEL32_GYRO32_NMEA"
-# The header of an IMU packet has no room for a count: n follows from the size, within reason.
+# The header has no sample count: n follows from the size, up to this limit.
 _MOST_SAMPLES = 256
 
 
@@ -50,13 +50,13 @@ def imu_size(samples: int) -> int:
 
 
 def float64(values: F32Array) -> F64Array:
-    """The values in double precision; damaged packets may hold NaN that signal."""
+    """Values as float64, without warnings for the signaling NaN of damaged packets."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.float64)
 
 
 def read_legacy(payloads: U8Array, sensor: int) -> ImuSamples:
-    """The one sample of each 48-byte packet; its stamp is the gyroscope's, as in the SDK."""
+    """The sample of each 48-byte packet, at the gyroscope's timestamp, as in the SDK."""
     sample = np.ascontiguousarray(payloads[:, :LEGACY_SIZE]).view(LEGACY_IMU)[:, 0]
     return ImuSamples(
         sensor,

@@ -1,9 +1,9 @@
 """Ouster metadata JSON: checked access to its values, and the sensor that it describes.
 
-Source: facts/ouster.md section 1 (ouster-sdk 1.0.1 `metadata.cpp`, `sensor_info.cpp`). Nested,
-flat, reduced and merged files hold the same fields under the same names, only in other places; so
-all objects are laid into one, and each field is looked up by its name. Sections that hold an error
-text instead of an object count as absent.
+Source: docs/sources/ouster.md section 1 (ouster-sdk 1.0.1 `metadata.cpp`, `sensor_info.cpp`).
+Nested, flat, reduced and merged files have the same fields under the same names, in different
+objects. All objects are merged into one mapping, in which a field is looked up by its name.
+Sections with an error text instead of an object count as absent.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mlbatch.sensors.ouster.profiles import (
 from mlbatch.types import F64Array
 from mlbatch.units import M_PER_MM, MM_PER_M, RAD_PER_DEG
 
-# Later ones win: config_params repeats fields of the data format as they were asked for.
+# Later sections win: config_params repeats fields of the data format as requested, not as used.
 _SECTIONS = (
     "config_params",
     "sensor_info",
@@ -39,7 +39,7 @@ _SECTIONS = (
     "data_format",
     "lidar_data_format",
 )
-# Any of these at the top makes a file Ouster's; others, too, might call a section `sensor_info`.
+# Any of these keys at the top identifies an Ouster file; `sensor_info` alone does not.
 _MARKS = ("beam_altitude_angles", "beam_intrinsics", "lidar_data_format")
 _SENSOR_INFO_MARKS = ("prod_line", "prod_sn", "initialization_id")
 _SHOWN_CHARS = 60
@@ -55,7 +55,7 @@ class Document:
     values: dict[str, object]
 
     def fail(self, key: str, expected: str, found: object) -> NoReturn:
-        """Raise the error of a value that cannot be used."""
+        """Raise RigError for a value that cannot be used."""
         text = found if isinstance(found, str) else json.dumps(found, default=str)
         shown = text if len(text) <= _SHOWN_CHARS else text[: _SHOWN_CHARS - 3] + "..."
         shown = " ".join(shown.split()) or "nothing"
@@ -64,7 +64,7 @@ class Document:
         )
 
     def text(self, key: str) -> str:
-        """A text, or "" where absent."""
+        """A text, or "" if absent."""
         value = self.values.get(key)
         if value is None:
             return ""
@@ -73,7 +73,7 @@ class Document:
         return value
 
     def integer(self, key: str, low: int, high: int) -> int | None:
-        """A whole number from low to high, or None where absent."""
+        """A whole number from low to high, or None if absent."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -85,12 +85,12 @@ class Document:
         return int(value)
 
     def number(self, key: str) -> float | None:
-        """A finite number, or None where absent."""
+        """A finite number, or None if absent."""
         value = self.values.get(key)
         return None if value is None else float(self._finite(key, "a finite number", [value])[0])
 
     def numbers(self, key: str, count: int | None, expected: str) -> F64Array | None:
-        """A list of finite numbers, of `count` entries if given, or None where absent."""
+        """A list of finite numbers, of `count` entries if given, or None if absent."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -101,14 +101,14 @@ class Document:
         return self._finite(key, expected, value)
 
     def pose_mm(self, key: str) -> F64Array | None:
-        """A rigid (4, 4) transform, millimetres in the file, metres here; None where absent."""
+        """A rigid (4, 4) transform, millimetres in the file, metres here; None if absent."""
         pose = self._pose(key)
         if pose is not None:
             pose[:3, 3] *= M_PER_MM
         return pose
 
     def pose_m(self, key: str) -> F64Array | None:
-        """A rigid (4, 4) transform in metres; None where absent."""
+        """A rigid (4, 4) transform in metres; None if absent."""
         return self._pose(key)
 
     def _pose(self, key: str) -> F64Array | None:
@@ -119,7 +119,7 @@ class Document:
         pose = values.reshape(4, 4)
         rotation = pose[:3, :3]
         rigid = (
-            # Beyond, the product below would overflow; no rotation has such numbers.
+            # Larger numbers are no rotation, and the product below would overflow.
             np.abs(rotation).max() <= 2.0
             and np.abs(rotation @ rotation.T - np.eye(3)).max() <= _RIGID_TOLERANCE
             and np.linalg.det(rotation) > 0
@@ -136,14 +136,14 @@ class Document:
         try:
             numbers = np.array(values, np.float64)
         except OverflowError:
-            self.fail(key, expected, "a number beyond all bounds")
+            self.fail(key, expected, "a number too large for a float")
         if not np.isfinite(numbers).all():
             self.fail(key, expected, str(numbers[~np.isfinite(numbers)][0]))
         return numbers
 
 
 def read_document(path: Path, content: bytes) -> Document | None:
-    """The metadata in a file, or None if it is another kind of file."""
+    """Read a metadata file as one mapping; None if it is another kind of file."""
     if not content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
         return None
     try:
@@ -155,7 +155,7 @@ def read_document(path: Path, content: bytes) -> Document | None:
         raise RigError(
             f"{path}: Ouster metadata: expected a JSON document, found {text}; {_REMEDY}"
         ) from err
-    if not isinstance(top, dict) or not _is_ours(top):
+    if not isinstance(top, dict) or not _is_ouster(top):
         return None
     values: dict[str, object] = {}
     for section in _SECTIONS:
@@ -169,7 +169,7 @@ def read_document(path: Path, content: bytes) -> Document | None:
     return Document(path, values)
 
 
-def _is_ours(top: dict[str, object]) -> bool:
+def _is_ouster(top: dict[str, object]) -> bool:
     info = top.get("sensor_info")
     return any(mark in top for mark in _MARKS) or (
         isinstance(info, dict) and any(mark in info for mark in _SENSOR_INFO_MARKS)
@@ -179,7 +179,7 @@ def _is_ours(top: dict[str, object]) -> bool:
 _DEFAULT_LIDAR_PORT = 7502
 _DEFAULT_IMU_PORT = 7503
 _DEFAULT_COLUMNS_PER_PACKET = 16
-# Beam origin offset by prefix of the product line, mm; the last one fits all others.
+# Beam origin offset by prefix of the product line, mm; the empty prefix matches all others.
 _DEFAULT_OFFSET_MM = (("OS-0-", 27.67), ("OS-1-", 15.806), ("OS-2-", 13.762), ("", 12.163))
 _DEFAULT_LIDAR_TO_SENSOR_M = np.array(
     [[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0.03618], [0, 0, 0, 1]]
@@ -193,11 +193,11 @@ _U16 = 65535
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """A sensor as its metadata describe it; lengths in metres, angles in rad, ids 0 if unknown.
+    """A sensor as described by its metadata; lengths in metres, angles in rad, ids 0 if unknown.
 
     altitude_rad, azimuth_rad: (B,), beam 0 is the top one; beam_offset_m: x and z of the beam
-    origins in the lidar frame; column_window: first and last measurement id that are sent, first
-    above last where the window spans encoder zero; imu_samples: samples per IMU packet, 0 unknown.
+    origins in the lidar frame; column_window: first and last measurement id sent, first
+    above last if the window spans encoder zero; imu_samples: samples per IMU packet, 0 unknown.
     """
 
     path: Path
@@ -225,7 +225,7 @@ class Metadata:
 
 
 def parse_metadata(document: Document) -> Metadata:
-    """All fields of a document, checked; RigError says which of them cannot be used."""
+    """Check and convert all fields of a document; RigError names a field that cannot be used."""
     altitude_deg, azimuth_deg = _angles_deg(document)
     layout = _layout(document, len(altitude_deg))
     columns_per_frame, lidar_mode = _frame(document, layout.columns)
@@ -269,7 +269,9 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
     for key in ("beam_altitude_angles", "beam_azimuth_angles"):
         value = document.values.get(key)
         if isinstance(value, list) and any(isinstance(entry, list) for entry in value):
-            document.fail(key, "one angle per beam", "a list per column: the unit does not spin")
+            document.fail(
+                key, "one angle per beam", "a list per column, as of a unit that does not spin"
+            )
         expected = "angles in degrees" if count is None else f"{count} angles in degrees"
         angles = document.numbers(key, count, expected)
         if angles is None or not len(angles):
@@ -283,9 +285,9 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
 
 def _layout(document: Document, beams: int) -> PacketLayout:
     key = "pixels_per_column"
-    told = document.integer(key, 1, _U16)
-    if told is not None and told != beams:
-        document.fail(key, f"{beams} as there are beam angles", told)
+    stated = document.integer(key, 1, _U16)
+    if stated is not None and stated != beams:
+        document.fail(key, f"{beams}, the number of beam angles", stated)
     name = document.text("udp_profile_lidar") or LEGACY
     if name not in PROFILES:
         document.fail("udp_profile_lidar", f"one of {', '.join(PROFILES)}", name)
@@ -305,7 +307,7 @@ def _frame(document: Document, columns_per_packet: int) -> tuple[int, str]:
     if columns is None:
         columns = int(match[1]) if match else None
     if not columns:
-        expected = "columns x rate such as 1024x10 where columns_per_frame is absent"
+        expected = "columns x rate such as 1024x10, as columns_per_frame is absent"
         document.fail("lidar_mode", expected, mode)
     if columns % columns_per_packet:
         expected = f"a multiple of columns_per_packet, {columns_per_packet}"
@@ -360,20 +362,20 @@ def _default_offset_mm(document: Document) -> float:
 
 
 def _extrinsics(document: Document) -> F64Array | None:
-    """Pose in the body frame; identity is what tools write that know of none."""
+    """Pose in the body frame; None for the identity, which tools write if they know no pose."""
     pose = document.pose_m("extrinsic")
     return None if pose is None or np.array_equal(pose, np.eye(4)) else pose
 
 
 def _notes(document: Document, beams: int) -> Iterator[str]:
-    """What a user should know of this file."""
+    """Notes for the user on unusual metadata."""
     product = re.match(r"OS-\w+-(\d+)", document.text("prod_line"))
     if product and int(product[1]) != beams:
-        # Firmware before 1.14: 64 angles and 64-beam packets for 16 and 32 beams, too.
+        # Firmware before 1.14 has 64 angles and 64-beam packets for units of 16 and 32 beams.
         yield f"{document.text('prod_line')} has {beams} beam angles: packets of {beams} beams"
     addresses = [document.values.get(key) for key in ("udp_dest", "udp_ip")]
     if document.values.get("udp_port_lidar") == 0 or ("" in addresses and not any(addresses)):
-        yield "the metadata say that the lidar output was off"
+        yield "lidar output is off according to the metadata"
     origin = ("beam_to_lidar_transform", "lidar_origin_to_beam_origin_mm")
     if all(document.values.get(key) is None for key in origin):
         offset_m = _default_offset_mm(document) * M_PER_MM

@@ -1,6 +1,6 @@
 """Headers of Ouster lidar packets, many packets at once.
 
-Source: facts/ouster.md sections 2, 5 and 10.
+Source: docs/sources/ouster.md sections 2, 5 and 10.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _ID_OFFSET = 8
 _ID_BYTES = 2
 # Firmware before 2.3 leaves the footer empty, 2.3 and 2.4 write DE C0 00 00 EF BE AD DE.
 _NO_CRC = (0, 0xDEADBEEF0000C0DE)
-# The smallest number of the machine that holds one of so many bytes.
+# Smallest integer type for a number of so many bytes.
 _WORDS = [np.dtype(f"<u{size}") for size in (1, 1, 2, 4, 4, 8, 8, 8)]
 
 
-def unsigned(packets: U8Array, place: tuple[int, int]) -> I64Array:
-    """The little-endian number (P,) at `place` (first byte, bytes) of all packets."""
-    first, size = place
+def unsigned(packets: U8Array, field_bytes: tuple[int, int]) -> I64Array:
+    """(P,) little-endian number at `field_bytes` (first byte, bytes)."""
+    first, size = field_bytes
     word = _WORDS[size]
     if first + word.itemsize <= packets.shape[1]:
         words = packets[:, first : first + word.itemsize].view(word)[:, 0].astype(np.int64)
@@ -52,7 +52,7 @@ def unsigned(packets: U8Array, place: tuple[int, int]) -> I64Array:
 
 
 def first_measurement_ids(packets: U8Array, layout: PacketLayout) -> I64Array:
-    """Measurement id of each packet's first column (P,)."""
+    """(P,) measurement id of the first column."""
     return unsigned(packets, (layout.record_start + _ID_OFFSET, _ID_BYTES))
 
 
@@ -65,24 +65,24 @@ def column_bytes(packets: U8Array, layout: PacketLayout) -> U8Array:
 
 @dataclass(frozen=True, slots=True)
 class LegacyHeaders:
-    """LEGACY packets: all there is stands in the columns; no serial number, no checksum."""
+    """LEGACY packets: no header, only columns; no serial number, no checksum."""
 
     layout: PacketLayout
     columns_per_frame: int
 
     def heads(self, packets: U8Array) -> Heads:
-        """Stamps, measurement ids and validity of all columns."""
+        """Timestamps, measurement ids and validity of all columns."""
         columns = self._columns(packets)
         mid = columns["measurement_id"].astype(np.int64)
         valid = self._measured(packets) & (mid < self.columns_per_frame)
         return Heads(columns["stamp_ns"].astype(np.int64), mid, valid)
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """True: packets carry no serial number."""
+        """(P,) True: packets carry no serial number."""
         return np.ones(len(packets), np.bool_)
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Valid columns of a packet stand side by side in one frame; else it is no such packet."""
+        """`bad_header` unless the valid columns of a packet are neighbours in one frame."""
         columns = self._columns(packets)
         measured = self._measured(packets)
         frame = columns["frame_id"].astype(np.int64)
@@ -95,11 +95,11 @@ class LegacyHeaders:
         return np.where(bad, BAD_HEADER, 0).astype(np.uint8)
 
     def frame_ids(self, packets: U8Array) -> I64Array:
-        """The frame of each packet."""
+        """(P,) frame id."""
         return self._columns(packets)["frame_id"][:, 0].astype(np.int64)
 
     def init_ids(self, packets: U8Array) -> I64Array:
-        """0: packets carry none."""
+        """(P,) 0: packets carry none."""
         return np.zeros(len(packets), np.int64)
 
     serials = init_ids
@@ -116,10 +116,10 @@ class LegacyHeaders:
 
 @dataclass(frozen=True, slots=True)
 class PacketHeaders:
-    """Packets with a header. `header` is what the metadata say of its layout.
+    """Packets with a header of the layout `header`, according to the metadata.
 
-    Manuals and firmware differ on the layout of STANDARD, so a serial number found where the other
-    layout has it decides for the other layout.
+    Manuals and firmware disagree on the layout of STANDARD: if the serial number is found at the
+    offset of the other layout, the other layout is used.
     """
 
     layout: PacketLayout
@@ -129,7 +129,7 @@ class PacketHeaders:
     check_crc: bool = False
 
     def heads(self, packets: U8Array) -> Heads:
-        """Stamps, measurement ids and validity of all columns."""
+        """Timestamps, measurement ids and validity of all columns."""
         raw = column_bytes(packets, self.layout)[:, :, : COLUMN.itemsize]
         columns = np.ascontiguousarray(raw).view(COLUMN)[..., 0]
         mid = columns["measurement_id"].astype(np.int64)
@@ -137,7 +137,7 @@ class PacketHeaders:
         return Heads(columns["stamp_ns"].astype(np.int64), mid, valid)
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """Whether the serial number is the sensor's; 0 on either side is unknown and fits all."""
+        """(P,) whether the serial number is the sensor's; 0 on either side matches all."""
         found = self.serials(packets)
         owned: BoolArray = found == self.serial
         if owned.all():
@@ -145,36 +145,36 @@ class PacketHeaders:
         return np.asarray(owned | (found == 0) | (self.serial == 0))
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Packets that are not lidar packets; with `check_crc` also those that were changed."""
+        """(P,) `bad_header` for other packets, `bad_crc` for changed ones if `check_crc`."""
         bad = self._read(packets, "packet_type") != LIDAR_PACKET
         verdict: U8Array = bad * np.uint8(BAD_HEADER)
         if self.check_crc and self.header == STANDARD:
-            # A checksum is written by STANDARD headers only, and not by early firmware.
-            told = np.ascontiguousarray(packets[:, -CRC_SIZE:]).view("<u8")[:, 0]
-            wrong = (crc64(packets[:, :-CRC_SIZE]) != told) & ~np.isin(told, _no_crc())
+            # Only packets with STANDARD headers have a checksum, and not of early firmware.
+            stated = np.ascontiguousarray(packets[:, -CRC_SIZE:]).view("<u8")[:, 0]
+            wrong = (crc64(packets[:, :-CRC_SIZE]) != stated) & ~np.isin(stated, _no_crc())
             verdict[wrong & ~bad] = BAD_CRC
         return verdict
 
     def frame_ids(self, packets: U8Array) -> I64Array:
-        """The frame of each packet."""
+        """(P,) frame id."""
         return self._read(packets, "frame_id")
 
     def init_ids(self, packets: U8Array) -> I64Array:
-        """The initialization id in each packet."""
+        """(P,) initialization id."""
         return self._read(packets, "init_id")
 
     def serials(self, packets: U8Array) -> I64Array:
-        """The serial number in each packet."""
+        """(P,) serial number."""
         return self._read(packets, "serial")
 
     def _read(self, packets: U8Array, field: str) -> I64Array:
         value = _header_field(packets, HEADERS[self.header], field)
         if self.serial == 0:
             return value
-        told = (
+        serial = (
             value if field == "serial" else _header_field(packets, HEADERS[self.header], "serial")
         )
-        here = told == self.serial
+        here = serial == self.serial
         if here.all():
             return value
         other = FUSA if self.header == STANDARD else STANDARD
@@ -183,8 +183,8 @@ class PacketHeaders:
 
 
 def _header_field(packets: U8Array, header: HeaderLayout, field: str) -> I64Array:
-    place: tuple[int, int] = getattr(header, field)
-    return unsigned(packets, place)
+    field_bytes: tuple[int, int] = getattr(header, field)
+    return unsigned(packets, field_bytes)
 
 
 def _no_crc() -> npt.NDArray[np.uint64]:

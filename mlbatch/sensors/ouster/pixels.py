@@ -1,8 +1,8 @@
-"""Pixels of gathered Ouster columns: the hot path.
+"""Pixels of gathered Ouster columns (hot path).
 
-Source: facts/ouster.md section 3. No field crosses a 32-bit word, so a column is a row of words and
-a range is one of them, shifted and masked; reflectivity and signal are whole bytes in all profiles.
-Few passes over scratch that is reused; where a pixel is one word, whole rows are shifted and
+Source: docs/sources/ouster.md section 3. No field crosses a 32-bit word, so a column is a row of
+words and a range is one word, shifted and masked; reflectivity and signal are whole bytes in all
+profiles. Few passes over reused scratch arrays; if a pixel is one word, whole rows are shifted and
 masked, header included, since short rows cost more.
 """
 
@@ -25,7 +25,7 @@ _WORD_BYTES = 4
 
 @dataclass(frozen=True, slots=True)
 class _BitField:
-    """A field as a word of a pixel: (word >> shift) & mask; None where the step is not needed."""
+    """A field as (word >> shift) & mask; None for a step that is not needed."""
 
     word: int
     shift: np.uint32 | None
@@ -34,7 +34,7 @@ class _BitField:
 
 @dataclass(frozen=True, slots=True)
 class _ByteField:
-    """A field that is whole bytes of a pixel, and so is read where it stands."""
+    """A field of whole bytes, read in place."""
 
     first: int
     dtype: np.dtype[np.unsignedinteger[Any]]
@@ -42,7 +42,7 @@ class _ByteField:
 
 @dataclass(frozen=True, slots=True)
 class _Return:
-    """The fields of one return; `per_metre`: units of the raw range in a metre."""
+    """Fields of one return; per_metre: raw range units in a metre."""
 
     range: _BitField
     per_metre: np.float32
@@ -51,7 +51,7 @@ class _Return:
 
 
 class PixelReader:
-    """Decodes columns of one layout; owns its scratch."""
+    """Decoder of the columns of one layout; owns its scratch arrays."""
 
     __slots__ = ("_beams", "_first", "_floats", "_returns", "_step", "_words")
 
@@ -73,7 +73,7 @@ class PixelReader:
         fields = self._returns[which]
         floats = self._floats[: len(records)]
         np.copyto(floats, self._take(words, fields.range))
-        # Below 2**24, so exact; one division of exact values is correctly rounded.
+        # Integers below 2**24 are exact in float32, so only the division rounds.
         np.divide(floats, fields.per_metre, out=out.range_m)
         reflectivity = self._whole(records, fields.reflectivity)
         if out.reflectivity is not None:
@@ -82,7 +82,7 @@ class PixelReader:
         np.copyto(out.intensity, reflectivity if signal is None else self._whole(records, signal))
 
     def _take(self, words: U32Array, part: _BitField) -> I32Array:
-        """A field of all pixels (n, H), in scratch: signed, as CPUs turn those into floats fast."""
+        """A field of all pixels (n, H), in scratch; signed, which CPUs convert to float faster."""
         taken = self._words[: len(words)]
         end = self._first + self._beams * self._step
         pixels = slice(self._first, end) if self._step == 1 else slice(None)
@@ -94,7 +94,7 @@ class PixelReader:
         return source[:, pixels].view(np.int32)
 
     def _whole(self, records: U8Array, field: _ByteField) -> npt.NDArray[np.unsignedinteger[Any]]:
-        """A field of all pixels (n, H), where it stands in the records."""
+        """A field of all pixels (n, H), a view of the records."""
         first = self._first * _WORD_BYTES
         size = self._step * _WORD_BYTES
         pixels = records[:, first : first + self._beams * size]
@@ -109,7 +109,7 @@ class PixelReader:
 
 
 def pixel_table(layout: PacketLayout) -> PixelTable:
-    """The same for compiled loops, as numbers in words."""
+    """Pixel layout for compiled decoding."""
     fields = layout.profile.fields
     returns = layout.profile.returns
     runs = (Run(layout.column_header_size, 0, layout.beams),)

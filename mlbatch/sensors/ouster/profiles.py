@@ -1,7 +1,8 @@
-"""Ouster packets as tables: where every field of every profile lies.
+"""Layout of Ouster packets and of the pixels of every profile.
 
-Source: facts/ouster.md sections 2-4 (ouster-sdk 1.0.1 `parsing.cpp` and the Firmware User Manual,
-"Lidar Data"). All integers are little-endian; bits count from bit 0 of a pixel's first byte.
+Source: docs/sources/ouster.md sections 2-4 (ouster-sdk 1.0.1 `parsing.cpp` and the Firmware User
+Manual, "Lidar Data"). All integers are little-endian; bits count from bit 0 of a pixel's first
+byte.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ HEADER_SIZE = 32
 FOOTER_SIZE = 32
 CRC_SIZE = 8
 
-# Section 2: 16 bytes, and 4 bytes of status behind the pixels.
+# Section 2: 16 bytes, and 4 bytes of status after the pixels.
 LEGACY_COLUMN = np.dtype(
     [("stamp_ns", "<i8"), ("measurement_id", "<u2"), ("frame_id", "<u2"), ("encoder", "<u4")]
 )
@@ -37,7 +38,7 @@ ENCODER_TICKS = 90112
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field of a pixel: its value is `width` bits from `first_bit` on, times 2**shift."""
+    """A field of a pixel: `width` bits from `first_bit` on, times 2**shift."""
 
     first_bit: int
     width: int
@@ -46,7 +47,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class HeaderLayout:
-    """Where a packet header holds its fields: (first byte, bytes)."""
+    """Fields of a packet header as (first byte, bytes)."""
 
     packet_type: tuple[int, int]
     frame_id: tuple[int, int]
@@ -64,7 +65,7 @@ HEADERS: Mapping[str, HeaderLayout] = {
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """A lidar profile: the fields of its pixels by name; RANGE is in mm, 0 is no return."""
+    """A lidar profile: pixel fields by name; RANGE in mm, 0 for no return."""
 
     name: str
     pixel_size: int
@@ -77,7 +78,7 @@ class Profile:
 
     @property
     def header(self) -> str:
-        """Header type that goes with the profile where the metadata name none."""
+        """Header type of the profile if the metadata have none."""
         return FUSA if self.name.startswith("FUSA") else STANDARD
 
 

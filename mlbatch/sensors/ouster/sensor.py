@@ -1,7 +1,7 @@
 """Ouster lidars: OS0, OS1, OS2, OSDome, all firmware since 1.12, described by their metadata JSON.
 
-Source: facts/ouster.md (ouster-sdk 1.0.1; Firmware User Manual, "Lidar Data"). A packet holds C
-columns with one stamp each; the pixels of a column fire together, so no firing offsets exist.
+Source: docs/sources/ouster.md (ouster-sdk 1.0.1; Firmware User Manual, "Lidar Data"). A packet has
+C columns with one timestamp each; the pixels of a column fire together, without firing offsets.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
 
 BUILT_IN: tuple[Calibration, ...] = ()
 
-# How sure a match is: a serial number decides, then the configuration, then the ports.
+# Match scores: the serial number decides, then the configuration, then the ports.
 _FITS_SERIAL = 1000
 _FITS_INIT_ID = 100
 _FITS_LIDAR_PORT = 10
@@ -82,7 +82,7 @@ _DEFAULT_FRAME_IDS = 1 << 16
 
 
 def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
-    """The metadata in a file, or None if it holds something else."""
+    """Parse a metadata file; None if it is something else."""
     document = read_document(path, content)
     return None if document is None else OusterCalibration(parse_metadata(document))
 
@@ -101,7 +101,7 @@ class OusterCalibration:
         self._headers = _headers(described, check_crc=False)
 
     def fit(self, evidence: Evidence) -> int:
-        """How well packets fit; a payload may have one byte more, as old ROS drivers append it."""
+        """Match score of packets; old ROS drivers append one byte to payloads."""
         size = self.metadata.layout.packet_size
         is_off = self.metadata.layout.profile.returns == 0
         if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
@@ -113,7 +113,7 @@ class OusterCalibration:
         return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> OusterLidar:
-        """The sensor."""
+        """Decoder of the sensor; RigError if its profile has no pixels."""
         check_options(options)
         if self.metadata.layout.profile.returns == 0:
             raise RigError(
@@ -139,11 +139,11 @@ class OusterCalibration:
 
 
 class OusterLidar:
-    """One sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; `Lidar` of lidar.py.
 
-    Beyond the protocol: `lidar_port`, `init_id`. `sequence` is negative for packets outside the
-    column window of the metadata: they stand outside the sensor's count, whose modulus is frames x
-    packets per frame.
+    Beyond the protocol: `lidar_port`, `init_id`. The sequence counts the packets within the column
+    window of the metadata, modulo frames x packets per frame; it is negative for packets outside
+    the window.
     """
 
     def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:
@@ -151,7 +151,7 @@ class OusterLidar:
         self.vendor = VENDOR
         self.model = model
         self.serial = serial
-        # LEGACY packets have no header, and so name nobody.
+        # LEGACY packets have no header, hence no serial number.
         self.carries_serial = layout.profile.name != LEGACY and bool(serial)
         self.mode = f"{described.lidar_mode or described.columns_per_frame} {layout.profile.name}"
         self.channels = layout.beams
@@ -162,7 +162,7 @@ class OusterLidar:
         self.column_period_ns = _column_period_ns(described)
         self.records = Records(layout.record_start, layout.record_size, layout.record_size)
         self.pixel_layout = (VENDOR, layout.profile.name, layout.beams, described.strongest_first)
-        # Which of two returns is the strongest depends on their order: the decoder sorts them out.
+        # The type of dual returns follows from their order, see `typed_by`.
         self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
         self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""
         self.sends_twice = False
@@ -189,15 +189,15 @@ class OusterLidar:
         self.sequence_modulus = self._frame_ids * in_window
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """Which packets carry this sensor's serial number, or none."""
+        """(P,) whether packets carry this sensor's serial number, or none."""
         return self._headers.owns(packets)
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         return self._headers.faults(packets)
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """Frame id and rank within the frame as one number."""
+        """(P,) frame id and rank within the frame as one number."""
         frame = self._headers.frame_ids(packets) % self._frame_ids
         first = first_measurement_ids(packets, self._metadata.layout)
         block = first // self.columns_per_packet
@@ -209,15 +209,15 @@ class OusterLidar:
         return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps, measurement ids and validity of all columns."""
+        """Timestamps, measurement ids and validity of all columns."""
         return self._headers.heads(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, record_size) into `out`, whose arrays may stride."""
+        """Decode return `which` of columns (n, record_size) into `out`, which may be strided."""
         self._pixels.read(records, which, out)
 
     def is_imu(self, size: int) -> bool:
-        """Whether a payload of this size is an IMU packet (perhaps with a driver's extra byte)."""
+        """Whether a payload of this size is an IMU packet; old ROS drivers append one byte."""
         return size != self.packet_size and _is_imu(self._metadata, size)
 
     def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
@@ -231,14 +231,14 @@ class OusterLidar:
         return pose
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """The vectors of the beams suffice."""
+        """None: the beam vectors suffice."""
         return None
 
 
 def beam_table(described: Metadata) -> BeamTable:
-    """Section 6 as vectors per beam, in the sensor frame, metres.
+    """Beam vectors in the sensor frame, metres (section 6).
 
-    The angle of a column falls while measurement ids rise: the sensor turns clockwise.
+    The angle of a column decreases with its measurement id: the sensor rotates clockwise.
     """
     azimuth = -described.azimuth_rad
     altitude = described.altitude_rad
@@ -254,7 +254,7 @@ def beam_table(described: Metadata) -> BeamTable:
     )
     offset_x, offset_z = described.beam_offset_m
     origin = np.array([[[offset_x, 0.0, 0.0]], [[0.0, offset_x, 0.0]], [[0.0, 0.0, offset_z]]])
-    # Ranges count from the front of the rotor, which lies this far from its axis.
+    # Ranges are measured from the front of the rotor, at this distance from its axis.
     reach_m = -(math.hypot(offset_x, offset_z) if offset_z else offset_x)
     column = np.arange(described.columns_per_frame)
     angle_rad = 2 * math.pi * (1 - column / described.columns_per_frame)
@@ -272,17 +272,17 @@ def _headers(described: Metadata, check_crc: bool) -> Headers:
 
 
 def _column_period_ns(described: Metadata) -> float:
-    """By the mode, as 1024x10; 0 where the metadata name none."""
-    turns_per_s = described.lidar_mode.rpartition("x")[2]
-    if not turns_per_s.isdigit() or not int(turns_per_s):
+    """Column period by the mode, such as 1024x10; 0 if the metadata have no mode."""
+    revolutions_per_s = described.lidar_mode.rpartition("x")[2]
+    if not revolutions_per_s.isdigit() or not int(revolutions_per_s):
         return 0.0
-    return NS_PER_S / (described.columns_per_frame * int(turns_per_s))
+    return NS_PER_S / (described.columns_per_frame * int(revolutions_per_s))
 
 
 def _packet_ranks(described: Metadata) -> tuple[I64Array, int]:
-    """Rank of every packet of a full frame among those that are sent (-1: not sent), and how many.
+    """Rank of every packet of a full frame among those sent (-1: not sent), and their number.
 
-    A window that spans encoder zero gives frames that begin at column 0 with its second part.
+    If the window spans encoder zero, a frame begins at column 0 with the second part of the window.
     """
     size = described.layout.columns
     blocks = np.arange(described.columns_per_frame // size)

@@ -1,7 +1,7 @@
-"""What ROBOSENSE units say of themselves beyond their model: DIFOP (device) packets, csv of angles.
+"""Properties of a ROBOSENSE unit: DIFOP (device) packets, csv of angles, first point packets.
 
-Source: facts/robosense.md sections 1 to 7. What both kinds of packets say together: mode, steps,
-firing times, notes_on_model.
+Source: docs/sources/robosense.md sections 1 to 7. Point and device packets together define return
+mode, distance unit and firing times.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ _MODE_AT = 300
 _SYNC_AT = 302
 _REVERSED_AT = 337
 _SYNC_STATES = {0: "not synchronised", 1: "GPS", 2: "PTP"}
-# What the counts of channels of all models are; a csv file has as many lines.
+# Channels of all models; a csv file has as many lines.
 _CHANNELS = tuple(sorted({row.channels for row in ROWS}))
 _MOST_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True)
 class Angles:
-    """Of each channel, degrees: elevation, and azimuth correction, clockwise; (channels,) each."""
+    """(channels,) elevations and clockwise azimuth corrections, degrees."""
 
     elevation_deg: F64Array
     azimuth_deg: F64Array
@@ -59,7 +59,7 @@ class Angles:
 class Difop:
     """A device packet; mode: DIFOP byte 300; installation: of an Airy (0 normal, 1 side, 2 M).
 
-    firmware: bytes 41 to 43, which are 0 in the first years' units; sync: state in words.
+    firmware: bytes 41 to 43, which are 0 in early units; sync: state in words.
     """
 
     payload: U8Array
@@ -71,24 +71,24 @@ class Difop:
     firmware: int
 
     def angles(self, model: Model) -> Angles | None:
-        """Angles of the channels, or None where the unit was never given any."""
-        places = model.angles
+        """Angles of the channels; None if the unit has none."""
+        offsets = model.angles
         count = model.channels
-        elevation = self._angles(places.elevation_at, count, signed=places.signed)
+        elevation = self._angles(offsets.elevation_at, count, signed=offsets.signed)
         azimuth: F64Array | None = np.zeros(count)
-        if places.azimuth_at:
-            azimuth = self._angles(places.azimuth_at, count, signed=True)
+        if offsets.azimuth_at:
+            azimuth = self._angles(offsets.azimuth_at, count, signed=True)
         if elevation is None or azimuth is None:
             return None
-        elevation = elevation * places.unit_deg
-        azimuth = azimuth * places.unit_deg
-        if not places.signed:
+        elevation = elevation * offsets.unit_deg
+        azimuth = azimuth * offsets.unit_deg
+        if not offsets.signed:
             elevation[: count // 2] *= -1.0
         usable = (np.abs(elevation) <= _MOST_DEG).all() and len(np.unique(elevation)) > 1
         return Angles(elevation, azimuth) if usable else None
 
     def _angles(self, at: int, count: int, *, signed: bool) -> F64Array | None:
-        """Three bytes a channel: sign and size, or size alone; None where one is not written."""
+        """(count,) three bytes each: sign and magnitude, or magnitude; None if one is unset."""
         fields = self.payload[at : at + 3 * count].reshape(count, 3)
         if not signed:
             return number(fields, 0, 3, ">").astype(np.float64)
@@ -98,9 +98,9 @@ class Difop:
 
 
 def find_difop(evidence: Evidence) -> Difop | None:
-    """The device packet of the unit that sent the point packets; RigError if several may be.
+    """Device packet of the unit that sent the point packets; RigError if several units fit.
 
-    On topics it comes between the point packets, else from the same source to another port.
+    On topics it is among the point packets, else it has the same source and another port.
     """
     own = _whole(evidence.sample)
     for packets in (own, np.concatenate([own, *(_whole(one.sample) for one in evidence.beside)])):
@@ -111,9 +111,9 @@ def find_difop(evidence: Evidence) -> Difop | None:
         if len(units) > 1:
             names = ", ".join(unit.tobytes().hex() for unit in units)
             raise RigError(
-                f"{evidence.stream}: ROBOSENSE: expected the device packets of one sensor beside "
-                f"its point packets, found those of {len(units)} (serial numbers {names}); give "
-                "the sensor a csv of its angles as metadata"
+                f"{evidence.stream}: ROBOSENSE: expected device packets of one sensor from the "
+                f"source of its point packets, found those of {len(units)} (serial numbers "
+                f"{names}); give the sensor a csv of its angles as metadata"
             )
         if len(packets):
             return _difop(packets)
@@ -127,7 +127,7 @@ def _whole(packets: U8Array) -> U8Array:
 
 
 def _of_port(packets: U8Array, port: int) -> U8Array:
-    """Those of units that send to this port, if that is what tells units apart."""
+    """Packets of units that send to this port; all packets if there are none."""
     at = _PORTS_AT + 2 * np.arange(_PORTS)
     ports = packets[:, at].astype(np.int64) << 8 | packets[:, at + 1]
     named = (ports == port).any(axis=1)
@@ -135,24 +135,24 @@ def _of_port(packets: U8Array, port: int) -> U8Array:
 
 
 def _difop(packets: U8Array) -> Difop:
-    """What most of the packets (k, 1248) say: damage of a few does no harm."""
-    said = np.sort(packets, axis=0)[len(packets) // 2]
-    serial = said[_SERIAL].tobytes()
+    """Device packet of the median of each byte of packets (k, 1248), robust to damage."""
+    median_packet = np.sort(packets, axis=0)[len(packets) // 2]
+    serial = median_packet[_SERIAL].tobytes()
     return Difop(
-        payload=said,
+        payload=median_packet,
         serial=serial.hex() if any(serial) else "",
-        mode=int(said[_MODE_AT]),
-        sync=_SYNC_STATES.get(int(said[_SYNC_AT]), ""),
-        installation=int(said[_INSTALLATION_AT]),
-        is_reversed=bool(said[_REVERSED_AT] == 1),
-        firmware=int.from_bytes(said[_FIRMWARE].tobytes(), "big"),
+        mode=int(median_packet[_MODE_AT]),
+        sync=_SYNC_STATES.get(int(median_packet[_SYNC_AT]), ""),
+        installation=int(median_packet[_INSTALLATION_AT]),
+        is_reversed=bool(median_packet[_REVERSED_AT] == 1),
+        firmware=int.from_bytes(median_packet[_FIRMWARE].tobytes(), "big"),
     )
 
 
 def read_angles(path: Path, content: bytes) -> Angles | None:
-    """The maker's csv of angles: "elevation,azimuth" in degrees, a line a channel.
+    """Parse the vendor's csv of angles: "elevation,azimuth" in degrees, one line per channel.
 
-    None if it is no table of two columns; RigError if its numbers cannot be a lidar's.
+    None if it is no table of two columns; RigError if its numbers are implausible.
     """
     lines = _lines(content)
     cells = [line.split(",") for line in lines]
@@ -163,24 +163,24 @@ def read_angles(path: Path, content: bytes) -> Angles | None:
     pairs = [(_number(first), _number(second)) for first, second in cells]
     if not any(math.isfinite(value) for pair in pairs for value in pair):
         return None
-    expected = f"{path}: ROBOSENSE angles: expected "
+    start = f"{path}: ROBOSENSE angles: expected "
     if len(pairs) not in _CHANNELS:
         raise RigError(
-            f"{expected}{', '.join(map(str, _CHANNELS[:-1]))} or {_CHANNELS[-1]} lines "
+            f"{start}{', '.join(map(str, _CHANNELS[:-1]))} or {_CHANNELS[-1]} lines "
             f"`elevation,azimuth`, found {len(pairs)}; give a line for each channel of the sensor"
         )
     for line, (elevation, azimuth) in enumerate(pairs, start=1):
         if not (abs(elevation) <= _MOST_DEG and abs(azimuth) <= 2 * _MOST_DEG):
             raise RigError(
-                f"{expected}degrees up to 90 and 180 in line {line + len(lines) - len(pairs)}, found "
-                f"{','.join(cells[line - 1])!r}; correct the file"
+                f"{start}degrees up to 90 and 180 in line {line + len(lines) - len(pairs)}, "
+                f"found {','.join(cells[line - 1])!r}; correct the file"
             )
     table = np.array(pairs)
     return Angles(table[:, 0].copy(), table[:, 1].copy())
 
 
 def _lines(content: bytes) -> list[str]:
-    """Lines of a short text that are not empty; none if it is something else."""
+    """Non-empty lines of a short text; none if it is something else."""
     if len(content) > 100_000:
         return []
     try:
@@ -199,10 +199,10 @@ def _number(text: str) -> float:
 
 COUNTER_MODULUS = 1 << 32
 _COUNTED_PACKETS = 16
-# Helios, byte 17: step of distances, here as steps in a metre.
+# Helios, byte 17: distance unit, here as units in a metre.
 _STEP_AT = 17
 _STEPS_PER_M = {0: 200, 1: 400}
-# Ruby Plus 80: the model byte, which sources put at either place.
+# Ruby Plus 80: offset of the model byte, on which sources disagree.
 _VARIANT_BYTES = (31, 32)
 _PLUS_80V = 3
 
@@ -210,31 +210,31 @@ _PLUS_80V = 3
 def return_mode(
     points: U8Array, row: Model, difop: Difop | None
 ) -> tuple[ReturnMode, tuple[str, ...]]:
-    """Return mode: how many returns by the point packets, which one by the device packet."""
-    told = None if difop is None else row.modes.get(difop.mode)
+    """Return mode: number of returns by point packets, type by the device packet; and notes."""
+    stated = None if difop is None else row.modes.get(difop.mode)
     seen = returns_of(points, row)
-    if told is not None and seen in (0, told.returns):
-        return told, ()
+    if stated is not None and seen in (0, stated.returns):
+        return stated, ()
     if seen:
         return ReturnMode(seen, OTHER), ()
-    note = "neither point nor DIFOP packets tell the return mode: single return is taken"
+    note = "neither point nor DIFOP packets state the return mode: single return assumed"
     return ReturnMode(1, OTHER), (note,)
 
 
 def units_per_m(points: U8Array, row: Model) -> tuple[int, tuple[str, ...]]:
-    """Steps of a raw distance in a metre."""
+    """Raw distance units in a metre; and notes."""
     if row.layout is not HELIOS_LAYOUT or not len(points):
         return row.units_per_m, ()
     code = most_common(number(points, _STEP_AT, 1))
     found = _STEPS_PER_M.get(code, row.units_per_m)
     if found == row.units_per_m:
         return found, ()
-    note = "byte 17 of its packets says that distances count in 5 mm, other units send 2.5 mm"
+    note = "according to byte 17 of its packets distances count in 5 mm; other units use 2.5 mm"
     return found, (note,)
 
 
 def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
-    """(1, channels) firing times after the column's stamp."""
+    """(1, channels) firing times after the column's timestamp."""
     chosen = 0
     if row.layout is AIRY_LAYOUT and difop is not None:
         chosen = difop.installation
@@ -245,7 +245,7 @@ def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
 
 
 def is_counted(points: U8Array, row: Model) -> bool:
-    """Whether packets have a count that goes up by one; not all firmware fills it in."""
+    """Whether packets have a counter with steps of one; not all firmware sets it."""
     if not row.counter_at:
         return False
     count = number(points[:_COUNTED_PACKETS], row.counter_at, 4, ">")
@@ -256,17 +256,17 @@ def is_counted(points: U8Array, row: Model) -> bool:
 def notes_on_model(
     points: U8Array, row: Model, difop: Difop | None, *, is_named: bool
 ) -> tuple[str, ...]:
-    """What the packets leave open and the user may know, or has said: is_named."""
+    """Notes on what packets leave open; is_named: the rig names the model."""
     texts = []
     found = identify(points)
     if found is not None and found.other is not None and not is_named:
         texts.append(
-            f"packets do not surely tell {found.name} apart: decoded as {row.name}; name the "
-            "sensor's model in the rig if it is the other (times differ by up to 34 us)"
+            f"packets fit {found.name}: decoded as {row.name}; name the sensor's model in the rig "
+            "if it is the other (times differ by up to 34 us)"
         )
     if row in (RS16, RS32) and difop is not None and difop.firmware == 0:
         texts.append(
-            "DIFOP names no firmware: that of the first years counted distances in 1 cm, "
-            "not in 5 mm as decoded here; check a known distance"
+            "DIFOP states no firmware: early firmware counted distances in 1 cm, not in 5 mm as "
+            "decoded here; check a known distance"
         )
     return tuple(texts)

@@ -1,6 +1,6 @@
-"""What ROBOSENSE packets are, by content: magic bytes, type bytes, block ids, return modes.
+"""Names of ROBOSENSE packets by content: magic bytes, type bytes, block ids, return modes.
 
-Source: facts/robosense.md sections 1 to 4 and 7.
+Source: docs/sources/robosense.md sections 1 to 4 and 7.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ _SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What point packets say they are.
+    """Model of point packets.
 
-    name: in words; model: its row, None where there is no decoder; other: a model that the bytes
-    do not surely tell from it.
+    name: in words; model: its row, None without a decoder; other: a model that the type bytes may
+    also stand for.
     """
 
     name: str
@@ -58,7 +58,7 @@ _OLD_TYPES = {
 _BPEARL_V4 = Identity("RS-Bpearl v4", rows.BPEARL_V4)
 _BPEARL_V4_TYPE = 3
 _BPEARL_V4_MODELS = (0, 4)
-# Second kind, by type and model; None: whatever the model.
+# Second kind, by type and model; None: any model.
 _TYPES: Mapping[tuple[int, int | None], Identity] = {
     (6, 1): Identity("Helios 32, 70 degrees", rows.HELIOS_32),
     (6, 2): Identity("Helios 32, 31 degrees", rows.HELIOS_32),
@@ -69,7 +69,7 @@ _TYPES: Mapping[tuple[int, int | None], Identity] = {
     (0x31, 2): Identity("Airy 96", rows.AIRY_96),
     (0x31, 3): Identity("Airy 192", None),
 }
-# Ruby: by the readings of a block.
+# Ruby: by readings per block.
 _RUBIES = {
     128: (rows.RUBY_128, rows.RUBY_PLUS_128),
     80: (rows.RUBY_80, rows.RUBY_PLUS_80),
@@ -80,7 +80,7 @@ MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """A line on ROBOSENSE packets, or None."""
+    """Name payloads (k, size); None if they are not ROBOSENSE's."""
     packets = payload_rows(size, sample)
     if packets is None:
         return None
@@ -100,17 +100,17 @@ def describe(size: int, sample: U8Array) -> str | None:
 
 
 def is_difop(packets: U8Array) -> BoolArray:
-    """Which of the packets (P, size) are device packets."""
+    """(P,) whether packets are device packets."""
     return has_bytes(packets, DIFOP)
 
 
 def point_packets(packets: U8Array) -> U8Array:
-    """Those that are no device packets, which come between them on topics."""
+    """Packets without the device packets that share their topic."""
     return packets[~is_difop(packets)]
 
 
 def fits(packets: U8Array, layout: Layout) -> BoolArray:
-    """Which packets have the magic bytes and the first two blocks of a layout."""
+    """(k,) whether packets have the magic bytes and the first two blocks of a layout."""
     if packets.shape[1] < layout.end:
         return np.zeros(len(packets), bool)
     good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
@@ -118,7 +118,7 @@ def fits(packets: U8Array, layout: Layout) -> BoolArray:
 
 
 def identify(packets: U8Array) -> Identity | None:
-    """What point packets (k, size) say they are; None if they are none of ROBOSENSE's."""
+    """Identify point packets (k, size); None if they are not ROBOSENSE's."""
     for layout in rows.LAYOUTS:
         chosen = majority(packets, fits(packets, layout))
         if chosen is not None:
@@ -148,21 +148,22 @@ def _identity(packets: U8Array, layout: Layout) -> Identity:
 
 
 def returns_of(packets: U8Array, model: Model) -> int:
-    """Returns of a shot: by a byte that tells, by azimuths, or by their pace; 0: not told."""
+    """Returns per shot: by the mode byte, by azimuths, or by pace; 0: unknown."""
     layout = model.layout
     chosen = majority(packets, fits(packets, layout))
     if chosen is None:
         return 0
     if layout.modes is not None:
-        told = layout.modes.get(most_common(number(chosen, layout.mode_at, 1)), layout.other_modes)
-        if told:
-            return told
+        code = most_common(number(chosen, layout.mode_at, 1))
+        stated = layout.modes.get(code, layout.other_modes)
+        if stated:
+            return stated
     azimuth = block_azimuths(chosen, layout.header, layout.stride, layout.blocks, ">")
     if model.rounds_per_block == 1:
-        turning = bool((azimuth[:, 0] != azimuth[:, -1]).all())
+        is_moving = bool((azimuth[:, 0] != azimuth[:, -1]).all())
         is_dual = in_pairs(azimuth) if layout.blocks % 2 == 0 else _repeats(azimuth)
-        return 1 + is_dual if turning else 0
-    # A block holds one round of two returns, or two rounds of one.
+        return 1 + is_dual if is_moving else 0
+    # A block has one round of two returns, or two rounds of one.
     took_us = block_time_us(_stamp_us(chosen, model), azimuth, _MINUTE_US)
     for returns in (1, 2):
         wanted_us = model.rounds_per_block / returns * model.round_ns / 1000
@@ -172,7 +173,7 @@ def returns_of(packets: U8Array, model: Model) -> int:
 
 
 def _repeats(azimuth: I64Array) -> bool:
-    """Whether most packets hold two blocks of one azimuth, though they cannot all come in pairs."""
+    """Whether most packets have a pair of equal azimuths, with an odd number of blocks."""
     return float((azimuth[:, 1:] == azimuth[:, :-1]).any(axis=1).mean()) > 0.75
 
 

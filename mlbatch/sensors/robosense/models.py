@@ -1,8 +1,8 @@
-"""ROBOSENSE models as rows: where their bytes lie, when their channels fire, where their lens is.
+"""ROBOSENSE models as tables: packet layouts, firing times, lens positions.
 
-Source: facts/robosense.md sections 1 to 6 (rs_driver of the maker and his manuals). For the firing
-times of the 80- and 48-line models section 5 names the maker's driver: rs_driver,
-`decoder_RS80.hpp`, `decoder_RS48.hpp`, `decoder_RSP80.hpp`, `decoder_RSP48.hpp`.
+Source: docs/sources/robosense.md sections 1 to 6 (the vendor's rs_driver and manuals). Firing times
+of the 80- and 48-line models (section 5): rs_driver, `decoder_RS80.hpp`, `decoder_RS48.hpp`,
+`decoder_RSP80.hpp`, `decoder_RSP48.hpp`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 
 def _ns(times_us: str) -> tuple[int, ...]:
-    """Times in us as ns; `t*n` stands for n channels that fire at t."""
+    """Times in us as ns; `t*n`: n channels fire at t."""
     found: list[int] = []
     for text in times_us.split():
         time, _, count = text.partition("*")
@@ -21,12 +21,12 @@ def _ns(times_us: str) -> tuple[int, ...]:
 
 
 def _each(times_us: str, channels: int) -> tuple[int, ...]:
-    """As many channels at each time."""
+    """Times in us as ns, with so many channels at each."""
     return _ns(" ".join(f"{time}*{channels}" for time in times_us.split()))
 
 
 def _steps(counts: str) -> tuple[int, ...]:
-    """Ruby: groups of channels 3.236 us apart, of so many channels."""
+    """Ruby: groups of channels 3.236 us apart; counts: channels of each group."""
     return tuple(3236 * group for group, count in enumerate(counts) for _ in range(int(count)))
 
 
@@ -64,7 +64,8 @@ _RUBY_PLUS_48_NS = _each(_RUBY_PLUS_LONG, 2)
 VENDOR = "ROBOSENSE"
 FIRST_KIND = bytes.fromhex("55aa050a5aa550a0")
 SECOND_KIND = bytes.fromhex("55aa055a")
-# Numbers of return types, facts/outputs.md section 3; the nearest return has none of its own.
+# Numbers of return types, docs/sources/outputs.md section 3; the nearest return has none of its
+# own.
 STRONGEST = 1
 LAST = 2
 OTHER = 0
@@ -73,10 +74,10 @@ READING = 3  # bytes: distance u16, reflectivity u8
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where blocks lie: `header` bytes, then `blocks` of `per_block` readings behind four bytes.
+    """Packet layout: `header` bytes, then `blocks` of four bytes and `per_block` readings.
 
-    mode_at: byte that tells one return from two (0: none); modes: returns by its values, else
-    `other_modes` (0: not told); point_at: byte that is 0 in point packets (0: none).
+    mode_at: byte of the return mode (0: none); modes: returns by its values, else `other_modes`
+    (0: unknown); point_at: byte that is 0 in point packets (0: none).
     """
 
     magic: bytes
@@ -92,20 +93,20 @@ class Layout:
 
     @property
     def stride(self) -> int:
-        """From block to block."""
+        """Bytes from block to block."""
         return 4 + READING * self.per_block
 
     @property
     def end(self) -> int:
-        """Bytes that a packet has at least."""
+        """Least size of a packet."""
         return self.header + self.blocks * self.stride
 
 
 @dataclass(frozen=True, slots=True)
-class AnglePlaces:
-    """Where a DIFOP packet holds angles; azimuth_at 0: nowhere.
+class AngleOffsets:
+    """Offsets of angles in a DIFOP packet; azimuth_at 0: none.
 
-    Without a sign byte (not `signed`) the lower half of the channels looks down.
+    Without a sign byte (not `signed`) the lower half of the channels points down.
     """
 
     elevation_at: int
@@ -127,11 +128,11 @@ class ReturnMode:
 class Model:
     """A model.
 
-    round_ns: from column to column; firing_ns: of each channel after its round begins, several
-    where the packets choose; units_per_m: raw distances in a metre; range_mask: their bits;
-    lens_m: radius and height of the lens; nominal_deg: elevations good enough without the unit's;
-    mirrors: a rotor told to turn the other way counts its azimuth backwards; has_sync: DIFOP bytes
-    301 and 302 tell of synchronisation.
+    round_ns: column period; firing_ns: of each channel after the begin of its round, several if
+    packets choose; units_per_m: raw distances in a metre; range_mask: their bits;
+    lens_m: radius and height of the lens; nominal_deg: elevations to assume without the unit's;
+    mirrors: azimuths count backwards if the rotor is set to reverse; has_sync: DIFOP bytes 301 and
+    302 are the state of synchronisation.
     """
 
     name: str
@@ -141,7 +142,7 @@ class Model:
     firing_ns: tuple[tuple[int, ...], ...]
     units_per_m: int
     lens_m: tuple[float, float]
-    angles: AnglePlaces
+    angles: AngleOffsets
     modes: Mapping[int, ReturnMode]
     verified: str = "one source"
     is_calendar: bool = False
@@ -153,12 +154,12 @@ class Model:
 
     @property
     def rounds_per_block(self) -> int:
-        """Rounds that fit into a block: two of 16-line models."""
+        """Rounds per block: two of 16-line models."""
         return max(1, self.layout.per_block // self.channels)
 
     @property
     def blocks_per_round(self) -> int:
-        """Blocks that a round takes: two of 96-line models."""
+        """Blocks per round: two of 96-line models."""
         return max(1, self.channels // self.layout.per_block)
 
 
@@ -177,7 +178,7 @@ _OLD_MODES = {0: _DUAL, 1: _STRONGEST, 2: _LAST}
 _NEW_MODES = {0: _DUAL, 4: _STRONGEST, 5: _LAST, 6: _FIRST}
 _RUBY_MODES = {3: _DUAL, 1: _STRONGEST, 2: _LAST}
 _PLUS_MODES = {0: _STRONGEST, 1: _LAST, 2: _FIRST, 3: _DUAL, 4: _DUAL, 5: _DUAL}
-# The manual knows no dual mode; that the point packets tell (byte 17).
+# The manual has no dual mode; point packets state it (byte 17).
 _AIRY_MODES = {0: _STRONGEST, 1: _FIRST, 2: _LAST}
 
 FIRST_LAYOUT = Layout(FIRST_KIND, 42, b"\xff\xee", 12, 32)
@@ -207,7 +208,7 @@ RS16 = Model(
     firing_ns=(tuple(2800 * k for k in range(16)),),
     units_per_m=200,
     lens_m=(0.03825, 0.0),
-    angles=AnglePlaces(1165, 0, 0.0001, signed=False),
+    angles=AngleOffsets(1165, 0, 0.0001, signed=False),
     modes=_OLD_MODES,
     verified="two sources",
     is_calendar=True,
@@ -221,7 +222,7 @@ RS32 = replace(
     # The sheet counts from 1 and divides k by 16, so that channels 16 and 32 fire later.
     firing_ns=(tuple(2880 * ((k - 1) % 16) + 1440 * (k // 16) for k in range(1, 33)),),
     lens_m=(0.03997, 0.0),
-    angles=AnglePlaces(468, 564, 0.001),
+    angles=AngleOffsets(468, 564, 0.001),
 )
 BPEARL_V3 = replace(
     RS32,
@@ -230,7 +231,7 @@ BPEARL_V3 = replace(
         tuple(2560 * (k % 16) + 1280 * (k // 16) + 5200 * (k % 16 // 8) for k in range(32)),
     ),
     lens_m=(0.01473, 0.09427),
-    angles=AnglePlaces(468, 564, 0.01),
+    angles=AngleOffsets(468, 564, 0.01),
     counter_at=12,
     has_sync=True,
 )
@@ -254,7 +255,7 @@ HELIOS_32 = Model(
     firing_ns=(tuple(1730 * k for k in range(32)),),
     units_per_m=400,
     lens_m=(0.03498, 0.0),
-    angles=AnglePlaces(468, 564, 0.01),
+    angles=AngleOffsets(468, 564, 0.01),
     modes=_NEW_MODES,
     verified="two sources",
 )
@@ -275,7 +276,7 @@ AIRY_96 = Model(
     firing_ns=_AIRY_96_NS,
     units_per_m=200,
     lens_m=(0.01002, 0.04532),
-    angles=AnglePlaces(468, 756, 0.01),
+    angles=AngleOffsets(468, 756, 0.01),
     modes=_AIRY_MODES,
     verified="two sources",
     range_mask=0x3FFF,
@@ -295,7 +296,7 @@ RUBY_128 = Model(
     firing_ns=(tuple(3236 * (k % 64 // 4) for k in range(128)),),
     units_per_m=200,
     lens_m=(0.03615, 0.0),
-    angles=AnglePlaces(468, 852, 0.01),
+    angles=AngleOffsets(468, 852, 0.01),
     modes=_RUBY_MODES,
 )
 RUBY_80 = replace(

@@ -1,7 +1,7 @@
-"""ROBOSENSE point (MSOP) packets: where columns lie, when and at which angle they were measured.
+"""ROBOSENSE point (MSOP) packets: layout, timestamps, angles and readings of columns.
 
-Source: facts/robosense.md sections 2, 3, 5 and 6. A packet carries the time of its first round; a
-block carries the rotor's angle at the begin of its (first) round.
+Source: docs/sources/robosense.md sections 2, 3, 5 and 6. A packet carries the time of its first
+round; a block carries the rotor's angle at the begin of its (first) round.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from mlbatch.sensors.robosense.models import READING, Layout, Model
 from mlbatch.types import BoolArray, F64Array, Heads, I64Array, Pixels, U8Array, U16Array
 from mlbatch.units import NS_PER_S, NS_PER_US
 
-_CDEG_PER_TURN = 36000
-# A wider step than 1 degree is a gap in the field of view.
+_CDEG_PER_REVOLUTION = 36000
+# An azimuth step above 1 degree is a gap in the field of view.
 _GAP_CDEG = 100
 _BAD_HEADER = FAULTS.index("bad_header")
 _YEAR_2000_MONTHS = 30 * 12
-# The length of a month is not looked at: days 29 to 31 run into the next one.
+# Lengths of months are not checked: days 29 to 31 may run into the next month.
 _CALENDAR_LIMITS = ((1, 12), (1, 31), (0, 23), (0, 59), (0, 60))
-# Beyond 2^33 s there is no time, only damage.
+# Times beyond 2^33 s are damaged.
 _MOST_SECONDS = 1 << 33
-# Packets nearer than this follow each other within the same turn, even at 1200 rpm.
+# Packets nearer than this are within one revolution, even at 1200 rpm.
 _NEIGHBOURS_NS = 5_000_000
 
 
@@ -36,9 +36,9 @@ _NEIGHBOURS_NS = 5_000_000
 class Shape:
     """Columns of a packet in one return mode.
 
-    rows: groups of blocks that begin with an azimuth; row_blocks: blocks of a group; columns: of
-    a row; records: where they lie; return_step: bytes from return to return within a record;
-    is_split: each return is a column of its own.
+    rows: groups of blocks with an azimuth; row_blocks: blocks of a row; columns: of a row; records:
+    their offsets; return_step: bytes from return to return within a record; is_split: each return
+    is a separate column.
     """
 
     rows: int
@@ -51,11 +51,11 @@ class Shape:
 
 
 def shape_of(model: Model, returns: int) -> Shape:
-    """Where the columns of a model lie.
+    """Columns of a packet of a model.
 
-    Blocks of 16-line models hold two rounds, or one round of two returns. 96-line rounds take two
-    blocks. The returns of other models fill blocks one after the other; three blocks of 128 lines
-    do not divide by two, so that each return is a column there, and a shot may span two packets.
+    Blocks of 16-line models have two rounds, or one round of two returns. A 96-line round has two
+    blocks. Other models have one block per return; three blocks of 128 lines do not divide by two,
+    so each return is a separate column, and a shot may span two packets.
     """
     layout = model.layout
     column = READING * model.channels
@@ -76,7 +76,7 @@ def shape_of(model: Model, returns: int) -> Shape:
 
 
 def times_ns(packets: U8Array, model: Model) -> tuple[I64Array, BoolArray]:
-    """Stamps of packets (P, size), and which are times at all; calendar times are UTC."""
+    """(P,) timestamps of packets, and whether they are valid; calendar times are UTC."""
     at = model.layout.time_at
     if not model.is_calendar:
         second = number(packets, at, 6, ">")
@@ -97,12 +97,12 @@ def times_ns(packets: U8Array, model: Model) -> tuple[I64Array, BoolArray]:
 
 
 class PacketReader:
-    """Reads point packets of one model in one return mode; see `Lidar`."""
+    """Decoder of point packets of one model in one return mode; see `Lidar`."""
 
     def __init__(
         self, model: Model, shape: Shape, units_per_m: int, *, mirrored: bool, moving: bool
     ) -> None:
-        """mirrored: azimuths count backwards; moving: the rotor goes on while channels fire."""
+        """mirrored: azimuths count backwards; moving: apply rotor motion during a round."""
         self._model = model
         self._shape = shape
         self._units_per_m = np.float32(units_per_m)
@@ -112,39 +112,39 @@ class PacketReader:
         self._cdeg_per_s = 0.0
 
     def learn_speed(self, packets: U8Array) -> None:
-        """Take the rotor's usual speed from packets of some seconds; it bridges gaps."""
+        """Measure the mean rotor speed from a sample of packets; used across gaps."""
         stamp_ns, _ = times_ns(packets, self._model)
         azimuth, good = self._azimuths(packets)
         took_ns = np.diff(stamp_ns)
-        turned = _signed(np.diff(azimuth[:, 0]))
+        rotated = _signed(np.diff(azimuth[:, 0]))
         near = (took_ns > 0) & (took_ns < _NEIGHBOURS_NS) & good[1:, 0] & good[:-1, 0]
         if near.any():
-            self._cdeg_per_s = float(turned[near].sum() / took_ns[near].sum() * NS_PER_S)
+            self._cdeg_per_s = float(rotated[near].sum() / took_ns[near].sum() * NS_PER_S)
         else:
             self._cdeg_per_s = median(self._steps(azimuth, good)[0])
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         layout = self._model.layout
         good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
         good &= times_ns(packets, self._model)[1]
         return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
 
     def heads(self, packets: U8Array) -> Heads:
-        """Stamps, rotor words and validity of all columns."""
+        """Timestamps, rotor words and validity of all columns."""
         model = self._model
         shape = self._shape
         stamp_ns, _ = times_ns(packets, model)
         azimuth, good = self._azimuths(packets)
         speed, row_ns = self._steps(azimuth, good)
         round_ns = np.arange(shape.columns) * model.round_ns + min(model.firing_ns[0])
-        # No packet at all is a batch of damaged ones.
+        # Written out, since -1 cannot be inferred without packets.
         flat = len(packets), row_ns.shape[1] * shape.columns
         after_ns = (row_ns[:, :, None] + round_ns).reshape(flat)
-        turned = azimuth[:, :, None] + speed[:, None, None] * (round_ns / NS_PER_S)
-        turns = self._sense / _CDEG_PER_TURN * turned.reshape(flat)
-        turns_per_s = (self._sense / _CDEG_PER_TURN * self._moving) * speed
-        words = rotor_words(turns, turns_per_s[:, None])
+        at_round = azimuth[:, :, None] + speed[:, None, None] * (round_ns / NS_PER_S)
+        revolutions = self._sense / _CDEG_PER_REVOLUTION * at_round.reshape(flat)
+        revolutions_per_s = (self._sense / _CDEG_PER_REVOLUTION * self._moving) * speed
+        words = rotor_words(revolutions, revolutions_per_s[:, None])
         valid = np.repeat(good, shape.columns, axis=1)
         return Heads(stamp_ns[:, None] + after_ns, words, valid)
 
@@ -159,11 +159,11 @@ class PacketReader:
             if self._model.range_mask != 0xFFFF:
                 raw = raw & np.uint16(self._model.range_mask)
             np.divide(raw, self._units_per_m, out=out.range_m[:, channels])
-            level = records[:, begin + 2 : begin + READING * per_block : READING]
-            out.intensity[:, channels] = level
+            intensity = records[:, begin + 2 : begin + READING * per_block : READING]
+            out.intensity[:, channels] = intensity
 
     def pixels(self) -> PixelTable:
-        """The same for compiled loops."""
+        """Pixel layout for compiled decoding."""
         model = self._model
         shape = self._shape
         firsts = tuple(
@@ -177,18 +177,18 @@ class PacketReader:
         return PixelTable(READING, echoes, float(self._units_per_m))
 
     def _azimuths(self, packets: U8Array) -> tuple[I64Array, BoolArray]:
-        """Azimuths of the rows (P, rows), 0.01 degree, and which rows are blocks at all."""
+        """Azimuths of the rows (P, rows), 0.01 degree, and whether the rows are valid."""
         layout = self._model.layout
         shape = self._shape
         at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
         azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
-        return azimuth, (azimuth < _CDEG_PER_TURN) & _has_ids(packets, at, layout)
+        return azimuth, (azimuth < _CDEG_PER_REVOLUTION) & _has_ids(packets, at, layout)
 
     def _steps(self, azimuth: I64Array, good: BoolArray) -> tuple[F64Array, I64Array]:
         """Speed (P,) of the rotor, 0.01 degree/s, and begin (P, rows) of the rows, ns.
 
-        Each packet tells its own speed, by its steps from row to row. A gap in the field of view
-        takes the time of its angle; a packet holds one at most, else an azimuth is damaged.
+        The speed of a packet follows from its steps from row to row. The duration of a gap in the
+        field of view follows from its angle; a packet has at most one, else an azimuth is damaged.
         """
         step = _signed(np.diff(azimuth, axis=1))
         sure = good[:, 1:] & good[:, :-1]
@@ -196,12 +196,12 @@ class PacketReader:
         gap = sure & (np.abs(step) > _GAP_CDEG)
         plain = sure & ~gap & ~again
         count = plain.sum(axis=1)
-        turned = np.where(plain, step, 0).sum(axis=1)
-        own = turned * (NS_PER_S / self._row_ns) / np.maximum(count, 1)
+        rotated = np.where(plain, step, 0).sum(axis=1)
+        own = rotated * (NS_PER_S / self._row_ns) / np.maximum(count, 1)
         wait_ns = np.where(again, 0, self._row_ns)
         if gap.any() and self._cdeg_per_s:
             gap &= gap.sum(axis=1, keepdims=True) == 1
-            forward = np.where(self._cdeg_per_s > 0, step, -step) % _CDEG_PER_TURN
+            forward = np.where(self._cdeg_per_s > 0, step, -step) % _CDEG_PER_REVOLUTION
             bridge_ns = np.rint(forward * (NS_PER_S / abs(self._cdeg_per_s))).astype(np.int64)
             wait_ns = np.where(gap, bridge_ns, wait_ns)
         begin_ns = np.zeros(azimuth.shape, np.int64)
@@ -210,7 +210,7 @@ class PacketReader:
 
 
 def _has_ids(packets: U8Array, at: I64Array, layout: Layout) -> BoolArray:
-    """Whether the rows (P, rows) at these bytes begin with the id of a block."""
+    """(P, rows) whether the rows at these bytes begin with the id of a block."""
     good = np.ones((len(packets), len(at)), np.bool_)
     for place, byte in enumerate(layout.block_id):
         good &= packets[:, at + place] == byte
@@ -218,6 +218,6 @@ def _has_ids(packets: U8Array, at: I64Array, layout: Layout) -> BoolArray:
 
 
 def _signed(step: I64Array) -> I64Array:
-    """Steps of an azimuth by the shorter way, 0.01 degree."""
-    half = _CDEG_PER_TURN // 2
-    return (step + half) % _CDEG_PER_TURN - half
+    """Azimuth steps in the shorter direction, 0.01 degree."""
+    half = _CDEG_PER_REVOLUTION // 2
+    return (step + half) % _CDEG_PER_REVOLUTION - half

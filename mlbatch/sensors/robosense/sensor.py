@@ -1,8 +1,9 @@
-"""ROBOSENSE turning lidars: RS-LiDAR-16 and -32, Bpearl, Helios, Ruby, Ruby Plus, Airy.
+"""ROBOSENSE spinning lidars: RS-LiDAR-16 and -32, Bpearl, Helios, Ruby, Ruby Plus, Airy.
 
-Source: facts/robosense.md (rs_driver of the maker, his manuals). Point packets (MSOP) name the
-model; device packets (DIFOP, another port or the same topic) hold the unit's angles and its return
-mode. Without them a csv of angles is needed, and the mode comes from the point packets alone.
+Source: docs/sources/robosense.md (the vendor's rs_driver and manuals). Point packets (MSOP) name
+the model; device packets (DIFOP, on another port or the same topic) contain the unit's angles and
+return mode. Without them a csv of angles is required, and the mode comes from the point packets
+alone.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
 
-# The bytes name the model; a file that was given is expected before what is built in.
+# Match scores: packets name the model; a file is preferred to device packets.
 _FITS_MODEL = 100
 _FITS_FILE = 200
 _DIFOP_PORT = 7788
@@ -65,18 +66,18 @@ MODELS: tuple[SensorModel, ...] = tuple(
 
 
 def read_calibration(path: Path, content: bytes) -> CsvCalibration | None:
-    """The angles in a csv file, or None if it holds something else."""
+    """Parse a csv file of angles; None if it is something else."""
     angles = read_angles(path, content)
     return None if angles is None else CsvCalibration(path, angles)
 
 
 class DifopCalibration:
-    """A model whose units tell their angles themselves; `Calibration` of lidar.py."""
+    """A model with angles from its device packets; `Calibration` of lidar.py."""
 
     __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
 
     def __init__(self, row: Model, *, is_named: bool = False) -> None:
-        """is_named: the rig says that it is this model."""
+        """is_named: the rig names this model."""
         self._row = row
         self._is_named = is_named
         self.path: Path | None = None
@@ -85,11 +86,11 @@ class DifopCalibration:
         self.is_shared = True
 
     def for_model(self, name: str) -> DifopCalibration | None:
-        """The same where the rig names this model: packets may leave open which of two it is."""
+        """The same calibration if the rig names this model; packets may fit two models."""
         return DifopCalibration(self._row, is_named=True) if name == self.model else None
 
     def fit(self, evidence: Evidence) -> int:
-        """Whether the point packets name this model, or at least could be read as its."""
+        """Match score: point packets name this model, or can at least be decoded as it."""
         points = point_packets(evidence.sample)
         found = identify(points)
         if found is not None and found.model is self._row:
@@ -102,7 +103,7 @@ class DifopCalibration:
         return READABLE if majority(chosen, times_ns(chosen, self._row)[1]) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
-        """The sensor, with the angles of its device packets."""
+        """Decoder of the sensor, with the angles of its device packets."""
         check_options(options)
         if evidence is None:
             raise _no_packets(f"{VENDOR} {self.model}")
@@ -115,15 +116,15 @@ class DifopCalibration:
             angles = Angles(elevation, np.zeros_like(elevation))
             origin = "nominal angles"
             notes = (
-                f"no DIFOP packet with the angles of this {self.model}: nominal ones are taken; "
+                f"no DIFOP packet with the angles of this {self.model}: nominal angles assumed; "
                 f"record its device port ({_DIFOP_PORT}) as well, or give a csv with --metadata",
             )
         if angles is None:
-            found = "no DIFOP packet" if difop is None else "DIFOP packets without angles"
+            found = "no DIFOP packets" if difop is None else "DIFOP packets without angles"
             raise RigError(
-                f"{VENDOR} {self.model}: expected the angles of its channels, found "
-                f"{found} beside its point packets; record its device port ({_DIFOP_PORT}) as well, "
-                "or give a csv of `elevation,azimuth` lines with --metadata"
+                f"{VENDOR} {self.model}: expected the angles of its channels, found {found}; "
+                f"record its device port ({_DIFOP_PORT}) as well, or give a csv of "
+                "`elevation,azimuth` lines with --metadata"
             )
         lidar = RobosenseLidar(self._row, angles, options, evidence, difop, is_named=self._is_named)
         lidar.calibration = origin
@@ -132,9 +133,9 @@ class DifopCalibration:
 
 
 class CsvCalibration:
-    """A csv file with the angles of one unit; `Calibration` of lidar.py.
+    """Csv file with the angles of one unit; `Calibration` of lidar.py.
 
-    named: the model, where the rig says it.
+    named: the model named in the rig.
     """
 
     __slots__ = ("_angles", "_named", "is_shared", "model", "path", "serial")
@@ -149,28 +150,29 @@ class CsvCalibration:
         self.is_shared = False
 
     def for_model(self, name: str) -> CsvCalibration | None:
-        """The same for a model of as many channels; packets may not tell which one it is."""
+        """The same file for a model of as many channels, named in the rig."""
         count = len(self._angles.elevation_deg)
         rows = [row for row in ROWS if row.name == name and row.channels == count]
         return CsvCalibration(self.path or Path(), self._angles, rows[0]) if rows else None
 
     def fit(self, evidence: Evidence) -> int:
-        """Whether the point packets name a model of as many channels, or can be read as it."""
+        """Match score: point packets name a model of as many channels, or can be decoded as it."""
         if self._named is not None:
             score = DifopCalibration(self._named, is_named=True).fit(evidence)
             return _FITS_FILE if score == _FITS_MODEL else score
         return _FITS_FILE if self._row(evidence) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
-        """The sensor, of the model that the packets name."""
+        """Decoder of the sensor, of the model named in its packets."""
         check_options(options)
         if evidence is None:
             raise _no_packets(f"{self.path}: {self.model}")
         row = self._row(evidence)
         if row is None:
             raise RigError(
-                f"{self.path}: expected packets of a {self.model} lidar from {evidence.stream}, found "
-                f"{describe(evidence.size, evidence.sample) or 'others'}; give the csv of its unit"
+                f"{self.path}: expected packets of a {self.model} lidar from {evidence.stream}, "
+                f"found {describe(evidence.size, evidence.sample) or 'others'}; give the csv of "
+                "its unit"
             )
         difop = find_difop(evidence)
         is_named = self._named is not None
@@ -190,11 +192,11 @@ BUILT_IN: tuple[Calibration, ...] = tuple(DifopCalibration(row) for row in ROWS)
 
 
 class RobosenseLidar(BaseLidar):
-    """One sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; `Lidar` of lidar.py.
 
-    Dual mode of 128-line models: three blocks a packet do not divide by two, so that each return
-    is a column of its own (`returns` 1) and the return types stay unknown; the two returns of a
-    shot may lie in two packets. Columns of equal azimuth have equal stamps.
+    Dual mode of 128-line models: three blocks per packet do not divide by two, so each return is a
+    separate column (`returns` 1) of unknown return type; the two returns of a shot may be in two
+    packets. Columns of equal azimuth have equal timestamps.
     """
 
     def __init__(
@@ -207,7 +209,7 @@ class RobosenseLidar(BaseLidar):
         *,
         is_named: bool = False,
     ) -> None:
-        """is_named: the rig says which model it is."""
+        """is_named: the rig names the model."""
         points = point_packets(evidence.sample)
         points = points[fits(points, row.layout)]
         returned, mode_notes = return_mode(points, row, difop)
@@ -253,23 +255,23 @@ class RobosenseLidar(BaseLidar):
         self.pixels = self._packets.pixels()
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """All point packets: device packets, which topics hold too, are nobody's."""
+        """(P,) True for point packets, False for device packets on the same topic."""
         own = ~is_difop(packets)
         at = self._row.layout.point_at
         return own & (packets[:, at] == 0) if at else own
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         return self._packets.faults(packets)
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """The packets' own count, else a number that only packets of equal content share."""
+        """(P,) packet counter; without one, a hash of the content."""
         if not self.sequence_modulus:
             return super().sequence(packets)
         return number(packets, self._row.counter_at, 4, ">")
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps, rotor words and validity of all columns."""
+        """Timestamps, rotor words and validity of all columns."""
         return self._packets.heads(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
@@ -278,11 +280,11 @@ class RobosenseLidar(BaseLidar):
 
 
 def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
-    """Section 6 as vectors, sensor frame (x forward, y left, z up), metres.
+    """Beam vectors in the sensor frame (x forward, y left, z up), metres (section 6).
 
-    The lens turns with the rotor, without the correction of the channel. Each channel has an
-    origin of its own, since it fires at a later rotor angle. mirrored: the unit counts
-    azimuths the other way, corrections included.
+    The lens rotates with the rotor, without the correction of the channel. Each channel has its own
+    origin, since channels fire at different rotor angles. mirrored: azimuths and corrections of the
+    unit count in the opposite direction.
     """
     azimuth_rad = angles.azimuth_deg * (-RAD_PER_DEG if mirrored else RAD_PER_DEG)
     direction = spherical(azimuth_rad, angles.elevation_deg * RAD_PER_DEG)
@@ -294,6 +296,6 @@ def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
 
 def _no_packets(what: str) -> RigError:
     return RigError(
-        f"{what}: expected a packet of it in the first 10 seconds to tell its return mode, found none; "
-        "correct its stream, or leave it out of the rig"
+        f"{what}: expected packets in the first 10 seconds, which define its return mode, found "
+        "none; correct its stream, or leave it out of the rig"
     )

@@ -1,10 +1,10 @@
 """Velodyne calibration files: the YAML of ROS drivers and the db.xml of VeloView.
 
-Source: facts/velodyne.md section 9. YAML gives radians and metres, db.xml degrees and centimetres;
-both number the lasers, and a missing correction is 0. The two-point flag and the focal (intensity)
-numbers are left alone: the first is missing from many files, of the second no two readers agree.
-Files may come from anywhere, so they are bounded in size, depth and number, and no entity or alias
-is followed.
+Source: docs/sources/velodyne.md section 9. YAML gives radians and metres, db.xml degrees and
+centimetres; both number the lasers, and a missing correction is 0. The two-point flag and the focal
+(intensity) numbers are ignored: the first is missing from many files, and no two readers agree on
+the second. Files may be untrusted, so size, depth and number are limited, and entities and aliases
+are refused.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
 MAX_BYTES = 1_000_000
 _SIZES = (16, 32, 64, 128)
 _M_PER_CM = 0.01
-# Real ones are 2 and 4 mm; the 7 mm of VLS-128 files is wrong, but no reason to refuse them.
+# Real values are 2 and 4 mm; the 7 mm of VLS-128 files is wrong, but accepted.
 _UNIT_RANGE_M = (0.0005, 0.02)
 _YAML_LEVELS = 8
 _YAML_KEY = re.compile(rb"^[ \t{,]*[\"']?(?:num_lasers|lasers)[\"']?[ \t]*:", re.MULTILINE)
 _YAML_WORDS = (b"laser_id", b"vert_correction", b"distance_resolution")
 _XML_WORDS = (b"rotCorrection_", b"vertCorrection_", b"distLSB_")
-_REMEDY = "take the maker's file of this sensor"
+_REMEDY = "use the vendor's file of this sensor"
 _UNIT_REMEDY = "check its unit"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VelodyneFile:
-    """The corrections of a file; arrays (lasers,) by laser id, 0 where it says nothing.
+    """Corrections of a file; arrays (lasers,) by laser id, 0 if missing.
 
-    unit_m: what one count of distance is worth, None if not said; azimuth_rad: rot_correction as
-    in the file, so that a beam stands at (rotor azimuth - azimuth_rad), clockwise from above.
+    unit_m: metres of one distance count, None if missing; azimuth_rad: rot_correction of the file,
+    so that a beam points to (rotor azimuth - azimuth_rad), clockwise from above.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class VelodyneFile:
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """A correction: its keys in both forms and the size (SI) beyond which a file is wrong."""
+    """A correction: keys in both formats, and largest plausible value (SI)."""
 
     yaml: str
     xml: str
@@ -84,8 +84,8 @@ _QUANTITIES: Mapping[str, _Quantity] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Form:
-    """How a form of file names a laser and how large its units are in SI."""
+class _Format:
+    """Key of the laser id, units and keys of a file format; units in SI."""
 
     id_key: str
     angle_unit: str
@@ -95,10 +95,10 @@ class _Form:
     keys: Mapping[str, str]
 
 
-_YAML = _Form(
+_YAML = _Format(
     "laser_id", "rad", 1.0, "m", 1.0, {name: one.yaml for name, one in _QUANTITIES.items()}
 )
-_XML = _Form(
+_XML = _Format(
     "id_",
     "degrees",
     RAD_PER_DEG,
@@ -110,14 +110,14 @@ _XML = _Form(
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """One laser as written: where it stands in the file, and its texts."""
+    """One laser as written: position in the file, and texts by key."""
 
     place: str
     texts: Mapping[str, str]
 
 
 def read_velodyne(path: Path, content: bytes) -> VelodyneFile | None:
-    """The corrections in a file; None if it is no Velodyne calibration, RigError if broken."""
+    """Parse a file; None if it is no Velodyne calibration, RigError if it is damaged."""
     if b"\0" in content:
         return None
     start = content[:64].removeprefix(b"\xef\xbb\xbf").lstrip()
@@ -162,7 +162,7 @@ def _read_yaml(path: Path, text: str) -> VelodyneFile:
 
 
 def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
-    """The document, scalars as text: 1e-3 is a number for us, but not for YAML 1.1."""
+    """Parse a document with scalars as text, since 1e-3 is no number in YAML 1.1."""
     import yaml
 
     loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
@@ -171,7 +171,7 @@ def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
         for event in yaml.parse(text, Loader=loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            # The C loader overruns its stack on brackets without end.
+            # Deep nesting overflows the stack of the C loader.
             if depth > _YAML_LEVELS:
                 raise _error(path, "", f"at most {_YAML_LEVELS} levels", "more")
             if isinstance(event, yaml.AliasEvent):
@@ -187,11 +187,11 @@ def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
 def _read_xml(path: Path, text: str) -> VelodyneFile | None:
     import xml.etree.ElementTree as ET
 
-    # Boost writes a bare document type; entities can only stand inside one with brackets.
+    # Boost writes a bare document type; entities require one with brackets.
     if re.search(r"<!ENTITY|<!DOCTYPE[^>]*(\[|SYSTEM|PUBLIC)", text):
         raise _error(path, "", "XML without entities and definitions", "some")
     try:
-        # Without the declaration: the text is decoded, whatever encoding it names.
+        # The text is already decoded, so its encoding declaration is removed.
         root = ET.fromstring(re.sub(r"^\s*<\?xml[^>]*\?>", "", text))
     except ET.ParseError as err:
         raise _error(path, "", "XML", str(err)) from err
@@ -222,16 +222,16 @@ def _enabled(path: Path, flags: list[str]) -> BoolArray:
         raise _error(path, "DB.enabled_", f"at most {max(_SIZES)} items of 0 or 1", "others")
     enabled = np.array([flag == "1" for flag in flags])
     if not enabled.any():
-        raise _error(path, "DB.enabled_", "lasers that are enabled", "none")
+        raise _error(path, "DB.enabled_", "enabled lasers", "none")
     return enabled
 
 
 def _file(
-    path: Path, form: _Form, entries: list[_Entry], enabled: BoolArray, unit_m: float | None
+    path: Path, form: _Format, entries: list[_Entry], enabled: BoolArray, unit_m: float | None
 ) -> VelodyneFile:
-    """Corrections in the order of laser ids, as far as lasers are enabled.
+    """Corrections of enabled lasers in the order of laser ids.
 
-    Files of 16 and 32 lasers may list 64 of which the first are enabled.
+    Files of 16 and 32 lasers may list 64 of which only the first are enabled.
     """
     by_id = _by_id(path, form, entries)
     used = int(np.flatnonzero(enabled)[-1]) + 1
@@ -250,7 +250,7 @@ def _file(
     return VelodyneFile(path, lasers, unit_m, enabled=flags, notes=notes, **values)
 
 
-def _by_id(path: Path, form: _Form, entries: list[_Entry]) -> dict[int, _Entry]:
+def _by_id(path: Path, form: _Format, entries: list[_Entry]) -> dict[int, _Entry]:
     by_id: dict[int, _Entry] = {}
     highest = max(len(entries), min(_SIZES)) - 1
     for entry in entries:
@@ -265,8 +265,8 @@ def _by_id(path: Path, form: _Form, entries: list[_Entry]) -> dict[int, _Entry]:
     return by_id
 
 
-def _value(path: Path, form: _Form, entry: _Entry, name: str) -> float:
-    """A correction in SI."""
+def _value(path: Path, form: _Format, entry: _Entry, name: str) -> float:
+    """A correction in SI units; RigError if it is implausible."""
     quantity = _QUANTITIES[name]
     key = form.keys[name]
     place = f"{entry.place}.{key}"
@@ -274,7 +274,7 @@ def _value(path: Path, form: _Form, entry: _Entry, name: str) -> float:
     unit, factor = (form.angle_unit, form.rad) if quantity.is_angle else (form.length_unit, form.m)
     value = _number(path, place, text) * factor
     if abs(value) > quantity.limit:
-        expected = f"at most {quantity.limit / factor:.6g} {unit} either way"
+        expected = f"at most {quantity.limit / factor:.6g} {unit} in absolute value"
         raise _error(path, place, expected, text, _UNIT_REMEDY)
     return value
 

@@ -1,7 +1,7 @@
-"""What the first packets of a Velodyne tell of time: the hour, the rotor's speed, its sequences.
+"""Clock of a Velodyne from its first packets: hour, rotor speed, firing sequence.
 
-Source: facts/velodyne.md sections 2, 7 and 8. Data packets count microseconds from the top of the
-hour; which hour comes from NMEA sentences in position packets, else from the recorder's clock.
+Source: docs/sources/velodyne.md sections 2, 7 and 8. Data packets count microseconds from the top
+of the hour; the hour comes from NMEA sentences in position packets, else from the receive times.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from mlbatch.lidar import Beside
 from mlbatch.median import median
 from mlbatch.sensors.packet_bytes import has_bytes, most_common, number
-from mlbatch.sensors.velodyne.models import STAMP_AT, TURN_CDEG
+from mlbatch.sensors.velodyne.models import CIRCLE_CDEG, STAMP_AT
 from mlbatch.types import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 HOUR_NS = 3600 * NS_PER_S
 HOUR_US = HOUR_NS // NS_PER_US
-# A position packet: where its stamp, the state of its pulse and its NMEA sentence begin.
+# Position packet: offsets of its stamp, of the state of its pulse and of its NMEA sentence.
 POSITION_SIZE = 512
 _POSITION_STAMP_AT = 198
 _PPS_AT = 202
@@ -32,13 +32,13 @@ _SENTENCE = re.compile(rb"\$(G.RMC,[^*$]*)\*([0-9A-Fa-f]{2})")
 _TIME = 1
 _STATUS = 2
 _DATE = 9
-# Packets this near follow each other; the rotor turns by less than half a turn.
+# Consecutive packets are this near: less than half a revolution.
 _NEAR_NS = 15 * NS_PER_MS
 _FAR_NS = 600 * NS_PER_MS
-# VLS-128: no firmware known leaves this range; a lost packet doubles the step.
+# VLS-128: range of all known firmware; a lost packet doubles the step.
 _SEQUENCE_NS = (50_000, 62_000)
 _ENOUGH_STEPS = 4
-# Evidence begins with so many; what follows them is chosen by arrival.
+# Number of consecutive packets at the start of a sample; the rest is chosen by receive time.
 _IN_A_ROW = 16
 
 
@@ -49,40 +49,40 @@ def top_of_hour_ns(packets: U8Array, at: int = STAMP_AT) -> I64Array:
 
 
 def absolute_ns(toh_ns: I64Array, near_ns: I64Array) -> I64Array:
-    """The times that lie this long after the top of an hour, nearest to `near_ns`."""
+    """Times at this offset from the top of an hour, nearest to `near_ns`."""
     return toh_ns + (near_ns - toh_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
 
 
 def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside]) -> int:
-    """True time minus the recorder's; with it, arrival times tell the hour of all packets.
+    """True time minus receive time, which makes receive times define the hour of all packets.
 
-    Fixed once, so that packets around a hard limit of half an hour all get the same hour.
+    Constant for a run, so that all packets near a difference of half an hour get the same hour.
     """
     if not len(packets):
         return 0
     away_ns = top_of_hour_ns(packets) - host_ns
-    # They lie around a circle of one hour.
+    # Differences are modulo one hour.
     spread_ns = (away_ns - away_ns[0] + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     offset_ns = int(away_ns[0]) + round(median(spread_ns))
     offset_ns = (offset_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
-    told_ns = [value for one in beside for value in _position_offsets_ns(one)]
-    if told_ns:
-        aim_ns = round(median(np.array(told_ns)))
-        offset_ns += (aim_ns - offset_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
+    known_ns = [value for one in beside for value in _position_offsets_ns(one)]
+    if known_ns:
+        target_ns = round(median(np.array(known_ns)))
+        offset_ns += (target_ns - offset_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
     if int(host_ns.min()) + offset_ns < 0:
         offset_ns += HOUR_NS
     return offset_ns
 
 
 def pulse(beside: Sequence[Beside]) -> str:
-    """What position packets say of the pulse per second; "" without them."""
+    """State of the pulse per second in position packets; "" without any."""
     rows = [_positions(one)[0] for one in beside]
     states = np.concatenate([np.zeros(0, np.int64), *(row[:, _PPS_AT] for row in rows if len(row))])
     return _PPS[most_common(states)] if len(states) else ""
 
 
 def rmc_ns(text: bytes) -> int | None:
-    """UTC of an RMC sentence that is valid and whole, ns since 1970; else None."""
+    """UTC of an RMC sentence, ns since 1970; None if it is invalid or incomplete."""
     found = _SENTENCE.search(text)
     if found is None:
         return None
@@ -104,32 +104,32 @@ def rmc_ns(text: bytes) -> int | None:
 
 
 def rotor_speed(stamp_ns: I64Array, azimuth: I64Array, rough: float | None) -> float | None:
-    """Mean speed in 0.01 degree/ns over packets with these first azimuths; None if they rest.
+    """Mean rotor speed in 0.01 degree/ns from first azimuths; None if the rotor rests.
 
-    rough: the speed within packets, where there is one; stamps are within the hour.
+    rough: the speed within packets, if known; stamps are within the hour.
     """
     step_ns = np.diff(stamp_ns) % HOUR_NS
-    turned = (np.diff(azimuth) % TURN_CDEG).astype(np.float64)
+    turned = (np.diff(azimuth) % CIRCLE_CDEG).astype(np.float64)
     near = (step_ns > 0) & (step_ns < _NEAR_NS)
     if near.any():
         rough = median(turned[near] / step_ns[near])
     if not rough or rough < 0:
         return None
-    # Whole turns between packets follow from the rough speed; over all, roundings cancel.
+    # The rough speed gives whole revolutions between packets; rounding cancels in the total.
     far = (step_ns > 0) & (step_ns < _FAR_NS)
     if not far.any():
         return rough
     step_ns = step_ns[far]
     turned = turned[far]
-    whole: F64Array = np.rint((rough * step_ns - turned) / TURN_CDEG) * TURN_CDEG
+    whole: F64Array = np.rint((rough * step_ns - turned) / CIRCLE_CDEG) * CIRCLE_CDEG
     return float((turned + whole).sum() / step_ns.sum())
 
 
 def measured_sequence_ns(stamp_ns: I64Array, sequences: int) -> float | None:
-    """Length of a firing sequence of a VLS-128 by the steps between its packets; None: too few.
+    """Firing sequence of a VLS-128 by the steps between its packets; None if there are too few.
 
-    The first packets suffice: they follow each other, so that the rounding of their stamps to us
-    cancels, and which ones they are does not depend on when they arrive.
+    Prefers the first packets: they are consecutive, so that rounding of stamps to us cancels, and
+    their choice does not depend on receive times.
     """
     low, high = (limit * sequences for limit in _SEQUENCE_NS)
     for count in (_IN_A_ROW, len(stamp_ns)):
@@ -141,7 +141,7 @@ def measured_sequence_ns(stamp_ns: I64Array, sequences: int) -> float | None:
 
 
 def are_positions(packets: U8Array) -> BoolArray:
-    """Which packets (k, 512) hold an NMEA sentence, or none yet, and a stamp within the hour."""
+    """(k,) whether packets (k, 512) have an NMEA sentence, or none yet, and a valid stamp."""
     nmea = packets[:, _NMEA_AT : _NMEA_AT + _NMEA_SIZE]
     stamp_us = number(packets, _POSITION_STAMP_AT, 4)
     silent = (nmea == 0).all(axis=1) & (packets[:, :14] == 0).all(axis=1) & (stamp_us > 0)
@@ -161,8 +161,8 @@ def _position_offsets_ns(one: Beside) -> list[int]:
     if not len(packets):
         return []
     toh_ns = top_of_hour_ns(packets, _POSITION_STAMP_AT)
-    told = [rmc_ns(packet[_NMEA_AT : _NMEA_AT + _NMEA_SIZE].tobytes()) for packet in packets]
-    good = [row for row, value in enumerate(told) if value is not None]
-    utc_ns = np.array([value for value in told if value is not None], np.int64)
+    times = [rmc_ns(packet[_NMEA_AT : _NMEA_AT + _NMEA_SIZE].tobytes()) for packet in packets]
+    good = [row for row, value in enumerate(times) if value is not None]
+    utc_ns = np.array([value for value in times if value is not None], np.int64)
     offsets: list[int] = (absolute_ns(toh_ns[good], utc_ns) - host_ns[good]).tolist()
     return offsets

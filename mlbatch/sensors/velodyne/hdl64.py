@@ -1,9 +1,9 @@
-"""Points of the HDL-64E, whose range correction depends on where a point lies.
+"""Points of the HDL-64E, whose range correction depends on the position of a point.
 
-Source: facts/velodyne.md section 10, the first variant (velodyne_decoder). A laser is calibrated
-at 25.04 m, and once more near by: along the side at 2.40 m (x) and ahead at 1.93 m (y). Nearer
-than 25.04 m its correction goes straight from one value to the other, along each axis of its own;
-height is_pace the mean of both.
+Source: docs/sources/velodyne.md section 10, the first variant (velodyne_decoder). A laser is
+calibrated at 25.04 m, and again at 2.40 m to the side (x) and 1.93 m ahead (y). Below 25.04 m its
+correction is interpolated linearly between the two, for each axis separately; height uses the mean
+of both.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _NEAR_FORWARD_M = 1.93
 
 
 class _Hdl64Projection:
-    """The projection of one HDL-64E; arrays (n, 64), float32."""
+    """Projection of one HDL-64E; arrays (n, 64), float32."""
 
     def __init__(
         self, file: VelodyneFile, firing_ns: I64Array, body_from_sensor: F64Array, columns: int
     ) -> None:
-        # Where a beam does not fire there is nothing to place.
+        # Beams that do not fire (-1) have no points.
         self._firing_ns = np.maximum(firing_ns, 0).astype(np.float32)
         self._cosine_rot = np.cos(file.azimuth_rad).astype(np.float32)
         self._sine_rot = np.sin(file.azimuth_rad).astype(np.float32)
@@ -34,7 +34,7 @@ class _Hdl64Projection:
         self._aside_m = file.horiz_offset_m.astype(np.float32)
         self._above_m = file.vert_offset_m.astype(np.float32)
         self._far = file.dist_correction_m.astype(np.float32)
-        # Lasers without values near by keep the one of far away: no slope, and the same at 0.
+        # Lasers without near values keep the far one: slope 0.
         two_points = (file.dist_correction_x_m != 0) & (file.dist_correction_y_m != 0)
         self._has_near = bool(two_points.any())
         self._right = _line(file.dist_correction_x_m, file, two_points, _NEAR_RIGHT_M)
@@ -44,10 +44,10 @@ class _Hdl64Projection:
         self._sine = np.empty_like(self._cosine)
 
     def aim(self, member: I64Array, encoder: I64Array) -> None:
-        """Cosine and sine of every beam's azimuth as it fires; `member` is always 0.
+        """Cosine and sine of every beam's azimuth when it fires; `member` is always 0.
 
-        The rotor's angle, back by rot_correction, on by d = speed * firing: c - d (s + d c / 2).
-        The rest of that series is below d**3 / 6: 5e-8 rad at 1200 rpm and 57 us.
+        Rotor angle minus rot_correction plus d = speed * firing time: c - d (s + d c / 2). The
+        remainder of the series is below d**3 / 6: 5e-8 rad at 1200 rpm and 57 us.
         """
         angle, speed, table = read_rotor_words(encoder)
         cosine = np.cos(angle).astype(np.float32)[:, None]
@@ -55,22 +55,22 @@ class _Hdl64Projection:
         first_cosine = cosine * self._cosine_rot + sine * self._sine_rot
         first_sine = sine * self._cosine_rot - cosine * self._sine_rot
         firing_ns = self._firing_ns[0] if len(self._firing_ns) == 1 else self._firing_ns[table]
-        turned = speed.astype(np.float32)[:, None] * firing_ns
-        half = turned * np.float32(0.5)
+        rotated = speed.astype(np.float32)[:, None] * firing_ns
+        half = rotated * np.float32(0.5)
         count = len(encoder)
         np.subtract(
             first_cosine,
-            turned * (first_sine + half * first_cosine),
+            rotated * (first_sine + half * first_cosine),
             out=self._cosine[:count],
         )
-        np.add(first_sine, turned * (first_cosine - half * first_sine), out=self._sine[:count])
+        np.add(first_sine, rotated * (first_cosine - half * first_sine), out=self._sine[:count])
 
     def points(self, range_m: F32Array, out: F32Array) -> None:
-        """Corrected along right, forward and up, then moved into the body frame."""
+        """Correct along right, forward and up, then transform into the body frame."""
         count = len(range_m)
         cosine = self._cosine[:count]
         sine = self._sine[:count]
-        to_right, to_forward, to_up = self._reached_m(range_m, cosine, sine)
+        to_right, to_forward, to_up = self._corrected_m(range_m, cosine, sine)
         right = to_right * self._flat * sine - self._aside_m * cosine
         forward = to_forward * self._flat * cosine + self._aside_m * sine
         up = to_up * self._up + self._above_m
@@ -78,10 +78,10 @@ class _Hdl64Projection:
         for axis, (x, y, z, moved) in enumerate(self._pose):
             np.add(x * forward - y * right + z * up, moved, out=out[..., axis])
 
-    def _reached_m(
+    def _corrected_m(
         self, range_m: F32Array, cosine: F32Array, sine: F32Array
     ) -> tuple[F32Array, F32Array, F32Array]:
-        """Distance with its correction along right, forward and up."""
+        """Range plus correction along right, forward and up."""
         far: F32Array = range_m + self._far
         if not self._has_near:
             return far, far, far
@@ -107,7 +107,7 @@ def hdl64_projection(
 ) -> Projection:
     """Ranges as measured to points of a sensor at `body_from_sensor` (4, 4), m.
 
-    Columns carry rotor words. firing_ns: (T, 64), as in `Lidar`; columns: the most aimed at once.
+    Columns carry rotor words. firing_ns: (T, 64), as in `Lidar`; columns: largest batch.
     """
     return _Hdl64Projection(file, firing_ns, body_from_sensor, columns)
 
@@ -115,7 +115,7 @@ def hdl64_projection(
 def _line(
     near: F64Array, file: VelodyneFile, two_points: BoolArray, near_m: float
 ) -> tuple[F32Array, F32Array]:
-    """Correction at 0 m and its slope, between what is known at `near_m` and at 25.04 m."""
+    """Correction at 0 m and its slope, from the values at `near_m` and at 25.04 m."""
     far = file.dist_correction_m
     slope = np.where(two_points, (far - near) / (_FAR_M - near_m), 0.0)
     start = np.where(two_points, near - slope * near_m, far)

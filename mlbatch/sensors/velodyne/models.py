@@ -1,7 +1,7 @@
-"""Velodyne models as rows of a table: beams, firing times, units, and how packets hold them.
+"""Velodyne models and packet layouts as tables: beams, firing times, units, offsets.
 
-Source: facts/velodyne.md sections 1, 2, 5 and 6. All tables are by laser id, which is the order of
-the wire; angles in degrees, as the manuals print them.
+Source: docs/sources/velodyne.md sections 1, 2, 5 and 6. All tables are in the order of laser ids,
+as in the packets; angles in degrees, as in the manuals.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ STAMP_AT = 1200
 MODE_AT = 1204
 _BLOCK_HEAD = 4
 _READING = 3
-TURN_CDEG = 36000
-# Block flags as numbers; a sequence is_pace a block of each bank.
+CIRCLE_CDEG = 36000
+# Block flags as numbers; a firing sequence has a block of each bank.
 BANK_FLAGS = {1: (0xEEFF,), 2: (0xEEFF, 0xDDFF), 4: (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)}
 DUAL = "dual return"
 UNSET_MODES = ("single return", DUAL)
@@ -38,13 +38,13 @@ VLS_128 = "VLS-128"
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A row.
+    """A model.
 
-    reported_as: what packets of this model name; banks: blocks of a firing sequence; halves: firing
-    sequences of a block; sequence_ns, slots: a firing sequence and the slots of its timetable;
-    slot: (lasers,) in which each laser fires; stamp_ns: first firing minus the packet's stamp;
-    clockwise_deg, elevation_deg, height_mm: of each beam, empty where only a file has them;
-    product: the byte that names the model in its packets, None where they have none.
+    reported_as: the model named in packets of this one; banks: blocks of a firing sequence; halves:
+    firing sequences of a block; sequence_ns, slots: length of a firing sequence, and its time
+    slots; slot: (lasers,) time slot of each laser; stamp_ns: first firing minus the packet's stamp;
+    clockwise_deg, elevation_deg, height_mm: of each beam, empty if only a file has them; product:
+    product byte of its packets, None if they have none.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where a packet of a model in a mode holds its columns.
+    """Columns of the packets of a model in a return mode.
 
     blocks: of a sequence with all its returns; sequences: groups of blocks with an azimuth each;
     first_byte: [return][bank] of a record.
@@ -115,7 +115,7 @@ def layout(model: Model, returns: int) -> Layout:
 
 @lru_cache(maxsize=8)
 def expected_flags(banks: int, returns: int) -> I64Array:
-    """Flags of the blocks that a packet uses, which may be fewer than it has.
+    """Flags of the used blocks of a packet, which may be fewer than 12.
 
     HDL-64E sends the second return after both banks of the first; VLS-128 bank by bank.
     """
@@ -125,7 +125,7 @@ def expected_flags(banks: int, returns: int) -> I64Array:
 
 
 def beam_table(model: Model, file: VelodyneFile | None, *, raised: bool) -> BeamTable:
-    """Beams in the sensor frame (x forward, y left); raised: by their vertical offsets."""
+    """Beams in the sensor frame (x forward, y left); raised: apply vertical offsets."""
     if file is None:
         azimuth_rad = np.array(model.clockwise_deg) * RAD_PER_DEG
         elevation_rad = np.array(model.elevation_deg) * RAD_PER_DEG
@@ -152,12 +152,12 @@ def beam_table(model: Model, file: VelodyneFile | None, *, raised: bool) -> Beam
 
 
 def ranks(elevation: F64Array) -> I64Array:
-    """Number of each beam counted from the lowest."""
+    """Rank of each beam, 0 for the lowest."""
     return np.argsort(np.argsort(elevation, kind="stable"))
 
 
 def _focal(length_mm: float, elevation_deg: tuple[float, ...]) -> tuple[float, ...]:
-    """Heights in mm of beams that leave a lens of this focal length (section 5)."""
+    """Heights in mm of beams through a lens of this focal length (section 5)."""
     return tuple((length_mm * np.tan(-np.array(elevation_deg) * RAD_PER_DEG)).tolist())
 
 
@@ -228,8 +228,8 @@ _VLS_128_DEG = (
     4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84, -0.45,
     8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
 )
-# sequence_ns: as measured on the one recording known; a stream's own is measured from its packets.
-# The stamp is that of the fourth group of eight lasers.
+# sequence_ns: measured on the only known recording; for each stream it is measured again. The stamp
+# is that of the fourth group of eight lasers.
 ALPHA_PRIME = Model(
     name="VLS-128", reported_as=VLS_128, lasers=128, units_per_m=250, sequence_ns=55_277, slots=20,
     slot=tuple(laser // 8 + (laser >= 64) for laser in range(128)), banks=4, stamp_ns=-8_700,
@@ -249,5 +249,5 @@ HDL_64E_S3 = replace(
 )
 # fmt: on
 
-# S3 before S2: what a calibration file of 64 lasers is taken for.
+# S3 before S2: a calibration file of 64 lasers is assumed to be of the first.
 ALL = (VLP_16, PUCK_LITE, PUCK_HI_RES, HDL_32E, VLP_32C, ALPHA_PRIME, HDL_64E_S3, HDL_64E_S2)

@@ -1,7 +1,7 @@
-"""Velodyne data packets: stamps, angles and readings of their columns.
+"""Velodyne data packets: timestamps, angles and readings of columns.
 
-Source: facts/velodyne.md sections 1 to 4. A column is one firing sequence; a packet has one stamp
-and an azimuth for each block, from which those of all columns follow.
+Source: docs/sources/velodyne.md sections 1 to 4. A column is one firing sequence; a packet has one
+timestamp and an azimuth for each block, from which those of all columns follow.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
 from mlbatch.sensors.velodyne.models import (
+    CIRCLE_CDEG,
     DUAL,
     MODE_AT,
     MODES,
     PACKET_SIZE,
     STRIDE,
-    TURN_CDEG,
     Layout,
     Model,
     beam_table,
@@ -38,13 +38,13 @@ VENDOR = "Velodyne"
 _AZIMUTH_AT = 2
 _BAD_HEADER = FAULTS.index("bad_header")
 _RETURN_TYPES = {"strongest return": (1,), "last return": (2,), DUAL: (0, 0)}
-# Section 4: a step of the azimuth this much wider than others is a blind sector.
+# Section 4: an azimuth step wider than others by this factor is a blind sector.
 _GAP_FACTOR = 3
 _GAP_CDEG = 100
-# Manuals: 300 rpm and more. Below, no time can be told from an angle.
-_SLOWEST = 4 * TURN_CDEG / NS_PER_S
+# Manuals: 300 rpm and more. Below, angles give no usable times.
+_SLOWEST = 4 * CIRCLE_CDEG / NS_PER_S
 _SPEED_TOLERANCE = 0.05
-# By the number of returns: which values of the mode's byte do not say another number.
+# By number of returns: values of the mode byte that do not contradict it.
 _MAY_BE_MODE = {
     returns: np.array([(MODES.get(code, mode) == DUAL) == (returns == 2) for code in range(256)])
     for returns, mode in ((1, ""), (2, DUAL))
@@ -53,10 +53,10 @@ _MAY_BE_MODE = {
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was told from the first packets.
+    """Properties measured from the first packets.
 
-    mode: of returns; sequence_ns: of a firing sequence; clock_offset_ns: true time minus arrival;
-    speed: of the rotor, 0.01 degree/ns, 0 where unknown.
+    mode: of returns; sequence_ns: length of a firing sequence; clock_offset_ns: true time minus
+    receive time; speed: of the rotor, 0.01 degree/ns, 0 if unknown.
     """
 
     mode: str
@@ -68,7 +68,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """--decode, as far as it concerns this maker."""
+    """Values of --decode for Velodyne."""
 
     firing_azimuth: bool = True
     vertical_offset: bool = True
@@ -76,7 +76,7 @@ class Options:
 
 
 class VelodyneLidar(BaseLidar):
-    """One sensor; `Lidar` of lidar.py."""
+    """Decoder of one sensor; `Lidar` of lidar.py."""
 
     def __init__(
         self,
@@ -124,12 +124,12 @@ class VelodyneLidar(BaseLidar):
         self._start_ns, self._ahead_ns = self._timetable()
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each packet."""
+        """(P,) index into FAULTS."""
         good = are_good(packets, self._model, self.returns)
         return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps and rotor words of all columns; all are valid."""
+        """Timestamps and rotor words of all columns; all are valid."""
         azimuth = first_azimuths(packets, self._layout)
         speed, delay_ns = self._motion(azimuth)
         toh_ns = top_of_hour_ns(packets)
@@ -137,27 +137,31 @@ class VelodyneLidar(BaseLidar):
         halves = self._model.halves
         shape = (len(packets), self._layout.columns)
         stamp_ns = packet_ns[:, None] + delay_ns.repeat(halves, axis=1) + self._start_ns
-        turns = (azimuth.repeat(halves, axis=1) + speed[:, None] * self._ahead_ns) / TURN_CDEG
-        turning = speed if self._options.firing_azimuth else np.zeros_like(speed)
-        turns_per_s = (turning * (NS_PER_S / TURN_CDEG))[:, None]
-        return Heads(stamp_ns, rotor_words(turns, turns_per_s), np.ones(shape, np.bool_))
+        revolutions = (
+            azimuth.repeat(halves, axis=1) + speed[:, None] * self._ahead_ns
+        ) / CIRCLE_CDEG
+        rotor_speed = speed if self._options.firing_azimuth else np.zeros_like(speed)
+        revolutions_per_s = (rotor_speed * (NS_PER_S / CIRCLE_CDEG))[:, None]
+        return Heads(
+            stamp_ns, rotor_words(revolutions, revolutions_per_s), np.ones(shape, np.bool_)
+        )
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, records.size) into `out`; its arrays may stride."""
+        """Decode return `which` of columns (n, records.size) into `out`, which may be strided."""
         count = len(records)
         lasers = self._layout.lasers_per_bank
         for bank, byte in enumerate(self._layout.first_byte[which]):
-            place = slice(bank * lasers, (bank + 1) * lasers)
+            channels = slice(bank * lasers, (bank + 1) * lasers)
             raw: U16Array = np.ndarray(
                 (count, lasers), "<u2", buffer=records, offset=byte, strides=(records.strides[0], 3)
             )
-            np.divide(raw, np.float32(self._model.units_per_m), out=out.range_m[:, place])
-            out.intensity[:, place] = records[:, byte + 2 : byte + 3 * lasers : 3]
+            np.divide(raw, np.float32(self._model.units_per_m), out=out.range_m[:, channels])
+            out.intensity[:, channels] = records[:, byte + 2 : byte + 3 * lasers : 3]
         if len(self._dark):
             out.range_m[:, self._dark] = 0
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """That of the HDL-64E, whose corrections depend on the range; else none."""
+        """Projection of the HDL-64E, whose corrections depend on the range; else None."""
         if not self._model.needs_file or self._file is None:
             return None
         file = self._file
@@ -166,7 +170,7 @@ class VelodyneLidar(BaseLidar):
         return hdl64_projection(file, self.firing_ns, body_from_sensor, columns)
 
     def _timetable(self) -> tuple[I64Array, F64Array]:
-        """Of each column: its first firing after the packet's stamp, and after its block's."""
+        """First firing of each column, after the packet's stamp and after its block's azimuth."""
         model = self._model
         sequence_ns = self._measured.sequence_ns
         number = np.arange(self._layout.columns)
@@ -177,7 +181,7 @@ class VelodyneLidar(BaseLidar):
         return start_ns, ahead_ns
 
     def _motion(self, azimuth: I64Array) -> tuple[F64Array, I64Array]:
-        """Speed of the rotor in each packet, and how late its columns are by blind sectors."""
+        """(P,) rotor speed, and (P, sequences) delay of columns after blind sectors."""
         known = self._measured.speed
         if azimuth.shape[1] < 2:
             return np.full(len(azimuth), known), np.zeros(azimuth.shape, np.int64)
@@ -189,24 +193,25 @@ class VelodyneLidar(BaseLidar):
         rows = some.nonzero()[0]
         if len(rows):
             own = speed[rows]
-            # Over half a turn the speed of many packets is surer than that of a few blocks.
+            # Across half a revolution, the speed over many packets is better than over a few
+            # blocks.
             steady = np.where(np.abs(own - known) < _SPEED_TOLERANCE * known, known, own)
-            turns = gap[rows] & (steady > _SLOWEST)[:, None]
+            is_blind = gap[rows] & (steady > _SLOWEST)[:, None]
             blind_ns = step[rows] / np.maximum(steady, _SLOWEST)[:, None] - group_ns
-            late_ns = np.where(turns, blind_ns, 0).cumsum(axis=1)
+            late_ns = np.where(is_blind, blind_ns, 0).cumsum(axis=1)
             delay_ns[rows, 1:] = np.rint(late_ns).astype(np.int64)
         return speed, delay_ns
 
 
 def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:
-    """Which packets are a model's, with this many returns: by flags, limits and return mode."""
+    """(P,) whether packets are a model's, with so many returns: flags, limits, return mode."""
     flags = expected_flags(model.banks, returns)
     used = len(flags)
     blocks = _block_words(packets, 0, used) == flags
-    blocks &= _block_words(packets, _AZIMUTH_AT, used) < TURN_CDEG
+    blocks &= _block_words(packets, _AZIMUTH_AT, used) < CIRCLE_CDEG
     good = blocks.all(axis=1)
     good &= top_of_hour_ns(packets) < HOUR_NS
-    if model.banks == 1:  # Elsewhere the flags tell, and HDL-64E has its status there.
+    if model.banks == 1:  # Other models differ by flags; the HDL-64E has its status there.
         good &= _MAY_BE_MODE[returns][packets[:, MODE_AT]]
     return np.asarray(good)
 
@@ -217,18 +222,18 @@ def first_azimuths(packets: U8Array, where: Layout) -> I64Array:
 
 
 def _block_words(packets: U8Array, at: int, count: int, every: int = 1) -> I64Array:
-    """(P, count) numbers of two bytes at byte `at` of every n-th block."""
+    """(P, count) two-byte numbers at byte `at` of every n-th block."""
     step = STRIDE * every
     blocks = packets[:, at : at + step * count].reshape(len(packets), count, step)
     return np.asarray(blocks[:, :, :2].view("<u2")[..., 0], np.int64)
 
 
 def steps(azimuth: I64Array) -> tuple[I64Array, BoolArray]:
-    """Steps of the azimuth within packets, and which of them pass a blind sector.
+    """Azimuth steps within packets, and whether they span a blind sector.
 
-    A rotor that jitters or rests may step back by less than a degree.
+    A jittering or resting rotor may step back by less than a degree.
     """
-    step = (azimuth[:, 1:] - azimuth[:, :-1] + _GAP_CDEG) % TURN_CDEG - _GAP_CDEG
+    step = (azimuth[:, 1:] - azimuth[:, :-1] + _GAP_CDEG) % CIRCLE_CDEG - _GAP_CDEG
     is_wide = step > _GAP_CDEG
     if not is_wide.any():
         return step, is_wide
@@ -237,7 +242,7 @@ def steps(azimuth: I64Array) -> tuple[I64Array, BoolArray]:
 
 
 def mean_step(step: I64Array, gap: BoolArray) -> F64Array:
-    """(P,) mean of the steps that are no gap; the middle one never is."""
+    """(P,) mean of the steps that are no gap; the median step never is one."""
     if not gap.any():
         return np.asarray(step.sum(axis=1) / step.shape[1], np.float64)
     total = np.where(gap, 0, step).sum(axis=1)

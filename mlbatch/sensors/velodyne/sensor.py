@@ -1,7 +1,7 @@
 """Velodyne lidars: VLP-16, Puck LITE, Puck Hi-Res, VLP-32C, HDL-32E, HDL-64E, VLS-128.
 
-Source: facts/velodyne.md. Their beams hardly differ from unit to unit, so that tables serve for
-all but the HDL-64E; a file of angles (YAML or db.xml) is_pace their place.
+Source: docs/sources/velodyne.md. Beams hardly differ from unit to unit, so all models
+but the HDL-64E have built-in tables, which a file of angles (YAML or db.xml) replaces.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["BUILT_IN", "MODELS", "VENDOR", "VelodyneCalibration", "describe", "r
 
 _FITS_BYTES = 100
 _FITS_FILE = 200
-# A file whose angles are further from those of all models is of none of them.
+# Largest mean difference between the angles of a file and those of its model.
 _ANGLE_TOLERANCE_DEG = 3.0
 _UNIT_TOLERANCE = 1e-6
 _OPTIONS = {"firing_azimuth": "on", "vertical_offset": "on", "packet_stamp": "start"}
@@ -52,7 +52,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
         vendor=VENDOR,
         channels=model.lasers,
         returns=(1, 2),
-        clock="us past the hour, GPS or free; hour from NMEA or arrival",
+        clock="us past the hour, GPS or free; hour from NMEA or receive time",
         calibration="YAML or db.xml, required" if model.needs_file else "built in; YAML or db.xml",
         verified=model.verified,
     )
@@ -61,10 +61,9 @@ MODELS: tuple[SensorModel, ...] = tuple(
 
 
 class VelodyneCalibration:
-    """A model's table, or a file in its place; `Calibration` of lidar.py.
+    """Built-in table of a model, or a file that replaces it; `Calibration` of lidar.py.
 
-    is_guessed: packets and file leave open which of several models it is; is_named: the rig says
-    that it is this one.
+    is_guessed: packets and file fit several models; is_named: the rig names this model.
     """
 
     __slots__ = ("file", "is_guessed", "is_named", "is_shared", "model", "path", "row", "serial")
@@ -83,21 +82,21 @@ class VelodyneCalibration:
         self.is_named = is_named
         self.path: Path | None = None if file is None else file.path
         self.model = row.name
-        # Neither packets nor files name a unit.
+        # Neither packets nor files have serial numbers.
         self.serial = ""
         self.is_shared = True
 
     def for_model(self, name: str) -> VelodyneCalibration | None:
-        """The same for a model with as many beams that the rig names; None if it cannot be one."""
+        """The same calibration for the model named in the rig; None if it has other beams."""
         rows = [row for row in ALL if row.name == name and row.lasers == self.row.lasers]
         return VelodyneCalibration(rows[0], self.file, is_named=True) if rows else None
 
     def fit(self, evidence: Evidence) -> int:
-        """How well packets fit: by what they name, or only by how they are laid out."""
+        """Match score of packets: by the model that they name, or by layout and pace."""
         seen = identify(evidence.size, evidence.sample)
         if seen is None or seen.banks != self.row.banks:
             return 0
-        # Models that packets do not name (Puck LITE, series of the HDL-64E) are named by the rig.
+        # Only the rig names models that packets do not (Puck LITE, series of the HDL-64E).
         first = next((row for row in ALL if row.reported_as == seen.model), None)
         if first is None or first.reported_as != self.row.reported_as:
             return READABLE if _is_paced(self.row, seen) else 0
@@ -106,13 +105,13 @@ class VelodyneCalibration:
         return _FITS_BYTES if first is self.row or self.is_named else READABLE
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> VelodyneLidar:
-        """The sensor."""
+        """Decoder of the sensor; RigError if its model needs a file."""
         check_options(options)
         chosen = {**_OPTIONS, **options}
         if self.row.needs_file and self.file is None:
             raise RigError(
-                f"{self.row.reported_as}: expected its calibration, found none; give the unit's YAML or "
-                "db.xml with --metadata or as `metadata:` in the rig"
+                f"{self.row.reported_as}: expected its calibration, found none; give the unit's "
+                "YAML or db.xml with --metadata or as `metadata:` in the rig"
             )
         measured, notes = _measure(self.row, evidence)
         if self.file is not None:
@@ -130,36 +129,38 @@ class VelodyneCalibration:
         )
 
 
-# The HDL-64E is among them to say what it lacks.
+# Includes the HDL-64E, whose entry raises the error about its missing file.
 BUILT_IN: tuple[Calibration, ...] = tuple(VelodyneCalibration(model) for model in ALL)
 
 
 def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
-    """The angles in a file, for the model that they are nearest to; None if it holds none."""
+    """Parse a file of angles, for the model with the nearest angles; None if it is another file."""
     file = read_velodyne(path, content)
     if file is None:
         return None
     rows = [row for row in ALL if row.lasers == file.lasers]
-    away_deg, row = min(((_away_deg(row, file), row) for row in rows), key=lambda pair: pair[0])
-    if away_deg > _ANGLE_TOLERANCE_DEG:
+    difference_deg, row = min(
+        ((_difference_deg(row, file), row) for row in rows), key=lambda pair: pair[0]
+    )
+    if difference_deg > _ANGLE_TOLERANCE_DEG:
         raise RigError(
-            f"{path}: Velodyne calibration: expected vertical angles of {row.name} or another model "
-            f"with {file.lasers} lasers, found some {away_deg:.1f} degrees off; give the file of a "
-            "supported model"
+            f"{path}: Velodyne calibration: expected vertical angles of {row.name} or another "
+            f"model with {file.lasers} lasers, found a mean difference of "
+            f"{difference_deg:.1f} degrees; give the file of a supported model"
         )
     return VelodyneCalibration(row, file, is_guessed=row.needs_file)
 
 
-def _away_deg(row: Model, file: VelodyneFile) -> float:
-    """How far the beams of a file are from a model's, on average; 0 where the model has none."""
+def _difference_deg(row: Model, file: VelodyneFile) -> float:
+    """Mean elevation difference between a file and a model; 0 if the model has no table."""
     if row.needs_file:
         return 0.0
-    away = np.abs(file.elevation_rad / RAD_PER_DEG - np.array(row.elevation_deg))
-    return float(away.mean())
+    difference = np.abs(file.elevation_rad / RAD_PER_DEG - np.array(row.elevation_deg))
+    return float(difference.mean())
 
 
 def _is_paced(row: Model, seen: Identity) -> bool:
-    """Whether packets come as fast as the model's: a wrong name is possible, a wrong pace not."""
+    """Whether the pace of packets fits the model; product bytes may be wrong, the pace is not."""
     return seen.block_us is None or is_pace(row.block_us, seen.block_us)
 
 
@@ -171,7 +172,9 @@ def _file_notes(calibration: VelodyneCalibration) -> list[str]:
         others = ", ".join(
             one.name for one in ALL if one.reported_as == row.reported_as and one != row
         )
-        notes.append(f"taken for an {row.name}; if it is an {others}, name its model in the rig")
+        notes.append(
+            f"assumed to be an {row.name}; if it is an {others}, name its model in the rig"
+        )
     if file is not None and file.unit_m is not None:
         unit_m = 1 / row.units_per_m
         if abs(file.unit_m - unit_m) > _UNIT_TOLERANCE:
@@ -185,7 +188,7 @@ def _file_notes(calibration: VelodyneCalibration) -> list[str]:
 def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]]:
     seen = None if evidence is None else identify(evidence.size, evidence.sample)
     if evidence is None or seen is None:
-        note = "no packet seen at first: taken for one that sends a single return"
+        note = "no packets in the first 10 seconds: single return assumed"
         return Measured("single return", row.sequence_ns), [note]
     notes = _identity_notes(row, seen)
     where = layout(row, seen.returns)
@@ -198,11 +201,11 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
     azimuth = first_azimuths(packets, where)
     sequence_ns = float(row.sequence_ns)
     if row.banks == 4:
-        told_ns = measured_sequence_ns(stamp_ns, where.sequences)
-        sequence_ns = told_ns or sequence_ns
-        if told_ns is None:
+        measured_ns = measured_sequence_ns(stamp_ns, where.sequences)
+        sequence_ns = measured_ns or sequence_ns
+        if measured_ns is None:
             notes.append(
-                f"too few packets to measure its firing sequence: {sequence_ns:g} ns taken"
+                f"too few packets to measure its firing sequence: {sequence_ns:g} ns assumed"
             )
     within = None
     if where.sequences > 1 and len(packets):
@@ -214,5 +217,5 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
 
 def _identity_notes(row: Model, seen: Identity) -> list[str]:
     if seen.model == row.reported_as and seen.label:
-        return [f"by the pace of its packets it is a {seen.model}, though {seen.label}"]
+        return [f"model by the pace of its packets: {seen.model}, although {seen.label}"]
     return []

@@ -145,7 +145,11 @@ BROKEN = {
     "name": (1, ["one,0,0"], "line 2: expected a channel from 1 to 128, found one"),
     "two cells": (16, ["16,8.0"], "line 17: expected channel, elevation, azimuth, found 16, 8.0"),
     "empty cell": (16, ["16,,3"], "line 17: expected elevation from -90 to 90 deg, found nothing"),
-    "long": (1, ["1" + "x" * 99], "line 2: expected channel, elevation, azimuth, found 1" + "x" * 56),
+    "long": (
+        1,
+        ["1" + "x" * 99],
+        "line 2: expected channel, elevation, azimuth, found 1" + "x" * 56,
+    ),
 }
 
 
@@ -175,7 +179,7 @@ def test_digest_finds_a_changed_angle() -> None:
     digest = hashlib.sha256(text(rows(), "\r\n")).hexdigest()
     lines = [*rows(), f"{digest},,"]
     lines[3] = "3,1.6,-3"
-    expected = "expected lines that agree with this SHA-256, found lines that were changed"
+    expected = "expected lines that match this SHA-256, found changed lines"
     assert refusal(lines) == f"line 18: {expected}"
 
 
@@ -238,7 +242,7 @@ def test_files_that_are_no_at128_files(content: bytes) -> None:
         (5, 4, "expected mirrors 3, found 4"),
         (6, 1, "expected frames 3, found 1"),
         (15, 0, "expected a resolution from 1 to 8, found 0"),
-        (9000, 1, "expected content that agrees with its SHA-256, found content that was changed"),
+        (9000, 1, "expected content that matches its SHA-256, found changed content"),
     ],
 )
 def test_damaged_at128_files_are_refused(at: int, value: int, message: str) -> None:

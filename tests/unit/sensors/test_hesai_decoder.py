@@ -320,8 +320,16 @@ def test_packets_without_a_decoder_fit_nothing() -> None:
 @pytest.mark.parametrize(
     ("model", "file", "text"),
     [
-        ("Pandar64", "Pandar40P", "expected 64 channels for the packets of a Pandar64, found 40; give"),
-        ("Pandar64", "AT128", "expected the csv of a Pandar64 for these packets, found the file of"),
+        (
+            "Pandar64",
+            "Pandar40P",
+            "expected 64 channels for the packets of a Pandar64, found 40; give",
+        ),
+        (
+            "Pandar64",
+            "AT128",
+            "expected the csv of a Pandar64 for these packets, found the file of",
+        ),
         ("AT128", "OT128", "HESAI AT128: expected its correction file (.dat), found a csv"),
     ],
 )

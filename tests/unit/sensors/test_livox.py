@@ -274,7 +274,9 @@ def test_fit() -> None:
 
 @pytest.mark.parametrize("seen", [None, evidence(livox1_packets(2, 1362))])
 def test_a_sensor_that_was_not_seen_is_refused(seen: Evidence | None) -> None:
-    with pytest.raises(RigError, match="Livox SDK2: expected packets of points in the first 10 sec"):
+    with pytest.raises(
+        RigError, match="Livox SDK2: expected packets of points in the first 10 sec"
+    ):
         CALIBRATION.lidar({}, seen)
 
 

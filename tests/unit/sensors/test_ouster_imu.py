@@ -96,7 +96,7 @@ def test_real_packets_equal_the_reference() -> None:
     calibration = read_file(case.metadata_path)
     assert calibration is not None
     lidar = calibration.lidar({}, None)
-    assert lidar.notes == ("the metadata say that the lidar output was off",)
+    assert lidar.notes == ("lidar output is off according to the metadata",)
     assert not lidar.is_imu(680)
     assert lidar.is_imu(452)
     packets = [lidar.imu(payload[None], 0) for payload in case.payloads(452)]

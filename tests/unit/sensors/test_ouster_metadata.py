@@ -130,7 +130,7 @@ def test_a_lidar_that_was_off_is_noted_and_the_file_stays_usable() -> None:
         document = metadata_json(SPEC)
         document["config_params"][key] = value
         assert read(document).lidar({}, None).notes == (
-            "the metadata say that the lidar output was off",
+            "lidar output is off according to the metadata",
         )
 
 
@@ -191,7 +191,9 @@ def test_options_of_this_and_other_makers() -> None:
         None,
     )
     known = "crc, firing_azimuth, optical_centre, packet_stamp, vertical_offset"
-    with pytest.raises(UsageError, match=f"--decode colour=red: expected one of {known}, found colour"):
+    with pytest.raises(
+        UsageError, match=f"--decode colour=red: expected one of {known}, found colour"
+    ):
         calibration.lidar({"colour": "red"}, None)
     with pytest.raises(UsageError, match="expected crc=check, found never"):
         calibration.lidar({"crc": "never"}, None)

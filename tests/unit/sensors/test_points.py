@@ -113,7 +113,9 @@ def test_no_maker_takes_our_packets_for_its_own(by_ring: bool) -> None:
 
 
 def test_a_silent_topic_is_asked_for() -> None:
-    with pytest.raises(RigError, match="PointCloud2: expected a cloud of the topic in the first 10"):
+    with pytest.raises(
+        RigError, match="PointCloud2: expected a cloud of the topic in the first 10"
+    ):
         CLOUD.lidar({}, None)
     with pytest.raises(UsageError, match="--decode speed=up"):
         CLOUD.lidar({"speed": "up"}, None)

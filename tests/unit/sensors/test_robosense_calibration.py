@@ -162,7 +162,7 @@ def test_a_sensor_that_is_silent_cannot_be_made() -> None:
     file = robosense.read_calibration(Path("a.csv"), _csv("Helios 32"))
     assert file is not None
     for calibration in (robosense.BUILT_IN[0], file):
-        with pytest.raises(RigError, match="expected a packet of it in the first 10 seconds"):
+        with pytest.raises(RigError, match="expected packets in the first 10 seconds"):
             calibration.lidar({}, None)
 
 
@@ -273,7 +273,10 @@ def test_files_that_are_no_angles(content: bytes) -> None:
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (b"1.0,2.0\n" * 31, "expected 16, 32, 48, 80, 96 or 128 lines `elevation,azimuth`, found 31"),
+        (
+            b"1.0,2.0\n" * 31,
+            "expected 16, 32, 48, 80, 96 or 128 lines `elevation,azimuth`, found 31",
+        ),
         (b"1.0,2.0\n" * 15 + b"95,0\n", "in line 16, found '95,0'"),
         (b"elevation,azimuth\n" + b"1,2\n" * 15 + b"1,x\n", "in line 17, found '1,x'"),
         (b"1.0,2.0\n" * 15 + b"nan,0\n", "in line 16, found 'nan,0'"),

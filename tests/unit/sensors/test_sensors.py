@@ -43,7 +43,9 @@ def test_a_metadata_file_is_read(tmp_path: Path) -> None:
 
 
 def test_files_that_cannot_be_read_are_told(tmp_path: Path) -> None:
-    with pytest.raises(RigError, match=r"none\.json: expected a calibration file, found no such file"):
+    with pytest.raises(
+        RigError, match=r"none\.json: expected a calibration file, found no such file"
+    ):
         sensors.read_calibration(tmp_path / "none.json")
     with pytest.raises(RigError, match="expected a calibration file, found a directory"):
         sensors.read_calibration(tmp_path)

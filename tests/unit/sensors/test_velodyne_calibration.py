@@ -139,7 +139,10 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
     ("text", "told"),
     [
         (yaml_of(sixteen()[:15]), "lasers: expected 16, 32, 64, 128 lasers, found 15"),
-        (yaml_of([], "num_lasers: 16\nlaser_id: 1\n"), "lasers: expected a list of lasers, found none"),
+        (
+            yaml_of([], "num_lasers: 16\nlaser_id: 1\n"),
+            "lasers: expected a list of lasers, found none",
+        ),
         ("num_lasers: 64\ndistance_resolution: 0.002\n", "lasers: expected a list of lasers"),
         ("lasers: many\nnum_lasers: 1\nlaser_id: 3", "lasers: expected a list of lasers"),
         ("[\nlasers: 16, laser_id: 3]\n", "lasers: expected a list of lasers, found none"),
@@ -154,15 +157,24 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
         (yaml_of(sixteen(vert_correction=".nan")), "lasers[3].vert_correction: expected a finite"),
         (yaml_of(sixteen(rot_correction=".inf")), "lasers[3].rot_correction: expected a finite"),
         (yaml_of(sixteen(rot_correction="nan")), "found nan"),
-        (yaml_of(sixteen(vert_correction="")), "lasers[3].vert_correction: expected a finite number"),
+        (
+            yaml_of(sixteen(vert_correction="")),
+            "lasers[3].vert_correction: expected a finite number",
+        ),
         (yaml_of(sixteen(vert_correction="[1]")), "found ['1']"),
         # Degrees instead of radians.
-        (yaml_of(sixteen(vert_correction=-15)), "expected at most 1.5708 rad either way, found -15"),
+        (
+            yaml_of(sixteen(vert_correction=-15)),
+            "expected at most 1.5708 rad in absolute value, found -15",
+        ),
         (yaml_of(sixteen(rot_correction=1.6)), "lasers[3].rot_correction: expected at most 1.5708"),
         # Centimetres instead of metres.
         (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: expected at most 5 m"),
-        (yaml_of(sixteen(vert_offset_correction=19.5)), "expected at most 1 m either way, found 19.5"),
-        (yaml_of(sixteen(horiz_offset_correction=-2.6)), "expected at most 1 m either way"),
+        (
+            yaml_of(sixteen(vert_offset_correction=19.5)),
+            "expected at most 1 m in absolute value, found 19.5",
+        ),
+        (yaml_of(sixteen(horiz_offset_correction=-2.6)), "expected at most 1 m in absolute value"),
         (
             yaml_of(sixteen(), "num_lasers: 32\n"),
             "num_lasers: expected 16, the lasers listed, found 32",
@@ -171,9 +183,15 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
             yaml_of(sixteen(), "distance_resolution: 2\n"),
             "distance_resolution: expected 0.0005 to 0.02 m",
         ),
-        (yaml_of(sixteen(), "distance_resolution: fine\n"), "distance_resolution: expected a finite"),
+        (
+            yaml_of(sixteen(), "distance_resolution: fine\n"),
+            "distance_resolution: expected a finite",
+        ),
         (yaml_of(sixteen())[:-30], ": expected YAML, found did not find"),
-        (yaml_of(sixteen(), "a: &a [1]\nb: *a\n"), "expected values written out, found the alias *a"),
+        (
+            yaml_of(sixteen(), "a: &a [1]\nb: *a\n"),
+            "expected values written out, found the alias *a",
+        ),
         (yaml_of(sixteen(), "a: " + "[" * 50_000), "expected at most 8 levels, found more"),
         (yaml_of(sixteen(), "a: \x07"), "expected YAML, found"),
         (yaml_of(sixteen(), "---\nb: 1\n"), "expected YAML, found"),

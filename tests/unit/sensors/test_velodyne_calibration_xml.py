@@ -107,7 +107,10 @@ ENTITIES = '<!DOCTYPE boost_serialization [<!ENTITY a "1111111111"><!ENTITY b "&
         ),
         (xml_of(points(64, id_=2)), "DB.points_.item[3].id_: expected each id once, found 2 again"),
         (xml_of(points(63)), "lasers: expected ids 0 to 63, found no laser 63"),
-        (xml_of([]).replace("0.2<", "0.2<!-- rotCorrection_ --><"), "DB.points_: expected 1 to 128"),
+        (
+            xml_of([]).replace("0.2<", "0.2<!-- rotCorrection_ --><"),
+            "DB.points_: expected 1 to 128",
+        ),
         (xml_of(points(129)), "DB.points_: expected 1 to 128 lasers, found 129"),
         (xml_of(points(64, vertCorrection_=91)), "vertCorrection_: expected at most 90 degrees"),
         (
@@ -115,7 +118,7 @@ ENTITIES = '<!DOCTYPE boost_serialization [<!ENTITY a "1111111111"><!ENTITY b "&
             "rotCorrection_: expected a finite number, found nan",
         ),
         (xml_of(points(64, distCorrection_=1500)), "distCorrection_: expected at most 500 cm"),
-        (xml_of(points(64), [0] * 64), "DB.enabled_: expected lasers that are enabled, found none"),
+        (xml_of(points(64), [0] * 64), "DB.enabled_: expected enabled lasers, found none"),
         (xml_of(points(64), [2] * 64), "DB.enabled_: expected at most 128 items of 0 or 1"),
         (xml_of(points(64), [1] * 200), "DB.enabled_: expected at most 128 items of 0 or 1"),
         (xml_of(points(64), lsb_cm=20), "DB.distLSB_: expected 0.05 to 2 cm, found 20"),

@@ -131,7 +131,7 @@ def test_what_positions_say_of_the_pulse() -> None:
 
 class TestSpeeds:
     def test_of_a_rotor_by_packets_of_many_turns(self) -> None:
-        """600.06 rpm, azimuths rounded to 0.01 degree, samples as the sampler is_pace them."""
+        """600.06 rpm, azimuths rounded to 0.01 degree, samples as the sampler takes them."""
         stamp_ns = times_ns() + HOUR_NS - SECOND_NS
         azimuth = np.rint(stamp_ns * 3.60036e-4).astype(np.int64) % 36000
         speed = rotor_speed(stamp_ns % HOUR_NS, azimuth, None)

@@ -157,7 +157,7 @@ def test_the_sequence_of_a_vls_128_is_measured(sequence_us: float, mode: str) ->
 def test_a_vls_128_seen_too_briefly_to_be_measured() -> None:
     seen = made_of(VelodyneSpec("VLS-128"), packets=3)
     (note,) = seen.lidar.notes
-    assert note == "too few packets to measure its firing sequence: 55277 ns taken"
+    assert note == "too few packets to measure its firing sequence: 55277 ns assumed"
 
 
 @pytest.mark.parametrize("rpm", [300.0, 1200.0])
@@ -215,7 +215,7 @@ def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     assert fits["VLP-16"] == 100
     assert fits["HDL-32E"] == 0
     (note,) = calibration("VLP-16").lidar({}, evidence(sent)).notes
-    assert note == "by the pace of its packets it is a VLP-16, though its product byte says HDL-32E"
+    assert note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
 
 
 def test_damaged_packets_are_told() -> None:
@@ -240,7 +240,7 @@ def test_damaged_packets_are_told() -> None:
 def test_a_sensor_that_is_silent_at_first_is_taken_for_a_single_return() -> None:
     lidar = calibration("VLP-16").lidar({}, None)
     (note,) = lidar.notes
-    assert note == "no packet seen at first: taken for one that sends a single return"
+    assert note == "no packets in the first 10 seconds: single return assumed"
     assert (lidar.returns, lidar.return_types) == (1, (0,))
     sent = made_of(VelodyneSpec("VLP-16", "last")).sent
     assert not lidar.faults(sent.payloads).any()

@@ -76,7 +76,7 @@ def test_a_file_of_no_model() -> None:
             f"vert_correction: {math.radians(old)!r}\n",
             f"vert_correction: {math.radians(new)!r} \n",
         )
-    with pytest.raises(RigError, match=r"odd\.yaml: .*expected vertical angles of .*found some"):
+    with pytest.raises(RigError, match=r"odd\.yaml: .*expected vertical angles of .*found a mean difference"):
         velodyne.read_calibration(Path("odd.yaml"), text.encode())
 
 
@@ -87,7 +87,7 @@ def test_a_hdl_64e_is_an_s3_until_the_rig_says_s2() -> None:
     assert read.model == "HDL-64E S3"
     assert read.fit(evidence(sent)) == 200
     (note,) = read.lidar({}, evidence(sent)).notes
-    assert note == "taken for an HDL-64E S3; if it is an HDL-64E S2, name its model in the rig"
+    assert note == "assumed to be an HDL-64E S3; if it is an HDL-64E S2, name its model in the rig"
     other = read.for_model("HDL-64E S2")
     assert other is not None
     assert other.lidar({}, evidence(sent)).notes == ()

@@ -175,7 +175,7 @@ def test_behind_blind_sectors_the_angle_still_follows_time() -> None:
     turns += np.rint(past_ns * 10e-9 - (turns - turns[0]))
     slope, start = np.polyfit(past_ns, turns, 1)
     assert slope * 1e9 == pytest.approx(10.0, abs=0.01)
-    # 0.01 degree is_pace 28 us.
+    # 0.01 degree takes 28 us.
     assert np.abs((turns - start) / slope - past_ns).max() < 20_000
 
 
@@ -243,7 +243,7 @@ def test_nmea_tells_the_hour_where_the_recorder_does_not(
 
 def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     (note,) = recorded(BELIED).lidar.notes
-    assert note == "by the pace of its packets it is a VLP-16, though its product byte says HDL-32E"
+    assert note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
     assert [recorded(name).lidar.notes for name in (GPS, DUAL, GAPS, OLD)] == [()] * 4
 
 
