@@ -26,7 +26,7 @@ from tests.builders.velodyne_tables import calibration_yaml
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes
-from tests.golden.test_loss_recordings import Came
+from tests.recordings.test_loss import Came
 
 # Ten turns a second, and a dark sector is known by a dozen of them.
 LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000

@@ -14,6 +14,7 @@ from mlbatch.readers import open_recording
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
+from tests.builders.naming import named
 from tests.builders.others import (
     filled,
     livox2_packets,
@@ -21,7 +22,6 @@ from tests.builders.others import (
     velodyne_packets,
 )
 from tests.builders.ouster import OusterSpec, encode_frame, imu_packet
-from tests.unit.sensors.naming import named
 
 RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings"
 # By recordings/MANIFEST.md: path, {payload size: description}.

@@ -10,8 +10,8 @@ import pytest
 
 from mlbatch.geometry import read_rotor_words
 from mlbatch.types import BoolArray, F32Array, I64Array
-from tests.unit.sensors.hesai_packets import HESAI, Decoded, decode, evidence, recorded
-from tests.unit.sensors.hesai_packets import calibration as calibration_of
+from tests.builders.hesai_decoded import HESAI, Decoded, decode, evidence, recorded
+from tests.builders.hesai_decoded import calibration as calibration_of
 
 pytestmark = pytest.mark.skipif(
     not HESAI.is_dir(), reason="the recordings are not beside the repository"

@@ -16,7 +16,7 @@ from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.sensors.ouster.sensor import read_calibration as read_content
 from mlbatch.types import Stream, U8Array
 from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
-from tests.unit.sensors.captures import (
+from tests.recordings.ouster import (
     CASES,
     OUSTER,
     Case,

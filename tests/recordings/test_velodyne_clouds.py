@@ -13,7 +13,7 @@ import pytest
 
 from mlbatch.types import BoolArray, F32Array, I64Array
 from tests.builders.velodyne_tables import MODELS
-from tests.golden.references import (
+from tests.recordings.references import (
     ONLY,
     STRONGEST_FIRST,
     STRONGEST_LAST,
@@ -25,7 +25,7 @@ from tests.golden.references import (
     turned_deg,
     xyz_of,
 )
-from tests.golden.velodyne_recordings import DUAL, FOLDER, GAPS
+from tests.recordings.velodyne import DUAL, FOLDER, GAPS
 
 pytestmark = pytest.mark.skipif(
     not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/velodyne"

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.types import F64Array, I64Array
 from tests.builders.run import RECORDINGS
-from tests.golden.references import read_pcd, xyz_of
+from tests.recordings.references import read_pcd, xyz_of
 
 FOLDER = RECORDINGS / "hesai"
 DUAL = "dual return, last and strongest"

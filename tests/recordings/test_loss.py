@@ -20,7 +20,7 @@ from mlbatch.matching import match
 from mlbatch.readers import merge, open_recording
 from mlbatch.streams import split_by_kind
 from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
-from tests.golden.test_doctor_recordings import CASES, RECORDINGS, Case, needs_recordings
+from tests.recordings.test_clocks import CASES, RECORDINGS, Case, needs_recordings
 
 # Fewer tell no pace.
 FEWEST = 17

@@ -23,7 +23,7 @@ from mlbatch.sensors.velodyne.packets import VelodyneLidar
 from mlbatch.streams import Sampler
 from mlbatch.types import BoolArray, F64Array, I64Array, StreamTable, U8Array
 from tests.builders.velodyne import Sent
-from tests.unit.sensors.velodyne_streams import fired, pixels, pointing
+from tests.builders.velodyne_streams import fired, pixels, pointing
 
 RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"
 pytestmark = pytest.mark.skipif(
@@ -243,7 +243,9 @@ def test_nmea_tells_the_hour_where_the_recorder_does_not(
 
 def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     (note,) = recorded(BELIED).lidar.notes
-    assert note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
+    assert (
+        note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
+    )
     assert [recorded(name).lidar.notes for name in (GPS, DUAL, GAPS, OLD)] == [()] * 4
 
 

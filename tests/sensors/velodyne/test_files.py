@@ -13,8 +13,8 @@ from mlbatch.errors import RigError
 from mlbatch.lidar import READABLE
 from mlbatch.sensors.velodyne import sensor as velodyne
 from tests.builders.velodyne import VelodyneSpec
+from tests.builders.velodyne_streams import PLAIN, evidence, made_of, pointing
 from tests.builders.velodyne_tables import MODELS, calibration_yaml
-from tests.unit.sensors.velodyne_streams import PLAIN, evidence, made_of, pointing
 
 
 def test_the_model_is_the_one_with_the_nearest_angles() -> None:
@@ -76,7 +76,9 @@ def test_a_file_of_no_model() -> None:
             f"vert_correction: {math.radians(old)!r}\n",
             f"vert_correction: {math.radians(new)!r} \n",
         )
-    with pytest.raises(RigError, match=r"odd\.yaml: .*expected vertical angles of .*found a mean difference"):
+    with pytest.raises(
+        RigError, match=r"odd\.yaml: .*expected vertical angles of .*found a mean difference"
+    ):
         velodyne.read_calibration(Path("odd.yaml"), text.encode())
 
 

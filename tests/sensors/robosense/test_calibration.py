@@ -17,8 +17,8 @@ from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, RS16, RS32, Mod
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
 from tests.builders.robosense import RobosenseSpec, angles_csv, difop, fan, msop
+from tests.builders.robosense_decoded import DIFOP, built_in, evidence_of
 from tests.builders.robosense_models import DUAL, LAST, STRONGEST
-from tests.unit.sensors.robosense_points import DIFOP, built_in, evidence_of
 
 MAGIC, TAIL = bytes.fromhex("a5ff005a11115555"), b"\x0f\xf0"
 

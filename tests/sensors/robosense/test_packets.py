@@ -12,8 +12,8 @@ from mlbatch.sensors.robosense.packets import times_ns
 from mlbatch.types import U8Array
 from tests.builders.others import filled, robosense_packets, rows
 from tests.builders.robosense import RobosenseSpec, difop, fan, msop
+from tests.builders.robosense_decoded import built_in, decoded, evidence_of
 from tests.builders.robosense_models import DUAL
-from tests.unit.sensors.robosense_points import built_in, decoded, evidence_of
 
 FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.sensors.velodyne.calibration import MAX_BYTES
-from tests.unit.sensors.test_velodyne_calibration import fault, read
+from tests.sensors.velodyne.test_calibration import fault, read
 
 XML = Path("drive/db.xml")
 

@@ -14,7 +14,7 @@ from mlbatch.sensors.ouster.imu import read_legacy
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
 from mlbatch.types import U8Array
 from tests.builders.ouster import OusterSpec, imu_packet, metadata_json
-from tests.unit.sensors.captures import CASES, Case, needs_recordings
+from tests.recordings.ouster import CASES, Case, needs_recordings
 
 ACCEL32 = "ACCEL32_GYRO32_NMEA"
 

@@ -17,7 +17,7 @@ from mlbatch.types import F64Array, I64Array, U8Array
 from tests.builders import hesai as builder
 from tests.builders.hesai import HesaiSpec, angles_csv, encode_packets
 from tests.builders.hesai_angles import Angles, Beams, MirrorAngles
-from tests.unit.sensors.hesai_packets import calibration, decode, evidence, rows
+from tests.builders.hesai_decoded import calibration, decode, evidence, rows
 
 COLUMNS = 420
 MODELS = (

@@ -20,8 +20,7 @@ from tests.builders.velodyne import (
     firing_times_ns,
     origins,
 )
-from tests.builders.velodyne_tables import MODELS, calibration_yaml
-from tests.unit.sensors.velodyne_streams import (
+from tests.builders.velodyne_streams import (
     ANGLE_DEG,
     MODES,
     PLAIN,
@@ -35,6 +34,7 @@ from tests.unit.sensors.velodyne_streams import (
     pixels,
     pointing,
 )
+from tests.builders.velodyne_tables import MODELS, calibration_yaml
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -215,7 +215,9 @@ def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     assert fits["VLP-16"] == 100
     assert fits["HDL-32E"] == 0
     (note,) = calibration("VLP-16").lidar({}, evidence(sent)).notes
-    assert note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
+    assert (
+        note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
+    )
 
 
 def test_damaged_packets_are_told() -> None:

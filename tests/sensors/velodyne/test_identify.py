@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from tests.builders.naming import LACKING, named
 from tests.builders.others import (
     BB,
     CC,
@@ -16,7 +17,6 @@ from tests.builders.others import (
     rows,
     velodyne_packets,
 )
-from tests.unit.sensors.naming import LACKING, named
 
 # facts/velodyne.md sections 1 and 2: time between the azimuths of a model, us.
 VLP_16_US, HDL_32E_US, VLP_32C_US = 110.592, 46.080, 55.296

@@ -16,7 +16,7 @@ import pytest
 
 from mlbatch.sensors.robosense.sensor import MODELS, RobosenseLidar
 from tests.builders.others import filled
-from tests.unit.sensors.robosense_cases import (
+from tests.builders.robosense_cases import (
     CALENDAR,
     CALENDAR_NS,
     CASES,
@@ -25,7 +25,7 @@ from tests.unit.sensors.robosense_cases import (
     Case,
     Probe,
 )
-from tests.unit.sensors.robosense_points import built_in, decoded, evidence_of
+from tests.builders.robosense_decoded import built_in, decoded, evidence_of
 
 DIFOP_MAGIC = bytes.fromhex("a5ff005a11115555")
 

@@ -11,7 +11,7 @@ import numpy as np
 from mlbatch.types import BoolArray, F64Array, I64Array
 from tests.builders.run import RECORDINGS
 from tests.builders.velodyne_tables import MODELS
-from tests.golden.references import Decoded
+from tests.recordings.references import Decoded
 
 FOLDER = RECORDINGS / "velodyne"
 

@@ -16,7 +16,7 @@ import pytest
 from mlbatch.types import U8Array
 from tests.builders.hesai import angles_csv
 from tests.builders.hesai_angles import MirrorAngles
-from tests.unit.sensors.hesai_packets import decode, rows
+from tests.builders.hesai_decoded import decode, rows
 
 # 2023-06-15 12:30:45.678901 UTC; `date -u -d 2023-06-15T12:30:45 +%s` says 1686832245.
 DATE = bytes([123, 6, 15, 12, 30, 45])

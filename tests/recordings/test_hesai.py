@@ -13,8 +13,8 @@ import pytest
 
 from mlbatch.types import BoolArray, I64Array
 from tests.builders.run import Cloud
-from tests.golden.hesai_recordings import CASES, FOLDER, Case
-from tests.golden.references import (
+from tests.recordings.hesai import CASES, FOLDER, Case
+from tests.recordings.references import (
     STRONGEST_FIRST,
     STRONGEST_LAST,
     WEAK_FIRST,

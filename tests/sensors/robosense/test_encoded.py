@@ -22,8 +22,8 @@ from tests.builders.robosense import (
     msop,
     origins,
 )
+from tests.builders.robosense_decoded import Decoded, built_in, decoded, evidence_of
 from tests.builders.robosense_models import AIRY_MOUNTS, DUAL, LAST, MODELS, NEAREST, STRONGEST
-from tests.unit.sensors.robosense_points import Decoded, built_in, decoded, evidence_of
 
 # A block's azimuth is rounded to 0.01 degree; two of them tell the speed of a short packet.
 MOST_DEG = 0.015

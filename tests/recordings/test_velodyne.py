@@ -17,14 +17,14 @@ from mlbatch.types import F64Array
 from tests.builders.run import Cloud
 from tests.builders.traffic import read_pcap
 from tests.builders.velodyne_tables import MODELS
-from tests.golden.references import (
+from tests.recordings.references import (
     US_NS,
     apart,
     assert_same_points,
     converted,
     heading_deg,
 )
-from tests.golden.velodyne_recordings import BELIED, CASES, DUAL, FOLDER, GAPS, GPS, Case
+from tests.recordings.velodyne import BELIED, CASES, DUAL, FOLDER, GAPS, GPS, Case
 
 pytestmark = pytest.mark.skipif(
     not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/velodyne"
