@@ -10,11 +10,9 @@ import numpy as np
 
 from mlbatch.geometry import Turning
 from mlbatch.lidar import Calibration, Evidence, Lidar
-from mlbatch.readers import open_recording
 from mlbatch.sensors.hesai import sensor as hesai
-from mlbatch.types import F32Array, Heads, I64Array, Pixels, Stream, StreamTable, U8Array
+from mlbatch.types import F32Array, Heads, I64Array, Pixels, Stream, U8Array
 
-HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
 STREAM = Stream("192.168.1.201", 2368)
 EVIDENCE_PACKETS = 16
 
@@ -90,14 +88,3 @@ def decode(packets: U8Array, content: bytes, options: Mapping[str, str] | None =
     return Decoded(
         lidar, lidar.heads(packets, np.zeros(len(packets), np.int64)), range_m, intensity
     )
-
-
-def recorded(folder: str) -> U8Array:
-    """All packets of a recording, (P, size)."""
-    (path,) = (one for one in (HESAI / folder).iterdir() if one.is_dir())
-    payloads = [
-        batch.data[start : start + size].tobytes()
-        for batch in open_recording(path, StreamTable()).packets()
-        for start, size in zip(batch.start.tolist(), batch.size.tolist(), strict=True)
-    ]
-    return rows(payloads)

@@ -10,17 +10,13 @@ from typing import Any, TypeAlias
 import dpkt
 import numpy as np
 import numpy.typing as npt
-import pytest
 
 from mlbatch.lidar import Beside, Evidence
 from mlbatch.types import Stream, U8Array
+from tests.recordings import RECORDINGS
 
-OUSTER = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "ouster"
+OUSTER = RECORDINGS / "ouster"
 Reference: TypeAlias = dict[str, npt.NDArray[Any]]
-
-needs_recordings = pytest.mark.skipif(
-    not OUSTER.is_dir(), reason="the recordings are not beside the repository"
-)
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,11 @@ from mlbatch.matching import match
 from mlbatch.readers import merge, open_recording
 from mlbatch.streams import split_by_kind
 from mlbatch.types import StreamTable
+from tests.recordings import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / ".." / "shared" / "recordings"
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 NS_PER_S = 10**9
 HOUR_NS = 3600 * NS_PER_S
-needs_recordings = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason="no recordings: wanted ../shared/recordings"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +123,6 @@ def findings(path: Path, period_ns: int = 0) -> dict[str, ClockFinding]:
     return {name: finding for name, finding in found.items() if finding is not None}
 
 
-@needs_recordings
 @pytest.mark.parametrize(("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value))
 def test_the_clock_of_a_recording(maker: str, case: Case) -> None:
     period_ns = HOUR_NS if maker == "velodyne" else 0
@@ -139,13 +135,11 @@ def test_the_clock_of_a_recording(maker: str, case: Case) -> None:
     assert finding.drift_ppm is None
 
 
-@needs_recordings
 @pytest.mark.parametrize("path", EMPTY)
 def test_nothing_is_said_where_no_lidar_is(path: str) -> None:
     assert findings(RECORDINGS / path) == {}
 
 
-@needs_recordings
 @pytest.mark.parametrize(("path", "uptimes_s"), PAIRS, ids=[path for path, _ in PAIRS])
 def test_two_sensors_that_count_from_power_on(path: str, uptimes_s: tuple[int, int] | None) -> None:
     """A packet each: apart by hours, which is sure; how far exactly is not."""

@@ -26,10 +26,6 @@ from tests.recordings.references import (
     turned_deg,
 )
 
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/hesai"
-)
-
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder)
 # As the published clouds: both returns, and no rotor motion while the beams of a column fire.
 AS_PUBLISHED = ("--keep-repeated", "--decode", "firing_azimuth=off")

@@ -10,12 +10,9 @@ import pytest
 
 from mlbatch.geometry import read_rotor_words
 from mlbatch.types import BoolArray, F32Array, I64Array
-from tests.builders.hesai_decoded import HESAI, Decoded, decode, evidence, recorded
+from tests.builders.hesai_decoded import Decoded, decode, evidence
 from tests.builders.hesai_decoded import calibration as calibration_of
-
-pytestmark = pytest.mark.skipif(
-    not HESAI.is_dir(), reason="the recordings are not beside the repository"
-)
+from tests.recordings.hesai import FOLDER, recorded
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ every_case = pytest.mark.parametrize("folder", list(BY_FOLDER))
 @lru_cache(maxsize=1)
 def _decoded(folder: str) -> Decoded:
     """As the published clouds: without the rotor's motion while the beams of a column fire."""
-    (csv,) = (HESAI / folder).glob("*.csv")
+    (csv,) = (FOLDER / folder).glob("*.csv")
     return decode(recorded(folder), csv.read_bytes(), {"firing_azimuth": "off"})
 
 
@@ -111,7 +108,7 @@ def test_nothing_is_lost(folder: str) -> None:
 
 @every_case
 def test_the_rotor_turns_as_fast_as_it_says(folder: str) -> None:
-    (csv,) = (HESAI / folder).glob("*.csv")
+    (csv,) = (FOLDER / folder).glob("*.csv")
     packets = recorded(folder)
     lidar = calibration_of(csv.read_bytes()).lidar({}, evidence(packets))
     heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
@@ -129,7 +126,7 @@ def test_every_published_point_and_no_other(folder: str) -> None:
     counts = np.bincount(turn[keep.any(axis=2)] - turn.min(), weights=keep.sum(axis=2)[keep.any(2)])
     assert tuple(counts.astype(int).tolist()) == case.points_per_turn
     points = found.xyz()[keep & (turn == turn.min() + case.turn)[:, :, None]]
-    (cloud,) = (HESAI / folder).glob("*.pcd")
+    (cloud,) = (FOLDER / folder).glob("*.pcd")
     published = _cloud(cloud.read_bytes())
     assert points.shape == published.shape
     # The order of both is firing group, channel, return.
@@ -138,7 +135,7 @@ def test_every_published_point_and_no_other(folder: str) -> None:
 
 def _turns(folder: str, found: Decoded) -> I64Array:
     """(n, channels) turn of every beam: it ends where the beam's own azimuth passes 0."""
-    (csv,) = (HESAI / folder).glob("*.csv")
+    (csv,) = (FOLDER / folder).glob("*.csv")
     lines = csv.read_text(encoding="utf-8").split()
     offset_deg = np.array([float(line.split(",")[2]) for line in lines if line[0].isdigit()])
     angle, _, _ = read_rotor_words(found.encoder)

@@ -20,7 +20,8 @@ from mlbatch.matching import match
 from mlbatch.readers import merge, open_recording
 from mlbatch.streams import split_by_kind
 from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
-from tests.recordings.test_clocks import CASES, RECORDINGS, Case, needs_recordings
+from tests.recordings import RECORDINGS
+from tests.recordings.test_clocks import CASES, Case
 
 # Fewer tell no pace.
 FEWEST = 17
@@ -77,7 +78,6 @@ def _read(maker: str, path: str) -> Came:
     return Came(lidar, lidar.sequence(packets), lidar.heads(packets, host_ns), host_ns)
 
 
-@needs_recordings
 @every_case
 def test_nothing_is_lost(maker: str, case: Case) -> None:
     packets = _read(maker, case.path)
@@ -85,7 +85,6 @@ def test_nothing_is_lost(maker: str, case: Case) -> None:
     assert packets.counted() == (0, 0)
 
 
-@needs_recordings
 @every_long_case
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.4])
 @pytest.mark.parametrize("seed", range(3))
@@ -98,7 +97,6 @@ def test_what_is_taken_out_is_what_is_lost(maker: str, case: Case, share: float,
     assert packets.counted(came, size=7) == (missing, 0)
 
 
-@needs_recordings
 @every_long_case
 def test_packets_lost_in_a_row(maker: str, case: Case) -> None:
     """A quarter of the recording, from its middle on."""
@@ -108,7 +106,6 @@ def test_packets_lost_in_a_row(maker: str, case: Case) -> None:
     assert _read(maker, case.path).counted(came) == (silent, 0)
 
 
-@needs_recordings
 @every_long_case
 def test_packets_that_cross_are_not_lost(maker: str, case: Case) -> None:
     packets = _read(maker, case.path)

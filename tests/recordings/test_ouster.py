@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 from mlbatch.types import BoolArray, F32Array, I64Array
-from tests.builders.run import RECORDINGS, Cloud, command
+from tests.builders.run import Cloud, command
+from tests.recordings import RECORDINGS
 
 FOLDER = RECORDINGS / "ouster"
 TOLERANCE_M = 1e-4
-
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/ouster"
-)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from mlbatch.sensors import read_calibration
 from mlbatch.sensors.crc import crc64
 from mlbatch.sensors.ouster.sensor import OusterCalibration, OusterLidar
 from mlbatch.types import F32Array, F64Array, Pixels, Stream, U8Array, U16Array
-from tests.recordings.ouster import CASES, OUSTER, Case, Reference, needs_recordings
+from tests.recordings.ouster import CASES, OUSTER, Case, Reference
 
-pytestmark = needs_recordings
 MAX_XYZ_ERROR_M = 1e-4
 MAX_TABLE_ERROR_M = 1e-9
 

@@ -24,12 +24,7 @@ from tests.recordings.references import (
     converted,
     heading_deg,
 )
-from tests.recordings.velodyne import BELIED, CASES, DUAL, FOLDER, GAPS, GPS, Case
-
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/velodyne"
-)
-
+from tests.recordings.velodyne import BELIED, CASES, DUAL, GAPS, GPS, Case
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder)
 

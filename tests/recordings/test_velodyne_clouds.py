@@ -27,10 +27,6 @@ from tests.recordings.references import (
 )
 from tests.recordings.velodyne import DUAL, FOLDER, GAPS
 
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="no recordings: wanted ../shared/recordings/velodyne"
-)
-
 # Nebula's types from 4 on (first and last weak, identical, ..., first and last strongest), by what
 # its blocks hold: see the test.
 NEBULA = [WEAK_LAST, WEAK_FIRST, ONLY, 0, 0, STRONGEST_LAST, STRONGEST_FIRST]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,9 @@ from mlbatch.streams import Sampler
 from mlbatch.types import BoolArray, F64Array, I64Array, StreamTable, U8Array
 from tests.builders.velodyne import Sent
 from tests.builders.velodyne_streams import fired, pixels, pointing
+from tests.recordings import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"
-pytestmark = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason="the recordings are not beside the repository"
-)
+FOLDER = RECORDINGS / "velodyne"
 US_NS = 1_000
 GPS, DUAL = "vlp16_gps/sample_velodyne_vlp16_gps.pcap", "vlp16_ros2_dual/1673400471837873222"
 GAPS = "vlp32c_ros2/1713492677464078412"
@@ -65,7 +62,7 @@ class Points:
 def recorded(name: str) -> Recorded:
     table = StreamTable()
     sampler, payloads, host_ns = Sampler(table), list[U8Array](), list[int]()
-    for batch in open_recording(RECORDINGS / name, table).packets():
+    for batch in open_recording(FOLDER / name, table).packets():
         sampler.add(batch)
         rows = (batch.size == 1206).nonzero()[0]
         payloads += [batch.data[at : at + 1206].copy() for at in batch.start[rows].tolist()]
@@ -103,7 +100,7 @@ def points(lidar: VelodyneLidar, sent: Sent) -> Points:
 
 
 def reference(name: str) -> dict[str, npt.NDArray[Any]]:
-    with np.load(RECORDINGS / name.split("/")[0] / "reference.npz") as archive:
+    with np.load(FOLDER / name.split("/")[0] / "reference.npz") as archive:
         return {key: archive[key] for key in archive.files}
 
 
@@ -252,7 +249,7 @@ def test_a_product_byte_belied_by_the_pace_is_told() -> None:
 def test_files_of_the_makers_angles_change_nothing() -> None:
     """Nebula's files hold the manual's angles, and no offsets."""
     for name, file in ((DUAL, "VLP16.yaml"), (GAPS, "VLP32.yaml")):
-        path = RECORDINGS / name.split("/")[0] / file
+        path = FOLDER / name.split("/")[0] / file
         read = velodyne.read_calibration(path, path.read_bytes())
         one = recorded(name)
         assert read is not None
@@ -275,7 +272,7 @@ def test_files_of_the_makers_angles_change_nothing() -> None:
     ],
 )
 def test_which_model_a_file_is_of(file: str, model: str) -> None:
-    path = RECORDINGS / "calibration-without-recording" / file
+    path = FOLDER / "calibration-without-recording" / file
     read = velodyne.read_calibration(path, path.read_bytes())
     assert read is not None
     assert read.model == model
@@ -283,7 +280,7 @@ def test_which_model_a_file_is_of(file: str, model: str) -> None:
 
 def read_pcd(name: str) -> npt.NDArray[np.void]:
     """Points of a binary PCD file."""
-    head, _, body = (RECORDINGS / name).read_bytes().partition(b"DATA binary\n")
+    head, _, body = (FOLDER / name).read_bytes().partition(b"DATA binary\n")
     words = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines()}
     kinds = zip(words["FIELDS"], words["TYPE"], words["SIZE"], strict=True)
     dtype = np.dtype([(name, f"<{kind.lower()}{size}") for name, kind, size in kinds])

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.types import BoolArray, F64Array, I64Array
-from tests.builders.run import RECORDINGS
 from tests.builders.velodyne_tables import MODELS
+from tests.recordings import RECORDINGS
 from tests.recordings.references import Decoded
 
 FOLDER = RECORDINGS / "velodyne"

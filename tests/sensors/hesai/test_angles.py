@@ -13,21 +13,7 @@ import pytest
 from mlbatch.errors import RigError
 from mlbatch.sensors.hesai.angles import HesaiAngles, read_angles, read_at128
 
-HESAI = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
 NAME = Path("unit.csv")
-needs_recordings = pytest.mark.skipif(
-    not HESAI.is_dir(), reason="the recordings are not beside the repository"
-)
-# First and last line of the files, as a text editor shows them: elevation, azimuth in deg.
-FILES = {
-    "pandar40p/Pandar40P.csv": (40, (14.794, -1.042), (-24.985, -1.042)),
-    "pandar64/Pandar64.csv": (64, (14.9, -1.042), (-24.879, -1.042)),
-    "pandarqt64/PandarQT64.csv": (64, (-52.121, 8.736), (52.133, -7.892)),
-    "pandarxt16/PandarXT16.csv": (16, (15, 0), (-15, 0)),
-    "pandarxt32/PandarXT32.csv": (32, (14.972363, 0.082385), (-16.023602, -0.129679)),
-    "calibration-without-recording/Pandar128E4X.csv": (128, (15.139, 0.157), (-24.71, 0.302)),
-    "calibration-without-recording/PandarAT128.csv": (128, (12.93, 2.4), (-12.47, 0.65)),
-}
 
 
 def rows(count: int = 16) -> list[str]:
@@ -53,19 +39,6 @@ def refusal(lines: list[str]) -> str:
     assert message.endswith("; read the correction file from the lidar again")
     assert "\n" not in message
     return message.removeprefix("unit.csv: HESAI angles, ").partition("; ")[0]
-
-
-@needs_recordings
-@pytest.mark.parametrize("name", FILES)
-def test_files_beside_recordings(name: str) -> None:
-    channels, first, last = FILES[name]
-    found = read_angles(HESAI / name, (HESAI / name).read_bytes())
-    assert found is not None
-    assert found.path == HESAI / name
-    assert found.azimuth_rad.shape == found.elevation_rad.shape == (channels,)
-    for at, (elevation, azimuth) in ((0, first), (-1, last)):
-        assert found.elevation_rad[at] == pytest.approx(math.radians(elevation), abs=1e-15)
-        assert found.azimuth_rad[at] == pytest.approx(math.radians(azimuth), abs=1e-15)
 
 
 def test_angles_are_in_rad_by_channel() -> None:
@@ -214,19 +187,6 @@ def test_at128_units(resolution: int) -> None:
     assert found.azimuth_adjust_rad[1, 2] * degrees == pytest.approx(0.06)
     assert found.elevation_adjust_rad[1, 2] * degrees == pytest.approx(-0.02)
     assert np.count_nonzero(found.azimuth_adjust_rad) == 1
-
-
-@needs_recordings
-def test_at128_file_beside_recordings() -> None:
-    path = HESAI / "calibration-without-recording" / "PandarAT128.dat"
-    found = read_at128(path, path.read_bytes())
-    assert found is not None
-    degrees = 180 / math.pi
-    # From the sheet, rounded there to 0.01 deg.
-    assert found.start_rad * degrees == pytest.approx([23.33, 143.21, 263.15], abs=0.005)
-    assert np.abs(found.azimuth_rad).max() * degrees == pytest.approx(2.4, abs=0.005)
-    assert found.elevation_rad.min() * degrees == pytest.approx(-12.46, abs=0.011)
-    assert found.elevation_rad.max() * degrees == pytest.approx(12.92, abs=0.011)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xee\xff", bytes(47176), text(rows())])

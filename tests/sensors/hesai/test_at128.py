@@ -8,16 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.geometry import Projection, read_rotor_words, rotor_words
-from mlbatch.sensors.hesai.angles import At128File, read_at128
+from mlbatch.geometry import Projection, rotor_words
+from mlbatch.sensors.hesai.angles import At128File
 from mlbatch.sensors.hesai.at128 import at128_projection
 from mlbatch.types import F32Array, F64Array, I64Array
 
-FILE = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "hesai"
-FILE = FILE / "calibration-without-recording" / "PandarAT128.dat"
-needs_recordings = pytest.mark.skipif(
-    not FILE.is_file(), reason="the recordings are not beside the repository"
-)
 DEG = math.pi / 180
 CHANNELS = 128
 NO_FIRING = np.zeros((1, CHANNELS), np.int64)
@@ -172,45 +167,3 @@ def by_the_sheet(file: At128File, rotor_rad: float, channel: int) -> tuple[float
         flat * math.cos(math.radians(azimuth)),
         math.sin(math.radians(elevation)),
     )
-
-
-@needs_recordings
-def test_real_file_against_plain_loops() -> None:
-    file = read_at128(FILE, FILE.read_bytes())
-    assert file is not None
-    rng = np.random.default_rng(7)
-    columns = 40
-    firing_ns = rng.integers(0, 15_000, (2, CHANNELS))
-    encoder = rotor_words(
-        rng.random(columns), rng.choice([-200, 0, 200], columns) / 60, rng.integers(0, 2, columns)
-    )
-    projection = at128_projection(file, firing_ns, np.eye(4), 64)
-    range_m = rng.uniform(1, 180, (columns, CHANNELS)).astype(np.float32)
-    found = points(projection, encoder, range_m)
-    angle, speed, table = read_rotor_words(encoder)
-    worst_m = 0.0
-    for column in range(columns):
-        for channel in range(CHANNELS):
-            rotor = angle[column] + speed[column] * firing_ns[table[column], channel]
-            vector = np.array(by_the_sheet(file, float(rotor), channel))
-            expected = vector * float(range_m[column, channel])
-            worst_m = max(worst_m, float(np.abs(found[column, channel] - expected).max()))
-    # Single precision, at up to 180 m: 3e-7 of it.
-    assert worst_m < 6e-5
-
-
-@needs_recordings
-def test_field_of_view_of_the_real_file() -> None:
-    """Where adjustments are given, beams look 30 to 150 deg and some more, as the maker says."""
-    file = read_at128(FILE, FILE.read_bytes())
-    assert file is not None
-    projection = at128_projection(file, NO_FIRING, np.eye(4), 180)
-    encoder = rotor_words(np.arange(180) / 180, np.zeros(180))
-    found = points(projection, encoder, np.ones((180, CHANNELS), np.float32))
-    given = file.azimuth_adjust_rad.T != 0
-    azimuth = np.arctan2(found[:, :, 0], found[:, :, 1])[given] / DEG
-    assert 10 < azimuth.min() < 30
-    assert 150 < azimuth.max() < 170
-    elevation = np.arcsin(found[:, :, 2][given]) / DEG
-    assert -15 < elevation.min() < -12
-    assert 12 < elevation.max() < 15

@@ -304,8 +304,8 @@ def test_fit_is_by_channels_then_by_where_beams_look() -> None:
     assert own.lidar({}, seen).notes == ()
     (note,) = qt64.lidar({}, seen).notes
     assert note == (
-        "unit.csv: expected elevations from about -25 to 15 deg for a Pandar64, found -52.1 to 52.1; "
-        "check that the file is of this lidar"
+        "unit.csv: expected elevations from about -25 to 15 deg for a Pandar64, found -52.1 to "
+        "52.1; check that the file is of this lidar"
     )
 
 

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.sensors import read_calibration as read_file
 from mlbatch.sensors.ouster.imu import read_legacy
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
 from mlbatch.types import U8Array
 from tests.builders.ouster import OusterSpec, imu_packet, metadata_json
-from tests.recordings.ouster import CASES, Case, needs_recordings
 
 ACCEL32 = "ACCEL32_GYRO32_NMEA"
 
@@ -87,49 +85,6 @@ def test_encode_then_decode_is_identity(profile: str, count: int) -> None:
     assert found.stamp_ns.tolist() == stamps[valid].tolist()
     np.testing.assert_allclose(found.acceleration, acceleration[valid], rtol=1e-6)
     np.testing.assert_allclose(found.angular_velocity, turn[valid], rtol=1e-6)
-
-
-@needs_recordings
-def test_real_packets_equal_the_reference() -> None:
-    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
-    reference = case.arrays()
-    calibration = read_file(case.metadata_path)
-    assert calibration is not None
-    lidar = calibration.lidar({}, None)
-    assert lidar.notes == ("lidar output is off according to the metadata",)
-    assert not lidar.is_imu(680)
-    assert lidar.is_imu(452)
-    packets = [lidar.imu(payload[None], 0) for payload in case.payloads(452)]
-    kept = (reference["imu_status"] & 1) != 0
-    stamps = np.concatenate([samples.stamp_ns for samples in packets])
-    acceleration = np.concatenate([samples.acceleration for samples in packets])
-    turn = np.concatenate([samples.angular_velocity for samples in packets])
-    assert kept.sum() == len(stamps) > 0
-    assert np.array_equal(stamps, reference["imu_timestamp"][kept])
-    assert np.array_equal(acceleration, reference["imu_acc"][kept].astype(np.float64))
-    assert np.array_equal(turn, reference["imu_gyro"][kept].astype(np.float64))
-
-
-@needs_recordings
-@pytest.mark.parametrize("number", [0, 1, 2, 3, 5])
-def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) -> None:
-    case = CASES[number]
-    calibration = read_file(case.metadata_path)
-    assert calibration is not None
-    lidar = calibration.lidar({}, None)
-    assert lidar.is_imu(48)
-    samples = [lidar.imu(payload[None], 0) for payload in case.payloads(48)]
-    stamps = np.concatenate([sample.stamp_ns for sample in samples])
-    packets = case.payloads(lidar.packet_size)
-    stamp_ns = lidar.heads(packets, np.zeros(len(packets), np.int64)).stamp_ns
-    first, last = np.sort(stamp_ns.ravel())[[0, -1]]
-    assert len(stamps) >= 10
-    assert (np.diff(stamps) > 0).all()
-    # A turn to either side, since one lidar measures half of its turn only.
-    assert ((stamps > first - 100_000_000) & (stamps < last + 100_000_000)).all()
-    for sample in samples:
-        assert np.linalg.norm(sample.acceleration) == pytest.approx(9.8, abs=1.5)
-        assert np.abs(sample.angular_velocity).max() < 2.0
 
 
 def test_a_nan_that_signals_makes_no_noise(recwarn: pytest.WarningsRecorder) -> None:

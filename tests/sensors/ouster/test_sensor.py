@@ -10,30 +10,13 @@ import numpy as np
 import pytest
 
 from mlbatch.lidar import Evidence
-from mlbatch.sensors import describe, read_calibration
+from mlbatch.sensors import describe
 from mlbatch.sensors.ouster import sensor as ouster
 from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.sensors.ouster.sensor import read_calibration as read_content
 from mlbatch.types import Stream, U8Array
 from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
-from tests.recordings.ouster import (
-    CASES,
-    OUSTER,
-    Case,
-    beside,
-    datagrams,
-    evidence,
-    needs_recordings,
-)
-
-SAME = OUSTER / "two-sensors_same-ports_nonlegacy"
-SOURCES = {1: "169.254.92.158", 2: "169.254.238.111"}
-
-
-def calibration_at(path: Path) -> OusterCalibration:
-    found = read_calibration(path)
-    assert isinstance(found, OusterCalibration)
-    return found
+from tests.recordings.ouster import beside
 
 
 def calibration_of(spec: OusterSpec) -> OusterCalibration:
@@ -53,47 +36,6 @@ def seen(packets: U8Array, port: int = 7502, *sizes: tuple[int, int]) -> Evidenc
     others = tuple(beside(Stream("192.0.2.7", at), bytes(length)) for at, length in sizes)
     host_ns = np.zeros(len(packets), np.int64)
     return Evidence(Stream("192.0.2.7", port), size, packets, host_ns, others)
-
-
-@needs_recordings
-@pytest.mark.parametrize(
-    ("kind", "sizes"), [("legacy", (24896, 12608)), ("nonlegacy", (16640,) * 2)]
-)
-def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> None:
-    folder = OUSTER / f"two-sensors_same-ports_{kind}"
-    for number, size in zip(SOURCES, sizes, strict=True):
-        found = evidence(folder / f"same_ports_{kind}.pcap", size, SOURCES[number])
-        fits = {
-            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").fit(found)
-            for other in SOURCES
-        }
-        assert fits[number] > 0
-        assert [other for other in SOURCES if fits[other]] == [number]
-
-
-@needs_recordings
-def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
-    found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
-    assert (7502, 48) in {(one.stream.port, one.size) for one in found.beside}
-    shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
-    apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
-    assert shared.fit(found) > apart.fit(found) > 0
-    moved = replace(found, beside=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
-    assert apart.fit(moved) > shared.fit(moved) > 0
-
-
-@needs_recordings
-def test_no_metadata_take_packets_of_another_unit() -> None:
-    calibrations = [calibration_at(case.metadata_path) for case in CASES]
-    for case in CASES:
-        own = calibration_at(case.metadata_path)
-        size = own.metadata.layout.packet_size
-        found = evidence(OUSTER / case.folder / case.capture, size, case.source)
-        for other in calibrations:
-            # Without serial numbers any unit with packets of this size may be the one.
-            might = own.serial in ("", other.serial) or own.metadata.layout.legacy
-            same = might and other.metadata.layout.packet_size == size
-            assert (other.fit(found) > 0) == same, (case, other.path)
 
 
 def test_serial_numbers_decide_then_configuration_then_ports() -> None:
@@ -144,44 +86,6 @@ def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:
     found = read_content(Path("a.json"), json.dumps(document).encode())
     assert found is not None
     assert found.fit(seen(np.ones((2, 256), np.uint8))) == 0
-
-
-@needs_recordings
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
-def test_real_packets_are_named(case: Case) -> None:
-    calibration = calibration_at(case.metadata_path)
-    layout = calibration.metadata.layout
-    packets = case.payloads(layout.packet_size)[:4]
-    text = describe(layout.packet_size, packets)
-    if layout.legacy:
-        assert text == f"Ouster lidar, LEGACY, {layout.beams} beams"
-    else:
-        assert text == (
-            f"Ouster lidar, serial {calibration.serial}, {layout.packet_size} bytes: "
-            "needs its metadata"
-        )
-    longer = np.hstack([packets, packets[:, :1]])
-    assert describe(layout.packet_size + 1, longer) == text
-
-
-@needs_recordings
-def test_real_imu_and_zone_packets_are_named() -> None:
-    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
-    serial = "serial 122247000785"
-    assert describe(452, case.payloads(452)) == f"Ouster IMU, {serial}, 452 bytes"
-    assert describe(680, case.payloads(680)) == f"Ouster zone monitor, {serial}, 680 bytes"
-    assert describe(48, CASES[0].payloads(48)[:4]) == "Ouster IMU"
-
-
-@needs_recordings
-@pytest.mark.parametrize("path", ["velodyne/vlp16_gps", "velodyne/hdl32e_named-vlp32", "other"])
-def test_real_packets_of_other_makers_are_not_ours(path: str) -> None:
-    checked = 0
-    for capture in sorted((OUSTER.parent / path).rglob("*.pcap")):
-        for _source, _port, data in datagrams(capture):
-            assert ouster.describe(len(data), np.frombuffer(data, np.uint8)[None, :]) is None
-            checked += 1
-    assert checked
 
 
 @pytest.mark.parametrize("fill", ["zero", "ones", "noise", "counting", "two"])

@@ -16,7 +16,6 @@ from mlbatch.errors import RigError
 from mlbatch.sensors.velodyne.calibration import MAX_BYTES, VelodyneFile, read_velodyne
 from tests.builders.velodyne_tables import MODELS, calibration_yaml
 
-RECORDINGS = Path(__file__).resolve().parents[3] / ".." / "shared" / "recordings" / "velodyne"
 PATH = Path("drive/unit.yaml")
 
 
@@ -35,51 +34,6 @@ def fault(content: str | bytes, path: Path = PATH) -> str:
     assert re.fullmatch(rf"{path}: .*expected .+, found .+; .+", message)
     assert len(message) < 250
     return message
-
-
-# Real files: the first lines, read by eye; angles of facts/velodyne.md section 6.
-REAL = {
-    "vlp16_ros2_dual/VLP16.yaml": (16, 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
-    "vlp32c_ros2/VLP32.yaml": (32, 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
-    "calibration-without-recording/HDL32.yaml": (32, 0.002, {0: -30.67, 1: -9.33, 31: 10.67}),
-    "calibration-without-recording/VLP16_hires.yaml": (16, 0.002, {0: -10.0, 1: 0.667, 15: 10.0}),
-    "calibration-without-recording/HDL64e_s2.yaml": (64, 0.002, {}),
-    "calibration-without-recording/HDL64e_s3.yaml": (64, 0.002, {}),
-}
-
-
-def real(name: str) -> VelodyneFile:
-    path = RECORDINGS / name
-    if not path.exists():
-        pytest.skip(f"recording {name} is not here")
-    return read(path.read_bytes(), path)
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_files(name: str) -> None:
-    lasers, unit_m, elevation_deg = REAL[name]
-    file = real(name)
-    assert (file.lasers, file.unit_m, file.notes) == (lasers, unit_m, ())
-    assert file.enabled.all()
-    for laser, angle_deg in elevation_deg.items():
-        assert math.degrees(file.elevation_rad[laser]) == pytest.approx(angle_deg, abs=4e-4)
-
-
-def test_a_real_vlp_32c_has_azimuths() -> None:
-    # rot_correction is minus the manual's offset: +1.4, -4.2 degrees.
-    rot_deg = [math.degrees(angle) for angle in real("vlp32c_ros2/VLP32.yaml").azimuth_rad[:2]]
-    assert rot_deg == pytest.approx([-1.4, 4.2])
-
-
-def test_a_real_hdl_64e_has_all_corrections() -> None:
-    file = real("calibration-without-recording/HDL64e_s2.yaml")
-    assert file.azimuth_rad[0] == -0.1248942899601548
-    assert file.elevation_rad[:2].tolist() == [-0.15304134919741974, -0.1458455539136526]
-    assert file.dist_correction_m[:2].tolist() == [1.5195264000000002, 1.5145139]
-    assert file.dist_correction_x_m[0] == 1.5500304
-    assert file.dist_correction_y_m[1] == 1.5491043
-    assert file.vert_offset_m[0] == 0.19548199
-    assert file.horiz_offset_m[:2].tolist() == [0.025999999, -0.025999999]
 
 
 def yaml_of(lasers: Sequence[Mapping[str, object]], end: str = "") -> str:
