@@ -1,4 +1,7 @@
-"""The encoder of HESAI packets against bytes and times worked by hand from facts/hesai.md."""
+"""The encoder of HESAI packets against bytes, times and directions worked by hand.
+
+Source: docs/sources/hesai.md sections 2 to 6.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,14 @@ from mlbatch.types import I64Array
 from tests.builders.hesai import (
     DUAL,
     TRIPLE,
+    Angles,
     HesaiSpec,
-    angles_csv,
+    MirrorAngles,
+    block_times_ns,
     crc32_mpeg2,
-    date_field,
+    directions,
     encode_packets,
 )
-from tests.builders.hesai_models import EPOCH, SINCE_1900, SINCE_2000
 
 # 2023-11-14 22:13:20 UTC (1 700 000 000 s) and 999 999.5 us.
 START_NS = 1_700_000_000_999_999_500
@@ -199,30 +203,66 @@ def test_checksums_of_qt128() -> None:
         assert stored == checksum(packet[begin:end])
 
 
-def test_checksum_of_jt16_covers_all_before_it() -> None:
-    one = spec("JT16")
-    packet, _ = encode_packets(one, *readings(one))
-    assert int.from_bytes(packet[76:], "little") == checksum(packet[:76])
+# The first packet is sent at 999 999.5 us of a second and says 999 999.
+TIMED = HesaiSpec("", start_deg=359.9, start_ns=1_700_000_000_999_999_500)
+T_NS = 1_700_000_000_999_999_000
 
 
-def test_date_forms() -> None:
-    assert date_field(START_NS, SINCE_1900).hex() == DATE
-    assert date_field(START_NS, SINCE_2000).hex() == DATE_2000
-    assert date_field(START_NS, EPOCH).hex() == "00006553f100"
-    # 1999-12-31 23:59:59
-    assert date_field(946_684_799 * 10**9, SINCE_1900).hex() == "630c1f173b3b"
-    with pytest.raises(ValueError, match="1999 cannot be told as since 2000"):
-        date_field(946_684_799 * 10**9, SINCE_2000)
+def timed(model: str, **chosen: Any) -> HesaiSpec:
+    return replace(TIMED, model=model, **chosen)
 
 
-def test_angle_file() -> None:
-    expected = b"Laser id,Elevation,Azimuth\n1,15.5,-1.042\n2,0.0,3.0\n"
-    assert angles_csv([15.5, 0.0], [-1.042, 3.0]) == expected
+# Times of the first columns after the packet's, by section 5.
+BLOCKS = [
+    ("Pandar40P", {}, {0: -28580 - 9 * 55560, 8: -84140, 9: -28580}),
+    ("Pandar40P", {"mode": DUAL}, {0: -28580 - 4 * 55560, 4: -28580}),
+    ("Pandar64", {}, {0: -42580 - 5 * 55560, 5: -42580}),
+    ("Pandar64-7", {}, {0: -42580 - 6 * 55560, 6: -42580}),
+    ("PandarQT64", {}, {0: 25710, 1: 192376, 2: 359043, 3: 525710}),
+    ("QT128C2X", {}, {0: 9000, 1: 120110}),
+    ("PandarXT-16", {"mode": DUAL}, {0: 5632 - 150000, 3: 5632}),
+    ("PandarXT-32", {}, {0: 5632 - 350000, 7: 5632}),
+    ("XT32M2X", {"mode": TRIPLE}, {0: -44368, 1: 5632}),
+    ("Pandar128E3X", {}, {0: -24630, 1: 3148}),
+    ("Pandar128E3X", {"operation": "standard"}, {0: -52408, 1: 3148}),
+    ("Pandar128E3X", {"mode": DUAL}, {0: 3148}),
+    ("OT128", {"operation": "standard"}, {0: -55556, 1: 0}),
+    ("AT128", {}, {0: -92581, 1: -50915}),
+    ("AT128", {"mode": DUAL}, {0: -50915}),
+    ("JT16", {}, {0: 0}),
+]
 
 
-def test_columns_must_fill_packets() -> None:
-    one = spec("PandarXT-32")
-    with pytest.raises(ValueError, match="no whole packets of 8 columns"):
-        encode_packets(one, np.zeros((7, 32, 1), np.int64))
-    with pytest.raises(ValueError, match="no whole packets of 8 columns"):
-        encode_packets(one, np.zeros((8, 16, 1), np.int64))
+@pytest.mark.parametrize(("model", "chosen", "after"), BLOCKS)
+def test_times_of_blocks(model: str, chosen: dict[str, Any], after: dict[int, int]) -> None:
+    one = timed(model, **chosen)
+    times = block_times_ns(one, one.groups) - T_NS
+    assert one.groups == max(after) + 1
+    assert {column: int(times[column]) for column in after} == after
+
+
+def test_beams_look_where_the_rotor_is_when_they_fire() -> None:
+    beams = Angles([0.0] * 31 + [30.0], [10.0] + [0.0] * 31)
+    one = timed("PandarXT-32", start_deg=80.0)
+    found = directions(one, beams, 1)[0]
+    # Channel 1 after 0.368 us: 0.0013248 deg; channel 32 after 47.24 us: 0.170064 deg.
+    azimuth = np.degrees(np.arctan2(found[:, 0], found[:, 1]))
+    assert azimuth[0] == pytest.approx(90.0013248)
+    assert azimuth[31] == pytest.approx(80.170064)
+    assert found[31, 2] == pytest.approx(0.5)
+    still = directions(one, beams, 1, turning=False)[0]
+    assert still[0].tolist() == pytest.approx([1, 0, 0], abs=1e-12)
+    # cos 30 deg x sin and cos of 80 deg.
+    assert still[31].tolist() == pytest.approx([0.852868532, 0.150383733, 0.5])
+
+
+def test_mirrors_double_the_angle() -> None:
+    mirrors = MirrorAngles((30.0, 150.0, 270.0), [0.0] * 128, [2.4] + [0.0] * 127)
+    found = directions(timed("AT128", start_deg=75.0), mirrors, 1, turning=False)[0]
+    # 2 x (75 - 30) - 2.4
+    assert np.degrees(np.arctan2(found[:2, 0], found[:2, 1])) == pytest.approx([87.6, 90])
+    content = mirrors.dat()
+    assert len(content) == 47176
+    # 30 deg x 25600 = 768000 = 0xbb800; 2.4 deg: 61440 = 0xf000.
+    assert content[16:20].hex() == "00b80b00"
+    assert content[40:44].hex() == "00f00000"

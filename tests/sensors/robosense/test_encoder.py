@@ -15,7 +15,6 @@ from mlbatch.types import I64Array
 from tests.builders.robosense import (
     Angles,
     RobosenseSpec,
-    angles_csv,
     azimuths_deg,
     difop,
     directions,
@@ -23,7 +22,6 @@ from tests.builders.robosense import (
     firing_times_ns,
     msop,
     origins,
-    rounds,
 )
 from tests.builders.robosense_models import DUAL, LAST, MODELS, NEAREST, STRONGEST
 
@@ -125,32 +123,6 @@ def test_dual_packets_of_128_lines_share_a_column() -> None:
     assert second[84:86].hex() == "0181"
 
 
-def test_second_packet_follows_after_all_columns_of_the_first() -> None:
-    """24 rounds of 55.5 us: 1332 us later, 4.7952 degrees on."""
-    _, second = packets("RS-16", count=2)
-    assert second[20:30] == bytes.fromhex("170b0e160d14 000d 0153")  # 13 ms, 339 us
-    assert second[44:46] == bytes.fromhex("2508")  # 94.7952: 9480
-
-
-def test_azimuth_starts_over_after_a_turn() -> None:
-    (payload,) = packets("RS-32", start_deg=359.9)
-    assert payload[44:46] == (35990).to_bytes(2, "big")
-    assert payload[144:146] == (10).to_bytes(2, "big")  # 360.0999 degrees
-
-
-def test_packets_arrive_after_their_last_round() -> None:
-    spec = RobosenseSpec("RS-32", start_ns=START_NS, latency_ns=1000)
-    ((host_ns, _),) = msop(spec, *counted(12, 32, 1))
-    assert host_ns == START_NS + 12 * 55_520 + 1000
-
-
-def test_columns_have_to_fill_packets() -> None:
-    with pytest.raises(ValueError, match="no whole packets"):
-        msop(RobosenseSpec("RS-32"), *counted(13, 32, 1))
-    with pytest.raises(ValueError, match="no whole packets"):
-        msop(RobosenseSpec("RS-32", DUAL), *counted(12, 32, 1))
-
-
 # Channels (from 1) and their us after the round, worked by section 5.
 @pytest.mark.parametrize(
     ("model", "wanted_us"),
@@ -177,25 +149,6 @@ def test_times_of_channels(model: str, wanted_us: dict[int, float]) -> None:
     after_ns = firing_times_ns(spec, np.arange(1))[0] - START_NS // 1000 * 1000
     found = {channel: after_ns[channel - 1] / 1000 for channel in wanted_us}
     assert found == pytest.approx(wanted_us)
-
-
-def test_times_are_those_that_packets_tell() -> None:
-    """Column 13 of RS-32: second packet, cut to us, one round of 55.52 us."""
-    spec = RobosenseSpec("RS-32", start_ns=START_NS)
-    times = firing_times_ns(spec, np.array([0, 1, 13]))
-    told_ns = (START_NS + 12 * 55_520) // 1000 * 1000
-    assert times[:, 0].tolist() == [START_NS - 999, START_NS - 999 + 55_520, told_ns + 55_520]
-
-
-def test_view_leaves_rounds_out() -> None:
-    """RS-32 turns 0.199872 degrees a round; outside 90..100 degrees nothing is sent.
-
-    100 degrees are passed in round 501 (100.136), 90 degrees a turn later in round 2252 (450.112).
-    """
-    spec = RobosenseSpec("RS-32", start_deg=0.0, view_deg=(90.0, 100.0))
-    found = rounds(spec, np.arange(52))
-    assert found[:2].tolist() == [451, 452]
-    assert found[49:].tolist() == [500, 2252, 2253]
 
 
 def test_a_beam_points_where_the_formula_says() -> None:
@@ -275,22 +228,3 @@ def test_device_packet(model: str, mode: str, code: int) -> None:
     time = CALENDAR if MODELS[model].is_calendar else SECONDS
     assert payload[303:313] == bytes.fromhex(time)
     assert payload[1246:] == b"\x0f\xf0"
-
-
-def test_bytes_put_into_a_device_packet_and_the_mount_of_an_airy() -> None:
-    spec = RobosenseSpec("Airy 96", mount="side")
-    payload = difop(spec, fan(spec), parts={41: b"\x01\x02\x03"})
-    assert (payload[41:44], payload[289]) == (b"\x01\x02\x03", 1)
-    times = firing_times_ns(spec, np.arange(1))[0]
-    assert (times[8] - times[0], times[95] - times[0]) == (11_424, 99_008)
-
-
-def test_step_of_ranges_in_the_header_of_helios() -> None:
-    spec = RobosenseSpec("Helios 32", unit_m=0.005)
-    ((_, payload),) = msop(spec, *counted(12, 32, 1))
-    assert payload[17] == 0
-
-
-def test_file_of_angles() -> None:
-    angles = Angles(np.array([-15.0, 0.25]), np.array([0.0, -3.5]))
-    assert angles_csv(angles) == "-15.0000,0.0000\n0.2500,-3.5000\n"

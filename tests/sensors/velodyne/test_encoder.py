@@ -23,7 +23,6 @@ from tests.builders.velodyne import (
     origins,
     position_packets,
 )
-from tests.builders.velodyne_tables import MODELS
 
 START = "40420f00"
 
@@ -155,10 +154,6 @@ def test_stamps(spec: VelodyneSpec, first_us: int, second_us: int) -> None:
     assert payloads[:, 1200:1204].copy().view("<u4").ravel().tolist() == [first_us, second_us]
 
 
-def test_stamp_is_little_endian() -> None:
-    check_bytes(counted(VelodyneSpec("VLP-16"), 1)[0], {1200: START + "3722"})
-
-
 @pytest.mark.parametrize(
     ("model", "laser", "offset_ns"),
     [
@@ -182,14 +177,6 @@ def test_firing_times(model: str, laser: int, offset_ns: int) -> None:
     assert found[0, laser] == 3_600_000_000_000 + 2_000 + offset_ns
 
 
-@pytest.mark.parametrize(
-    ("model", "us"), [("VLP-16", 55.296), ("VLS-128", 55.277), ("HDL-64E S3", 57.6)]
-)
-def test_columns_follow_each_other(model: str, us: float) -> None:
-    found = firing_times_ns(VelodyneSpec(model), np.array([3, 0, 2]))[:, 0]
-    assert (found - found[1]).tolist() == [round(3000 * us), 0, round(2000 * us)]
-
-
 def test_a_blind_sector_is_left_out_inside_a_packet() -> None:
     spec = VelodyneSpec("VLP-32C", start_azimuth_deg=89.9, blind_deg=(90, 270))
     payloads = counted(spec, 2)
@@ -198,23 +185,6 @@ def test_a_blind_sector_is_left_out_inside_a_packet() -> None:
     # The second packet begins with row 916, 50 651.136 us after the start.
     assert payloads[1, 1200:1204].copy().view("<u4")[0] == 1_050_651
     assert np.diff(firing_times_ns(spec, np.array([0, 1]))[:, 0]).tolist() == [905 * 55_296]
-
-
-def test_a_blind_sector_through_zero() -> None:
-    spec = VelodyneSpec("VLP-32C", start_azimuth_deg=350.0, blind_deg=(345, 15))
-    # 126 x 0.1990656 = 25.0823: 15.08 degrees.
-    check_bytes(counted(spec, 1)[0], {0: "ffeee405"})
-
-
-def test_packets_arrive_after_their_last_row() -> None:
-    spec = VelodyneSpec("HDL-32E", hour=0, start_us=0.0, host_ahead_ns=5)
-    sent = encode(spec, *np.zeros((2, 24, 32, 1), np.int64))
-    assert sent.host_ns.tolist() == [552_960 + 100_005, 2 * 552_960 + 100_005]
-
-
-def test_incomplete_packets_are_refused() -> None:
-    with pytest.raises(ValueError, match="whole packets of 24 columns"):
-        encode(VelodyneSpec("VLP-16"), *np.zeros((2, 23, 16, 1), np.int64))
 
 
 def test_direction_to_the_right() -> None:
@@ -256,40 +226,6 @@ def test_a_wall_5_m_ahead() -> None:
     check_bytes(payload, {4 + 15: "e2044d"})
     behind = observe(VelodyneSpec("VLP-32C", start_azimuth_deg=180), 1, see).payloads[0]
     assert not behind[4:100].any()
-
-
-@pytest.mark.parametrize(
-    ("model", "distance_m", "count"),
-    [
-        ("VLP-32C", 10.0, 2500),
-        ("VLP-32C", 300.0, 0),
-        ("VLP-16", 131.07, 65535),
-        # Laser 0 measures 1.2 m less than there is.
-        ("HDL-64E S2", 10.0, 4400),
-        ("HDL-64E S2", 1.0, 0),
-        ("VLP-16", math.inf, 0),
-    ],
-)
-def test_counts_of_distance(model: str, distance_m: float, count: int) -> None:
-    def see(rays: Rays) -> tuple[F64Array, F64Array]:
-        return np.full(rays.time_ns.shape, distance_m), np.full(rays.time_ns.shape, 9.0)
-
-    payload = observe(VelodyneSpec(model), 1, see).payloads[0]
-    level = 9 if count else 0
-    check_bytes(payload, {4: count.to_bytes(2, "little").hex() + f"{level:02x}"})
-
-
-def test_tables_are_complete() -> None:
-    for table in MODELS.values():
-        sizes = {
-            len(table.firing_us),
-            len(table.elevation_deg),
-            len(table.azimuth_deg),
-            len(table.vertical_m),
-            len(table.horizontal_m),
-            len(table.dist_m),
-        }
-        assert sizes == {32 * len(table.flags) // table.columns_per_row}
 
 
 def test_the_known_sentence() -> None:
