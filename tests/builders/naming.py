@@ -9,7 +9,7 @@ LACKING = ": no decoder in this version"
 
 
 def named(packets: U8Array) -> str | None:
-    """What the makers but Ouster, which names packets by their sizes, call payloads (k, size)."""
-    makers = (plugin for plugin in plugins() if plugin.VENDOR != "Ouster")
-    names = (maker.describe(packets.shape[1], packets) for maker in makers)
+    """What the vendors but Ouster, which names packets by their sizes, call payloads (k, size)."""
+    vendors = (plugin for plugin in plugins() if plugin.VENDOR != "Ouster")
+    names = (vendor.describe(packets.shape[1], packets) for vendor in vendors)
     return next((name for name in names if name is not None), None)

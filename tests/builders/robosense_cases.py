@@ -1,6 +1,6 @@
 """Readings of ROBOSENSE packets: byte by byte where they lie, and when they fired.
 
-Source: facts/robosense.md sections 1 to 6, each number worked out by hand.
+Source: docs/sources/robosense.md sections 1 to 6, each number worked out by hand.
 """
 
 from __future__ import annotations

@@ -22,11 +22,11 @@ def evidence_of(
 ) -> Evidence:
     """Point packets on port 6699, device packets on port 7788 of one source."""
     sample = rows(points)
-    arrival_ns = np.arange(len(points)) * 1_000_000 if host_ns is None else host_ns
-    beside = tuple(Beside(DIFOP, len(difop), rows([difop]), arrival_ns[:1]) for difop in difops[:1])
+    receive_ns = np.arange(len(points)) * 1_000_000 if host_ns is None else host_ns
+    beside = tuple(Beside(DIFOP, len(difop), rows([difop]), receive_ns[:1]) for difop in difops[:1])
     if len(difops) > 1:
         beside = (Beside(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
-    return Evidence(MSOP, sample.shape[1], sample, arrival_ns, beside)
+    return Evidence(MSOP, sample.shape[1], sample, receive_ns, beside)
 
 
 def built_in(evidence: Evidence) -> robosense.DifopCalibration:

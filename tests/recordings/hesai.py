@@ -1,4 +1,4 @@
-"""The real HESAI recordings: the tables of facts/hesai.md sections 0, 3 (pairs), 4 and 5."""
+"""The real HESAI recordings: the tables of docs/sources/hesai.md sections 0, 3 (pairs), 4 and 5."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Case:
 
     @property
     def file(self) -> str:
-        """Name of the angle file beside it."""
+        """Name of its angle file."""
         (csv,) = (FOLDER / self.folder).glob("*.csv")
         return csv.name
 

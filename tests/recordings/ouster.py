@@ -1,4 +1,4 @@
-"""Payloads of the recordings beside the repository, read by dpkt: independent of our readers."""
+"""Payloads of the real Ouster recordings, read by dpkt: independent of the readers of mlbatch."""
 
 from __future__ import annotations
 

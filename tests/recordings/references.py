@@ -20,7 +20,7 @@ from tests.builders.run import Cloud, command, load, scan_files
 HOUR_NS = 3_600_000_000_000
 US_NS = 1_000
 
-# Autoware's numbering, facts/outputs.md section 3.
+# Autoware's numbering, docs/sources/outputs.md section 3.
 STRONGEST_FIRST, STRONGEST_LAST, WEAK_FIRST, WEAK_LAST, ONLY = 3, 4, 5, 6, 7
 
 
@@ -55,9 +55,9 @@ class Made:
 
 def converted(recording: Path, folder: Path, *options: str) -> Made:
     """Convert all of a recording into `folder`; its ledgers must balance."""
-    told = command("convert", recording, "-o", folder, "--keep-partial", "--quiet", *options)
-    assert told.code == 0, told.err
-    made = Made(folder, json.loads((folder / "report.json").read_text("utf-8")), told.err)
+    result = command("convert", recording, "-o", folder, "--keep-partial", "--quiet", *options)
+    assert result.code == 0, result.err
+    made = Made(folder, json.loads((folder / "report.json").read_text("utf-8")), result.err)
     capture, sensor = made.report["capture"], made.sensor
     assert capture["frames"] == capture["datagrams"] + sum(capture["skipped"].values())
     packets, columns, points = (sensor[name] for name in ("packets", "columns", "points"))

@@ -17,7 +17,7 @@ from tests.sensors.velodyne.test_calibration import read
 from tests.sensors.velodyne.test_hdl64 import check_many_points
 
 VELODYNE_FOLDER = RECORDINGS / "velodyne"
-# Real files: the first lines, read by eye; angles of facts/velodyne.md section 6.
+# Real files: the first lines, read by eye; angles of docs/sources/velodyne.md section 6.
 VELODYNE = {
     "vlp16_ros2_dual/VLP16.yaml": (16, 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
     "vlp32c_ros2/VLP32.yaml": (32, 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
@@ -64,7 +64,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files_beside_recordings(name: str) -> None:
+def test_real_csv_files(name: str) -> None:
     channels, first, last = FILES[name]
     found = read_angles(HESAI_FOLDER / name, (HESAI_FOLDER / name).read_bytes())
     assert found is not None
@@ -75,7 +75,7 @@ def test_files_beside_recordings(name: str) -> None:
         assert found.azimuth_rad[at] == pytest.approx(math.radians(azimuth), abs=1e-15)
 
 
-def test_at128_file_beside_recordings() -> None:
+def test_at128_real_dat_file() -> None:
     path = HESAI_FOLDER / "calibration-without-recording" / "PandarAT128.dat"
     found = read_at128(path, path.read_bytes())
     assert found is not None
@@ -115,7 +115,7 @@ def test_real_file_against_plain_loops() -> None:
 
 
 def test_field_of_view_of_the_real_file() -> None:
-    """Where adjustments are given, beams look 30 to 150 deg and some more, as the maker says."""
+    """Beams with adjustments cover 30 to 150 deg and a margin."""
     file = read_at128(AT128, AT128.read_bytes())
     assert file is not None
     projection = at128_projection(file, NO_FIRING, np.eye(4), 180)

@@ -1,8 +1,8 @@
-"""The clock doctor on real recordings, against what their sheets say of their clocks.
+"""Clock estimates on real recordings, against what is known of their clocks.
 
-Figures: recordings/MANIFEST.md (last column); facts/hesai.md section 4 and facts/velodyne.md
-section 7 (arrival minus stamp, measured with other programs). Ouster stamps are those of columns,
-which an arrival follows by up to the length of a packet, 1.6 ms.
+Figures: recordings/MANIFEST.md (last column); docs/sources/hesai.md section 4 and
+docs/sources/velodyne.md section 7 (receive time minus stamp, measured with other programs). Ouster
+stamps are those of columns, which a receive time follows by up to the length of a packet, 1.6 ms.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HOUR_NS = 3600 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A recording; domain and stamp minus arrival, s, of its sensor: None where not told."""
+    """A recording; domain and stamp minus receive time, s, of its sensor: None if not stated."""
 
     path: str
     domain: str
@@ -146,8 +146,8 @@ def test_two_sensors_that_count_from_power_on(path: str, uptimes_s: tuple[int, i
     found = findings(RECORDINGS / path)
     assert [finding.domain for finding in found.values()] == ["uptime", "uptime"]
     if uptimes_s is not None:
-        told_s = sorted(one.stretches[0].first_stamp_ns / NS_PER_S for one in found.values())
-        assert told_s == pytest.approx(uptimes_s, abs=0.5)
+        stated_s = sorted(one.stretches[0].first_stamp_ns / NS_PER_S for one in found.values())
+        assert stated_s == pytest.approx(uptimes_s, abs=0.5)
     comparison = compare(list(found.items()))
     assert comparison.verdict == UNSYNCHRONISED
     assert comparison.pairs[0].why.startswith("apart, and too few packets")

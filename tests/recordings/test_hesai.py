@@ -1,6 +1,6 @@
 """Real HESAI recordings, converted whole, against the published clouds and the sheet's totals.
 
-Figures and the rules of the clouds: facts/hesai.md sections 0, 3, 4, 5 and 9.
+Figures and the rules of the clouds: docs/sources/hesai.md sections 0, 3, 4, 5 and 9.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def test_times_channels_and_returns(case: Case, tmp_path: Path) -> None:
 
 
 @every_case
-def test_returns_of_a_pair_are_told_apart(case: Case, tmp_path: Path) -> None:
+def test_returns_of_a_pair_are_distinguished(case: Case, tmp_path: Path) -> None:
     """Equal ones are one; of others the nearer is first and the brighter strongest (section 3)."""
     made = converted(case.bag, tmp_path / "out", "--decode", "firing_azimuth=off")
     assert made.sensor["points"]["repeated"] == case.equal
@@ -182,7 +182,7 @@ def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None
         assert_same_points(again, whole)
 
 
-def test_the_published_turn_of_the_xt16_starts_when_the_sheet_says(tmp_path: Path) -> None:
+def test_the_published_turn_of_the_xt16_starts_when_the_manual_states(tmp_path: Path) -> None:
     """The column at exactly 0, which the rule of the clouds still counts to the turn before."""
     (case,) = (case for case in CASES if case.folder == "pandarxt16")
     points = Sorted.of(case, converted(case.bag, tmp_path / "out", *AS_PUBLISHED).cloud)

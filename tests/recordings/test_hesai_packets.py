@@ -1,4 +1,4 @@
-"""Real HESAI recordings: totals, published clouds and times of facts/hesai.md sections 0 and 9."""
+"""Real HESAI recordings: totals, published clouds and times (docs/sources/hesai.md 0 and 9)."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _cloud(content: bytes) -> F32Array:
     return np.frombuffer(body, "<f4").reshape(-1, 3)
 
 
-def test_the_published_turn_of_the_xt16_starts_when_the_sheet_says() -> None:
+def test_the_published_turn_of_the_xt16_starts_when_the_manual_states() -> None:
     """The column at exactly 0, which the rule of the clouds still counts to the turn before."""
     found = _decoded("pandarxt16")
     angle, _, _ = read_rotor_words(found.encoder)

@@ -1,6 +1,6 @@
 """Loss on real recordings: none as they are, and of what is taken out of them exactly that.
 
-Their sheets say of none that packets are missing (recordings/MANIFEST.md): counts go on without a
+No packet is known to be missing (recordings/MANIFEST.md): counts continue without a
 gap, the Pandar40P's and the Velodynes' packets follow at their pace, and the silence of the VLP-32C
 for half of each turn "is normal, not loss".
 """
@@ -23,7 +23,7 @@ from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
 from tests.recordings import RECORDINGS
 from tests.recordings.test_clocks import CASES, Case
 
-# Fewer tell no pace.
+# Fewer give no pace.
 FEWEST = 17
 every_case = pytest.mark.parametrize(
     ("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value)
@@ -37,7 +37,7 @@ every_long_case = pytest.mark.parametrize(
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """Packets (P,) of the lidar of a recording, in order of arrival."""
+    """Packets (P,) of the lidar of a recording, in order of receive time."""
 
     lidar: Lidar
     sequence: I64Array
@@ -45,7 +45,7 @@ class Came:
     host_ns: I64Array
 
     def counted(self, came: BoolArray | slice = slice(None), size: int = 64) -> tuple[int, int]:
-        """Lost and reordered of those packets, told in batches of `size`."""
+        """Lost and reordered of those packets, given in batches of `size`."""
         packet_ns = self.lidar.columns_per_packet * self.lidar.column_period_ns
         loss = PacketLoss(self.lidar.sequence_modulus, packet_ns)
         rows = np.arange(len(self.host_ns))[came]
@@ -89,7 +89,7 @@ def test_nothing_is_lost(maker: str, case: Case) -> None:
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.4])
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_taken_out_is_what_is_lost(maker: str, case: Case, share: float, seed: int) -> None:
-    """All but the first and the last packet: nobody can tell what was before."""
+    """All but the first and the last packet: the packets before are unknown."""
     came = np.random.default_rng(seed).random(case.packets) >= share
     came[[0, -1]] = True
     packets, missing = _read(maker, case.path), int(np.count_nonzero(~came))

@@ -87,7 +87,7 @@ def test_every_real_recording_is_tested() -> None:
     }
 
 
-def test_real_packets_of_ouster_are_not_theirs() -> None:
+def test_real_packets_of_ouster_are_unknown_to_others() -> None:
     checked = 0
     for path in sorted((RECORDINGS / "ouster").rglob("*.pcap")):
         sampler = _sampled(path)

@@ -1,4 +1,4 @@
-"""Real recordings against the maker's own decoder (MANIFEST.md beside them, reference A)."""
+"""Real recordings against the vendor's own decoder (MANIFEST.md of the recordings, reference A)."""
 
 from __future__ import annotations
 
@@ -137,8 +137,8 @@ def compare(got: Cloud, want: Reference, *, ring_base: int = 0) -> None:
 
 @pytest.mark.parametrize("case", ALONE, ids=name_of)
 def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
-    told = command(*case.options(), "-o", tmp_path / "scans", "--keep-partial")
-    assert told.code == 0, told.err
+    result = command(*case.options(), "-o", tmp_path / "scans", "--keep-partial")
+    assert result.code == 0, result.err
     got, want = Cloud.of_all(tmp_path / "scans"), Reference.of(case)
     assert np.array_equal(got.column_stamp_ns, want.column_stamp_ns)
     assert np.array_equal(got.stamp_ns, want.stamp_ns)
@@ -147,7 +147,7 @@ def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", SINGLES, ids=name_of)
-def test_metadata_beside_the_recording_is_found(case: Case, tmp_path: Path) -> None:
+def test_metadata_next_to_the_recording_is_found(case: Case, tmp_path: Path) -> None:
     explicit = command(*case.options(), "--dry-run", "--keep-partial", "--quiet")
     found = command("convert", FOLDER / case.name / case.pcap, "--dry-run", "--keep-partial")
     assert found.code == 0, found.err
@@ -165,33 +165,33 @@ def test_clocks_thousands_of_seconds_apart_are_an_error(
     pair: tuple[Case, Case], tmp_path: Path
 ) -> None:
     both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
-    told = command(*both.options(), "-o", tmp_path / "scans", "--identity-extrinsics")
-    assert told.code == 1
-    assert told.err.count("\n") == 1, told.err
-    assert "--clock host" in told.err
-    assert "clock.offset_s" in told.err
+    result = command(*both.options(), "-o", tmp_path / "scans", "--identity-extrinsics")
+    assert result.code == 1
+    assert result.err.count("\n") == 1, result.err
+    assert "--clock host" in result.err
+    assert "clock.offset_s" in result.err
     for case in pair:
-        assert f"ouster_{case.only}" in told.err
-        assert f"{_offset_s(case):.3f}" in told.err
+        assert f"ouster_{case.only}" in result.err
+        assert f"{_offset_s(case):.3f}" in result.err
     assert not (tmp_path / "scans").exists()
 
 
 def _offset_s(case: Case) -> float:
-    """First stamp minus arrival, as the decoder's output has them."""
+    """First stamp minus receive time, as the decoder's output has them."""
     with np.load(FOLDER / case.name / case.reference) as npz:
-        arrival = npz["packet_timestamp_ns"].astype(np.int64)
+        receive_ns = npz["packet_timestamp_ns"].astype(np.int64)
         stamp = npz["timestamp_ns"].astype(np.int64)[npz["valid"]]
-    return float(stamp.min() - arrival[arrival > 0].min()) / 1e9
+    return float(stamp.min() - receive_ns[receive_ns > 0].min()) / 1e9
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].name)
-def test_two_sensors_on_the_clock_of_the_recorder(pair: tuple[Case, Case], tmp_path: Path) -> None:
+def test_two_sensors_by_receive_time(pair: tuple[Case, Case], tmp_path: Path) -> None:
     both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
-    told = command(
+    result = command(
         *both.options(),
         *("-o", tmp_path / "scans", "--keep-partial", "--clock", "host", "--identity-extrinsics"),
     )
-    assert told.code == 0, told.err
+    assert result.code == 0, result.err
     cloud, total, ring_base = Cloud.of_all(tmp_path / "scans"), 0, 0
     # Sensors are ordered by serial number.
     for number, case in enumerate(sorted(pair, key=lambda case: case.only)):
@@ -218,12 +218,12 @@ def _channels(case: Case) -> int:
     ],
 )
 def test_recordings_without_lidar_data_say_so(path: str, words: list[str], tmp_path: Path) -> None:
-    told = command("convert", FOLDER / path, "-o", tmp_path / "scans", "--keep-partial")
-    assert told.code == 1
-    assert told.out == ""
-    assert told.err.count("\n") == 1, told.err
+    result = command("convert", FOLDER / path, "-o", tmp_path / "scans", "--keep-partial")
+    assert result.code == 1
+    assert result.out == ""
+    assert result.err.count("\n") == 1, result.err
     for word in ("no lidar packets", "wanted", path.split("/")[-1], *words):
-        assert word in told.err
+        assert word in result.err
     assert not list(tmp_path.iterdir())
 
 

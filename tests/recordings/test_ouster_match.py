@@ -139,7 +139,7 @@ def test_real_imu_and_zone_packets_are_named() -> None:
 
 
 @pytest.mark.parametrize("path", ["velodyne/vlp16_gps", "velodyne/hdl32e_named-vlp32", "other"])
-def test_real_packets_of_other_makers_are_not_ours(path: str) -> None:
+def test_real_packets_of_other_vendors_are_unknown(path: str) -> None:
     checked = 0
     for capture in sorted((OUSTER.parent / path).rglob("*.pcap")):
         for _source, _port, data in datagrams(capture):

@@ -1,4 +1,4 @@
-"""Every real Ouster recording against the maker's own decoder, field by field."""
+"""Every real Ouster recording against the vendor's own decoder, field by field."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ class TestEveryRecording:
             kept = reference["valid"][frame, mid]
             assert (valid == kept).all()
             assert (reference["measurement_id"][frame, mid[kept]] == mid[kept]).all()
-            told = reference["timestamp_ns"][frame, mid[kept]].astype(np.int64)
-            assert (told == stamp_ns[kept]).all()
+            result = reference["timestamp_ns"][frame, mid[kept]].astype(np.int64)
+            assert (result == stamp_ns[kept]).all()
         assert heads.valid.sum() == reference["valid"].sum()
 
     def test_ranges_signal_and_reflectivity_of_every_pixel(self, case: Case) -> None:
@@ -183,21 +183,21 @@ def formula_m(reference: Reference, range_m: F64Array) -> F64Array:
 def test_checksums_of_recent_firmware(folder: str, count: int) -> None:
     case = next(case for case in reversed(CASES) if case.folder == folder)
     packets = case.payloads(calibration_of(case).metadata.layout.packet_size)
-    told = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
+    result = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
     assert len(packets) == count
-    assert (crc64(packets[:, :-8]) == told).all()
+    assert (crc64(packets[:, :-8]) == result).all()
 
 
 def test_checksum_of_an_imu_and_a_zone_packet() -> None:
     case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
     for size, count in ((452, 8), (680, 1)):
         packets = case.payloads(size)
-        told = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
+        result = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
         assert len(packets) == count
-        assert (crc64(packets[:, :-8]) == told).all()
+        assert (crc64(packets[:, :-8]) == result).all()
 
 
-def test_a_changed_packet_is_told_by_its_checksum_only_if_asked() -> None:
+def test_a_changed_packet_is_found_by_its_checksum_only_if_asked() -> None:
     calibration = calibration_of(CASES[0])
     packets = CASES[0].payloads(calibration.metadata.layout.packet_size)
     packets[3, 777] ^= 4
@@ -208,7 +208,7 @@ def test_a_changed_packet_is_told_by_its_checksum_only_if_asked() -> None:
     assert not calibration.lidar({}, None).faults(packets).any()
 
 
-def test_foreign_json_beside_the_recordings_is_no_calibration() -> None:
+def test_foreign_json_of_the_recordings_is_no_calibration() -> None:
     paths = [*OUSTER.glob("*/*digest.json"), *OUSTER.glob("*/extrinsic_parameters.json")]
     assert len(paths) == 4
     assert [read_calibration(path) for path in paths] == [None] * 4

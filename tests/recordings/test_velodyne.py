@@ -1,7 +1,7 @@
 """Real Velodyne recordings, converted whole, against the points of velodyne-decoder.
 
-Figures: recordings/MANIFEST.md; facts/velodyne.md section 11 (how well decoders agree) and 12
-(where that one is wrong).
+Figures: recordings/MANIFEST.md; docs/sources/velodyne.md section 11 (how well decoders agree) and
+12 (where that one is wrong).
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder
 
 @every_case
 @pytest.mark.parametrize("rate", ["10", "7.5", "100/3"])
-def test_every_point_with_the_angles_of_the_maker(case: Case, rate: str, tmp_path: Path) -> None:
+def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_path: Path) -> None:
     ours = converted(case.alone(tmp_path), tmp_path / "out", "--rate", rate).cloud
     check(case, ours, added_m=0 * case.heights_m)
 
 
 @pytest.mark.parametrize("case", [DUAL, GAPS], ids=lambda case: case.folder)
-def test_every_point_with_the_file_beside_the_bag(case: Case, tmp_path: Path) -> None:
-    """The file, found by itself, holds the maker's angles, but no heights of the origins."""
+def test_every_point_with_the_file_next_to_the_bag(case: Case, tmp_path: Path) -> None:
+    """The file, found by itself, holds the vendor's angles, but no heights of the origins."""
     made = converted(case.path, tmp_path / "found")
     assert made.sensor["calibration"] == case.file
     check(case, made.cloud, added_m=case.heights_m)
@@ -68,7 +68,7 @@ def check(case: Case, ours: Cloud, added_m: F64Array) -> None:
 
 
 @every_case
-def test_what_the_report_says(case: Case, tmp_path: Path) -> None:
+def test_the_report(case: Case, tmp_path: Path) -> None:
     made, theirs = converted(case.path, tmp_path / "out"), case.theirs
     sensor, points = made.sensor, made.sensor["points"]
     assert (sensor["model"], sensor["mode"]) == (case.model, case.mode)
@@ -96,7 +96,7 @@ def test_what_the_report_says(case: Case, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("decode", ["on", "off"])
 def test_angle_follows_time_over_blind_sectors(decode: str, tmp_path: Path) -> None:
-    """The unit is silent for half of each turn, but its rotor goes on: one line over all turns."""
+    """The unit is silent for half of each revolution, but its rotor keeps its speed."""
     words = ("--decode", f"firing_azimuth={decode}")
     ours = converted(GAPS.path, tmp_path / "out", *words).cloud
     assert GAPS.theirs.behind_jump.sum() == 26
@@ -116,7 +116,7 @@ def test_angle_follows_time_over_blind_sectors(decode: str, tmp_path: Path) -> N
 
 
 def test_time_of_the_first_packet_by_hand(tmp_path: Path) -> None:
-    """GPRMC tells the hour, the packet the microseconds past it; the pulse is locked: UTC."""
+    """GPRMC gives the hour, the packet the microseconds past it; the pulse is locked: UTC."""
     payloads = [frame[42:] for _, frame in read_pcap(GPS.path)]
     position = next(one for one in payloads if len(one) == 512)
     assert position[202] == 2
@@ -125,7 +125,7 @@ def test_time_of_the_first_packet_by_hand(tmp_path: Path) -> None:
     assert sentence[9] == b"210116"
     packet = next(one for one in payloads if len(one) == 1206)
     (past_hour_us,) = struct.unpack_from("<I", packet, 1200)
-    # 18 min 2.340595 s, as the sentence says.
+    # 18 min 2.340595 s, by the sentence.
     assert past_hour_us == 1_082_340_595
     hour_s = int(datetime(2016, 1, 21, 8, tzinfo=timezone.utc).timestamp())
     made = converted(GPS.path, tmp_path / "out")

@@ -1,6 +1,6 @@
 """Returns of a real VLP-16, and Velodyne recordings against Nebula's published clouds.
 
-Figures: facts/velodyne.md sections 3 (returns), 11, and 12 (where those clouds are wrong).
+Figures: docs/sources/velodyne.md sections 3 (returns), 11, and 12 (where those clouds are wrong).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.recordings.velodyne import DUAL, FOLDER, GAPS
 NEBULA = [WEAK_LAST, WEAK_FIRST, ONLY, 0, 0, STRONGEST_LAST, STRONGEST_FIRST]
 
 
-def test_returns_of_a_pair_are_told_apart(tmp_path: Path) -> None:
+def test_returns_of_a_pair_are_distinguished(tmp_path: Path) -> None:
     """Even blocks hold the last return: the farther one, wherever two are seen (section 3)."""
     ours, theirs = converted(DUAL.path, tmp_path / "out").cloud, DUAL.theirs
     types = ours.return_type[np.lexsort((ours.range_m, ours.ring, ours.column))]

@@ -1,7 +1,7 @@
 """Real Velodyne recordings against two other decoders: velodyne-decoder and Nebula.
 
-recordings/MANIFEST.md says how the references were made, facts/velodyne.md sections 11 and 12 where
-they are wrong.
+recordings/MANIFEST.md says how the references were made, docs/sources/velodyne.md sections 11 and
+12 where they are wrong.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def reference(name: str) -> dict[str, npt.NDArray[Any]]:
         return {key: archive[key] for key in archive.files}
 
 
-def columns_of(told: dict[str, npt.NDArray[Any]]) -> dict[str, F64Array]:
-    names = [str(name) for name in told["point_fields"]]
-    return {name: told["points"][:, at].astype(np.float64) for at, name in enumerate(names)}
+def columns_of(result: dict[str, npt.NDArray[Any]]) -> dict[str, F64Array]:
+    names = [str(name) for name in result["point_fields"]]
+    return {name: result["points"][:, at].astype(np.float64) for at, name in enumerate(names)}
 
 
 def heading_deg(x: F64Array, y: F64Array) -> F64Array:
@@ -129,8 +129,8 @@ def turned_deg(one: F64Array, other: F64Array) -> F64Array:
     ],
 )
 def test_every_point_of_velodyne_decoder(name: str, model: str, mode: str, count: int) -> None:
-    one, told = recorded(name), reference(name)
-    lidar, theirs = one.lidar, columns_of(told)
+    one, result = recorded(name), reference(name)
+    lidar, theirs = one.lidar, columns_of(result)
     assert (lidar.model, lidar.mode) == (model, mode)
     assert not lidar.faults(one.sent.payloads).any()
     ours = points(lidar, one.sent)
@@ -153,11 +153,11 @@ def test_every_point_of_velodyne_decoder(name: str, model: str, mode: str, count
     assert late_ns[good].max() < US_NS
     away = turned_deg(heading_deg(*ours.xyz.T[:2]), heading_deg(theirs["x"], theirs["y"]))
     assert away[good].max() < 0.006
-    assert abs(last_ns - float(told["device_time_s"]) * 1e9) < US_NS
+    assert abs(last_ns - float(result["device_time_s"]) * 1e9) < US_NS
 
 
 def test_behind_blind_sectors_the_angle_still_follows_time() -> None:
-    """The sensor sends half of each turn; the rotor goes on, so that angle and time stay in step.
+    """The sensor sends half of each revolution, but its rotor keeps its speed.
 
     Other decoders put the end of such packets 50 ms too early.
     """
@@ -221,11 +221,9 @@ def test_every_point_of_nebula_on_a_vlp_32c() -> None:
 
 @pytest.mark.parametrize(("name", "pulse"), [(GPS, "PPS locked"), (OLD, "no PPS")])
 @pytest.mark.parametrize("wrong_s", [-86_400 * 400, -7_200, 5_000, 86_400])
-def test_nmea_tells_the_hour_where_the_recorder_does_not(
-    name: str, pulse: str, wrong_s: int
-) -> None:
-    """Both recordings hold valid sentences: times stay right however wrong the recorder's are."""
-    one, told = recorded(name), reference(name)
+def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wrong_s: int) -> None:
+    """Both recordings have valid sentences: wrong receive times have no effect."""
+    one, result = recorded(name), reference(name)
     shift_ns = wrong_s * 1_000_000_000
     beside = tuple(
         replace(other, host_ns=other.host_ns + shift_ns) for other in one.evidence.beside
@@ -235,10 +233,10 @@ def test_nmea_tells_the_hour_where_the_recorder_does_not(
     assert lidar.timestamp_mode == pulse
     heads = lidar.heads(one.sent.payloads, one.sent.host_ns + shift_ns)
     assert (heads.stamp_ns == one.lidar.heads(one.sent.payloads, one.sent.host_ns).stamp_ns).all()
-    assert abs(heads.stamp_ns[-1, 0] - float(told["device_time_s"]) * 1e9) < US_NS
+    assert abs(heads.stamp_ns[-1, 0] - float(result["device_time_s"]) * 1e9) < US_NS
 
 
-def test_a_product_byte_belied_by_the_pace_is_told() -> None:
+def test_a_product_byte_contradicted_by_the_pace_is_noted() -> None:
     (note,) = recorded(BELIED).lidar.notes
     assert (
         note == "model by the pace of its packets: VLP-16, although its product byte says HDL-32E"
@@ -246,7 +244,7 @@ def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     assert [recorded(name).lidar.notes for name in (GPS, DUAL, GAPS, OLD)] == [()] * 4
 
 
-def test_files_of_the_makers_angles_change_nothing() -> None:
+def test_files_of_the_vendors_angles_change_nothing() -> None:
     """Nebula's files hold the manual's angles, and no offsets."""
     for name, file in ((DUAL, "VLP16.yaml"), (GAPS, "VLP32.yaml")):
         path = FOLDER / name.split("/")[0] / file

@@ -1,4 +1,4 @@
-"""The real Velodyne recordings, by recordings/MANIFEST.md and facts/velodyne.md section 11."""
+"""The real Velodyne recordings (MANIFEST.md, docs/sources/velodyne.md section 11)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOLDER = RECORDINGS / "velodyne"
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A recording; file: angles beside it."""
+    """A recording; file: its angles."""
 
     folder: str
     recording: str
@@ -41,14 +41,14 @@ class Case:
         return Decoded.of(FOLDER / self.folder / "reference.npz")
 
     def alone(self, folder: Path) -> Path:
-        """The recording with nothing beside it."""
+        """The recording without its angle file."""
         if not self.file:
             return self.path
         return Path(shutil.copytree(self.path, folder / "bag"))
 
     @property
     def heights_m(self) -> F64Array:
-        """(rings,) height of the beams' origins, facts/velodyne.md section 6; ring 0 is lowest."""
+        """(rings,) heights of beam origins (docs/sources/velodyne.md 6); ring 0 is lowest."""
         table = MODELS[self.model]
         heights: F64Array = np.array(table.vertical_m)[np.argsort(table.elevation_deg)]
         return heights

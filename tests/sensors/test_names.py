@@ -35,7 +35,7 @@ def test_a_damaged_packet_does_not_hide_a_stream() -> None:
 
 
 @pytest.mark.parametrize("profile", [name for name, one in PROFILES.items() if one.fields])
-def test_packets_of_ouster_are_not_theirs(profile: str) -> None:
+def test_packets_of_ouster_are_unknown_to_others(profile: str) -> None:
     for beams in (16, 32, 64, 128):
         spec = OusterSpec(profile=profile, beams=beams, columns_per_frame=512)
         ranges = np.full((512, beams, 1), 4000)
@@ -45,7 +45,7 @@ def test_packets_of_ouster_are_not_theirs(profile: str) -> None:
         assert all(named(packet[None]) is None for packet in sample)
 
 
-def test_imu_packets_of_ouster_are_not_theirs() -> None:
+def test_imu_packets_of_ouster_are_unknown_to_others() -> None:
     spec = OusterSpec(imu_profile="ACCEL32_GYRO32_NMEA")
     data = imu_packet(spec, np.arange(1, 9), np.ones((8, 3)), np.ones((8, 3)))
     assert named(rows([data])) is None
@@ -57,7 +57,7 @@ SIZES += [1206, 1210, 1212, 1248, 1256, 1262, 1268, 1278, 1318, 1362, 1380, 1388
 
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
-def test_random_bytes_are_nobodys(size: int, seed: int, count: int) -> None:
+def test_random_bytes_are_unknown(size: int, seed: int, count: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
     assert named(noise) is None
 
@@ -69,12 +69,12 @@ def test_any_bytes_give_a_name_or_none(payload: bytes, count: int) -> None:
 
 
 @pytest.mark.parametrize("fill", [0, 1, 2, 0x55, 0xEE, 0xFF])
-def test_bytes_that_are_all_the_same_are_nobodys(fill: int) -> None:
+def test_bytes_that_are_all_the_same_are_unknown(fill: int) -> None:
     for size in range(1, 1500):
         assert named(np.full((2, size), fill, np.uint8)) is None
 
 
-def test_nothing_is_nobodys() -> None:
+def test_nothing_is_unknown() -> None:
     for plugin in sensors.plugins():
         assert plugin.describe(0, np.zeros((0, 0), np.uint8)) is None
         assert plugin.describe(1206, np.zeros((0, 1206), np.uint8)) is None

@@ -1,4 +1,4 @@
-"""Evidence in packets by which models are told."""
+"""Block times, by which models are distinguished."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_time_of_a_block_by_the_speed_between_packets() -> None:
     assert block_time_us(late_us, turned, HOUR_US) == pytest.approx(50)
 
 
-def test_what_tells_no_time() -> None:
+def test_without_a_block_time() -> None:
     rest = np.zeros_like(AZIMUTH)
     for stamps_us, azimuth in (
         (STAMP_US[:1], AZIMUTH[:1]),

@@ -13,7 +13,7 @@ from mlbatch.errors import RigError
 from tests.builders.ouster import OusterSpec, metadata_json
 
 
-def test_every_model_has_its_own_name_and_a_maker() -> None:
+def test_every_model_has_its_own_name_and_a_vendor() -> None:
     names = [model.name for model in sensors.models()]
     assert len(set(names)) == len(names)
     assert {model.vendor for model in sensors.models()} == {
@@ -21,7 +21,7 @@ def test_every_model_has_its_own_name_and_a_maker() -> None:
     }
 
 
-def test_every_model_says_how_it_was_verified() -> None:
+def test_every_model_states_how_it_was_verified() -> None:
     verified = {model.verified for model in sensors.models()}
     assert verified == {"real recording", "two sources", "one source"}
 
@@ -42,7 +42,7 @@ def test_a_metadata_file_is_read(tmp_path: Path) -> None:
     assert (found.path, found.model, found.serial) == (path, "OS-1-128", "77")
 
 
-def test_files_that_cannot_be_read_are_told(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_are_reported(tmp_path: Path) -> None:
     with pytest.raises(
         RigError, match=r"none\.json: expected a calibration file, found no such file"
     ):
@@ -61,5 +61,5 @@ def test_a_file_too_large_for_a_calibration_is_none(tmp_path: Path) -> None:
     assert sensors.read_calibration(path) is None
 
 
-def test_nobody_knows_an_odd_packet() -> None:
+def test_no_vendor_knows_an_odd_packet() -> None:
     assert sensors.describe(3, np.zeros((2, 3), np.uint8)) is None

@@ -66,7 +66,7 @@ def test_columns_are_found_by_their_titles() -> None:
     np.testing.assert_array_equal(read(swapped).azimuth_rad, read(rows()).azimuth_rad)
 
 
-def test_what_stands_around_the_rows_does_not_matter() -> None:
+def test_lines_around_the_rows_does_not_matter() -> None:
     first, *others = rows()
     dressed = [
         "\ufeffEEFF,1,1",

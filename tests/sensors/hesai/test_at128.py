@@ -1,4 +1,4 @@
-"""Points of the AT128: by hand, and against the rule of facts/hesai.md section 6 in plain loops."""
+"""Points of the AT128 by hand, and in plain loops (docs/sources/hesai.md section 6)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def words(rotor_deg: list[float], turns_per_s: float = 0.0) -> I64Array:
 
 def points(projection: Projection, encoder: I64Array, range_m: F32Array) -> F32Array:
     projection.aim(np.zeros(len(encoder), np.int64), encoder)
-    # As the core calls it: x, y, z stand beside the intensity.
+    # As the core calls it: x, y, z are strided by the intensity.
     wide = np.zeros((*range_m.shape, 4), np.float32)
     projection.points(range_m, wide[:, :, :3])
     assert not wide[:, :, 3].any()
@@ -146,7 +146,7 @@ def test_pose_turns_and_moves_the_points() -> None:
 
 
 def by_the_sheet(file: At128File, rotor_rad: float, channel: int) -> tuple[float, float, float]:
-    """The unit vector of a beam; the rule as it stands in the sheet, in degrees."""
+    """The unit vector of a beam; the rule of the source, in degrees."""
     rotor = math.degrees(rotor_rad) % 360
     starts, ends = np.degrees(file.start_rad), np.degrees(file.end_rad)
     for start, end in zip(starts, ends, strict=True):

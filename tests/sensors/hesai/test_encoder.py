@@ -203,7 +203,7 @@ def test_checksums_of_qt128() -> None:
         assert stored == checksum(packet[begin:end])
 
 
-# The first packet is sent at 999 999.5 us of a second and says 999 999.
+# The first packet is sent at 999 999.5 us of a second and states 999 999.
 TIMED = HesaiSpec("", start_deg=359.9, start_ns=1_700_000_000_999_999_500)
 T_NS = 1_700_000_000_999_999_000
 

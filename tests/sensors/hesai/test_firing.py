@@ -1,4 +1,4 @@
-"""Firing tables against facts/hesai.md sections 5 and 12 (JT128: the file of the SDK)."""
+"""Firing tables against docs/sources/hesai.md sections 5 and 12 (JT128: the file of the SDK)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_sum_of_the_first_row(name: str) -> None:
     assert int(table[:count].sum()) == total
 
 
-def test_tables_are_on_the_side_of_the_block_time_that_the_sheet_says() -> None:
+def test_tables_are_on_the_side_of_the_block_time_that_the_manual_states() -> None:
     assert firing.P40.max() == firing.P64.max() == -3620
     assert min(firing.QT64.min(), firing.XT16.min(), firing.XT32.min()) > 0
 
@@ -94,7 +94,7 @@ def test_far_field_of_pandar128() -> None:
     assert set(E128) == set(E128_NEAR)
     assert len(E128) == 4 + 2 + 2
     assert E128[HIGH, 0][[0, 1, 2, 24, 126]].tolist() == [4436, NEVER, 776, 4436, 6441]
-    # Channel 7 in state 2: the maker's 6091, not the other driver's -185.
+    # Channel 7 in state 2: the vendor's 6091, not the other driver's -185.
     assert E128[HIGH, 2][6] == 6091
     assert E128[STANDARD, 0][[0, 1, 25, 127]].tolist() == [4436, 28554, 38509, 28554]
     assert E128[STANDARD, 1][[6, 25, 54]].tolist() == [6091, 37809, 51519]

@@ -1,4 +1,4 @@
-"""What HESAI packets are called, by facts/hesai.md."""
+"""What HESAI packets are called, by docs/sources/hesai.md."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def hesai(size: int, head: str, mode_at: int = 0, mode: int = 0x37) -> U8Array:
     return rows([filled(size, parts)] * 2)
 
 
-# (model, size, header, byte of the return mode) by facts/hesai.md sections 1 to 3; the byte is
-# header + blocks x stride + checks + place in the tail, worked by hand.
+# (model, size, header, byte of the return mode) by docs/sources/hesai.md sections 1 to 3; the byte
+# is header + blocks x stride + checks + place in the tail, worked by hand.
 DECODED = [
     ("Pandar20A or Pandar20B", 1270, "eeff14140004", 1262),  # 8 + 20 x 62 + 14
     ("Pandar64", 1194, "eeff40060004", 1186),  # 8 + 6 x 194 + 14
@@ -77,7 +77,7 @@ def test_models_without_a_decoder(model: str, size: int, head: str, mode_at: int
 def test_pandar40_bears_a_flag_at_every_block(size: int, model: str) -> None:
     parts = {124 * block: EE for block in range(10)}
     parts[1240 + 14] = b"\x38"
-    # The Pandar40 does not say its date.
+    # The Pandar40 has no date.
     lacking = LACKING if model == "Pandar40" else ""
     assert named(rows([filled(size, parts)])) == f"HESAI lidar {model}, last return{lacking}"
     assert named(rows([filled(size, {0: EE})])) is None
@@ -131,7 +131,7 @@ def test_automotive_hesai_behind_a_prefix() -> None:
     assert named(packets) is None
 
 
-def test_packets_beside_those_of_hesai() -> None:
+def test_other_packets_of_hesai() -> None:
     gps = {0: EE + b"712190403180", 18: b"$GPRMC"}
     assert named(rows([filled(512, gps)])) == "HESAI GPS packet"
     assert named(rows([filled(512, {0: EE})])) is None

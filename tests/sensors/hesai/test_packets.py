@@ -1,4 +1,4 @@
-"""Dates of HESAI packets, facts/hesai.md section 4; seconds by `date -u -d ... +%s`."""
+"""Dates of HESAI packets, docs/sources/hesai.md section 4; seconds by `date -u -d ... +%s`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def _read(date: bytes, us: int = 0) -> tuple[int, bool]:
 @pytest.mark.parametrize(
     ("date", "us", "time_ns"),
     [
-        # The first packets of the recordings of a Pandar40P and a Pandar64, facts/hesai.md 0.
+        # The first packets of the recordings of a Pandar40P and a Pandar64, docs/sources/hesai.md
+        # 0.
         (bytes([17, 9, 6, 16, 19, 46]), 881567, 1504714786881567000),
         (bytes([120, 6, 25, 12, 2, 9]), 977341, 1593086529977341000),
         (bytes([70, 1, 1, 0, 0, 0]), 0, 0),

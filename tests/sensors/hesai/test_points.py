@@ -1,7 +1,8 @@
 """Points of every HESAI model, worked by hand from packets that are laid out byte by byte.
 
-Places: facts/hesai.md section 2 and 3 (header + block x stride + lead + channel x unit); times:
-sections 5 and 12. All beams look 30 deg up and 1 deg to the right of the rotor (AT128: left).
+Places: docs/sources/hesai.md section 2 and 3 (header + block x stride + lead + channel x unit);
+times: sections 5 and 12. All beams look 30 deg up and 1 deg to the right of the rotor (AT128:
+left).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ MODES = (
 
 
 def _beams(channels: int, model: str = "") -> tuple[Beams, bytes]:
-    """Some beams, and the file that tells them."""
+    """Some beams, and their file."""
     elevation = np.round(np.linspace(14.9, -24.9, channels), 3).tolist()
     azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
     if model == "AT128":
@@ -100,7 +100,7 @@ def test_a_rotor_that_turns_the_other_way(model: str) -> None:
     found = decode(packets, content)
     fired = builder.fires(spec, len(found.stamp_ns))
     expected = found.range_m[..., None] * builder.directions(spec, beams, len(fired))[:, :, None, :]
-    if model == "QT128C2X":  # Its checksums no longer hold, which nobody asked for.
+    if model == "QT128C2X":  # Its checksums are wrong now, but not checked.
         assert calibration(content).lidar({"crc": "check"}, evidence(packets)).faults(packets).all()
     assert np.abs(found.xyz() - expected)[fired].max() < 1e-4
 
@@ -283,7 +283,7 @@ def test_optical_centre_of_a_jt16_is_where_its_ranges_begin() -> None:
     assert points[0, 3].tolist() == pytest.approx([2.010955, 0.00625, 0.003911], abs=1e-6)
 
 
-def test_files_are_told_by_content() -> None:
+def test_files_are_identified_by_content() -> None:
     assert hesai.read_calibration(Path("a.json"), b'{"lidar_mode": 1}') is None
     assert hesai.read_calibration(Path("topic"), b"elevation,azimuth\n1,2\n") is None
     csv = calibration(_beams(64)[1])

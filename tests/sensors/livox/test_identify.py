@@ -1,4 +1,4 @@
-"""What Livox packets are called, by facts/others.md."""
+"""What Livox packets are called, by docs/sources/others.md."""
 
 from __future__ import annotations
 

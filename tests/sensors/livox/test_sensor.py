@@ -173,7 +173,7 @@ def test_times_that_points_do_not_divide_are_cut() -> None:
     assert (heads.stamp_ns[0] - START_NS).tolist() == [0, 33, 66]
 
 
-def test_what_a_lidar_says_of_itself() -> None:
+def test_attributes() -> None:
     _, _, packets = random_packets(LivoxSpec(DUAL, points=48, time_type=0))
     lidar = sensor(packets)
     assert (lidar.vendor, lidar.model) == ("Livox", "Livox SDK2")

@@ -107,7 +107,7 @@ def test_old_firmware_sends_64_beams_for_16() -> None:
     assert "OS-1-16-A0 has 64 beam angles: packets of 64 beams" in lidar.notes
 
 
-def test_header_type_follows_the_profile_unless_told() -> None:
+def test_header_type_follows_the_profile_unless_stated() -> None:
     for profile, header in (
         ("FUSA_RNG15_RFL8_NIR8_DUAL", "FUSA"),
         ("RNG15_RFL8_NIR8_DUAL", "STANDARD"),
@@ -120,9 +120,9 @@ def test_header_type_follows_the_profile_unless_told() -> None:
 
 def test_extrinsics_are_metres_and_identity_means_none() -> None:
     pose = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -2.0, 0.0, 0.0, 1.0, 0.25, 0.0, 0.0, 0.0, 1.0]
-    told = read(metadata_json(OusterSpec(beams=64, extrinsic_m=pose))).lidar({}, None)
-    assert told.extrinsics is not None
-    assert told.extrinsics.ravel().tolist() == pose
+    result = read(metadata_json(OusterSpec(beams=64, extrinsic_m=pose))).lidar({}, None)
+    assert result.extrinsics is not None
+    assert result.extrinsics.ravel().tolist() == pose
     unknown = OusterSpec(beams=64, extrinsic_m=np.eye(4).ravel().tolist())
     assert read(metadata_json(unknown)).lidar({}, None).extrinsics is None
 
@@ -186,7 +186,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
         np.testing.assert_allclose(xyz, [level, up], atol=1e-12)
 
 
-def test_options_of_this_and_other_makers() -> None:
+def test_options_of_this_and_other_vendors() -> None:
     calibration = read(metadata_json(SPEC))
     calibration.lidar(
         {"crc": "check", "firing_azimuth": "on", "vertical_offset": "off", "optical_centre": "on"},
@@ -221,7 +221,7 @@ def test_a_serial_number_may_be_a_number_or_absent() -> None:
         b"{" * 100_000,
     ],
 )
-def test_other_files_are_none_of_ours(content: bytes) -> None:
+def test_other_files_are_not_recognised(content: bytes) -> None:
     assert read_calibration(PATH, content) is None
 
 
@@ -316,7 +316,9 @@ MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
 
 
 @pytest.mark.parametrize(("path", "value", "message"), MISTAKES)
-def test_mistakes_are_told_in_one_line(path: tuple[str, ...], value: object, message: str) -> None:
+def test_mistakes_are_reported_in_one_line(
+    path: tuple[str, ...], value: object, message: str
+) -> None:
     document = copy.deepcopy(metadata_json(PLAIN))
     _set(*path)(document, value)
     with pytest.raises(RigError, match=message) as caught:
@@ -328,7 +330,7 @@ def test_mistakes_are_told_in_one_line(path: tuple[str, ...], value: object, mes
     assert len(text) < 500
 
 
-def test_a_mode_is_needed_where_the_columns_are_not_told() -> None:
+def test_a_mode_is_needed_where_the_columns_are_not_stated() -> None:
     for mode in ("", "fast", None):
         document: JsonObject = {"lidar_mode": mode}
         document |= {key: [1.0] * 64 for key in ("beam_altitude_angles", "beam_azimuth_angles")}
@@ -336,7 +338,7 @@ def test_a_mode_is_needed_where_the_columns_are_not_told() -> None:
             read(document)
 
 
-def test_a_file_cut_off_is_ours_but_unusable() -> None:
+def test_a_file_cut_off_is_recognised_but_unusable() -> None:
     content = json.dumps(metadata_json(PLAIN)).encode()[:-40]
     with pytest.raises(RigError, match=r"front\.json: Ouster metadata: expected a JSON document"):
         read_calibration(PATH, content)

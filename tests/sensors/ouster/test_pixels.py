@@ -241,9 +241,9 @@ def test_packets_of_a_window_are_numbered_without_gaps(
 
 
 def test_a_standard_packet_with_the_other_layout_is_read_by_its_serial_number() -> None:
-    told = OusterSpec(beams=16, header="STANDARD")
+    result = OusterSpec(beams=16, header="STANDARD")
     sent = OusterSpec(beams=16, header="FUSA")
-    lidar = lidar_of(told)
+    lidar = lidar_of(result)
     packets = two_packets(sent, frame=65536 + 9)
     assert lidar.owns(packets).all()
     # The packets hold no checksum, as those of FUSA do.
@@ -251,7 +251,7 @@ def test_a_standard_packet_with_the_other_layout_is_read_by_its_serial_number() 
     assert lidar.sequence(packets).tolist() == [9 * 64, 9 * 64 + 1]
 
 
-def test_packets_of_another_sensor_or_kind_are_told_apart() -> None:
+def test_packets_of_another_sensor_or_kind_are_distinguished() -> None:
     spec = OusterSpec(beams=16, serial=111, with_crc=False)
     lidar = lidar_of(spec)
     packets = two_packets(spec)

@@ -89,7 +89,7 @@ def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:
 
 
 @pytest.mark.parametrize("fill", ["zero", "ones", "noise", "counting", "two"])
-def test_no_bytes_are_taken_for_ours_by_their_size(fill: str) -> None:
+def test_no_bytes_are_recognised_by_their_size(fill: str) -> None:
     rng = np.random.default_rng(3)
     sizes = (1, 48, 49, 200, 452, 512, 554, 568, 680, 893, 1072, 1080, 1198, 1206, 1212, 1262)
     for size in (*sizes, 1248, 1280, 2304, 3328, 3392, 4352, 8448, 12608, 16640, 24896):

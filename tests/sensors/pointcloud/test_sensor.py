@@ -63,7 +63,7 @@ def test_packets_tell_which_clouds_they_come_from() -> None:
         )
 
 
-def test_other_packets_are_none_of_ours() -> None:
+def test_other_packets_are_not_recognised() -> None:
     packets, _ = _packets()
     others = [np.zeros_like(packets), packets[:, :20], packets[:, :-8], packets[:0]]
     for at, value in ((0, 0), (4, 2), (5, 9), (6, 0), (6, 3), (7, 9)):
@@ -83,7 +83,7 @@ def test_one_damaged_packet_hides_no_stream() -> None:
     assert CLOUD.fit(_evidence(packets)) == 100
 
 
-def test_streams_are_told_in_words() -> None:
+def test_streams_are_described() -> None:
     packets, _ = _packets()
     words = "lidar points of a PointCloud2, up to 2 points a column in turn"
     assert sensors.describe(packets.shape[1], packets) == words
@@ -95,7 +95,7 @@ def test_streams_are_told_in_words() -> None:
 
 
 @pytest.mark.parametrize("by_ring", [False, True])
-def test_no_maker_takes_our_packets_for_its_own(by_ring: bool) -> None:
+def test_no_vendor_claims_cloud_packets(by_ring: bool) -> None:
     """Lengths may coincide: 1206 and 1248 bytes are no multiples of 8, but others could be."""
     count = 300
     reals = np.ones((4, count), np.float32)

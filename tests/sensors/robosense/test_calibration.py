@@ -80,7 +80,7 @@ def test_angles_that_were_never_written(parts: dict[int, bytes]) -> None:
     assert _difop_angles(parts, BPEARL_V4) is None
 
 
-def test_what_a_device_packet_says() -> None:
+def test_fields_of_a_device_packet() -> None:
     lidar = built_in(_evidence("Helios 32", LAST)).lidar({}, _evidence("Helios 32", LAST))
     assert lidar.serial == "0a1b2c3d4e5f"
     assert lidar.timestamp_mode == "PTP"
@@ -110,7 +110,7 @@ def test_damage_of_one_device_packet_does_no_harm() -> None:
     np.testing.assert_array_equal(lidar.beams.direction, expected.beams.direction)
 
 
-def test_units_behind_one_address_are_told_by_their_ports() -> None:
+def test_units_behind_one_address_are_identified_by_their_ports() -> None:
     spec, other = RobosenseSpec("RS-32"), RobosenseSpec("RS-32", serial="ffffffffffff")
     mine = difop(spec, fan(spec))
     theirs = difop(other, fan(other), parts={24: b"\x1a\x2c\x1a\x2c"})  # 6700
@@ -190,7 +190,7 @@ def test_models_that_could_read_packets_of_another() -> None:
     assert _scores(evidence_of([bytes(12)] * 3)) == {}
 
 
-def test_ruby_and_ruby_plus_are_not_told_apart_silently() -> None:
+def test_ruby_and_ruby_plus_are_not_distinguished_silently() -> None:
     evidence = _evidence("Ruby 80")
     (plus,) = [one for one in robosense.BUILT_IN if one.model == "Ruby Plus 80"]
     for lidar in (built_in(evidence).lidar({}, evidence), plus.lidar({}, evidence)):
@@ -198,7 +198,7 @@ def test_ruby_and_ruby_plus_are_not_told_apart_silently() -> None:
 
 
 @pytest.mark.parametrize("model", ["Ruby 80", "Ruby Plus 80"])
-def test_a_rig_tells_ruby_and_ruby_plus_apart(model: str) -> None:
+def test_a_rig_distinguishes_ruby_and_ruby_plus(model: str) -> None:
     evidence = _evidence("Ruby 80")
     (known,) = [one for one in robosense.BUILT_IN if one.model == model]
     file = robosense.read_calibration(Path("a.csv"), _csv("Ruby 80"))
@@ -222,7 +222,7 @@ def test_the_first_firmware_is_not_decoded_silently() -> None:
     assert built_in(evidence).lidar({}, evidence).notes == ()
 
 
-def test_a_mode_that_nothing_tells() -> None:
+def test_a_mode_that_is_unknown() -> None:
     evidence = evidence_of(_sent(RobosenseSpec("RS-16"))[:1])
     file = robosense.read_calibration(Path("a.csv"), _csv("RS-16"))
     assert file is not None

@@ -1,4 +1,4 @@
-"""The encoder of ROBOSENSE packets, by bytes worked out by hand from facts/robosense.md.
+"""The encoder of ROBOSENSE packets, by bytes worked out by hand from docs/sources/robosense.md.
 
 At 600 rpm the rotor turns 0.0036 degrees in a microsecond. Readings count up from 1 in the order
 (column, return, channel), levels likewise modulo 251.
@@ -151,7 +151,7 @@ def test_times_of_channels(model: str, wanted_us: dict[int, float]) -> None:
     assert found == pytest.approx(wanted_us)
 
 
-def test_a_beam_points_where_the_formula_says() -> None:
+def test_a_beam_points_by_the_formula() -> None:
     """Channel 2 of RS-16: 2.8 us after 90 degrees it is 0.01008 degrees on; 10 degrees up."""
     spec = RobosenseSpec("RS-16", start_deg=90.0)
     angles = Angles(np.full(16, 10.0), np.full(16, 3.0))

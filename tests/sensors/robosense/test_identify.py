@@ -1,4 +1,4 @@
-"""What ROBOSENSE packets are called, by facts/robosense.md sections 1 to 4 and 7."""
+"""What ROBOSENSE packets are called, by docs/sources/robosense.md sections 1 to 4 and 7."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_solid_state_robosense(size: int, model: str) -> None:
     assert named(packets) == f"ROBOSENSE lidar {model}{LACKING}"
 
 
-def test_packets_beside_those_of_robosense() -> None:
+def test_other_packets_of_robosense() -> None:
     assert named(rows([DIFOP])) == "ROBOSENSE DIFOP packet"
     assert named(rows([filled(51, {0: bytes.fromhex("aa555a05")})])) == "ROBOSENSE IMU packet, Airy"
     assert named(rows([filled(1248, {0: FIRST})])) is None
@@ -120,17 +120,17 @@ SIZES = [51, 812, 1200, 1210, 1248, 1268, 1342, 1404, 1448]
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
-def test_random_bytes_are_nobodys(size: int, seed: int, count: int) -> None:
+def test_random_bytes_are_unknown(size: int, seed: int, count: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
     assert robosense.describe(size, noise) is None
 
 
 @pytest.mark.parametrize("fill", [0, 1, 0x55, 0xEE, 0xFE, 0xFF])
-def test_bytes_that_are_all_the_same_are_nobodys(fill: int) -> None:
+def test_bytes_that_are_all_the_same_are_unknown(fill: int) -> None:
     for size in (*SIZES, 10):
         assert robosense.describe(size, np.full((2, size), fill, np.uint8)) is None
 
 
-def test_nothing_is_nobodys() -> None:
+def test_nothing_is_unknown() -> None:
     assert robosense.describe(0, np.zeros((0, 0), np.uint8)) is None
     assert robosense.describe(1248, np.zeros((1, 100), np.uint8)) is None

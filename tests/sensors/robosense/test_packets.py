@@ -47,7 +47,7 @@ def _head(parts: dict[int, bytes], cdeg: int) -> bytes:
 
 
 def test_the_real_head_of_a_bpearl_v4() -> None:
-    """Never synchronised: its clock says 4066 s, which stays as it is."""
+    """Never synchronised: its clock counts from 0, here 4066 s."""
     parts = {0: FIRST, 12: struct.pack(">I", 6062479), 20: struct.pack(">HII", 0, 4066, 355991)}
     packet = _head({**parts, 31: b"\x03\x04"}, 21582)
     after = _head({**parts, 12: struct.pack(">I", 6062480), 31: b"\x03\x04"}, 21822)
@@ -169,7 +169,7 @@ def test_returns_of_128_lines_are_columns_of_one_time(name: str) -> None:
     assert begun_ns.tolist() == [[0, 0, round_ns], [0, round_ns, round_ns]] * 2
 
 
-def test_packets_without_a_count_are_told_by_content() -> None:
+def test_packets_without_a_count_are_identified_by_content() -> None:
     spec = RobosenseSpec("Helios 32")
     evidence = evidence_of(_sent(spec, 4), [difop(spec, fan(spec))])
     lidar = built_in(evidence).lidar({}, evidence)
@@ -177,7 +177,7 @@ def test_packets_without_a_count_are_told_by_content() -> None:
     assert len(set(lidar.sequence(evidence.sample).tolist())) == 4
 
 
-def test_a_bpearl_that_leaves_its_count_at_zero_is_told_by_content() -> None:
+def test_a_bpearl_that_leaves_its_count_at_zero_is_identified_by_content() -> None:
     packets = robosense_packets({0: FIRST, 31: b"\x03\x04"})
     evidence = evidence_of([row.tobytes() for row in packets])
     lidar = built_in(evidence).lidar({}, evidence)
@@ -205,7 +205,7 @@ def test_a_rotor_at_rest_is_no_error() -> None:
     assert steps_ns.max() < 56_600
 
 
-# A block's azimuth is rounded to 0.01 degree; two of them tell the speed of a short packet.
+# A block's azimuth is rounded to 0.01 degree; two of them give the speed of a short packet.
 MOST_DEG = 0.015
 # The time of a packet is cut to whole us, of which its second half of a column knows nothing.
 SPLIT_NS = 1000

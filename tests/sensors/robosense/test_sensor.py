@@ -1,7 +1,7 @@
 """ROBOSENSE points worked out by hand, from packets laid out byte by byte.
 
-Source: facts/robosense.md. Of every model some readings are put where the sheet says that they
-lie; when they fired, where the rotor was by then, and the point follow from the formulas of
+Source: docs/sources/robosense.md. Of every model some readings are put where the sheet says that
+they lie; when they fired, where the rotor was by then, and the point follow from the formulas of
 sections 5 and 6, written out here with the numbers of each case.
 """
 
@@ -89,7 +89,7 @@ def _point(case: Case, probe: Probe, range_m: float) -> tuple[float, float, floa
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.model}, {case.mode}")
-def test_readings_are_where_when_and_what_the_sheet_says(case: Case) -> None:
+def test_readings_are_where_when_and_what_the_manual_states(case: Case) -> None:
     for number, probe in enumerate(case.probes):
         raw, level = 4000 + 37 * number, 200 + number
         packet = _packet(case, {probe.at: struct.pack(">HB", raw, level)})

@@ -88,7 +88,7 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (yaml_of(sixteen()[:15]), "lasers: expected 16, 32, 64, 128 lasers, found 15"),
         (
@@ -151,8 +151,8 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
         (yaml_of(sixteen()).encode() + b"# \xff", "expected UTF-8 text, found the byte 0xff"),
     ],
 )
-def test_broken_yaml(text: str | bytes, told: str) -> None:
-    assert told in fault(text)
+def test_broken_yaml(text: str | bytes, message: str) -> None:
+    assert message in fault(text)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_broken_yaml(text: str | bytes, told: str) -> None:
         "num_lasers: 16\nlaser_id: 3".encode("utf-16"),
     ],
 )
-def test_other_files_are_none_of_ours(content: bytes) -> None:
+def test_other_files_are_not_recognised(content: bytes) -> None:
     assert read_velodyne(PATH, content) is None
 
 
@@ -276,7 +276,7 @@ ENTITIES = '<!DOCTYPE boost_serialization [<!ENTITY a "1111111111"><!ENTITY b "&
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             xml_of(points(64, id_=64)),
@@ -311,5 +311,5 @@ ENTITIES = '<!DOCTYPE boost_serialization [<!ENTITY a "1111111111"><!ENTITY b "&
         (xml_of(points(64)) + " " * MAX_BYTES, "expected at most 1000000 bytes"),
     ],
 )
-def test_broken_xml(text: str, told: str) -> None:
-    assert told in fault(text, XML)
+def test_broken_xml(text: str, message: str) -> None:
+    assert message in fault(text, XML)

@@ -1,4 +1,4 @@
-"""The hour of Velodyne stamps, and what the first packets tell of speeds, by facts/velodyne.md."""
+"""Hour, rotor speed and firing sequence of a Velodyne (docs/sources/velodyne.md)."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class TestHours:
         assert (absolute_ns(true_ns % HOUR_NS, true_ns + error_ns) == true_ns).all()
 
     def test_around_half_an_hour_all_packets_get_one_hour(self) -> None:
-        """The recorder is half an hour ahead, give or take its jitter."""
+        """The capture host is half an hour ahead, give or take its jitter."""
         spec = VelodyneSpec("VLP-16", host_ahead_ns=HALF_NS)
         sent = random_packets(spec, 200)
         jitter_ns = np.random.default_rng(1).integers(-(10**9), 10**9, len(sent.host_ns))
@@ -102,7 +102,7 @@ class TestHours:
             heads = built_in("VLP-16").lidar({}, evidence).heads(sent.payloads, host_ns)
             assert (heads.stamp_ns >= 0).all()
 
-    def test_positions_beat_the_recorder(self) -> None:
+    def test_position_packets_override_receive_times(self) -> None:
         spec = VelodyneSpec("VLP-16", host_ahead_ns=-7 * HOUR_NS - 1234)
         sent = random_packets(spec, 16)
         for valid, hours in ((True, 0), (False, -7)):
@@ -148,7 +148,7 @@ class TestSpeeds:
         stamp_ns = np.rint(np.arange(16) * 165.832).astype(np.int64) * 1000
         assert measured_sequence_ns(stamp_ns, 3) == pytest.approx(55_277, abs=25)
         assert measured_sequence_ns(np.delete(stamp_ns, 5), 3) == pytest.approx(55_277, abs=40)
-        # What comes later is chosen by arrival, and must not count where enough is known.
+        # What comes later is chosen by receive time, and must not count where enough is known.
         more_ns = np.append(stamp_ns, stamp_ns[-1] + np.arange(1, 9) * 166_000)
         assert measured_sequence_ns(more_ns, 3) == measured_sequence_ns(stamp_ns, 3)
         # They are the last resort.

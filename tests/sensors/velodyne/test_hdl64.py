@@ -1,4 +1,4 @@
-"""Points of the HDL-64E against section 10 of facts/velodyne.md, by hand and in a scalar loop."""
+"""Points of the HDL-64E by hand, and in a scalar loop (docs/sources/velodyne.md section 10)."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_beams_fire_while_the_rotor_turns() -> None:
 
 
 def test_points_are_moved_into_the_body_frame() -> None:
-    # Forward becomes left; then 1, 2, 3 m on.
+    # Forward becomes left; then by 1, 2, 3 m.
     pose = np.array([[0, -1.0, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     points = project(unit(Laser(o=0.2)), np.zeros(1), np.full((1, LASERS), 10.0), pose=pose)
     assert points[0, 0] == pytest.approx([1, 12, 3.2], abs=1e-6)

@@ -1,4 +1,4 @@
-"""Names of Velodyne packets and their look-alikes, by facts/velodyne.md and facts/others.md."""
+"""Names of Velodyne packets and their look-alikes (docs/sources/velodyne.md, others.md)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.builders.others import (
     velodyne_packets,
 )
 
-# facts/velodyne.md sections 1 and 2: time between the azimuths of a model, us.
+# docs/sources/velodyne.md sections 1 and 2: time between the azimuths of a model, us.
 VLP_16_US, HDL_32E_US, VLP_32C_US = 110.592, 46.080, 55.296
 # Section 1: models that the sheet has no beams or no layout of.
 REFUSED = {"VLP-32A/B", "Velarray"}
@@ -54,8 +54,8 @@ def test_velodyne(
 
 @pytest.mark.parametrize(("mode", "azimuths"), [(0x37, 12), (0x39, 6)])
 @pytest.mark.parametrize("every", [1, 2, 3])
-def test_a_product_byte_belied_by_the_pace(mode: int, azimuths: int, every: int) -> None:
-    """Though packets are lost: the rotor goes on."""
+def test_a_product_byte_contradicted_by_the_pace(mode: int, azimuths: int, every: int) -> None:
+    """Also if packets are lost."""
     returns = {0x37: "strongest return", 0x39: "dual return"}[mode]
     packets = velodyne_packets(bytes((mode, 0x21)), VLP_16_US, azimuths=azimuths, count=16)[::every]
     assert named(packets) == f"Velodyne lidar VLP-16 (its product byte says HDL-32E), {returns}"
@@ -65,7 +65,7 @@ def test_a_product_byte_belied_by_the_pace(mode: int, azimuths: int, every: int)
     assert named(packets) == f"Velodyne lidar HDL-32E (its product byte says VLP-16), {returns}"
 
 
-def test_one_packet_cannot_belie_its_product_byte() -> None:
+def test_one_packet_cannot_contradict_its_product_byte() -> None:
     packets = velodyne_packets(b"\x37\x21", VLP_16_US, count=1)
     assert named(packets) == "Velodyne lidar HDL-32E, strongest return"
 
@@ -86,7 +86,7 @@ def test_other_factory_bytes_are_named_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("product", [0xA1, 0x63])
-def test_vls_128_is_told_by_its_four_banks(product: int) -> None:
+def test_vls_128_is_identified_by_its_four_banks(product: int) -> None:
     single = velodyne_packets(bytes((0x38, product)), 55.3, (EE, DD, CC, BB) * 3, azimuths=3)
     assert named(single) == "Velodyne lidar VLS-128, last return"
     banks = (EE, EE, DD, DD, CC, CC, BB, BB)
@@ -94,7 +94,7 @@ def test_vls_128_is_told_by_its_four_banks(product: int) -> None:
     assert named(dual) == "Velodyne lidar VLS-128, dual return"
 
 
-def test_hdl_64e_is_told_by_its_two_banks() -> None:
+def test_hdl_64e_is_identified_by_its_two_banks() -> None:
     for azimuths, returns in ((6, "single return"), (3, "dual return")):
         packets = velodyne_packets(b"\0\0", 57.6, (EE, DD) * 6, azimuths=azimuths)
         # Status characters and values, another in every packet.

@@ -73,7 +73,7 @@ class TestEveryModel:
             direction, _ = pointing(seen.lidar, angle)
             assert apart_deg(direction, directions(spec, seen.columns)) < ANGLE_DEG
 
-    def test_what_it_says_of_itself(self, model: str, mode: str) -> None:
+    def test_attributes(self, model: str, mode: str) -> None:
         seen = made_of(VelodyneSpec(model, mode))
         lidar, is_hdl64 = seen.lidar, model.startswith("HDL-64E")
         single = "single return" if is_hdl64 else f"{mode} return"
@@ -194,7 +194,7 @@ def test_a_rig_may_name_what_packets_do_not() -> None:
     files = [one for one in velodyne.BUILT_IN if isinstance(one, ModelFile)]
     named = [one.for_model(one.model) for one in files]
     fits = {one.model: one.fit(evidence(sent)) for one in named if one is not None}
-    # VLP-16 and Puck LITE send the same; the packets say that they are of no Puck Hi-Res.
+    # VLP-16 and Puck LITE send the same; the Puck Hi-Res has its own product byte.
     assert fits == {"VLP-16": 100, **others, "Puck LITE": 100, "Puck Hi-Res": READABLE}
 
 
@@ -208,7 +208,7 @@ def test_models_without_tables_are_never_taken_for_others(product: int) -> None:
     assert "no decoder in this version" in str(velodyne.describe(1206, packets))
 
 
-def test_a_product_byte_belied_by_the_pace_is_told() -> None:
+def test_a_product_byte_contradicted_by_the_pace_is_noted() -> None:
     spec = VelodyneSpec("VLP-16", product=0x21)
     sent = encode(spec, *np.ones((2, 16 * spec.columns_per_packet, 16, 1), np.int64))
     fits = {one.model: one.fit(evidence(sent)) for one in velodyne.BUILT_IN}
@@ -220,7 +220,7 @@ def test_a_product_byte_belied_by_the_pace_is_told() -> None:
     )
 
 
-def test_damaged_packets_are_told() -> None:
+def test_damaged_packets_are_reported() -> None:
     good = made_of(VelodyneSpec("VLP-16", "dual"))
     spoiled = {
         "flag": (300, b"\xff\xdd"),
@@ -364,7 +364,7 @@ def test_a_file_of_no_model() -> None:
         velodyne.read_calibration(Path("odd.yaml"), text.encode())
 
 
-def test_a_hdl_64e_is_an_s3_until_the_rig_says_s2() -> None:
+def test_a_hdl_64e_is_an_s3_until_the_rig_names_s2() -> None:
     read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml("HDL-64E S2").encode())
     assert read is not None
     sent = made_of(VelodyneSpec("HDL-64E S3")).sent
