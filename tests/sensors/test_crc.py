@@ -25,7 +25,7 @@ def test_the_check_value_of_the_catalogue() -> None:
     assert crc64(message).tolist() == [0x995DC9BBDF1939FA]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(8, 200).flatmap(lambda size: st.lists(st.binary(min_size=size, max_size=size))))
 def test_any_messages_equal_the_definition(messages: list[bytes]) -> None:
     if not messages:

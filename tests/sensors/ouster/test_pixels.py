@@ -160,7 +160,7 @@ def combinations() -> list[OusterSpec]:
 @pytest.mark.parametrize(
     "spec", combinations(), ids=lambda spec: f"{spec.profile}-{spec.beams}-{spec.header_type}"
 )
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 2**32), frame=st.integers(0, 2**16 - 1), block=st.integers(0, 62))
 def test_encode_then_decode_is_identity(
     spec: OusterSpec, seed: int, frame: int, block: int

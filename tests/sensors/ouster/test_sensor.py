@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,3 +109,26 @@ def test_encoded_imu_packets_are_named() -> None:
     data = imu_packet(spec, np.arange(1, 5), np.ones((4, 3)), np.ones((4, 3)))
     sample = np.frombuffer(data, np.uint8)
     assert describe(len(data), sample) == f"Ouster IMU, serial 5, {len(data)} bytes"
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        (OusterSpec(profile="LEGACY", beams=64), "Ouster lidar, LEGACY, 64 beams"),
+        (OusterSpec(beams=16, serial=7), "Ouster lidar, serial 7, 1280 bytes: needs its metadata"),
+        (OusterSpec(beams=16, serial=0), "Ouster lidar, 1280 bytes: needs its metadata"),
+    ],
+)
+def test_encoded_lidar_packets_are_named(spec: OusterSpec, text: str) -> None:
+    packets = packets_of(spec)
+    assert describe(packets.shape[1], packets) == text
+    longer = np.hstack([packets, packets[:, :1]])
+    assert describe(longer.shape[1], longer) == text
+
+
+def test_other_ouster_packets_are_named() -> None:
+    zones = np.zeros((2, 680), np.uint8)
+    zones[:, 0] = 3
+    assert describe(680, zones) == "Ouster zone monitor, 680 bytes"
+    sample = struct.pack("<QQQffffff", 1, 2, 3, 0, 0, 1, 0, 0, 0)
+    assert describe(48, np.frombuffer(sample, np.uint8)) == "Ouster IMU"

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mlbatch import sensors
-from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.types import U8Array
 from tests.builders.others import EE, filled, robosense_packets, rows
 
@@ -113,24 +110,3 @@ def test_a_damaged_packet_does_not_hide_a_stream() -> None:
     devices = rows([DIFOP] * 3)
     devices[1, 0] = 0
     assert named(devices) == "ROBOSENSE DIFOP packet"
-
-
-SIZES = [51, 812, 1200, 1210, 1248, 1268, 1342, 1404, 1448]
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
-def test_random_bytes_are_unknown(size: int, seed: int, count: int) -> None:
-    noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
-    assert robosense.describe(size, noise) is None
-
-
-@pytest.mark.parametrize("fill", [0, 1, 0x55, 0xEE, 0xFE, 0xFF])
-def test_bytes_that_are_all_the_same_are_unknown(fill: int) -> None:
-    for size in (*SIZES, 10):
-        assert robosense.describe(size, np.full((2, size), fill, np.uint8)) is None
-
-
-def test_nothing_is_unknown() -> None:
-    assert robosense.describe(0, np.zeros((0, 0), np.uint8)) is None
-    assert robosense.describe(1248, np.zeros((1, 100), np.uint8)) is None
