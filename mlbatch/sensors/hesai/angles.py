@@ -80,8 +80,9 @@ class HesaiAngles:
 class At128File:
     """Angles of an AT128, whose rotor carries mirrors.
 
-    start_rad, end_rad: (3,) range of rotor angles of each mirror; azimuth_rad, elevation_rad:
-    (128,); adjust: (128, 180), added at rotor angles 0, 2, 4 .. 358 deg.
+    start_rad, end_rad: (3,) range of rotor angles of each mirror.
+    azimuth_rad, elevation_rad: (128,).
+    adjust: (128, 180), added at rotor angles 0, 2, 4 .. 358 deg.
     """
 
     path: Path

@@ -68,7 +68,8 @@ _JT16_SIZE = 80
 class Identity:
     """Model and mode of packets of a stream.
 
-    mode: None if unknown; layout: None without a decoder.
+    mode: None if unknown.
+    layout: None without a decoder.
     """
 
     name: str
@@ -80,8 +81,8 @@ class Identity:
 class _Family:
     """Models of a protocol version, distinguished by lasers and blocks.
 
-    name: of models that are not in the list; spins: False for automotive models, which may have a
-    prefix.
+    name: of models that are not in the list.
+    spins: False for automotive models, which may have a prefix.
     """
 
     name: str

@@ -56,8 +56,9 @@ ONLY_RETURN = ReturnMode("single return", 1, (0,))
 class Layout:
     """Packets of a stream according to their headers; offsets count from the end of the prefix.
 
-    size: of the payload, including `prefix` bytes; flags, unit_mm: of the header; fixed: constant
-    bytes of the header by offset.
+    size: of the payload, including `prefix` bytes.
+    flags, unit_mm: of the header.
+    fixed: constant bytes of the header by offset.
     """
 
     model: Model

@@ -36,9 +36,10 @@ _SLOWER = (1, 2, 2, 2)
 class Tail:
     """Offsets in a tail.
 
-    size: without optional fields; rpm_step: rpm of one step of the speed field;
-    loop_at, states_at, operation_at: fields that choose the firing table of columns; has_crc: a CRC
-    over the tail follows the sequence number and the IMU block.
+    size: without optional fields.
+    rpm_step: rpm of one step of the speed field.
+    loop_at, states_at, operation_at: fields that choose the firing table of columns.
+    has_crc: a CRC over the tail follows the sequence number and the IMU block.
     """
 
     size: int
@@ -74,13 +75,17 @@ class Timing:
 class Model:
     """Packets of a model, apart from the values in their headers.
 
-    lead: bytes of a block before its channels; azimuth_at: in the block; ticks: azimuth ticks of a
-    revolution (36000, or more with a third byte); unit: bytes per channel without optional fields;
-    unit_mm_at: header byte of the distance unit (None: 4 mm); has_checks: a CRC of the body before
-    the tail; tail_at: None for after the body and its checks. `firing_ns` has a row for every
-    table, `tables` is the row by operation mode and azimuth state. silent: largest raw distance
-    that means no return. elevation_deg: lowest and highest beam of the data sheet, None: not
-    checked; same_packets_as: the model whose packets equal those of this one.
+    lead: bytes of a block before its channels.
+    azimuth_at: in the block.
+    ticks: azimuth ticks of a revolution (36000, or more with a third byte).
+    unit: bytes per channel without optional fields.
+    unit_mm_at: header byte of the distance unit (None: 4 mm).
+    has_checks: a CRC of the body before the tail.
+    tail_at: None for after the body and its checks. `firing_ns` has a row for every table, `tables`
+        is the row by operation mode and azimuth state.
+    silent: largest raw distance that means no return.
+    elevation_deg: lowest and highest beam of the data sheet, None: not checked.
+    same_packets_as: the model whose packets equal those of this one.
     """
 
     name: str

@@ -68,7 +68,8 @@ _S_PER_NS = 1e-9
 class PacketReader:
     """Decoder of packets of one layout.
 
-    sense: 1 for a clockwise rotor, else -1; follows_rotor: apply rotor motion during a firing;
+    sense: 1 for a clockwise rotor, else -1.
+    follows_rotor: apply rotor motion during a firing.
     checks_crc: check all parts that have a CRC.
     """
 

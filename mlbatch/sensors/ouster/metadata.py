@@ -195,9 +195,11 @@ _U16 = 65535
 class Metadata:
     """A sensor as described by its metadata; lengths in metres, angles in rad, ids 0 if unknown.
 
-    altitude_rad, azimuth_rad: (B,), beam 0 is the top one; beam_offset_m: x and z of the beam
-    origins in the lidar frame; column_window: first and last measurement id sent, first
-    above last if the window spans encoder zero; imu_samples: samples per IMU packet, 0 unknown.
+    altitude_rad, azimuth_rad: (B,), beam 0 is the top one.
+    beam_offset_m: x and z of the beam origins in the lidar frame.
+    column_window: first and last measurement id sent, first above last if the window spans encoder
+        zero.
+    imu_samples: samples per IMU packet, 0 unknown.
     """
 
     path: Path

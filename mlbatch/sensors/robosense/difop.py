@@ -59,7 +59,8 @@ class Angles:
 class Difop:
     """A device packet; mode: DIFOP byte 300; installation: of an Airy (0 normal, 1 side, 2 M).
 
-    firmware: bytes 41 to 43, which are 0 in early units; sync: state in words.
+    firmware: bytes 41 to 43, which are 0 in early units.
+    sync: state in words.
     """
 
     payload: U8Array

@@ -41,8 +41,9 @@ _SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812:
 class Identity:
     """Model of point packets.
 
-    name: in words; model: its row, None without a decoder; other: a model that the type bytes may
-    also stand for.
+    name: in words.
+    model: its row, None without a decoder.
+    other: a model that the type bytes may also stand for.
     """
 
     name: str

@@ -76,8 +76,9 @@ READING = 3  # bytes: distance u16, reflectivity u8
 class Layout:
     """Packet layout: `header` bytes, then `blocks` of four bytes and `per_block` readings.
 
-    mode_at: byte of the return mode (0: none); modes: returns by its values, else `other_modes`
-    (0: unknown); point_at: byte that is 0 in point packets (0: none).
+    mode_at: byte of the return mode (0: none).
+    modes: returns by its values, else `other_modes` (0: unknown).
+    point_at: byte that is 0 in point packets (0: none).
     """
 
     magic: bytes
@@ -128,11 +129,14 @@ class ReturnMode:
 class Model:
     """A model.
 
-    round_ns: column period; firing_ns: of each channel after the begin of its round, several if
-    packets choose; units_per_m: raw distances in a metre; range_mask: their bits;
-    lens_m: radius and height of the lens; nominal_deg: elevations to assume without the unit's;
-    mirrors: azimuths count backwards if the rotor is set to reverse; has_sync: DIFOP bytes 301 and
-    302 are the state of synchronisation.
+    round_ns: column period.
+    firing_ns: of each channel after the begin of its round, several if packets choose.
+    units_per_m: raw distances in a metre.
+    range_mask: their bits.
+    lens_m: radius and height of the lens.
+    nominal_deg: elevations to assume without the unit's.
+    mirrors: azimuths count backwards if the rotor is set to reverse.
+    has_sync: DIFOP bytes 301 and 302 are the state of synchronisation.
     """
 
     name: str

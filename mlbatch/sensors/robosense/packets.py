@@ -36,9 +36,12 @@ _NEIGHBOURS_NS = 5_000_000
 class Shape:
     """Columns of a packet in one return mode.
 
-    rows: groups of blocks with an azimuth; row_blocks: blocks of a row; columns: of a row; records:
-    their offsets; return_step: bytes from return to return within a record; is_split: each return
-    is a separate column.
+    rows: groups of blocks with an azimuth.
+    row_blocks: blocks of a row.
+    columns: of a row.
+    records: their offsets.
+    return_step: bytes from return to return within a record.
+    is_split: each return is a separate column.
     """
 
     rows: int

@@ -43,8 +43,9 @@ _UNIT_REMEDY = "check its unit"
 class VelodyneFile:
     """Corrections of a file; arrays (lasers,) by laser id, 0 if missing.
 
-    unit_m: metres of one distance count, None if missing; azimuth_rad: rot_correction of the file,
-    so that a beam points to (rotor azimuth - azimuth_rad), clockwise from above.
+    unit_m: metres of one distance count, None if missing.
+    azimuth_rad: rot_correction of the file, so that a beam points to (rotor azimuth - azimuth_rad),
+        clockwise from above.
     """
 
     path: Path

@@ -56,8 +56,10 @@ _OLDEST = (VLP_16, HDL_32E)
 class Identity:
     """Model and mode of data packets by their bytes and their pace.
 
-    model: "" if unknown; banks: blocks of a firing sequence; label: remark on factory bytes that
-    are wrong or unset; block_us: time from block to block, None if it was not measured.
+    model: "" if unknown.
+    banks: blocks of a firing sequence.
+    label: remark on factory bytes that are wrong or unset.
+    block_us: time from block to block, None if it was not measured.
     """
 
     model: str

@@ -40,11 +40,14 @@ VLS_128 = "VLS-128"
 class Model:
     """A model.
 
-    reported_as: the model named in packets of this one; banks: blocks of a firing sequence; halves:
-    firing sequences of a block; sequence_ns, slots: length of a firing sequence, and its time
-    slots; slot: (lasers,) time slot of each laser; stamp_ns: first firing minus the packet's stamp;
-    clockwise_deg, elevation_deg, height_mm: of each beam, empty if only a file has them; product:
-    product byte of its packets, None if they have none.
+    reported_as: the model named in packets of this one.
+    banks: blocks of a firing sequence.
+    halves: firing sequences of a block.
+    sequence_ns, slots: length of a firing sequence, and its time slots.
+    slot: (lasers,) time slot of each laser.
+    stamp_ns: first firing minus the packet's stamp.
+    clockwise_deg, elevation_deg, height_mm: of each beam, empty if only a file has them.
+    product: product byte of its packets, None if they have none.
     """
 
     name: str
@@ -84,7 +87,8 @@ class Model:
 class Layout:
     """Columns of the packets of a model in a return mode.
 
-    blocks: of a sequence with all its returns; sequences: groups of blocks with an azimuth each;
+    blocks: of a sequence with all its returns.
+    sequences: groups of blocks with an azimuth each.
     first_byte: [return][bank] of a record.
     """
 

@@ -55,8 +55,10 @@ _MAY_BE_MODE = {
 class Measured:
     """Properties measured from the first packets.
 
-    mode: of returns; sequence_ns: length of a firing sequence; clock_offset_ns: true time minus
-    receive time; speed: of the rotor, 0.01 degree/ns, 0 if unknown.
+    mode: of returns.
+    sequence_ns: length of a firing sequence.
+    clock_offset_ns: true time minus receive time.
+    speed: of the rotor, 0.01 degree/ns, 0 if unknown.
     """
 
     mode: str

@@ -63,7 +63,8 @@ MODELS: tuple[SensorModel, ...] = tuple(
 class VelodyneCalibration:
     """Built-in table of a model, or a file that replaces it; `Calibration` of lidar.py.
 
-    is_guessed: packets and file fit several models; is_named: the rig names this model.
+    is_guessed: packets and file fit several models.
+    is_named: the rig names this model.
     """
 
     __slots__ = ("file", "is_guessed", "is_named", "is_shared", "model", "path", "row", "serial")
