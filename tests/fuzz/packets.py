@@ -34,7 +34,7 @@ from tests.fuzz.framing import Part, joined, mutated_parts, parts_of
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.golden.test_every_model import CASES
-from tests.sensors.velodyne.test_calibration_xml import points, xml_of
+from tests.sensors.velodyne.test_calibration import points, xml_of
 
 # Parts of an input that are no datagrams: a calibration, its name.
 CALIBRATION, _LIDAR_PORT, _DEVICE_PORT = 0, 2368, 7788
