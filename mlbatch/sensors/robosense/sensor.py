@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -106,7 +107,7 @@ class DifopCalibration:
         """Decoder of the sensor, with the angles of its device packets."""
         check_options(options)
         if evidence is None:
-            raise _no_packets(f"{VENDOR} {self.model}")
+            _refuse_without_packets(f"{VENDOR} {self.model}")
         difop = find_difop(evidence)
         angles = None if difop is None else difop.angles(self._row)
         notes: tuple[str, ...] = ()
@@ -166,7 +167,7 @@ class CsvCalibration:
         """Decoder of the sensor, of the model named in its packets."""
         check_options(options)
         if evidence is None:
-            raise _no_packets(f"{self.path}: {self.model}")
+            _refuse_without_packets(f"{self.path}: {self.model}")
         row = self._row(evidence)
         if row is None:
             raise RigError(
@@ -294,8 +295,8 @@ def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:
     return BeamTable(direction, origin, np.zeros(1))
 
 
-def _no_packets(what: str) -> RigError:
-    return RigError(
+def _refuse_without_packets(what: str) -> NoReturn:
+    raise RigError(
         f"{what}: expected packets in the first 10 seconds, which define its return mode, found "
         "none; correct its stream, or leave it out of the rig"
     )
