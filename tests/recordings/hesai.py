@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.readers import open_recording
-from mlbatch.types import F64Array, I64Array, StreamTable, U8Array
-from tests.builders.hesai_decoded import rows
+from mlbatch.types import F64Array, I64Array
 from tests.recordings import RECORDINGS
 from tests.recordings.references import read_pcd, xyz_of
 
@@ -172,14 +170,3 @@ CASES = (
         limits_m=(0.05, 120.0),
     ),
 )
-
-
-def recorded(folder: str) -> U8Array:
-    """All packets of a recording, (P, size)."""
-    (path,) = (one for one in (FOLDER / folder).iterdir() if one.is_dir())
-    payloads = [
-        batch.data[start : start + size].tobytes()
-        for batch in open_recording(path, StreamTable()).packets()
-        for start, size in zip(batch.start.tolist(), batch.size.tolist(), strict=True)
-    ]
-    return rows(payloads)
