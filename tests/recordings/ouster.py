@@ -11,8 +11,9 @@ import dpkt
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.lidar import Beside, Evidence
+from mlbatch.lidar import Evidence
 from mlbatch.types import Stream, U8Array
+from tests.builders.streams import beside
 from tests.recordings import RECORDINGS
 
 OUSTER = RECORDINGS / "ouster"
@@ -129,9 +130,3 @@ def evidence(capture: Path, size: int, source: str = "") -> Evidence:
         np.zeros(len(sample), np.int64),
         tuple(beside(Stream(ip, port), data) for (ip, port, _), (_, _, data) in others.items()),
     )
-
-
-def beside(stream: Stream, payload: bytes) -> Beside:
-    """One packet from the same source."""
-    sample = np.frombuffer(payload, np.uint8)[None]
-    return Beside(stream, len(payload), sample, np.zeros(1, np.int64))

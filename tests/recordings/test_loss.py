@@ -7,19 +7,17 @@ for half of each turn "is normal, not loss".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
-from mlbatch.batching.loss import PacketLoss
-from mlbatch.lidar import Lidar
 from mlbatch.looking import calibrations_for, look
 from mlbatch.matching import match
 from mlbatch.readers import merge, open_recording
 from mlbatch.streams import split_by_kind
-from mlbatch.types import BoolArray, Heads, I64Array, StreamTable
+from mlbatch.types import Heads, StreamTable
+from tests.builders.loss import Came
 from tests.recordings import RECORDINGS
 from tests.recordings.test_clocks import CASES, Case
 
@@ -33,27 +31,6 @@ every_long_case = pytest.mark.parametrize(
     [(maker, case) for maker, case in CASES if case.packets >= FEWEST],
     ids=lambda value: getattr(value, "path", value),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Came:
-    """Packets (P,) of the lidar of a recording, in order of receive time."""
-
-    lidar: Lidar
-    sequence: I64Array
-    heads: Heads
-    host_ns: I64Array
-
-    def counted(self, came: BoolArray | slice = slice(None), size: int = 64) -> tuple[int, int]:
-        """Lost and reordered of those packets, given in batches of `size`."""
-        packet_ns = self.lidar.columns_per_packet * self.lidar.column_period_ns
-        loss = PacketLoss(self.lidar.sequence_modulus, packet_ns)
-        rows = np.arange(len(self.host_ns))[came]
-        for part in np.split(rows, range(size, len(rows), size)):
-            heads = self.heads
-            chosen = Heads(heads.stamp_ns[part], heads.encoder[part], heads.valid[part])
-            loss.add(self.sequence[part], chosen, self.host_ns[part])
-        return loss.lost, loss.reordered
 
 
 @lru_cache(maxsize=2)

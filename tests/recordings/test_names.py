@@ -10,7 +10,7 @@ from mlbatch import sensors
 from mlbatch.readers import open_recording
 from mlbatch.streams import Sampler
 from mlbatch.types import StreamTable
-from tests.builders.naming import named
+from tests.builders.streams import named
 from tests.recordings import RECORDINGS
 
 # By recordings/MANIFEST.md: path, {payload size: description}.

@@ -12,11 +12,11 @@ from mlbatch.sensors import describe, read_calibration
 from mlbatch.sensors.ouster import sensor as ouster
 from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.types import Stream
+from tests.builders.streams import beside
 from tests.recordings.ouster import (
     CASES,
     OUSTER,
     Case,
-    beside,
     datagrams,
     evidence,
 )

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from mlbatch import sensors
 from mlbatch.errors import RigError
 from mlbatch.sensors.ouster.profiles import PROFILES
-from tests.builders.naming import named
 from tests.builders.others import (
     filled,
     livox2_packets,
@@ -21,6 +20,7 @@ from tests.builders.others import (
     velodyne_packets,
 )
 from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
+from tests.builders.streams import named
 
 
 def test_every_model_has_its_own_name_and_a_vendor() -> None:

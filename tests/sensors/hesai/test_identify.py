@@ -7,12 +7,12 @@ import struct
 import pytest
 
 from mlbatch.types import U8Array
-from tests.builders.naming import LACKING, named
 from tests.builders.others import (
     EE,
     filled,
     rows,
 )
+from tests.builders.streams import LACKING, named
 
 
 def hesai(size: int, head: str, mode_at: int = 0, mode: int = 0x37) -> U8Array:

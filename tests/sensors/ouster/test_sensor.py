@@ -17,7 +17,7 @@ from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.sensors.ouster.sensor import read_calibration as read_content
 from mlbatch.types import Stream, U8Array
 from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
-from tests.recordings.ouster import beside
+from tests.builders.streams import beside
 
 
 def calibration_of(spec: OusterSpec) -> OusterCalibration:

@@ -7,7 +7,6 @@ import struct
 import numpy as np
 import pytest
 
-from tests.builders.naming import LACKING, named
 from tests.builders.others import (
     BB,
     CC,
@@ -17,6 +16,7 @@ from tests.builders.others import (
     rows,
     velodyne_packets,
 )
+from tests.builders.streams import LACKING, named
 
 # docs/sources/velodyne.md sections 1 and 2: time between the azimuths of a model, us.
 VLP_16_US, HDL_32E_US, VLP_32C_US = 110.592, 46.080, 55.296

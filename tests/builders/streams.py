@@ -1,9 +1,12 @@
-"""What packets are called, in the tests."""
+"""Names of packets, and packets of neighbouring streams, for tests of all vendors."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from mlbatch.lidar import Beside
 from mlbatch.sensors import plugins
-from mlbatch.types import U8Array
+from mlbatch.types import Stream, U8Array
 
 LACKING = ": no decoder in this version"
 
@@ -13,3 +16,9 @@ def named(packets: U8Array) -> str | None:
     vendors = (plugin for plugin in plugins() if plugin.VENDOR != "Ouster")
     names = (vendor.describe(packets.shape[1], packets) for vendor in vendors)
     return next((name for name in names if name is not None), None)
+
+
+def beside(stream: Stream, payload: bytes) -> Beside:
+    """One packet from the same source."""
+    sample = np.frombuffer(payload, np.uint8)[None]
+    return Beside(stream, len(payload), sample, np.zeros(1, np.int64))
