@@ -19,7 +19,7 @@ def sensors(
     rows: list[dict[str, object]] = [
         {
             "model": model.name,
-            "maker": model.maker,
+            "maker": model.vendor,
             "channels": model.channels,
             "returns": list(model.returns),
             "clock": model.clock,

@@ -435,12 +435,12 @@ def mount(
     rigged: what the rig says of each sensor, None without a rig; metadata_topics: those that gave
     calibrations.
     """
-    makers = Counter(sensor.lidar.maker for sensor in found)
+    makers = Counter(sensor.lidar.vendor for sensor in found)
     frames = {
         sensor.name: candidates(
-            sensor.lidar.maker,
+            sensor.lidar.vendor,
             _places(table, sensor, metadata_topics),
-            alone=makers[sensor.lidar.maker] == 1,
+            alone=makers[sensor.lidar.vendor] == 1,
             sensor_from_lidar=sensor.lidar.sensor_from_lidar,
         )
         for sensor in found

@@ -75,7 +75,7 @@ def _name_all(table: StreamTable, found: Sequence[Found]) -> None:
     """After the namespace of its topics if that tells a place, else maker and serial number."""
     counts: dict[str, int] = {}
     for sensor in found:
-        maker = sensor.lidar.maker.lower()
+        maker = sensor.lidar.vendor.lower()
         counts[maker] = counts.get(maker, 0) + 1
         topic = min((table.streams[stream].topic for stream, _ in sensor.kinds), default="")
         place = "_".join(part for part in namespace(topic) if part not in GENERIC)
@@ -230,7 +230,7 @@ def match_rig(sampler: Sampler, wanted: Sequence[Wanted], origin: Path) -> Match
 
 def is_model(wanted: str, got: str) -> bool:
     """Whether a lidar is of the model that the rig names."""
-    alike = {model.like for model in sensors.models() if model.name == wanted}
+    alike = {model.same_packets_as for model in sensors.models() if model.name == wanted}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
     return got in alike or got.replace("-", "").startswith(wanted.replace("-", ""))
 

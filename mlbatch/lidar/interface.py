@@ -20,17 +20,17 @@ FAULTS = ("", "bad_size", "bad_header", "bad_crc")
 class SensorModel:
     """A row of `mlbatch sensors`: what is supported, and how it was verified.
 
-    like: the model under whose name this one is found, where packets cannot tell them apart.
+    same_packets_as: the model whose packets equal those of this one, under whose name it is found.
     """
 
     name: str
-    maker: str
+    vendor: str
     channels: int
     returns: tuple[int, ...]
     clock: str
     calibration: str
     verified: str
-    like: str = ""
+    same_packets_as: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class Lidar(Protocol):
     `clock_period_ns`: what its stamps leave out and the recorder's clock gave (an hour), or 0.
     """
 
-    maker: str
+    vendor: str
     model: str
     serial: str
     carries_serial: bool

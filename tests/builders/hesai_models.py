@@ -14,7 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.sensors import _hesai_firing as firing
+from mlbatch.sensors.hesai import firing
 
 SEQUENCE, IMU, SAFETY, SIGNATURE, CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10
 # Each adds a byte to the channels of protocol 1.4: confidence, weight factor, ambient light.

@@ -333,7 +333,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata missing": (
         "fix/two_lidars.pcap --metadata none.json",
         1,
-        "none.json: wanted a calibration file, got no such file; check the path",
+        "none.json: expected a calibration file, found no such file; check the path",
     ),
     "metadata is something else": (
         "fix/two_lidars.pcap --metadata fix/rig.yaml",

@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, U8Array
-from mlbatch.sensors._crc import crc64
-from mlbatch.sensors._ouster_imu import (
+from mlbatch.sensors.crc import crc64
+from mlbatch.sensors.ouster.imu import (
     ACCEL32,
     LEGACY_IMU,
     SAMPLE,
     SAMPLES_START,
     imu_size,
 )
-from mlbatch.sensors._ouster_profiles import (
+from mlbatch.sensors.ouster.profiles import (
     COLUMN,
     ENCODER_TICKS,
     FUSA,

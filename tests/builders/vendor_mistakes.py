@@ -84,15 +84,15 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "broken angles beside the recording": (
         "xt16_broken/drive.pcap",
         1,
-        "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, "
-        "strongest return; wanted metadata that fits, got only 16.csv; give the sensor's with "
-        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to "
-        "360 deg, got zero; read the correction file from the lidar again)",
+        "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
+        "return; wanted metadata that fits, got only 16.csv; give the sensor's with --metadata "
+        "FILE (xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to 360 deg, "
+        "found zero; read the correction file from the lidar again)",
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",
         1,
-        "xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to 360 deg, got "
+        "xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to 360 deg, found "
         "zero; read the correction file from the lidar again",
     ),
     "angles of one for two lidars": (
@@ -119,23 +119,22 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "ROBOSENSE without device packets": (
         "helios_bare/drive.pcap",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles "
-        "of its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: expected the angles of "
+        "its channels, found no DIFOP packets; record its device port (7788) as well, or give a "
+        "csv of `elevation,azimuth` lines with --metadata",
     ),
     "ROBOSENSE angles of too few lines": (
         "helios_bare/drive.pcap --metadata files/rs15.csv",
         1,
-        "files/rs15.csv: ROBOSENSE angles: wanted 16, 32, 48, 80, 96 or 128 lines "
-        "`elevation,azimuth`, got 15; give a line for each channel of the sensor",
+        "files/rs15.csv: ROBOSENSE angles: expected 16, 32, 48, 80, 96 or 128 lines "
+        "`elevation,azimuth`, found 15; give a line for each channel of the sensor",
     ),
     "ROBOSENSE angles of another model": (
         "helios_bare/drive.pcap --metadata files/rs32.csv",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles "
-        "of its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata (does not "
-        "fit: rs32.csv)",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: expected the angles of "
+        "its channels, found no DIFOP packets; record its device port (7788) as well, or give a "
+        "csv of `elevation,azimuth` lines with --metadata (does not fit: rs32.csv)",
     ),
     "serial number of another ROBOSENSE": (
         "helios/drive.pcap --rig serial.yaml",
@@ -146,34 +145,34 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "serial number of a ROBOSENSE without device packets": (
         "helios_bare/drive.pcap --rig serial.yaml",
         1,
-        "serial.yaml: sensor top: ROBOSENSE Helios 16: wanted the angles of its channels, got "
-        "no DIFOP packet beside its point packets; record its device port (7788) as well, or "
-        "give a csv of `elevation,azimuth` lines with --metadata",
+        "serial.yaml: sensor top: ROBOSENSE Helios 16: expected the angles of its channels, found "
+        "no DIFOP packets; record its device port (7788) as well, or give a csv of "
+        "`elevation,azimuth` lines with --metadata",
     ),
     "another model of ROBOSENSE": (
         "helios/drive.pcap --rig helios32.yaml",
         1,
-        "helios32.yaml: sensor top: its packets are ROBOSENSE lidar Helios 16, single return, "
-        "not Helios 32, as which they were read: ROBOSENSE Helios 32: wanted the angles of its "
-        "channels, got DIFOP packets without angles beside its point packets; record its device "
-        "port (7788) as well, or give a csv of `elevation,azimuth` lines with --metadata",
+        "helios32.yaml: sensor top: its packets are ROBOSENSE lidar Helios 16, single return, not "
+        "Helios 32, as which they were read: ROBOSENSE Helios 32: expected the angles of its "
+        "channels, found DIFOP packets without angles; record its device port (7788) as well, or "
+        "give a csv of `elevation,azimuth` lines with --metadata",
     ),
     "HDL-64E without its file": (
         "hdl64/drive.pcap",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; "
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: expected its calibration, found none; "
         "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig",
     ),
     "HDL-64E of a rig without its file": (
         "hdl64/drive.pcap --rig any.yaml",
         1,
-        "any.yaml: sensor top: HDL-64E: wanted its calibration, got none; give the unit's YAML "
+        "any.yaml: sensor top: HDL-64E: expected its calibration, found none; give the unit's YAML "
         "or db.xml with --metadata or as `metadata:` in the rig",
     ),
     "HDL-64E with another file": (
         "hdl64/drive.pcap --metadata files/vlp16.yml",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; "
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: expected its calibration, found none; "
         "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (does not "
         "fit: vlp16.yml)",
     ),
@@ -193,8 +192,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "file of a Velodyne that is cut off": (
         "vlp16/drive.pcap --metadata files/cut.yml",
         1,
-        "files/cut.yml: lasers: wanted 16, 32, 64, 128 lasers, got 3 (Velodyne calibration); "
-        "take the maker's file of this sensor",
+        "files/cut.yml: lasers: expected 16, 32, 64, 128 lasers, found 3 (Velodyne calibration); "
+        "use the vendor's file of this sensor",
     ),
     "model in small letters": (
         "vlp16/drive.pcap --rig small.yaml",
@@ -253,22 +252,22 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "silent HESAI": (
         "silent/drive.pcap --rig silent_csv.yaml",
         1,
-        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: wanted packets of the lidar "
-        "in the first 10 seconds, to tell its model and mode, got none; check its stream in the "
-        "rig file, or leave it out",
+        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: expected packets of the lidar "
+        "in the first 10 seconds, which define its model and mode, found none; check its stream in "
+        "the rig file, or leave it out",
     ),
     "silent ROBOSENSE": (
         "silent/drive.pcap --rig silent_helios.yaml",
         1,
-        "silent_helios.yaml: sensor top: ROBOSENSE Helios 16: wanted a packet of it in the "
-        "first 10 seconds to tell its return mode, got none; correct its stream, or leave it "
-        "out of the rig",
+        "silent_helios.yaml: sensor top: ROBOSENSE Helios 16: expected packets in the first 10 "
+        "seconds, which define its return mode, found none; correct its stream, or leave it out of "
+        "the rig",
     ),
     "silent Livox": (
         "silent/drive.pcap --rig silent_livox.yaml",
         1,
-        "silent_livox.yaml: sensor top: Livox SDK2: wanted packets of points in the first 10 "
-        "seconds, to tell their kind, got none; check the sensor's stream in the rig file, or "
+        "silent_livox.yaml: sensor top: Livox SDK2: expected packets of points in the first 10 "
+        "seconds, which define the kind, found none; check the sensor's stream in the rig file, or "
         "leave it out",
     ),
     "decoder option with another value": (
@@ -285,8 +284,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",
         1,
-        "firing.yaml: --decode firing_azimuth=maybe: wanted firing_azimuth=on or "
-        "firing_azimuth=off, got maybe",
+        "firing.yaml: --decode firing_azimuth=maybe: expected firing_azimuth=on or "
+        "firing_azimuth=off, found maybe",
     ),
     "counters 20 minutes apart": (
         "apart/drive.pcap",
@@ -389,7 +388,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata is a folder": (
         "vlp16/drive.pcap --metadata files",
         1,
-        "files: wanted a calibration file, got a directory; check the path",
+        "files: expected a calibration file, found a directory; check the path",
     ),
     "metadata of clouds": (
         "clouds.db3 --rig cloud_csv.yaml",

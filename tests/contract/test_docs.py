@@ -135,7 +135,7 @@ def test_the_table_of_sensors_names_every_model() -> None:
     table = README.partition("<!-- sensors:")[2].partition("<!-- end of sensors")[0]
     for model in models():
         row = next(row for row in _rows(table) if model.name in re.split(r", | \(", row[1]))
-        assert (row[0], row[-1]) == (model.maker, model.verified)
+        assert (row[0], row[-1]) == (model.vendor, model.verified)
         assert f"| {model.verified} | " in README, "say what the word means"
 
 

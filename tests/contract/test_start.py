@@ -38,8 +38,12 @@ def test_the_library_leaves_the_collector_alone() -> None:
 # Makers that are asked after Ouster, containers and messages that are not there, outputs and
 # commands that were not wanted.
 NEEDLESS = (
-    *("mlbatch.sensors.points", "mlbatch.sensors.robosense", "mlbatch.sensors.velodyne"),
-    *("mlbatch.sensors._recognise_robosense", "mlbatch.sensors._recognise_velodyne"),
+    *(
+        "mlbatch.sensors.pointcloud.sensor",
+        "mlbatch.sensors.robosense.sensor",
+        "mlbatch.sensors.velodyne.sensor",
+    ),
+    *("mlbatch.sensors.robosense.identify", "mlbatch.sensors.velodyne.identify"),
     *("mlbatch.readers.mcap", "mlbatch.readers.pcapng", "mlbatch.readers.rosbag1"),
     *("mlbatch.readers._bag", "mlbatch.readers._envelopes", "mlbatch.readers._folder"),
     *("mlbatch.clouds", "mlbatch.faults", "mlbatch.frames.urdf", "mlbatch.discovery.inspect"),

@@ -16,7 +16,7 @@ from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import fixed_joints, joints
 from mlbatch.rig.rig import Rig, StreamSelector, read_rig, write_rig
-from mlbatch.sensors._options import check_options
+from mlbatch.sensors.options import check_options
 from mlbatch.types import StreamTable
 from tests.builders.four_makers import RIG
 from tests.builders.sessions_of_bags import urdf

@@ -17,7 +17,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.report.report import report_text
 from tests.builders import four_makers
 from tests.builders.engines import WANTED, check_conversion, few_kernels, needs_numba
-from tests.builders.run import FIXTURE, RECORDINGS, command, in_memory, prints
+from tests.builders.run import FIXTURE, command, in_memory, prints
 from tests.golden.test_every_model import CASES, Sent, job_of
 
 pytestmark = needs_numba
@@ -26,20 +26,6 @@ MAKERS = Job(
     (four_makers.FOLDER / "four_makers.pcap",),
     Wishes(rig=four_makers.FOLDER / "rig.yaml"),
     keep_partial=True,
-)
-REAL = (
-    "velodyne/vlp16_gps/sample_velodyne_vlp16_gps.pcap",
-    "velodyne/vlp16_ros2_dual/1673400471837873222",
-    "velodyne/vlp32c_ros2/1713492677464078412",
-    "ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10.pcap",
-    "ouster/os0-32_v2.2.0_rng19-dual/OS-0-32-U1_v2.2.0_1024x10.pcap",
-    "ouster/os1-32-g_v2.1.1_legacy/OS-1-32-G_v2.1.1_1024x10.pcap",
-    "ouster/os0-128_windowed",
-    "hesai/pandar40p",
-    "hesai/pandar64",
-    "hesai/pandarqt64",
-    "hesai/pandarxt16",
-    "hesai/pandarxt32",
 )
 
 
@@ -117,14 +103,3 @@ def test_the_report_tells_the_engine(tmp_path: Path) -> None:
     words: list[str | Path] = ["--dry-run", "--engine", "numba", "--report", report]
     assert command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words).code == 0
     assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "numba"
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_recordings(name: str) -> None:
-    path = RECORDINGS / name
-    if not path.exists():
-        pytest.skip(f"no recordings: wanted ../shared/recordings/{name}")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        found = [*path.glob("*.pcap"), *(one.parent for one in path.glob("*/metadata.yaml"))]
-        (path,) = found
-    check_conversion(Job((path,), Wishes(identity_extrinsics=True), keep_partial=True))

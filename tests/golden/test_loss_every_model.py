@@ -21,12 +21,12 @@ from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.hesai_angles import MirrorAngles, angles_csv
+from tests.builders.loss import Came
 from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes
-from tests.golden.test_loss_recordings import Came
 
 # Ten turns a second, and a dark sector is known by a dozen of them.
 LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000
