@@ -121,8 +121,8 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     """Join turns in several ways, and batch the same columns by windows."""
     settings = settings or Settings()
     # Where the sensors sit plays no part; whole turns may reach into the partial windows.
-    wishes = replace(job.wishes, identity_extrinsics=True)
-    run = Conversion(replace(job, wishes=wishes, keep_partial=True))
+    selection = replace(job.selection, identity_extrinsics=True)
+    run = Conversion(replace(job, selection=selection, keep_partial=True))
     sensors, period_ns = [sensor.detected for sensor in run.sensors], int(NS_PER_S / run.grid.rate)
     if len(sensors) < 2:
         raise RecordingError(

@@ -35,7 +35,7 @@ _NO_SUPPORTED = "wanted a supported lidar, got none; see `mlbatch sensors` for t
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class SensorSelection:
     """What the user said of the sensors, besides the rig."""
 
     rig: Path | None = None
@@ -75,40 +75,42 @@ class Setup:
     ignored: set[Kind] = field(default_factory=set)
 
 
-def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes) -> Setup:
+def discover(
+    recordings: Sequence[Recording], table: StreamTable, selection: SensorSelection
+) -> Setup:
     """Find the sensors of a session; errors name what is missing and the ways to give it."""
-    rig = None if wishes.rig is None else read_rig(wishes.rig)
+    rig = None if selection.rig is None else read_rig(selection.rig)
     streams = [] if rig is None else [one.stream for one in rig.sensors if one.stream is not None]
     recordings = with_clouds(recordings, table, {stream.topic for stream in streams} - {""})
     sampler, learner = look(recordings, table)
     paths = [recording.path for recording in recordings]
-    calibrations, files = calibrations_besides(rig, paths, wishes.metadata)
+    calibrations, files = calibrations_besides(rig, paths, selection.metadata)
     recorded = learner.calibrations()
     calibrations += recorded
     looked = [path.name for path in files] + [str(one.path) for one in recorded]
-    if rig is None or wishes.rig is None:
-        matched = match(sampler, calibrations, wishes.decode)
+    if rig is None or selection.rig is None:
+        matched = match(sampler, calibrations, selection.decode)
         rigged: list[RigSensor | None] = [None] * len(matched.sensors)
     else:
         rigged = list(rig.sensors)
-        matched = _find_rigged(sampler, rig, wishes.rig, calibrations, wishes)
+        matched = _find_rigged(sampler, rig, selection.rig, calibrations, selection)
     found = matched.sensors
     lidar_kinds = [kind for kind in matched.unknown if _is_lidar(sampler, kind)]
     if not any(sensor.kinds for sensor in found):
-        files = files or calibrations_for(paths, wishes.metadata)[1]
+        files = files or calibrations_for(paths, selection.metadata)[1]
         looked = [*(path.name for path in files), *(str(one.path) for one in recorded)]
         reason = _nothing_found(sampler, recordings, lidar_kinds, looked, matched.failures)
         faults = [*learner.faults, *filter(None, map(fault_of, files))]
         raise RecordingError(f"{reason}{_hints(recordings, faults)}")
     notes = [] if rig is not None else _unmatched(sampler, lidar_kinds, looked, matched.failures)
-    notes += _unused(found, wishes.metadata)
-    chosen = _choose(found, wishes)
+    notes += _unused(found, selection.metadata)
+    chosen = _choose(found, selection)
     ignored = {kind for sensor in found if sensor not in chosen for kind in sensor.kinds}
     rigged = [entry for entry, sensor in zip(rigged, found, strict=True) if sensor in chosen]
     router = Router(table, chosen, sampler.samples)
     if shared := next(filter(None, (shared_by(sampler, sensor) for sensor in chosen)), ""):
         raise RecordingError(shared)
-    _compare_clocks(sampler, chosen, rigged, wishes)
+    _compare_clocks(sampler, chosen, rigged, selection)
     mounted, mounting = mount(
         table,
         chosen,
@@ -116,7 +118,7 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
         rig,
         learner.knowledge,
         metadata_topics=learner.metadata_topics,
-        identity_extrinsics=wishes.identity_extrinsics,
+        identity_extrinsics=selection.identity_extrinsics,
     )
     for sensor in mounted:
         sensor.offset_ns = rig_offset_ns(sampler, sensor.found, sensor.rig)
@@ -137,7 +139,11 @@ def discover(recordings: Sequence[Recording], table: StreamTable, wishes: Wishes
 
 
 def _find_rigged(
-    sampler: Sampler, rig: Rig, origin: Path, calibrations: Sequence[Calibration], wishes: Wishes
+    sampler: Sampler,
+    rig: Rig,
+    origin: Path,
+    calibrations: Sequence[Calibration],
+    selection: SensorSelection,
 ) -> Matched:
     for sensor in rig.sensors:
         _refuse_undecodable(sampler, sensor, origin)
@@ -147,7 +153,7 @@ def _find_rigged(
             sensor.name,
             sensor.stream or StreamSelector(),
             _of_model(_possible(sensor, calibrations), sensor.model),
-            wishes.decode | sensor.decode,
+            selection.decode | sensor.decode,
             sensor.model,
         )
         for sensor in rig.sensors
@@ -325,14 +331,17 @@ def _known(words: Sequence[str]) -> str:
 
 
 def _compare_clocks(
-    sampler: Sampler, chosen: Sequence[Found], rigged: Sequence[RigSensor | None], wishes: Wishes
+    sampler: Sampler,
+    chosen: Sequence[Found],
+    rigged: Sequence[RigSensor | None],
+    selection: SensorSelection,
 ) -> None:
     """Refuse clocks that cannot be merged before anything else is asked for."""
-    if wishes.aligned:
+    if selection.aligned:
         return
     offsets_ns: list[tuple[str, int | None]] = []
     for sensor, entry in zip(chosen, rigged, strict=True):
-        by_host = wishes.host_clock or (entry is not None and entry.clock == "host")
+        by_host = selection.host_clock or (entry is not None and entry.clock == "host")
         offset_ns = None if by_host else sampler.clock_offset_ns(sensor)
         if offset_ns is not None:
             offset_ns += rig_offset_ns(sampler, sensor, entry)
@@ -361,10 +370,10 @@ def untimed(table: StreamTable, sensor: Found, option: str) -> UsageError | None
     return None
 
 
-def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
+def _choose(found: Sequence[Found], selection: SensorSelection) -> list[Found]:
     """Apply --only and --ignore; both take names and serial numbers."""
     known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
-    for option, words in (("--only", wishes.only), ("--ignore", wishes.ignore)):
+    for option, words in (("--only", selection.only), ("--ignore", selection.ignore)):
         for word in words:
             if word not in known:
                 raise UsageError(
@@ -374,8 +383,8 @@ def _choose(found: Sequence[Found], wishes: Wishes) -> list[Found]:
     chosen = [
         sensor
         for sensor in found
-        if (not wishes.only or {sensor.name, sensor.lidar.serial} & set(wishes.only))
-        and not {sensor.name, sensor.lidar.serial} & set(wishes.ignore)
+        if (not selection.only or {sensor.name, sensor.lidar.serial} & set(selection.only))
+        and not {sensor.name, sensor.lidar.serial} & set(selection.ignore)
     ]
     if not chosen:
         raise UsageError(

@@ -262,7 +262,7 @@ class Conversion:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""
         if self.info is None or self.info.timescale not in ("utc", "tai"):
             return None
-        if self.job.wishes.host_clock:
+        if self.job.selection.host_clock:
             return 0
         offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
         return next(offsets, None)

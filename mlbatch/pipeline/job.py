@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
 from mlbatch.batching.windows import Limit
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import Part
 from mlbatch.types import EXTRAS
@@ -39,7 +39,7 @@ class Job:
     """
 
     recordings: tuple[Path, ...]
-    wishes: Wishes = field(default_factory=Wishes)
+    selection: SensorSelection = field(default_factory=SensorSelection)
     rate: Fraction | None = None
     slices: int = 1
     layout: str = "dense"

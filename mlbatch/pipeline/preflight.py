@@ -68,7 +68,7 @@ def _own_files(output: Path, name: str) -> list[Path]:
 
 def _read_by(job: Job) -> list[Path]:
     """All files that a job names."""
-    return [*job.recordings, *job.wishes.metadata, *filter(None, [job.wishes.rig])]
+    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig])]
 
 
 def disk(job: Job, output: Path) -> None:
@@ -88,12 +88,12 @@ def disk(job: Job, output: Path) -> None:
 
 def _is_limited(job: Job) -> bool:
     """Whether only a part is wanted, so that the output may be as small as one likes."""
-    wishes = job.wishes
+    selection = job.selection
     ranges_m = [job.max_range_m]
-    if wishes.rig is not None:
-        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(wishes.rig).sensors]
+    if selection.rig is not None:
+        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(selection.rig).sensors]
     in_time = job.start is not None or job.end is not None
-    return in_time or min(ranges_m) < math.inf or bool(wishes.only or wishes.ignore)
+    return in_time or min(ranges_m) < math.inf or bool(selection.only or selection.ignore)
 
 
 def report(job: Job, path: Path | None, output: Path | None, name: str) -> None:

@@ -365,7 +365,7 @@ def _boot() -> str:
 
 # Said by the files themselves, by the sensors, or not by options; or outputs do not depend on it.
 _ELSEWHERE = frozenset(
-    {"recordings", "wishes", "part", "extras", "fault_begin_ns", "jobs", "engine"}
+    {"recordings", "selection", "part", "extras", "fault_begin_ns", "jobs", "engine"}
 )
 _DIGITS = 12
 
@@ -405,7 +405,7 @@ def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:
 
 
 def _options(job: Job) -> Iterator[tuple[str, object]]:
-    for holder in (job, job.wishes):
+    for holder in (job, job.selection):
         for one in fields(holder):
             if one.name not in _ELSEWHERE:
                 yield one.name, getattr(holder, one.name)

@@ -52,7 +52,7 @@ class Session:
         use_engine(opened, self.engine)
         if job.part != Part():
             opened = [ClippedRecording(recording, job.part) for recording in opened]
-        self.setup: Setup = discover(opened, streams, job.wishes)
+        self.setup: Setup = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
@@ -81,7 +81,7 @@ class Session:
             index=len(self.sensors),
             detected=found,
             clock=SensorClock(
-                by_host=job.wishes.host_clock or (rig is not None and rig.clock == "host"),
+                by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
                 offset_ns=found.offset_ns,
                 has_receive_times=has_receive_times(sampler.table.untimed, found.found),
                 watch=clock_watch(lidar),
@@ -194,7 +194,7 @@ class Session:
         """Raise RigError if a sensor that the rig requires sent no packet."""
         for sensor in self.sensors:
             if sensor.is_required and not sensor.ledger.packets.read:
-                raise absent(sensor.detected, self.job.wishes.rig)
+                raise absent(sensor.detected, self.job.selection.rig)
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""

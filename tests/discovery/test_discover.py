@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Setup, Wishes, describe, discover
+from mlbatch.discovery.discover import Setup, SensorSelection, describe, discover
 from mlbatch.discovery.probe import calibrations_for, first_seconds, look
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.readers import open_recording
@@ -26,9 +26,9 @@ from tests.builders.sessions import (
 POSE = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -0.25, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def _discover(capture: Path, wishes: Wishes | None = None) -> Setup:
+def _discover(capture: Path, selection: SensorSelection | None = None) -> Setup:
     table = StreamTable()
-    return discover([open_recording(capture, table)], table, wishes or Wishes())
+    return discover([open_recording(capture, table)], table, selection or SensorSelection())
 
 
 def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
@@ -70,15 +70,17 @@ def test_two_lidars_need_extrinsics_or_a_word_that_they_do_not(tmp_path: Path) -
     capture = write_session(tmp_path, known, twin(Unit(), 222))
     with pytest.raises(RigError, match="extrinsics unknown for ouster_222; wanted for every"):
         _discover(capture)
-    setup = _discover(capture, Wishes(identity_extrinsics=True))
+    setup = _discover(capture, SensorSelection(identity_extrinsics=True))
     assert [s.extrinsics_source for s in setup.sensors] == ["metadata", "identity"]
     assert setup.frame_id == "base_link"
     # A single one may do without.
-    assert [s.name for s in _discover(capture, Wishes(only=("222",))).sensors] == ["ouster_222"]
+    assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
+        "ouster_222"
+    ]
 
 
 def test_the_rig_gives_names_order_frame_and_extrinsics(tmp_path: Path) -> None:
-    setup = _discover(FIXTURE / "two_lidars.pcap", Wishes(rig=FIXTURE / "rig.yaml"))
+    setup = _discover(FIXTURE / "two_lidars.pcap", SensorSelection(rig=FIXTURE / "rig.yaml"))
     assert [sensor.name for sensor in setup.sensors] == ["left", "right"]
     assert [sensor.extrinsics_source for sensor in setup.sensors] == ["rig", "rig"]
     assert setup.sensors[0].body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
@@ -90,10 +92,10 @@ def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: P
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
     rig = tmp_path / "rig.yaml"
     rig.write_text("sensors:\n- {name: top, extrinsics: {translation_m: [1, 2, 3]}}\n")
-    (sensor,) = _discover(capture, Wishes(rig=rig)).sensors
+    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
     assert (sensor.extrinsics_source, sensor.body_from_sensor[:3, 3].tolist()) == ("rig", [1, 2, 3])
     rig.write_text("sensors:\n- {name: top}\n")
-    (sensor,) = _discover(capture, Wishes(rig=rig)).sensors
+    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
     assert sensor.extrinsics_source == "metadata"
 
 
@@ -140,12 +142,12 @@ def test_unknown_packets_are_described(tmp_path: Path) -> None:
 
 def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), twin(Unit(), 222))
-    for wishes in (Wishes(only=("222",)), Wishes(ignore=("ouster_111",))):
-        setup = _discover(capture, wishes)
+    for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
+        setup = _discover(capture, selection)
         assert [sensor.name for sensor in setup.sensors] == ["ouster_222"]
         assert len(setup.ignored) == 1
     with pytest.raises(UsageError, match="one of ouster_111, ouster_222, got 'front'"):
-        _discover(capture, Wishes(only=("front",)))
+        _discover(capture, SensorSelection(only=("front",)))
 
 
 def test_what_a_lidar_says_of_itself_becomes_a_note(tmp_path: Path) -> None:
@@ -164,5 +166,5 @@ def test_a_sensor_of_the_rig_that_is_silent_at_first_is_noted(tmp_path: Path) ->
         "\n- {name: rear, stream: {source_ip: 10.0.0.2}, metadata: 111.json, "
         "extrinsics: {translation_m: [0, 0, 0]}}\n"
     )
-    (note,) = _discover(capture, Wishes(rig=rig)).notes
+    (note,) = _discover(capture, SensorSelection(rig=rig)).notes
     assert (note.code, note.sensor) == ("not_seen_yet", "rear")

@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.faults.replay import Fault, parse_fault
 from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
@@ -111,8 +111,8 @@ class Session:
     @property
     def job(self) -> Job:
         """A conversion of it."""
-        wishes = Wishes(rig=self.rig)
-        return Job((Path("memory.pcap"),), wishes, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
+        selection = SensorSelection(rig=self.rig)
+        return Job((Path("memory.pcap"),), selection, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
 
 
 def printed(job: Job) -> Print:
