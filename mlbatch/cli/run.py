@@ -198,7 +198,7 @@ def _tell(conversion: Conversion) -> None:
         typer.echo(
             one_line(
                 f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-                f"extrinsics from {sensor.detected.origin}"
+                f"extrinsics from {sensor.detected.pose.describe()}"
             )
         )
     typer.echo(f"decoded by {conversion.session.engine}")

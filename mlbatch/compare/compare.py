@@ -23,8 +23,7 @@ from mlbatch.compare.sweeps import (
     Way,
     in_order,
 )
-from mlbatch.discovery.discover import Note
-from mlbatch.discovery.extrinsics import Mounted
+from mlbatch.discovery.types import DetectedSensor, Note
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline import accounts
 from mlbatch.pipeline.conversion import Conversion
@@ -183,11 +182,11 @@ def _parts(window: Window, sensors: int) -> TurnSet:
     return tuple(parts)
 
 
-def _cutter(number: int, sensor: Mounted) -> TurnCutter:
-    angles = sensor.found.lidar.beams.angle_rad
+def _cutter(number: int, sensor: DetectedSensor) -> TurnCutter:
+    angles = sensor.lidar.beams.angle_rad
     return TurnCutter(number, None if angles is None else len(angles))
 
 
-def _sensor_turns(sensor: Mounted, lengths_ns: array[int]) -> SensorTurns:
+def _sensor_turns(sensor: DetectedSensor, lengths_ns: array[int]) -> SensorTurns:
     usual = Figures.of(lengths_ns).p50
-    return SensorTurns(sensor.name, sensor.found.lidar.model, len(lengths_ns), usual)
+    return SensorTurns(sensor.name, sensor.lidar.model, len(lengths_ns), usual)

@@ -15,7 +15,7 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
-from mlbatch.discovery.discover import Note
+from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import accounts
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes

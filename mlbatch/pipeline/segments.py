@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.discovery.probe import teaches
+from mlbatch.discovery.probe import is_metadata
 from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
 
 
@@ -87,7 +87,7 @@ class ClippedRecording:
         low, high = self.part.begin_ns, self.part.end_ns
         if high is not None and message.host_ns >= high:
             return False
-        return low is None or message.host_ns >= low or teaches(message.topic)
+        return low is None or message.host_ns >= low or is_metadata(message.topic)
 
     def _leave_out(self, count: int) -> None:
         """Take packets out of the inner counts: what clouds become is counted there as well."""

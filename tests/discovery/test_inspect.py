@@ -98,7 +98,7 @@ def test_a_stream_without_metadata_says_what_is_missing(shell: Shell, tmp_path: 
     assert stream["what"] == "Ouster lidar, serial 111, 1280 bytes: needs its metadata"
     outcome = shell(f"inspect {capture}")
     assert outcome.out.splitlines()[-1] == (
-        "note: no lidar with its metadata; files looked at: none"
+        "note: no lidar with its metadata; files examined: none"
     )
 
 
@@ -163,7 +163,7 @@ def test_no_rig_is_written_of_nothing(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"inspect {capture} --write-rig rig.yaml")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: --write-rig: wanted at least one lidar with its metadata, got none; "
+        "mlbatch: error: --write-rig: expected at least one lidar with its metadata, found none; "
         "give --metadata FILE\n"
     )
     assert not Path("rig.yaml").exists()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mlbatch import sensors
 from mlbatch.cli import options
-from mlbatch.discovery.match import Wanted, match_rig
+from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import fixed_joints, joints
@@ -94,8 +94,8 @@ def _rig(data: bytes, folder: Path) -> None:
 
 def _match(rig: Rig, path: Path) -> None:
     every = sensors.built_in()
-    wanted = [
-        Wanted(
+    expected = [
+        ExpectedSensor(
             one.name,
             one.stream or StreamSelector(),
             [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
@@ -104,7 +104,7 @@ def _match(rig: Rig, path: Path) -> None:
         )
         for one in rig.sensors
     ]
-    match_rig(_sampler(), wanted, path)
+    match_rig(_sampler(), expected, path)
 
 
 def _urdfs() -> Seeds:

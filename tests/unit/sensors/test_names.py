@@ -79,8 +79,8 @@ def test_real_recordings(name: str) -> None:
         pytest.skip("the recordings are not beside the repository")
     sampler = _sampled(RECORDINGS / name)
     found = {
-        kind[1]: sensors.describe(kind[1], sampler.evidence(kind).sample)
-        for kind in sampler.samples
+        kind.size: sensors.describe(kind.size, sampler.evidence(kind).sample)
+        for kind in sampler.kinds
     }
     assert found == REAL[name]
 
@@ -102,7 +102,7 @@ def test_real_packets_of_ouster_are_not_theirs() -> None:
     checked = 0
     for path in sorted((RECORDINGS / "ouster").rglob("*.pcap")):
         sampler = _sampled(path)
-        for kind in sampler.samples:
+        for kind in sampler.kinds:
             sample = sampler.evidence(kind).sample
             assert named(sample) is None
             assert all(named(packet[None]) is None for packet in sample)
