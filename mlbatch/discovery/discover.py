@@ -34,8 +34,8 @@ from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.frames.tree import some
-from mlbatch.lidar.interface import Calibration, ModelFile
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.lidar.interface import Calibration
+from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -208,13 +208,14 @@ def _match(
     for sensor in rig.sensors:
         _refuse_undecodable(sampler, sensor, origin)
         _refuse_unknown_model(sensor, origin)
+    # Built-in calibrations load all vendors, and are not needed where the rig names all files.
     expected = [
         ExpectedSensor(
-            sensor.name,
-            sensor.stream or StreamSelector(),
-            _calibrations_for(sensor, calibrations),
-            selection.decode | sensor.decode,
-            sensor.model,
+            sensor,
+            [*calibrations, *sensors.built_in()]
+            if sensor.metadata is None
+            else [read_given(sensor.metadata)],
+            selection.decode,
         )
         for sensor in rig.sensors
     ]
@@ -223,29 +224,12 @@ def _match(
     except UsageError as err:
         raise RigError(f"{origin}: {err}") from err
     for sensor, detected in zip(rig.sensors, matched.sensors, strict=True):
-        detected.rig = sensor
         if sensor.model is not None and not is_model(sensor.model, detected.lidar.model):
             raise RigError(
                 f"{origin}: sensor {sensor.name}: expected the model {sensor.model}, found "
                 f"metadata of {detected.lidar.model}; correct model or metadata"
             )
     return matched
-
-
-def _calibrations_for(sensor: RigSensor, calibrations: Sequence[Calibration]) -> list[Calibration]:
-    """The calibration that the rig names, else all; files without a model take the rig's."""
-    if sensor.metadata is not None:
-        calibrations = [read_given(sensor.metadata)]
-    else:
-        calibrations = [*calibrations, *sensors.built_in()]
-    if sensor.model is None:
-        return list(calibrations)
-    return [
-        (one.for_model(sensor.model) or one)
-        if one.path is not None and isinstance(one, ModelFile)
-        else one
-        for one in calibrations
-    ]
 
 
 def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:

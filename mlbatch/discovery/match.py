@@ -22,7 +22,7 @@ from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.tree import GENERIC, namespace
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import READABLE, Calibration, Evidence, Lidar, ModelFile
-from mlbatch.rig.rig import StreamSelector
+from mlbatch.rig.rig import RigSensor, StreamSelector
 from mlbatch.types import Heads, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -224,23 +224,39 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedSensor:
-    """A sensor of the rig: its streams, calibrations it may have, model if named."""
+    """A sensor of the rig, and calibrations it may have; options: of the command line."""
 
-    name: str
-    selector: StreamSelector
+    rig: RigSensor
     calibrations: Sequence[Calibration]
-    decode: Mapping[str, str]
-    model: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.rig.name
+
+    @property
+    def selector(self) -> StreamSelector:
+        """Streams it may send on."""
+        return self.rig.stream or StreamSelector()
+
+    @property
+    def decode(self) -> dict[str, str]:
+        """Options of its decoder: the rig's before those of the command line."""
+        return {**self.options, **self.rig.decode}
 
     def usable(self) -> list[Calibration]:
-        """Calibrations of its serial number, as those of its model where they leave that open."""
+        """Calibrations of its serial number; those that leave the model open take the rig's."""
         serial = self.selector.serial
+        usable = [one for one in self.calibrations if not serial or one.serial in ("", serial)]
+        model = self.rig.model
+        if model is None:
+            return usable
         return [
-            (one.for_model(self.model) or one)
-            if self.model == one.model and isinstance(one, ModelFile)
+            (one.for_model(model) or one)
+            if isinstance(one, ModelFile) and (one.path is not None or one.model == model)
             else one
-            for one in self.calibrations
-            if not serial or one.serial in ("", serial)
+            for one in usable
         ]
 
 
@@ -291,13 +307,15 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
         if not expected.selector.selects(sampler.table.streams[kind.stream]):
             continue
         evidence = sampler.evidence(kind)
-        fits, failure = best_fits(evidence, usable, expected.decode, expected.model)
+        fits, failure = best_fits(evidence, usable, expected.decode, expected.rig.model)
         if failure:
             failures.append(failure)
         for fit in fits:
             if serial and fit.lidar.serial != serial:
                 other_serials.add(fit.lidar.serial)
-            elif expected.model is not None and not is_model(expected.model, fit.lidar.model):
+            elif expected.rig.model is not None and not is_model(
+                expected.rig.model, fit.lidar.model
+            ):
                 other_models.add(fit.lidar.model)
             else:
                 known = matches.setdefault(fit.number, _Match(fit, set()))
@@ -320,7 +338,7 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
         )
     if other_models:
         raise RigError(
-            f"{start} expected packets of the model {expected.model}, found those of "
+            f"{start} expected packets of the model {expected.rig.model}, found those of "
             f"{', '.join(sorted(other_models))}; correct model, stream or metadata"
         )
     return None
@@ -342,7 +360,7 @@ def _chosen(
             f"several ({', '.join(models)}) on {', '.join(sorted(streams))}; name its stream "
             "(source_ip, port, topic or serial)"
         )
-    found = DetectedSensor(expected.name, lidar, expected.selector, best.kinds)
+    found = DetectedSensor(expected.name, lidar, expected.selector, best.kinds, rig=expected.rig)
     if best.fit.score == READABLE:
         what = describe(sampler, min(best.kinds)) or "another model"
         found.notes.append(f"read as {lidar.model}, which the rig names; it looks like {what}")
@@ -409,7 +427,7 @@ def _silent(
             f"{start} expected a packet of it{selector} in the first 10 seconds, found none to "
             f"decide {which}; correct its stream, or give {remedy}"
         )
-    return DetectedSensor(expected.name, lidar, expected.selector)
+    return DetectedSensor(expected.name, lidar, expected.selector, rig=expected.rig)
 
 
 def _refuse_other_lidars(
@@ -431,7 +449,7 @@ def _refuse_other_lidars(
     has_serial = lidar is not None and lidar.carries_serial
     if has_stream or (len(own) == 1 and not has_serial):
         is_built_in = any(one.path is None for one in own)
-        which = f"of the model {expected.model}" if is_built_in else f"that match {_paths(own)}"
+        which = f"of the model {expected.rig.model}" if is_built_in else f"that match {_paths(own)}"
         remedy = "correct model, stream or metadata"
         raise RigError(f"{start} packets {which}, found {others}; {remedy}")
 
@@ -442,9 +460,9 @@ def _own_calibrations(expected: ExpectedSensor, used: Collection[str]) -> list[C
     own = [one for one in usable if one.path is not None]
     if len(expected.calibrations) > 1:
         own = [one for one in own if str(one.path) not in used]
-    if expected.model is None:
+    if expected.rig.model is None:
         return own
-    named = [one for one in usable if one.model == expected.model]
+    named = [one for one in usable if one.model == expected.rig.model]
     return [one for one in named if one.path is not None] or named or own
 
 

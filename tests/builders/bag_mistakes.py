@@ -10,8 +10,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "clouds.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
         "the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
-        "read; the first: expected a message of little-endian CDR (00 01 00 00), found 00 00 00 "
-        "00; convert the recording to that encoding)",
+        "read; the first: wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; "
+        "convert the recording to that encoding)",
     ),
     "clouds without times": (
         "timeless.db3",
@@ -19,8 +19,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "timeless.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
         "the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
-        "read; the first: expected the time of each point in a field t, time, timestamp, "
-        "time_stamp, timestamps, offset_time or ts, found x, y, z; record the raw packets, or "
+        "read; the first: wanted the time of each point in a field t, time, timestamp, "
+        "time_stamp, timestamps, offset_time or ts, got x, y, z; record the raw packets, or "
         "clouds with times)",
     ),
     "one of two lidars": (
@@ -91,17 +91,17 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "head.mcap",
         1,
         "head.mcap: no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch "
-        "sensors`), found no UDP packet at all; check that the recording contains the sensor's data "
-        "port (head.mcap: byte 20: the file ends within a record: expected its footer; the rest "
+        "sensors`), found no UDP packet at all; check that the recording contains the sensor's "
+        "data port (head.mcap: byte 20: the file ends within a record: wanted its footer; the rest "
         "was read)",
     ),
     "cut ROS 1 bag": (
         "head.bag",
         1,
         "head.bag: no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch "
-        "sensors`), found no UDP packet at all; check that the recording contains the sensor's data "
-        "port (head.bag: the bag ends within its header, head.bag: byte 13: the bag ends within a "
-        "record; it was cut off)",
+        "sensors`), found no UDP packet at all; check that the recording contains the sensor's "
+        "data port (head.bag: the bag ends within its header, head.bag: byte 13: the bag ends "
+        "within a record; it was cut off)",
     ),
     "cut database": (
         "head.db3",

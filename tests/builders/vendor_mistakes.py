@@ -85,8 +85,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 16.csv; give the sensor's with "
-        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to "
-        "360 deg, found zero; read the correction file from the lidar again)",
+        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to "
+        "360 deg, got zero; read the correction file from the lidar again)",
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",
@@ -252,8 +252,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "silent HESAI": (
         "silent/drive.pcap --rig silent_csv.yaml",
         1,
-        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: expected packets of the lidar "
-        "in the first 10 seconds, to tell its model and mode, found none; check its stream in the "
+        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: wanted packets of the lidar "
+        "in the first 10 seconds, to tell its model and mode, got none; check its stream in the "
         "rig file, or leave it out",
     ),
     "silent ROBOSENSE": (

@@ -15,7 +15,7 @@ from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import fixed_joints, joints
-from mlbatch.rig.rig import Rig, StreamSelector, read_rig, write_rig
+from mlbatch.rig.rig import Rig, read_rig, write_rig
 from mlbatch.sensors._options import check_options
 from mlbatch.types import StreamTable
 from tests.builders.four_makers import RIG
@@ -96,11 +96,7 @@ def _match(rig: Rig, path: Path) -> None:
     every = sensors.built_in()
     expected = [
         ExpectedSensor(
-            one.name,
-            one.stream or StreamSelector(),
-            [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
-            one.decode,
-            one.model,
+            one, [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every
         )
         for one in rig.sensors
     ]
