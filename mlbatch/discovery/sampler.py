@@ -32,7 +32,8 @@ class KindSamples:
     """Samples and counts of one packet kind; times are receive times.
 
     payloads, host_ns: of the packets that were kept; packets: count of all; first_words: of the
-    packets kept for their first word.
+    packets kept for their first word; keep_next: True after the first packet of a quarter of a
+    second.
     """
 
     payloads: list[bytes]
@@ -41,6 +42,7 @@ class KindSamples:
     first_host_ns: int
     last_host_ns: int
     first_words: set[int]
+    keep_next: bool = False
 
     def arrays(self) -> tuple[U8Array, I64Array]:
         """Kept payloads (k, size) and their receive times (k,)."""
@@ -165,8 +167,9 @@ def _rows_to_keep(
     host_ns = batch.host_ns[index]
     last_host_ns = samples.last_host_ns
     tick = np.concatenate([[last_host_ns], host_ns]) // SAMPLE_EVERY_NS
-    keep = tick[1:] != tick[:-1]
-    keep[1:] |= keep[:-1]
+    is_first = tick[1:] != tick[:-1]
+    keep = is_first | np.concatenate([[samples.keep_next], is_first[:-1]])
+    samples.keep_next = bool(is_first[-1])
     keep[: max(SAMPLES_PER_KIND - samples.packets, 0)] = True
     if kind.size >= _WORD_BYTES and len(samples.first_words) < MAX_FIRST_WORDS:
         words = batch.data[batch.start[index, None] + np.arange(_WORD_BYTES)].view("<u4")[:, 0]

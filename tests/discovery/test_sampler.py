@@ -49,9 +49,9 @@ def test_packets_are_split_by_stream_and_size_in_receive_order() -> None:
     }
 
 
-@pytest.mark.parametrize("batch_size", [26, 1000])
+@pytest.mark.parametrize("batch_size", [1, 7, 26, 1000])
 def test_the_first_packets_are_kept_and_two_of_every_quarter_of_a_second(batch_size: int) -> None:
-    """Quarters of the clock of receive times, not from the first packet on."""
+    """Quarters of the clock of receive times, in whatever batches packets come."""
     host_ns = [BEGIN_NS + number * 10 * NS_PER_MS for number in range(100)]
     words = [0] * len(host_ns)
     sampler = _sampled(
