@@ -1,4 +1,4 @@
-"""What is found out about a session before it is converted."""
+"""Sensors of a session: names, poses, metadata, choice, warnings."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ def test_the_frame_of_a_single_lidar(tmp_path: Path, posed: bool, frame: str) ->
     assert _discover(write_session(tmp_path, Unit(spec=spec))).frame_id == frame
 
 
-def test_two_lidars_need_extrinsics_or_a_word_that_they_do_not(tmp_path: Path) -> None:
+def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> None:
     known = Unit(spec=replace(SMALL, extrinsic_m=POSE))
     capture = write_session(tmp_path, known, twin(Unit(), 222))
     with pytest.raises(RigError, match="extrinsics unknown for ouster_222; required for every"):
         _discover(capture)
-    setup = _discover(capture, SensorSelection(identity_extrinsics=True))
-    assert [s.pose.source for s in setup.sensors] == ["metadata", "identity"]
-    assert setup.frame_id == "base_link"
+    found = _discover(capture, SensorSelection(identity_extrinsics=True))
+    assert [s.pose.source for s in found.sensors] == ["metadata", "identity"]
+    assert found.frame_id == "base_link"
     # A single one may do without.
     assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
         "ouster_222"
@@ -81,12 +81,12 @@ def test_two_lidars_need_extrinsics_or_a_word_that_they_do_not(tmp_path: Path) -
 
 
 def test_the_rig_gives_names_order_frame_and_extrinsics(tmp_path: Path) -> None:
-    setup = _discover(FIXTURE / "two_lidars.pcap", SensorSelection(rig=FIXTURE / "rig.yaml"))
-    assert [sensor.name for sensor in setup.sensors] == ["left", "right"]
-    assert [sensor.pose.source for sensor in setup.sensors] == ["rig", "rig"]
-    assert setup.sensors[0].pose.body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
-    assert setup.frame_id == "base_link"
-    assert setup.notes == []
+    found = _discover(FIXTURE / "two_lidars.pcap", SensorSelection(rig=FIXTURE / "rig.yaml"))
+    assert [sensor.name for sensor in found.sensors] == ["left", "right"]
+    assert [sensor.pose.source for sensor in found.sensors] == ["rig", "rig"]
+    assert found.sensors[0].pose.body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
+    assert found.frame_id == "base_link"
+    assert found.notes == []
 
 
 def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: Path) -> None:
@@ -107,9 +107,9 @@ def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) 
         write_metadata(folder / "any name.JSON", replace(SMALL, serial=serial))
         (folder / "notes.txt").write_text("not looked at")
         (folder / "other.json").write_text("[1, 2]")
-    found, looked = find_calibrations([first / "a.pcap", second / "b.pcap", first / "c.pcap"], [])
+    found, examined = find_calibrations([first / "a.pcap", second / "b.pcap", first / "c.pcap"], [])
     assert [calibration.serial for calibration in found] == ["1", "2"]
-    assert len(looked) == 4
+    assert len(examined) == 4
 
 
 def test_given_metadata_must_be_such(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_given_metadata_must_be_such(tmp_path: Path) -> None:
         find_calibrations([tmp_path / "a.pcap"], [other])
 
 
-def test_an_unusable_file_beside_the_recording_is_passed_over(tmp_path: Path) -> None:
+def test_an_unusable_file_in_the_directory_is_skipped(tmp_path: Path) -> None:
     """It was never named by the user; where it is named it is an error."""
     broken = write_metadata(tmp_path / "broken.json", replace(SMALL, altitude_deg=(1.0, 2.0)))
     assert find_calibrations([tmp_path / "a.pcap"], []) == ([], [broken])
@@ -144,14 +144,14 @@ def test_unknown_packets_are_described(tmp_path: Path) -> None:
 def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), twin(Unit(), 222))
     for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
-        setup = _discover(capture, selection)
-        assert [sensor.name for sensor in setup.sensors] == ["ouster_222"]
-        assert len(setup.ignored) == 1
+        found = _discover(capture, selection)
+        assert [sensor.name for sensor in found.sensors] == ["ouster_222"]
+        assert len(found.ignored) == 1
     with pytest.raises(UsageError, match="one of ouster_111, ouster_222, found 'front'"):
         _discover(capture, SensorSelection(only=("front",)))
 
 
-def test_what_a_lidar_says_of_itself_becomes_a_note(tmp_path: Path) -> None:
+def test_warnings_of_a_decoder_become_notes(tmp_path: Path) -> None:
     """Here that its output was off, by the metadata, though packets came."""
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, lidar_port=0)))
     (note,) = _discover(capture).notes
