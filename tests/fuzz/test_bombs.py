@@ -160,7 +160,7 @@ def test_a_gigabyte_beside_the_recording_is_not_read(
         path = _sparse(tmp_path / name, 1 << 30, data)
         found, looked = find_calibrations([tmp_path / "a.pcap"], [])
         assert (found, looked) == ([], [])
-        with pytest.raises(RigError, match="wanted the metadata"):
+        with pytest.raises(RigError, match="expected the metadata"):
             read_given(path)
 
     _sound(_examined(begin, run))
