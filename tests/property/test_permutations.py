@@ -20,7 +20,7 @@ import pytest
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.faults.replay import Fault, parse_fault
-from mlbatch.pipeline import conversion
+from mlbatch.pipeline import session as session_module
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable, Topic
@@ -105,7 +105,7 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(conversion, "open_recording", opened):
+        with patch.object(session_module, "open_recording", opened):
             return printed(replace(self.job, faults=faults))
 
     @property
