@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.decode.kernels import ENGINES
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
@@ -57,7 +57,7 @@ def scans(
     check_ranges_m("min_range", min_range, "max_range", max_range)
     job = Job(
         recordings=tuple(Path(path) for path in recordings),
-        wishes=Wishes(
+        selection=SensorSelection(
             rig=None if rig is None else Path(rig),
             metadata=tuple(Path(path) for path in metadata),
             only=tuple(only),

@@ -40,7 +40,7 @@ def compare(
     from mlbatch.cli import options
     from mlbatch.cli.tables import table_lines
     from mlbatch.compare.compare import Settings, compare
-    from mlbatch.discovery.discover import Wishes
+    from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
     options.choice("--clock", clock, ("sensor", "host"))
@@ -48,8 +48,8 @@ def compare(
         _duration_ns("--tolerance", tolerance),
         _duration_ns("--timeout", timeout),
     )
-    wishes = Wishes(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(tuple(recordings), wishes, rate=None if rate is None else options.rate(rate))
+    selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
+    job = Job(tuple(recordings), selection, rate=None if rate is None else options.rate(rate))
     found = compare(job, settings)
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)

@@ -141,7 +141,7 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.decode.kernels import ENGINES
-    from mlbatch.discovery.discover import Wishes
+    from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
     options.choices(
@@ -157,7 +157,7 @@ def convert(
     first, last, are_dates = options.time_limits(start, end)
     job = Job(
         recordings=tuple(recordings),
-        wishes=Wishes(
+        selection=SensorSelection(
             rig=rig,
             metadata=tuple(metadata or ()),
             only=tuple(only or ()),

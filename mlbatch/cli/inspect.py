@@ -29,9 +29,9 @@ def inspect(
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
     from mlbatch.cli.tables import table_lines
-    from mlbatch.discovery.inspect import survey
+    from mlbatch.discovery.inspect import inspect as inspect_recordings
 
-    found = survey(tuple(recordings), tuple(metadata or ()), whole=whole)
+    found = inspect_recordings(tuple(recordings), tuple(metadata or ()), whole=whole)
     if write_rig is not None:
         from mlbatch.errors import ExportError
         from mlbatch.writers import write_text

@@ -184,7 +184,7 @@ def _print_sensors(conversion: Conversion) -> None:
         typer.echo(
             one_line(
                 f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-                f"extrinsics from {sensor.detected.origin}"
+                f"extrinsics from {sensor.detected.pose.describe()}"
             )
         )
     typer.echo(f"decoded by {conversion.session.engine}")

@@ -23,7 +23,7 @@ from mlbatch.compare.sweeps import (
     SweepSet,
     publication_order,
 )
-from mlbatch.discovery.discover import Note
+from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion
@@ -149,8 +149,8 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     """Join the sweeps of a recording by each policy, and batch the same columns by windows."""
     settings = settings or Settings()
     # Extrinsics are not used. Partial windows are read: sweeps may begin or end in them.
-    wishes = replace(job.wishes, identity_extrinsics=True)
-    run = Conversion(replace(job, wishes=wishes, keep_partial=True))
+    selection = replace(job.selection, identity_extrinsics=True)
+    run = Conversion(replace(job, selection=selection, keep_partial=True))
     count = len(run.sensors)
     if count < 2:
         raise RecordingError(

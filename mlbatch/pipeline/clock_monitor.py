@@ -13,9 +13,9 @@ from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, JumpGuard, extremes
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.watch import ClockEstimate
-from mlbatch.discovery.discover import Note
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import clock_watch
+from mlbatch.discovery.types import Note
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import PacketBatch

@@ -15,7 +15,7 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
-from mlbatch.discovery.discover import Note
+from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes
@@ -262,7 +262,7 @@ class Conversion:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""
         if self.info is None or self.info.timescale not in ("utc", "tai"):
             return None
-        if self.job.wishes.host_clock:
+        if self.job.selection.host_clock:
             return 0
         offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
         return next(offsets, None)

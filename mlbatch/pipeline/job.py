@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
 from mlbatch.batching.windows import Limit
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment
 from mlbatch.types import EXTRAS
@@ -31,7 +31,7 @@ class Job:
     """What to make of which recordings: the options of a conversion."""
 
     recordings: tuple[Path, ...]
-    wishes: Wishes = field(default_factory=Wishes)
+    selection: SensorSelection = field(default_factory=SensorSelection)
     rate: Fraction | None = None  # Hz; None: the rig's, else 10
     slices: int = 1  # sub-scans a window
     layout: str = "dense"  # or organized

@@ -66,7 +66,7 @@ def _own_files(output: Path, name: str) -> list[Path]:
 
 def _read_by(job: Job) -> list[Path]:
     """All files that a job names as input."""
-    return [*job.recordings, *job.wishes.metadata, *filter(None, [job.wishes.rig])]
+    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig])]
 
 
 def check_disk(job: Job, output: Path) -> str:
@@ -86,12 +86,12 @@ def check_disk(job: Job, output: Path) -> str:
 
 def _is_limited(job: Job) -> bool:
     """True if the options can make the output arbitrarily small."""
-    wishes = job.wishes
+    selection = job.selection
     ranges_m = [job.max_range_m]
-    if wishes.rig is not None:
-        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(wishes.rig).sensors]
+    if selection.rig is not None:
+        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(selection.rig).sensors]
     in_time = job.start is not None or job.end is not None
-    return in_time or min(ranges_m) < math.inf or bool(wishes.only or wishes.ignore)
+    return in_time or min(ranges_m) < math.inf or bool(selection.only or selection.ignore)
 
 
 def check_report(job: Job, path: Path | None, output: Path | None, name: str) -> None:

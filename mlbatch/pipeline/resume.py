@@ -47,7 +47,7 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 # Fields of a job that are not part of its identity: digests of files and sensors replace them, or
 # the output does not depend on them.
 _NOT_IDENTITY = frozenset(
-    {"recordings", "wishes", "segment", "extras", "fault_begin_ns", "jobs", "engine"}
+    {"recordings", "selection", "segment", "extras", "fault_begin_ns", "jobs", "engine"}
 )
 _DIGITS = 12
 
@@ -418,7 +418,7 @@ def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:
 
 
 def _options(job: Job) -> Iterator[tuple[str, object]]:
-    for holder in (job, job.wishes):
+    for holder in (job, job.selection):
         for one in fields(holder):
             if one.name not in _NOT_IDENTITY:
                 yield one.name, getattr(holder, one.name)

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import sensors
-from mlbatch.discovery import discover
-from mlbatch.discovery.discover import Note
-from mlbatch.discovery.sampler import Kind
+from mlbatch.discovery.match import describe
+from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
@@ -111,7 +110,7 @@ def final_notes(run: Conversion) -> list[Note]:
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
-    table, seen = run.session.setup.sampler.table, run.session.setup.sampler.samples
+    table, seen = run.session.setup.sampler.table, run.session.setup.sampler.kinds
     for kind in sorted(run.session.ingest.samples):
         what = _what(run, kind)
         # A rig lists the sensors to use; others need no warning.
@@ -199,7 +198,7 @@ def _repeated(run: Conversion) -> int:
 
 def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
     table = run.session.setup.sampler.table
-    kinds = sensor.detected.found.kinds
+    kinds = sensor.detected.kinds
     streams = sorted({str(table.streams[stream]) for stream, _ in kinds})
     return SensorReport(
         name=sensor.name,
@@ -209,7 +208,7 @@ def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
         mode=sensor.lidar.mode,
         ledger=sensor.ledger,
         clock=_clock(run, sensor),
-        extrinsics_source=sensor.detected.origin,
+        extrinsics_source=sensor.detected.pose.describe(),
         body_from_sensor=sensor.body_from_sensor,
         calibration=Path(sensor.lidar.calibration).name,
     )
@@ -248,7 +247,7 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     for kind, count in by_name:
         stream = streams[kind[0]]
         what = _what(run, kind)
-        if kind not in setup.sampler.samples:
+        if kind not in setup.sampler.kinds:
             what = f"not seen in the first 10 s: {what}"
         if kind in setup.ignored:
             what = f"ignored: {what}"
@@ -258,13 +257,13 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     return tuple(rows)
 
 
-def _what(run: Conversion, kind: Kind) -> str:
+def _what(run: Conversion, kind: PacketKind) -> str:
     """Description of unassigned packets: by one of them, else by those sampled by discovery."""
     sample = run.session.ingest.samples.get(kind)
     if sample is not None and (text := sensors.describe(kind[1], sample)):
         return text
-    if kind in run.session.setup.sampler.samples:
-        return discover.describe(run.session.setup.sampler, kind) or "unknown"
+    if kind in run.session.setup.sampler.kinds:
+        return describe(run.session.setup.sampler, kind) or "unknown"
     return "unknown"
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.discovery.probe import teaches
+from mlbatch.discovery.probe import is_metadata
 from mlbatch.types import Message, PacketBatch, Recording, WrappedRecording
 
 
@@ -64,7 +64,7 @@ class ClippedRecording(WrappedRecording):
         low, high = self.segment.begin_ns, self.segment.end_ns
         if high is not None and message.host_ns >= high:
             return False
-        return low is None or message.host_ns >= low or teaches(message.topic)
+        return low is None or message.host_ns >= low or is_metadata(message.topic)
 
     def _leave_out(self, count: int) -> None:
         """Take packets out of the inner counts."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.decode.kernels import ENGINES
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import DecodePool
 from mlbatch.pipeline.job import Job
@@ -129,8 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--packets", type=int, default=20_000, help="packets that are measured")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    wishes = Wishes(rig=options.rig)
-    job = Job((options.recording,), wishes, slices=options.slices, engine=options.engine)
+    selection = SensorSelection(rig=options.rig)
+    job = Job((options.recording,), selection, slices=options.slices, engine=options.engine)
     found = figures(measure(job, options.warm, options.packets))
     if options.json:
         print(json.dumps({name: asdict(one) for name, one in found.items()}))

@@ -7,9 +7,10 @@ DIGEST = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10_digest.json"
 ONE_UNIT = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10"
 PAIR = "R/ouster/two-sensors_same-ports_nonlegacy/same_ports_nonlegacy.pcap"
 NO_LIDAR = (
-    "no lidar packets; wanted raw UDP packets of a supported lidar (see `mlbatch sensors`), got "
+    "no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch sensors`), "
+    "found "
 )
-DATA_PORT = "; check that the recording holds the sensor's data port"
+DATA_PORT = "; check that the recording contains the sensor's data port"
 
 # (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} stands
 # for words of the parser, which differ between its versions, and for lists that grow.
@@ -278,14 +279,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown sensor": (
         f"{FIX} --only front",
         2,
-        "--only: wanted the name or serial number of a sensor, one of left, right, got 'front'; "
-        "choose one",
+        "--only: expected the name or serial number of a sensor, one of left, right, found "
+        "'front'; choose one",
     ),
     "no sensor left": (
         f"{FIX} --ignore left --ignore 122648000456",
         2,
-        "--only/--ignore: wanted at least one sensor to convert, got none that is left; leave one "
-        "of them out",
+        "--only/--ignore: expected at least one sensor to convert, found none that is left; leave "
+        "one of them out",
     ),
     "rig missing": (
         "fix/two_lidars.pcap --rig none.yaml",
@@ -308,14 +309,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "rig sensor of no stream": (
         "fix/two_lidars.pcap --rig fix/astray.yaml",
         1,
-        "fix/astray.yaml: sensor rear: wanted a packet of it (source_ip 10.5.5.99) in the first "
-        "10 seconds, got none to tell its model; correct its stream, or give `metadata:` or "
+        "fix/astray.yaml: sensor rear: expected a packet of it (source_ip 10.5.5.99) in the first "
+        "10 seconds, found none to decide its model; correct its stream, or give `metadata:` or "
         "`model:`",
     ),
     "rig sensor that is silent": (
         "fix/two_lidars.pcap --rig fix/silent.yaml",
         1,
-        "fix/silent.yaml: sensor rear: wanted its packets, got none from source_ip 10.5.5.99; "
+        "fix/silent.yaml: sensor rear: expected its packets, found none from source_ip 10.5.5.99; "
         "correct its stream or serial, or set `optional: true`",
     ),
     "rig sensor without metadata": (
@@ -338,30 +339,29 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata is something else": (
         "fix/two_lidars.pcap --metadata fix/rig.yaml",
         1,
-        "fix/rig.yaml: wanted the metadata or calibration of a lidar, got another kind of file; "
-        "give the file that the sensor's driver or recorder saved",
+        "fix/rig.yaml: expected the metadata or calibration of a lidar, found another kind of "
+        "file; give the file that the sensor's driver or recorder saved",
     ),
     "metadata of another lidar": (
         "bare/drive.pcap --metadata pair/222.json",
         1,
-        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
-        "its metadata; wanted metadata that fits, got only 222.json; give the sensor's with "
-        "--metadata FILE",
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found only 222.json; give the sensor's "
+        "with --metadata FILE",
     ),
     "no metadata": (
         "bare/drive.pcap",
         1,
-        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
-        "its metadata; wanted metadata that fits, got none beside the recording; give the sensor's "
-        "with --metadata FILE",
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found none in the recording's "
+        "directory; give the sensor's with --metadata FILE",
     ),
     "two lidars without extrinsics": (
         "pair/drive.pcap",
         1,
-        "extrinsics unknown for ouster_111, ouster_222; wanted for every sensor when there are two "
-        "or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), "
-        "or "
-        "accept the body origin with --identity-extrinsics",
+        "extrinsics unknown for ouster_111, ouster_222; required for every sensor when there are "
+        "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
+        "extrinsic), or accept the body origin with --identity-extrinsics",
     ),
     "incomparable clocks": (
         "apart/drive.pcap --identity-extrinsics",
@@ -404,7 +404,7 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata is a digest": (
         f"{ONE_UNIT}.pcap --metadata {DIGEST}",
         1,
-        f"{DIGEST}: wanted the metadata or calibration of a lidar, got another kind of file; "
+        f"{DIGEST}: expected the metadata or calibration of a lidar, found another kind of file; "
         "give the file that the sensor's driver or recorder saved",
     ),
     "TCP only": (

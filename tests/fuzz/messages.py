@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.discovery.probe import look, with_clouds
+from mlbatch.discovery.probe import probe, with_clouds
 from mlbatch.frames.tree import Candidate
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.readers.bag.recording import BagRecording, Portion
@@ -144,13 +144,13 @@ def _read(data: bytes, folder: Path) -> None:
 
     bag = BagRecording(folder, "bag", 0, table, portions, topics=(topic,))
     recordings = with_clouds([bag], table, {topic.name})
-    sampler, learner = look(recordings, table)
+    sampler, collector = probe(recordings, table)
     for recording in recordings:
         for batch in recording.packets():
             check_batch(batch, table)
-    calibrations = learner.calibrations()
+    calibrations = collector.calibrations()
     frames = [Candidate("left/os_sensor")]
-    learner.knowledge.mount({"left": frames}, {}, {}, None)
+    collector.extrinsics.resolve({"left": frames}, {}, {}, None)
     decode_samples(sampler, calibrations, random.Random(zlib.crc32(data)))
 
 

@@ -160,7 +160,7 @@ def _seen() -> Sequence[Part]:
 @lru_cache(maxsize=1)
 def _evidence() -> Sequence[Evidence]:
     sampler = sampled(_seen())
-    return [sampler.evidence(kind) for kind in sampler.samples]
+    return [sampler.evidence(kind) for kind in sampler.kinds]
 
 
 def _calibrate(suffix: str, data: bytes, folder: Path) -> None:

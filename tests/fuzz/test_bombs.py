@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from mlbatch.discovery.probe import calibrations_for, read_given
+from mlbatch.discovery.probe import find_calibrations, read_given
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.readers import open_recording
 from mlbatch.rig.rig import read_rig
@@ -158,9 +158,9 @@ def test_a_gigabyte_beside_the_recording_is_not_read(
     def run(data: bytes, folder: Path) -> None:
         (folder / "a.pcap").write_bytes(pcap_bytes([]))
         path = _sparse(tmp_path / name, 1 << 30, data)
-        found, looked = calibrations_for([tmp_path / "a.pcap"], [])
+        found, looked = find_calibrations([tmp_path / "a.pcap"], [])
         assert (found, looked) == ([], [])
-        with pytest.raises(RigError, match="wanted the metadata"):
+        with pytest.raises(RigError, match="expected the metadata"):
             read_given(path)
 
     _sound(_examined(begin, run))

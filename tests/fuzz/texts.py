@@ -11,11 +11,11 @@ from pathlib import Path
 
 from mlbatch import sensors
 from mlbatch.cli import options
-from mlbatch.discovery.match import Wanted, match_rig
+from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import fixed_joints, joints
-from mlbatch.rig.rig import Rig, StreamSelector, read_rig, write_rig
+from mlbatch.rig.rig import Rig, read_rig, write_rig
 from mlbatch.sensors.options import check_options
 from mlbatch.types import StreamTable
 from tests.builders.four_makers import RIG
@@ -94,17 +94,13 @@ def _rig(data: bytes, folder: Path) -> None:
 
 def _match(rig: Rig, path: Path) -> None:
     every = sensors.built_in()
-    wanted = [
-        Wanted(
-            one.name,
-            one.stream or StreamSelector(),
-            [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
-            one.decode,
-            one.model,
+    expected = [
+        ExpectedSensor(
+            one, [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every
         )
         for one in rig.sensors
     ]
-    match_rig(_sampler(), wanted, path)
+    match_rig(_sampler(), expected, path)
 
 
 def _urdfs() -> Seeds:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.report.report import report_text
 from tests.builders import four_makers
@@ -24,7 +24,7 @@ pytestmark = needs_numba
 
 MAKERS = Job(
     (four_makers.FOLDER / "four_makers.pcap",),
-    Wishes(rig=four_makers.FOLDER / "rig.yaml"),
+    SensorSelection(rig=four_makers.FOLDER / "rig.yaml"),
     keep_partial=True,
 )
 
@@ -48,7 +48,7 @@ def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path
     assert cut.box > 0
     assert near.written > 0
     still = {"firing_azimuth": "off"}
-    check_conversion(replace(job, wishes=replace(job.wishes, decode=still)), WANTED[:1])
+    check_conversion(replace(job, selection=replace(job.selection, decode=still)), WANTED[:1])
 
 
 @pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
@@ -84,7 +84,7 @@ def test_outputs_do_not_tell_the_engine(suffix: str, tmp_path: Path) -> None:
     for engine in ("numpy", "numba"):
         target: list[str | Path] = ["-o", tmp_path / f"{engine}.{suffix}"]
         words = [*target, "--engine", engine, "--quiet"]
-        told = command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words)
+        told = command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words)
         assert (told.code, told.err) == (0, "")
     one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "numba"))
     assert one == other
@@ -101,5 +101,5 @@ def test_the_report_tells_the_engine(tmp_path: Path) -> None:
     (recording,) = FIXTURE.recordings
     report = tmp_path / "report.json"
     words: list[str | Path] = ["--dry-run", "--engine", "numba", "--report", report]
-    assert command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words).code == 0
+    assert command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words).code == 0
     assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "numba"

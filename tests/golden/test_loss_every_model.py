@@ -131,7 +131,7 @@ def found(spoken: Spoken) -> Came:
         (sensor,) = match(sampler, calibrations, {}).sensors
         lidar = sensor.lidar
     else:
-        (kind,) = sampler.samples
+        (kind,) = sampler.kinds
         (fit,), _ = best_fits(
             sampler.evidence(kind), [*calibrations, *sensors.built_in()], {}, spoken.model
         )

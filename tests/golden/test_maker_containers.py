@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from tests.builders import hesai, velodyne
 from tests.builders.hesai_angles import angles_csv
@@ -52,8 +52,8 @@ def angles(folder: Path) -> Path:
 
 def job(metadata: Path, *recordings: Path) -> Job:
     """Everything in a session, at 20 Hz."""
-    wishes = Wishes(metadata=(metadata,), identity_extrinsics=True)
-    return Job(recordings, wishes, Fraction(20), keep_partial=True)
+    selection = SensorSelection(metadata=(metadata,), identity_extrinsics=True)
+    return Job(recordings, selection, Fraction(20), keep_partial=True)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mlbatch
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
@@ -25,8 +25,8 @@ CAPTURE = TWO_LIDARS / "two_lidars.pcap"
 RIG = TWO_LIDARS / "rig.yaml"
 
 
-def _job(capture: Path, **wishes: bool) -> Job:
-    return Job((capture,), Wishes(identity_extrinsics=wishes.get("identity", False)))
+def _job(capture: Path, **selection: bool) -> Job:
+    return Job((capture,), SensorSelection(identity_extrinsics=selection.get("identity", False)))
 
 
 def _rig(folder: Path, *clocks: str) -> Path:
@@ -53,7 +53,7 @@ def test_an_offset_of_the_rig_brings_clocks_together(tmp_path: Path) -> None:
     with pytest.raises(ClockError, match=r"37\.000 s apart"):
         in_memory(_job(capture, identity=True))
     rig = _rig(tmp_path, "{source: sensor}", "{offset_s: -37}")
-    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     for scan in result.scans:
         assert scan.columns_per_sensor == (512, 512)
@@ -70,7 +70,7 @@ def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
     )
     capture = write_session(tmp_path, one, uptime)
     rig = _rig(tmp_path, "{source: sensor}", "{source: host}")
-    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     assert [sensor.clock.source for sensor in result.report.sensors] == ["sensor", "host"]
     # The last column of a packet counts as its arrival: 1 ms and a column's 0.195 ms after it was.

@@ -16,7 +16,7 @@ from types import FrameType
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
 from mlbatch.report.report import RunReport, build_report
@@ -67,7 +67,7 @@ JOBS = (
     replace(FIXTURE, rate=Fraction(100, 3), max_wait_ns=None),
     replace(
         FIXTURE,
-        wishes=Wishes(
+        selection=SensorSelection(
             metadata=tuple(TWO_LIDARS / name for name in LIDARS),
             identity_extrinsics=True,
             decode={"crc": "check"},
@@ -299,9 +299,11 @@ def test_damaged_metadata(kind: Damage, seed: int, short: Path, tmp_path: Path) 
     rng = random.Random(f"metadata {kind.__name__} {seed}")
     name = rng.choice(LIDARS)
     rig = set_up(tmp_path, name, kind(rng, (TWO_LIDARS / name).read_text(encoding="utf-8")))
-    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
-    given = Wishes(metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True)
-    outcome(replace(FIXTURE, recordings=(short,), wishes=given))
+    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))
+    given = SensorSelection(
+        metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True
+    )
+    outcome(replace(FIXTURE, recordings=(short,), selection=given))
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -309,4 +311,4 @@ def test_damaged_rigs(seed: int, short: Path, tmp_path: Path) -> None:
     rng = random.Random(f"rig {seed}")
     text = (TWO_LIDARS / RIG).read_text(encoding="utf-8")
     rig = set_up(tmp_path, RIG, damaged_text(rng, text))
-    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
+    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))

@@ -18,9 +18,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.faults import Fault, parse_fault
-from mlbatch.pipeline import conversion
+from mlbatch.pipeline import session as session_module
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable
@@ -100,14 +100,14 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(conversion, "open_recording", opened):
+        with patch.object(session_module, "open_recording", opened):
             return printed(replace(self.job, faults=faults))
 
     @property
     def job(self) -> Job:
         """A conversion of it."""
-        wishes = Wishes(rig=self.rig)
-        return Job((Path("memory.pcap"),), wishes, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
+        selection = SensorSelection(rig=self.rig)
+        return Job((Path("memory.pcap"),), selection, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
 
 
 def printed(job: Job) -> Print:

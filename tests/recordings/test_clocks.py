@@ -17,7 +17,7 @@ from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.clocks.compare import SYNCHRONISED, UNSYNCHRONISED, compare
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.discovery.match import match
-from mlbatch.discovery.probe import calibrations_for, look
+from mlbatch.discovery.probe import find_calibrations, probe
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
 from mlbatch.types import StreamTable
@@ -103,9 +103,9 @@ def estimates(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
         (path,) = path.glob("*.db3")
     table = StreamTable()
     recordings = [open_recording(path, table)]
-    sampler, learner = look(recordings, table)
-    calibrations, _ = calibrations_for([path], ())
-    sensors = match(sampler, [*calibrations, *learner.calibrations()], {}).sensors
+    sampler, collector = probe(recordings, table)
+    calibrations, _ = find_calibrations([path], ())
+    sensors = match(sampler, [*calibrations, *collector.calibrations()], {}).sensors
     watches = {sensor.name: ClockWatch(period_ns=period_ns) for sensor in sensors}
     for batch in merge(recordings):
         for kind, index in split_by_kind(batch):

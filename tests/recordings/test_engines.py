@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from tests.builders.engines import check_conversion
 from tests.recordings import RECORDINGS
@@ -31,4 +31,4 @@ def test_real_recordings(name: str) -> None:
     if path.is_dir() and not (path / "metadata.yaml").exists():
         found = [*path.glob("*.pcap"), *(one.parent for one in path.glob("*/metadata.yaml"))]
         (path,) = found
-    check_conversion(Job((path,), Wishes(identity_extrinsics=True), keep_partial=True))
+    check_conversion(Job((path,), SensorSelection(identity_extrinsics=True), keep_partial=True))

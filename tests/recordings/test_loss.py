@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mlbatch.discovery.match import match
-from mlbatch.discovery.probe import calibrations_for, look
+from mlbatch.discovery.probe import find_calibrations, probe
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
 from mlbatch.types import Heads, StreamTable
@@ -41,14 +41,14 @@ def _read(maker: str, path: str) -> Came:
         (place,) = place.glob("*.db3")
     table = StreamTable()
     recordings = [open_recording(place, table)]
-    sampler, learner = look(recordings, table)
-    calibrations, _ = calibrations_for([place], ())
-    (sensor,) = match(sampler, [*calibrations, *learner.calibrations()], {}).sensors
+    sampler, collector = probe(recordings, table)
+    calibrations, _ = find_calibrations([place], ())
+    (sensor,) = match(sampler, [*calibrations, *collector.calibrations()], {}).sensors
     lidar, payloads, hosts = sensor.lidar, [], []
     for batch in merge(recordings):
         for kind, index in split_by_kind(batch):
             if kind in sensor.kinds:
-                payloads.append(batch.data[batch.start[index, None] + np.arange(kind[1])])
+                payloads.append(batch.data[batch.start[index, None] + np.arange(kind.size)])
                 hosts.append(batch.host_ns[index])
     packets, host_ns = np.concatenate(payloads), np.concatenate(hosts)
     assert (lidar.faults(packets) == 0).all()

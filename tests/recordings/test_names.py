@@ -72,8 +72,7 @@ def _sampled(path: Path) -> Sampler:
 def test_real_recordings(name: str) -> None:
     sampler = _sampled(RECORDINGS / name)
     found = {
-        kind[1]: sensors.describe(kind[1], sampler.evidence(kind).sample)
-        for kind in sampler.samples
+        kind[1]: sensors.describe(kind[1], sampler.evidence(kind).sample) for kind in sampler.kinds
     }
     assert found == REAL[name]
 
@@ -91,7 +90,7 @@ def test_real_packets_of_ouster_are_unknown_to_others() -> None:
     checked = 0
     for path in sorted((RECORDINGS / "ouster").rglob("*.pcap")):
         sampler = _sampled(path)
-        for kind in sampler.samples:
+        for kind in sampler.kinds:
             sample = sampler.evidence(kind).sample
             assert named(sample) is None
             assert all(named(packet[None]) is None for packet in sample)

@@ -45,7 +45,7 @@ def recorded(name: str) -> Recorded:
         rows = (batch.size == 1206).nonzero()[0]
         payloads += [batch.data[at : at + 1206].copy() for at in batch.start[rows].tolist()]
         host_ns += batch.host_ns[rows].tolist()
-    (kind,) = (one for one in sampler.samples if one[1] == 1206)
+    (kind,) = (one for one in sampler.kinds if one[1] == 1206)
     evidence = sampler.evidence(kind)
     return Recorded(evidence, Sent(np.stack(payloads), np.array(host_ns)), lidar_for(evidence))
 

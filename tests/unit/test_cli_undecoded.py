@@ -13,7 +13,7 @@ from tests.builders.sessions import EPOCH_NS, Records, Shell, Unit, write_sessio
 
 WHAT = "ROBOSENSE lidar M1: no decoder in this version"
 WHERE = "10.0.0.8 > port 6699"
-ADVICE = "wanted a supported lidar, got none; see `mlbatch sensors` for those that are"
+ADVICE = "expected a supported lidar, found none; see `mlbatch sensors` for those that are"
 
 
 def _m1() -> Records:

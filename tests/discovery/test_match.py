@@ -1,4 +1,4 @@
-"""Two lidars behind one address are refused; what one lidar's packets may look like is not."""
+"""Several lidars at one address are refused; damage of the packets of one lidar is not."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def one(maker: str) -> Sent:
 
 
 def both(maker: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
-    """Packets of two lidars by arrival, the second ahead in time, and its clock behind that."""
+    """Packets of two lidars in receive order; of the second, sending and clock are ahead."""
     spell = Spell(BEGIN_NS + ahead_ns + clock_ahead_ns, LENGTH_NS, ahead_ns=-clock_ahead_ns)
     mixed = one(maker).then(VENDORS[maker].send(spell))
     return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
@@ -45,14 +45,14 @@ def converted(maker: str, sent: Sent, folder: Path) -> tuple[int, str]:
     ]
     capture = write_pcap(folder / "drive.pcap", frames)
     files: list[str | Path] = ["--metadata", folder / FILES[maker]] if FILES[maker] else []
-    told = command("convert", capture, *files, "--dry-run", "--quiet")
-    return told.code, told.err
+    result = command("convert", capture, *files, "--dry-run", "--quiet")
+    return result.code, result.err
 
 
 @pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
 @pytest.mark.parametrize("maker", VENDORS)
-def test_two_lidars_in_turn_are_refused(maker: str, share: float, tmp_path: Path) -> None:
-    # A third of a turn apart, so that the rotors differ as well.
+def test_two_lidars_that_alternate_are_refused(maker: str, share: float, tmp_path: Path) -> None:
+    # A third of a revolution apart, so that the rotors differ as well.
     ahead_ns = 33 * NS_PER_MS // PACKET_NS[maker] * PACKET_NS[maker]
     code, err = converted(maker, both(maker, ahead_ns + int(share * PACKET_NS[maker])), tmp_path)
     assert code == 1
@@ -67,7 +67,7 @@ def test_two_clocks_are_refused(maker: str, tmp_path: Path) -> None:
 
 
 def repeated(sent: Sent) -> Sent:
-    """As captured at two ports of a bridge: every packet again, three packets later."""
+    """Captured at two ports of a bridge: every packet again, three packets later."""
     late = sent.where(np.arange(len(sent.payloads)))
     late.host_ns[:] += 3 * int(np.median(np.diff(sent.host_ns))) + 10_000
     mixed = sent.then(late)
@@ -75,7 +75,7 @@ def repeated(sent: Sent) -> Sent:
 
 
 def swapped(sent: Sent) -> Sent:
-    """Neighbours change places; arrivals stay."""
+    """Neighbours change places; receive times do not."""
     count = len(sent.payloads) // 2 * 2
     order = np.arange(count).reshape(-1, 2)[:, ::-1].reshape(-1)
     mixed = sent.where(order)
@@ -101,8 +101,8 @@ def test_one_lidar_is_not_refused(maker: str, change: str, tmp_path: Path) -> No
     assert code == 0, err
 
 
-def test_inspect_says_it(tmp_path: Path) -> None:
+def test_inspect_notes_it(tmp_path: Path) -> None:
     converted("velodyne", both("velodyne", 600_000), tmp_path)
-    told = command("inspect", tmp_path / "drive.pcap")
-    assert told.code == 0
-    assert "several lidars share the address" in told.out
+    result = command("inspect", tmp_path / "drive.pcap")
+    assert result.code == 0
+    assert "several lidars share the address" in result.out
