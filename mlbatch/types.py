@@ -109,7 +109,7 @@ class CaptureCounts:
     skipped: dict[str, int] = field(default_factory=dict)
 
     def skip(self, reason: str, count: int = 1) -> None:
-        """Count `count` frames that gave no datagram; reasons are CONTRACT's closed list."""
+        """Count `count` frames that gave no datagram; reasons: `ledger.CAPTURE_REASONS`."""
         if count:
             self.skipped[reason] = self.skipped.get(reason, 0) + count
 

@@ -18,7 +18,7 @@ RAD_PER_DEG = math.pi / 180.0
 STANDARD_GRAVITY = 9.80665
 
 
-# Scan rates as exact rationals: what a user wrote is the number (CONTRACT.md section 1).
+# Scan rates as exact rationals, equal to the number that the user wrote (docs/batching.md).
 
 MIN_RATE_HZ = Fraction(1, 4)
 MAX_RATE_HZ = Fraction(1_000_000)

@@ -213,7 +213,7 @@ class Projector:
         return self._records[: len(place)]
 
     def _type_returns(self, part: Part) -> None:
-        """Numbering of facts/outputs.md section 3, by which of two returns is nearer and stronger.
+        """Numbering of docs/sources/outputs.md section 3, by the nearer and stronger return.
 
         3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: there is only one.
         """

@@ -1,8 +1,8 @@
 """Coordinate frames of a recording: how they hang together, and which of them is a sensor's.
 
-Facts: facts/messages.md section 6 (tf2_msgs/TFMessage, frames of the makers' drivers). An edge maps
-coordinates of its child into its parent. What is wrong with an edge matters only to those who walk
-over it: a recording holds many frames that no lidar needs.
+Facts: docs/sources/messages.md section 6 (tf2_msgs/TFMessage, frames of the makers' drivers). An
+edge maps coordinates of its child into its parent. What is wrong with an edge matters only to those
+who walk over it: a recording holds many frames that no lidar needs.
 """
 
 from __future__ import annotations

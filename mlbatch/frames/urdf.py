@@ -1,9 +1,10 @@
 """Joints of a robot description (URDF), as `robot_description` holds it.
 
-Source: facts/messages.md section 6; ROS URDF/XML specification, elements `joint` and `origin`:
-origin maps the child link's frame into the parent's, xyz in metres, rpy in radians about the fixed
-axes x, y, z, both 0 where absent. Documents come with a recording, so they are not trusted: no
-document types (and thus no entities), no more than 16 MB, and no tree of elements is built.
+Source: docs/sources/messages.md section 6; ROS URDF/XML specification, elements `joint` and
+`origin`: origin maps the child link's frame into the parent's, xyz in metres, rpy in radians about
+the fixed axes x, y, z, both 0 where absent. Documents come with a recording, so they are not
+trusted: no document types (and thus no entities), no more than 16 MB, and no tree of elements is
+built.
 """
 
 from __future__ import annotations

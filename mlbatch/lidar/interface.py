@@ -124,9 +124,9 @@ class Lidar(Protocol):
     count). `pixel_layout`: equal for sensors whose records `read` decodes alike; `pixels`: where
     they lie, None where only `read` knows. `carries_serial`:
     the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
-    numbering of facts/outputs.md section 3 per return; `typed_by`: how those of two returns are
-    told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at all).
-    `column_period_ns`: from column to column where nothing is left out, 0 unknown.
+    numbering of docs/sources/outputs.md section 3 per return; `typed_by`: how those of two returns
+    are told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at
+    all). `column_period_ns`: from column to column where nothing is left out, 0 unknown.
     `sends_twice`: a single return is sent once for each return of the mode. `extrinsics`: (4, 4)
     body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
     driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "";

@@ -1,6 +1,6 @@
 """The rig file: which sensors a vehicle carries, where they sit and how they are told apart.
 
-Format: CONTRACT.md section 5. Every mistake is told with file, line, key path, what was wanted and
+Format: docs/rig.md. Every mistake is told with file, line, key path, what was wanted and
 what was got; all user units are converted here.
 """
 

@@ -1,6 +1,6 @@
 """Single values of a rig file: each function reads one, checks it and converts its units.
 
-Format: CONTRACT.md section 5.
+Format: docs/rig.md.
 """
 
 from __future__ import annotations

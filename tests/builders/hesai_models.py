@@ -1,7 +1,7 @@
 """Layouts of HESAI packets by model, for the encoder.
 
-Source: facts/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times), laid out here once
-more, apart from the decoder; only the firing tables of section 12 are shared. Pandar20:
+Source: docs/sources/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times), laid out here
+once more, apart from the decoder; only the firing tables of section 12 are shared. Pandar20:
 HesaiTechnology/HesaiLidar_General_SDK.
 """
 

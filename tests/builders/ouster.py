@@ -1,7 +1,8 @@
 """Encoder of Ouster packets and metadata: what a sensor would send, from plain values.
 
-Source: facts/ouster.md sections 1-3 and 8. Encoding is the inverse of decoding; where fields lie is
-taken from the tables of the decoder, which the tests check bit by bit and on real recordings.
+Source: docs/sources/ouster.md sections 1-3 and 8. Encoding is the inverse of decoding; where fields
+lie is taken from the tables of the decoder, which the tests check bit by bit and on real
+recordings.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def print_of(scan: Scan) -> Values:
 
 
 def prints(result: Result) -> list[Values]:
-    """All that identity covers (CONTRACT.md section 1), of a run in memory."""
+    """All that identity covers, of a run in memory."""
     assert result.memory is not None
     assert result.memory.summary is not None
     table = csv_without_arrival(result.memory.summary.scans_csv)

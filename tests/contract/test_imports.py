@@ -10,15 +10,15 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 
 # From top to bottom: a package imports from its own modules and from lower floors.
 FLOORS: tuple[tuple[str, ...], ...] = (
-    ("cli", "__main__"),
-    ("api",),
-    ("compare", "bench"),
+    ("__main__",),
+    ("cli",),
+    ("api", "compare", "bench"),
     ("pipeline",),
     ("discovery",),
     ("readers", "sensors", "writers", "verify", "faults"),
     ("decode", "batching"),
     ("report", "rig", "clocks"),
-    ("lidar", "frames", "ros", "clouds", "_cloud_messages", "_cloud_packets", "_cloud_times"),
+    ("lidar", "frames", "ros"),
     ("types",),
     ("arrays", "units"),
     # "": the package itself, with its version; it loads the rest on demand.
@@ -83,8 +83,13 @@ def test_vendors_know_nothing_of_each_other(module: Module) -> None:
 
 
 def test_no_module_is_private() -> None:
-    """A module that only one other imports is a part of that one."""
-    assert [name for name in sorted(NAMES) if re.search(r"(?:^|\.)_(?!_main__)", name)] == []
+    """A module that only one other imports is a part of that one.
+
+    The kernels keep their names: a native engine is to replace them.
+    """
+    private = re.compile(r"(?:^|\.)_(?!_main__)")
+    found = [name for name in NAMES if private.search(name) and "kernels" not in name]
+    assert sorted(found) == []
 
 
 def test_the_root_has_seven_modules() -> None:

@@ -165,7 +165,7 @@ def test_points_lie_by_column_then_channel(tmp_path: Path) -> None:
 
 
 def test_two_returns_share_a_ring_and_say_which_is_nearer(tmp_path: Path) -> None:
-    """Numbering of facts/outputs.md section 3; the strongest comes first."""
+    """Numbering of docs/sources/outputs.md section 3; the strongest comes first."""
     strong = _ranges(c0_b0=1000, c0_b1=5000, c0_b2=3000)
     weak = _ranges(c0_b0=4000, c0_b1=2000)
     bench = Bench(tmp_path, DUAL, {"RANGE": strong, "RANGE2": weak})
