@@ -33,7 +33,8 @@ from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import merge, open_recording
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector
+from mlbatch.rig.write import write_rig
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 

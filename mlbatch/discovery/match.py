@@ -17,7 +17,7 @@ from mlbatch import sensors
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
 from mlbatch.discovery.sampler import Found, Kind, Sampler, as_rows
 from mlbatch.errors import RecordingError, RigError
-from mlbatch.frames.tree import GENERIC, namespace
+from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import READABLE, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import StreamSelector

@@ -13,7 +13,7 @@ from mlbatch import readers, sensors
 from mlbatch.discovery.extrinsics import Knowledge
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
-from mlbatch.frames.tree import nearest_topic
+from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import holds_packets, merge
 from mlbatch.rig.rig import Rig

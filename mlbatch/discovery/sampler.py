@@ -15,7 +15,7 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.frames.tree import same_namespace
+from mlbatch.frames.naming import same_namespace
 from mlbatch.lidar.interface import Beside, Evidence, Lidar
 from mlbatch.rig.rig import StreamSelector
 from mlbatch.types import PacketBatch, Stream, StreamTable

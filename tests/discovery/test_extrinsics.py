@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from mlbatch.arrays import F64Array
 from mlbatch.discovery.extrinsics import Knowledge, Mounting, Stated
 from mlbatch.errors import RigError
+from mlbatch.frames.naming import Candidate, candidates
 from mlbatch.frames.transforms import compose, from_rpy_deg, quaternion
-from mlbatch.frames.tree import Candidate, candidates
 
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # An Ouster's lidar frame: turned by half a turn about z, 36 mm above its sensor frame.

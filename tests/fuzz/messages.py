@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.discovery.probe import look, with_clouds
-from mlbatch.frames.tree import Candidate
+from mlbatch.frames.naming import Candidate
 from mlbatch.readers._bag import BagRecording, Portion
 from mlbatch.readers._definitions import definition_text
 from mlbatch.readers._packet_types import PACKET_TYPES

@@ -15,7 +15,8 @@ from mlbatch.discovery.match import Wanted, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import fixed_joints, joints
-from mlbatch.rig.rig import Rig, StreamSelector, read_rig, write_rig
+from mlbatch.rig.rig import Rig, StreamSelector, read_rig
+from mlbatch.rig.write import write_rig
 from mlbatch.sensors._options import check_options
 from mlbatch.types import StreamTable
 from tests.builders.four_makers import RIG
