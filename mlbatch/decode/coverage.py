@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.decode.scan_buffer import Due
+from mlbatch.decode.scan_buffer import WindowColumns
 from mlbatch.lidar.geometry import SECTORS, sectors
 
 
 @dataclass(frozen=True, slots=True)
-class Outline:
+class ColumnStats:
     """The columns of a sensor in a scan, but for its points; shares are those of Scan."""
 
     columns: int
@@ -22,17 +22,17 @@ class Outline:
     overlap: float
 
 
-NO_COLUMNS = Outline(0, 0, 0.0, 0.0)
+NO_COLUMNS = ColumnStats(0, 0, 0.0, 0.0)
 
 
-class Outliner:
+class ColumnStatistics:
     """Tells the outlines of scans, by passes of numpy."""
 
     def __init__(self, positions: Sequence[int | None]) -> None:
         """positions: rotor positions of a turn of each sensor; None: rotor words."""
         self._positions = positions
 
-    def outlines(self, due: Due) -> list[Outline]:
+    def measure(self, due: WindowColumns) -> list[ColumnStats]:
         """Of each sensor."""
         if len(self._positions) == 1:
             return [_outline(due.stamp_ns, due.encoder, self._positions[0])]
@@ -46,7 +46,7 @@ class Outliner:
         ]
 
 
-def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> Outline:
+def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> ColumnStats:
     """Of the columns of one sensor, (n,) each; positions: see `sectors`."""
     if not len(stamp_ns):
         return NO_COLUMNS
@@ -57,4 +57,4 @@ def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> Ou
     passes = np.bincount(entered, minlength=SECTORS)
     passes[sector[0]] += 1
     once, again = np.count_nonzero(passes), np.count_nonzero(passes > 1)
-    return Outline(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)
+    return ColumnStats(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)

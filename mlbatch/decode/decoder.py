@@ -14,21 +14,21 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import F64Array, U8Array
-from mlbatch.decode.coverage import NO_COLUMNS, Outline, Outliner
-from mlbatch.decode.numpy_engine import Tiles
+from mlbatch.decode.coverage import NO_COLUMNS, ColumnStatistics, ColumnStats
+from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
-from mlbatch.decode.scan_buffer import Buffer, Due
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import EXTRAS, RunInfo, Scan
 
-__all__ = ["Decoder", "Due", "Label", "Source"]
+__all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
 # What became of the slots of every sensor of a run, in the order of `ledger.POINT_FATES`.
-Fates: TypeAlias = Sequence[Sequence[int]]
+PointOutcomes: TypeAlias = Sequence[Sequence[int]]
 
 
 @dataclass(frozen=True, slots=True)
-class Label:
+class ScanHeader:
     """What a scan says of itself; see Scan."""
 
     index: int
@@ -84,15 +84,15 @@ class Decoder:
         wide = self._slots if self._organized else 0
         if engine == "numba":
             # Loaded only here, as what it needs may not be there.
-            from mlbatch.decode.numba_engine import CompiledOutliner, Kinds
+            from mlbatch.decode.numba_engine import CompiledColumnStatistics, NumbaEngine
 
-            self._outliner: Outliner = CompiledOutliner(positions)
-            self._kinds: Tiles | Kinds = Kinds(
+            self._outliner: ColumnStatistics = CompiledColumnStatistics(positions)
+            self._kinds: NumpyEngine | NumbaEngine = NumbaEngine(
                 self._projectors, self._seat, columns, first, shown, wide
             )
         else:
-            self._outliner = Outliner(positions)
-            self._kinds = Tiles(self._projectors, self._seat, columns, first, shown)
+            self._outliner = ColumnStatistics(positions)
+            self._kinds = NumpyEngine(self._projectors, self._seat, columns, first, shown)
         self._buffer = self._new_buffer(0)
         self._others = deque(self._new_buffer(0) for _ in range(buffers - 1))
 
@@ -101,26 +101,28 @@ class Decoder:
         """The ledger of pixels of each sensor."""
         return [self._projectors[which].counts[member] for which, member in self._seat]
 
-    def scan(self, due: Due, label: Label, fates: Fates | None = None) -> Scan:
+    def scan(
+        self, due: WindowColumns, label: ScanHeader, outcomes: PointOutcomes | None = None
+    ) -> Scan:
         """Decode the columns of one window; the arrays are valid until as many calls as buffers.
 
-        fates: given where an output already holds the points; their arrays then mean nothing.
+        outcomes: given where an output already holds the points; their arrays then mean nothing.
         """
-        if fates is not None:
-            return self._outline(due, label, fates)
+        if outcomes is not None:
+            return self._outline(due, label, outcomes)
         self._others.append(self._buffer)
         self._buffer = self._others.popleft()
         self._fit(len(due))
         points = self._kinds.decode(due, label.start_ns, 0, self._buffer)
         return self._scan(due, label, points)
 
-    def _outline(self, due: Due, label: Label, fates: Fates) -> Scan:
+    def _outline(self, due: WindowColumns, label: ScanHeader, outcomes: PointOutcomes) -> Scan:
         """All of a scan but its points; organized, its arrays have their shapes."""
         if self._organized:
             self._fit(len(due))
         counts = self.counts
         before = sum(one.written for one in counts)
-        own = fates if self._only is None else fates[self._only : self._only + 1]
+        own = outcomes if self._only is None else outcomes[self._only : self._only + 1]
         for one, numbers in zip(counts, own, strict=True):
             one.add(numbers)
         points = sum(one.written for one in counts) - before
@@ -131,16 +133,16 @@ class Decoder:
         if rows > self._buffer.rows:
             self._buffer = self._new_buffer(rows)
 
-    def _new_buffer(self, rows: int) -> Buffer:
-        return Buffer(rows, self._slots if self._organized else None)
+    def _new_buffer(self, rows: int) -> ScanBuffer:
+        return ScanBuffer(rows, self._slots if self._organized else None)
 
-    def _lidar_id(self, due: Due, columns: slice) -> U8Array:
+    def _lidar_id(self, due: WindowColumns, columns: slice) -> U8Array:
         sensor = due.sensor[columns]
         if self._only is not None:
             return np.full(len(sensor), self._only, np.uint8)
         return sensor.astype(np.uint8)
 
-    def _scan(self, due: Due, label: Label, points: int) -> Scan:
+    def _scan(self, due: WindowColumns, label: ScanHeader, points: int) -> Scan:
         rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
         lidar_id = self._lidar_id(due, slice(None))
         own = self._outlines(due)
@@ -171,9 +173,9 @@ class Decoder:
             overlap=tuple(one.overlap for one in own),
         )
 
-    def _outlines(self, due: Due) -> list[Outline]:
+    def _outlines(self, due: WindowColumns) -> list[ColumnStats]:
         """What the columns of each sensor are."""
-        outlines = self._outliner.outlines(due)
+        outlines = self._outliner.measure(due)
         if self._only is None:
             return outlines
         nothing = [NO_COLUMNS] * (len(self._info.sensors) - 1)

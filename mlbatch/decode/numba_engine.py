@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, I64Array
-from mlbatch.decode.coverage import Outline, Outliner
+from mlbatch.decode.coverage import ColumnStatistics, ColumnStats
 from mlbatch.decode.kernels import frame as at
 from mlbatch.decode.kernels.native import has_features, load
-from mlbatch.decode.numpy_engine import Tiles
+from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector
-from mlbatch.decode.scan_buffer import Buffer, Due
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 from mlbatch.lidar.geometry import SECTORS, Tabled, Turning, rotor_angles
 from mlbatch.lidar.interface import Lidar
 from mlbatch.lidar.pixel_table import Bits, PixelTable
@@ -33,7 +33,7 @@ _RELAY_SOURCE, _PARTS_SOURCE = (
 )
 
 
-class CompiledKind:
+class SensorGroup:
     """Sensors of one kind, from raw columns to points in their final rows."""
 
     def __init__(
@@ -67,7 +67,7 @@ class CompiledKind:
         self._counts = np.zeros((len(self._ledgers), 5), np.int64)
         self._tables.set(at.COUNTS, self._counts)
 
-    def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
+    def decode(self, due: WindowColumns, start_ns: int, first: int, out: ScanBuffer) -> int:
         """Decode those of the columns that are of this kind, from the buffer's first row on.
 
         first: number of the first column. Gives the number of points.
@@ -77,7 +77,7 @@ class CompiledKind:
         self.account()
         return count
 
-    def prepare(self, due: Due, start_ns: int, first: int, out: Buffer) -> None:
+    def prepare(self, due: WindowColumns, start_ns: int, first: int, out: ScanBuffer) -> None:
         """What the kernel needs for `decode` goes into its frame."""
         tables = self._tables
         tables.set_numbers({at.BEGIN: 0, at.END: len(due), at.ROW: 0, at.NUMBER: 0})
@@ -96,7 +96,7 @@ class CompiledKind:
         _put_outputs(tables, out, self._extras)
         self._counts[:] = 0
 
-    def _aim(self, due: Due) -> None:
+    def _aim(self, due: WindowColumns) -> None:
         if not self._turns:
             return
         own = due.encoder
@@ -137,17 +137,17 @@ def compiled_angles(words: I64Array) -> tuple[F32Array, F32Array]:
     return cosine, sine
 
 
-class CopiedKind:
-    """Sensors of one kind that numpy decodes, where others have kernels: as CompiledKind."""
+class NumpyGroup:
+    """Sensors of one kind that numpy decodes, where others have kernels: as SensorGroup."""
 
     def __init__(
-        self, tiles: Tiles, slots: int, columns: int, sensors: int, extras: Extras
+        self, tiles: NumpyEngine, slots: int, columns: int, sensors: int, extras: Extras
     ) -> None:
         """slots: of a column; columns: the most that are decoded at once; sensors: of the rig."""
         self.kernel = load(_PARTS_SOURCE)
         self._tiles = tiles
         self._extras = extras
-        self._part = part = Buffer(columns * slots, None)
+        self._part = part = ScanBuffer(columns * slots, None)
         self._points = np.zeros(columns, np.int64)
         self._tables = Tables(at.SIZE)
         self.frame = self._tables.frame
@@ -162,7 +162,7 @@ class CopiedKind:
         ):
             self._tables.set(place, values)
 
-    def prepare(self, due: Due, start_ns: int, first: int, out: Buffer) -> None:
+    def prepare(self, due: WindowColumns, start_ns: int, first: int, out: ScanBuffer) -> None:
         """Decode the columns of the kind; what has to be copied goes into the kernel's frame."""
         self._tiles.decode(due, start_ns, first, self._part, self._points[: len(due)])
         self._tables.set_numbers({at.NUMBER: 0, at.FIRST_NUMBER: first})
@@ -173,11 +173,11 @@ class CopiedKind:
         """Nothing: numpy keeps ledgers of its own."""
 
 
-class Relay:
+class GroupInterleaver:
     """Decodes dense scans of several kinds of sensors, whose kernels take turns."""
 
     def __init__(
-        self, kinds: Sequence[CompiledKind | CopiedKind], kind: I64Array, most: int | None
+        self, kinds: Sequence[SensorGroup | NumpyGroup], kind: I64Array, most: int | None
     ) -> None:
         """kind: (sensors,) of each; most: columns that are decoded at once, None for all."""
         self._kinds = kinds
@@ -188,8 +188,8 @@ class Relay:
         self._tables.set(at.RELAY_KIND, kind)
         self._tables.set(at.RELAY_KERNELS, np.array(addresses, np.int64))
 
-    def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
-        """As `CompiledKind.decode`, of all sensors."""
+    def decode(self, due: WindowColumns, start_ns: int, first: int, out: ScanBuffer) -> int:
+        """As `SensorGroup.decode`, of all sensors."""
         tables, row, most = self._tables, 0, self._most or max(len(due), 1)
         for begin in range(0, len(due), most):
             some = due.part(slice(begin, begin + most))
@@ -203,8 +203,8 @@ class Relay:
         return row
 
 
-class Kinds:
-    """All kinds of sensors of a rig, as `tiles.Tiles`; numpy decodes what has no kernel."""
+class NumbaEngine:
+    """All kinds of sensors of a rig, as `tiles.NumpyEngine`; numpy decodes what has no kernel."""
 
     def __init__(
         self,
@@ -215,11 +215,11 @@ class Kinds:
         extras: Extras,
         wide: int,
     ) -> None:
-        """wide: see CompiledKind; all else as of Tiles."""
-        self._kinds: list[CompiledKind | Tiles] = []
-        self._relay: Relay | None = None
+        """wide: see SensorGroup; all else as of NumpyEngine."""
+        self._kinds: list[SensorGroup | NumpyEngine] = []
+        self._relay: GroupInterleaver | None = None
         if not any(is_compiled(projector) for projector in projectors):
-            self._kinds = [Tiles(projectors, seat, columns, first_sensor, extras)]
+            self._kinds = [NumpyEngine(projectors, seat, columns, first_sensor, extras)]
             return
         kind, slots = np.empty(len(seat), np.int64), []
         for number, group in enumerate(_alike(projectors)):
@@ -228,22 +228,22 @@ class Kinds:
             kind[member >= 0] = number
             slots.append(alike[0].slots)
             if is_compiled(alike[0]):
-                self._kinds.append(CompiledKind(alike, member, extras, wide))
+                self._kinds.append(SensorGroup(alike, member, extras, wide))
             else:
                 own = np.stack([np.minimum(member, 0), member], axis=1)
-                self._kinds.append(Tiles(alike, own, columns, first_sensor, extras))
+                self._kinds.append(NumpyEngine(alike, own, columns, first_sensor, extras))
         if len(self._kinds) > 1 and not wide:
             parts = [
-                CopiedKind(one, count, columns, len(seat), extras)
-                if isinstance(one, Tiles)
+                NumpyGroup(one, count, columns, len(seat), extras)
+                if isinstance(one, NumpyEngine)
                 else one
                 for one, count in zip(self._kinds, slots, strict=True)
             ]
-            has_copies = any(isinstance(part, CopiedKind) for part in parts)
-            self._relay = Relay(parts, kind, columns if has_copies else None)
+            has_copies = any(isinstance(part, NumpyGroup) for part in parts)
+            self._relay = GroupInterleaver(parts, kind, columns if has_copies else None)
 
-    def decode(self, due: Due, start_ns: int, first: int, out: Buffer) -> int:
-        """As `CompiledKind.decode`, of all sensors."""
+    def decode(self, due: WindowColumns, start_ns: int, first: int, out: ScanBuffer) -> int:
+        """As `SensorGroup.decode`, of all sensors."""
         if self._relay is not None:
             return self._relay.decode(due, start_ns, first, out)
         return sum(kind.decode(due, start_ns, first, out) for kind in self._kinds)
@@ -278,7 +278,7 @@ def _places(pieces: Sequence[AnyArray]) -> I64Array:
     )
 
 
-def _put_outputs(tables: Tables, out: Buffer, extras: Extras) -> None:
+def _put_outputs(tables: Tables, out: ScanBuffer, extras: Extras) -> None:
     """Where points go; rows of organized scans are always whole."""
     tables.set(at.POINT, out.point)
     tables.set(at.LABEL, out.label)
@@ -384,7 +384,7 @@ def likeness(projector: Projector) -> Hashable:
 
 
 def described(projectors: Sequence[Projector], table: PixelTable, wide: int) -> Tables:
-    """All that stays the same from window to window; wide: see `compiled.CompiledKind`.
+    """All that stays the same from window to window; wide: see `compiled.SensorGroup`.
 
     projectors: as many as are alike.
     """
@@ -524,7 +524,7 @@ def _wide(values: F32Array, pad: int) -> F32Array:
 _SOURCE = "mlbatch.decode.kernels._outline_source"
 
 
-class CompiledOutliner(Outliner):
+class CompiledColumnStatistics(ColumnStatistics):
     """The same; numpy tells where a position lies beyond the turn."""
 
     def __init__(self, positions: Sequence[int | None]) -> None:
@@ -540,7 +540,7 @@ class CompiledOutliner(Outliner):
         ):
             tables.set(place, values)
 
-    def outlines(self, due: Due) -> list[Outline]:
+    def measure(self, due: WindowColumns) -> list[ColumnStats]:
         """Of each sensor."""
         self._tables.set_numbers({at.OUTLINED: len(due)})
         for place, values in (
@@ -550,8 +550,8 @@ class CompiledOutliner(Outliner):
         ):
             self._tables.set(place, np.asarray(values, np.int64))
         if self._kernel(self._tables.frame):
-            return super().outlines(due)
+            return super().measure(due)
         return [
-            Outline(columns, gap_ns, once / SECTORS, again / SECTORS)
+            ColumnStats(columns, gap_ns, once / SECTORS, again / SECTORS)
             for columns, gap_ns, once, again, *_ in self._figures.tolist()
         ]

@@ -13,25 +13,25 @@ from itertools import pairwise
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.decode.projector import Extras, Part, Projector, Tile, wanted_points
-from mlbatch.decode.scan_buffer import Buffer, Due
+from mlbatch.decode.projector import Extras, Projector, Tile, TileView, wanted_points
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 
 
 @dataclass(slots=True)
-class _Laid:
+class _TilePart:
     """Columns of a tile that are decoded together.
 
     rows: in the scan's order; begin: first element in the tile's planes; encoder: of each.
     """
 
     projector: Projector
-    part: Part
+    part: TileView
     rows: I64Array
     begin: int
     encoder: I64Array
 
 
-class Tiles:
+class NumpyEngine:
     """Decodes the columns of some kinds of sensors; those of others are passed over."""
 
     def __init__(
@@ -66,9 +66,14 @@ class Tiles:
         self._is_alone = seats == 1
 
     def decode(
-        self, due: Due, start_ns: int, first: int, out: Buffer, points: I64Array | None = None
+        self,
+        due: WindowColumns,
+        start_ns: int,
+        first: int,
+        out: ScanBuffer,
+        points: I64Array | None = None,
     ) -> int:
-        """As `compiled.CompiledKind.decode`."""
+        """As `compiled.SensorGroup.decode`."""
         count = 0
         # Of equal size, since what a small one costs is mostly its calls.
         tiles = max(1, -(-len(due) // self._columns))
@@ -95,7 +100,7 @@ class Tiles:
             count += len(index)
         return count
 
-    def _project(self, due: Due, start_ns: int) -> list[_Laid]:
+    def _project(self, due: WindowColumns, start_ns: int) -> list[_TilePart]:
         """Decode the columns of one tile, sensor by sensor."""
         seat = self._seat[due.sensor]
         rows = self._element[: len(due)]
@@ -103,7 +108,7 @@ class Tiles:
             rows = seat.argsort(kind="stable")
             due, seat = due.part(rows), seat[rows]
         member, offset_ns = self._member[seat], due.stamp_ns - start_ns
-        laid: list[_Laid] = []
+        laid: list[_TilePart] = []
         element = begin = 0
         ends = np.searchsorted(seat, self._ends).tolist()
         for projector, end in zip(self._projectors, ends, strict=True):
@@ -113,12 +118,12 @@ class Tiles:
             part = self._tile.part(element, end - begin, projector.slots)
             encoder = due.encoder[own]
             projector.project(member[own], due.place[own], encoder, offset_ns[own], part)
-            laid.append(_Laid(projector, part, rows[own], element, encoder))
+            laid.append(_TilePart(projector, part, rows[own], element, encoder))
             element += (end - begin) * projector.slots
             begin = end
         return laid
 
-    def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, BoolArray]:
+    def _index(self, laid: Sequence[_TilePart], columns: int) -> tuple[I64Array, BoolArray]:
         """Elements of the tile's planes in the order of the scan; wanted slots (columns, slots)."""
         if len(laid) == 1:
             return self._index_one(laid[0])
@@ -140,7 +145,7 @@ class Tiles:
         index += shift.repeat(wanted_points(wide))
         return index if elements is None else elements.take(index), wide
 
-    def _index_one(self, laid: _Laid) -> tuple[I64Array, BoolArray]:
+    def _index_one(self, laid: _TilePart) -> tuple[I64Array, BoolArray]:
         """The same, where all columns were decoded together."""
         keep, element = laid.projector.in_firing_order(laid.part.keep, laid.encoder)
         if self._is_alone:
@@ -156,7 +161,7 @@ class Tiles:
             index += place.repeat(wanted_points(keep))
         return index if element is None else element.take(index), keep
 
-    def _move(self, index: I64Array, buffer: Buffer, at: int) -> None:
+    def _move(self, index: I64Array, buffer: ScanBuffer, at: int) -> None:
         """Copy the wanted points of a tile to their final rows, from row `at` on.
 
         No index is out of bounds; of what `take` might do then, to wrap is the fastest.
@@ -172,7 +177,9 @@ class Tiles:
         if "reflectivity" in self._extras:
             tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="wrap")
 
-    def _place(self, laid: Sequence[_Laid], due: Due, number: I64Array, buffer: Buffer) -> int:
+    def _place(
+        self, laid: Sequence[_TilePart], due: WindowColumns, number: I64Array, buffer: ScanBuffer
+    ) -> int:
         """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points.
 
         number: (n,) of the columns in the scan.

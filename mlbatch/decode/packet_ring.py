@@ -11,7 +11,7 @@ from mlbatch.lidar.interface import Records
 _FIRST_PACKETS = 64
 
 
-class RawRing:
+class PacketRing:
     """Whole packets in a reused buffer; their columns lie in rows of equal length.
 
     A packet takes a whole number of rows, so row r of the packet in slot p begins at byte

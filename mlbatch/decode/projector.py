@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, Labels
 from mlbatch.lidar.geometry import Projection, Tabled, Turning, blocks, read_rotor_words
 from mlbatch.lidar.interface import Lidar
@@ -35,7 +35,7 @@ class Source:
     """A sensor, its raw packets, and what of its points is wanted; ranges in m, 0 and inf: all."""
 
     lidar: Lidar
-    ring: RawRing
+    ring: PacketRing
     body_from_sensor: F64Array
     ring_base: int
     min_range_m: float = 0.0
@@ -67,10 +67,10 @@ class Tile:
         self.label = np.zeros(size, LABEL)
         self.keep = np.zeros(size, np.bool_)
 
-    def part(self, begin: int, count: int, slots: int) -> Part:
+    def part(self, begin: int, count: int, slots: int) -> TileView:
         """`count` columns of `slots` slots each, from element `begin` on."""
         place, shape = slice(begin, begin + count * slots), (count, slots)
-        return Part(
+        return TileView(
             self.point[place].reshape(*shape, 4),
             self.range_m[place].reshape(shape),
             self.reflectivity[place].reshape(shape),
@@ -80,7 +80,7 @@ class Tile:
 
 
 @dataclass(slots=True)
-class Part:
+class TileView:
     """The part of one sensor in a tile: (n, slots) views, `point` (n, slots, 4)."""
 
     point: F32Array
@@ -143,7 +143,12 @@ class Projector:
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
     def project(
-        self, member: I64Array, place: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part
+        self,
+        member: I64Array,
+        place: I64Array,
+        encoder: I64Array,
+        offset_ns: I64Array,
+        part: TileView,
     ) -> None:
         """Decode the columns at `place` into `part`, and mark the wanted points.
 
@@ -170,7 +175,9 @@ class Projector:
             self._type_returns(part)
         self._keep(own, part)
 
-    def _label(self, member: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part) -> None:
+    def _label(
+        self, member: I64Array, encoder: I64Array, offset_ns: I64Array, part: TileView
+    ) -> None:
         """What the points are, their times included."""
         words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)
         if self._repeated_labels is None:
@@ -212,7 +219,7 @@ class Projector:
             source.ring.gather(place[own], self._records[own])
         return self._records[: len(place)]
 
-    def _type_returns(self, part: Part) -> None:
+    def _type_returns(self, part: TileView) -> None:
         """Numbering of facts/outputs.md section 3, by which of two returns is nearer and stronger.
 
         3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: there is only one.
@@ -235,7 +242,7 @@ class Projector:
         np.bitwise_or(kind, only, out=types[:, 0::2])
         np.bitwise_or(np.subtract(_BOTH, kind, out=kind), only, out=types[:, 1::2])
 
-    def _keep(self, blocks: Sequence[slice], part: Part) -> None:
+    def _keep(self, blocks: Sequence[slice], part: TileView) -> None:
         """Mark the points that are wanted, and count the others under their reason."""
         keep = part.keep
         found, left = self._mark(blocks, part)
@@ -263,7 +270,7 @@ class Projector:
             setattr(counts, reason, getattr(counts, reason) + had - has)
         return left
 
-    def _mark(self, blocks: Sequence[slice], part: Part) -> tuple[list[int], list[int]]:
+    def _mark(self, blocks: Sequence[slice], part: TileView) -> tuple[list[int], list[int]]:
         """Mark the slots with a return; how many there are, and how many equal no earlier one.
 
         Both for each sensor. A return that equals an earlier one of the same shot is not marked.

@@ -18,7 +18,7 @@ _NAN = np.float32("nan")
 
 
 @dataclass(slots=True)
-class Due:
+class WindowColumns:
     """Columns of a scan in their final order; all (n,) int64, stamps in ns."""
 
     stamp_ns: I64Array
@@ -29,14 +29,14 @@ class Due:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def part(self, columns: slice | I64Array) -> Due:
+    def part(self, columns: slice | I64Array) -> WindowColumns:
         """Some of them."""
-        return Due(
+        return WindowColumns(
             self.stamp_ns[columns], self.sensor[columns], self.place[columns], self.encoder[columns]
         )
 
 
-class Buffer:
+class ScanBuffer:
     """Arrays of one scan, reused by the next; rows beyond a scan's points are stale.
 
     slots: of a row, for organized scans; None: a row is a point.

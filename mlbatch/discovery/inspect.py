@@ -15,7 +15,7 @@ from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.clouds import CloudRecording
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.discover import describe, lacks_decoder, named, packet_types
 from mlbatch.discovery.extrinsics import Mounted, in_words, mount
 from mlbatch.discovery.match import match, shared_by
@@ -90,7 +90,7 @@ class StreamReport:
 class _Count:
     """What a pass over the first seconds shows of one sensor."""
 
-    ring: RawRing
+    ring: PacketRing
     loss: PacketLoss
     watch: ClockWatch
     first: tuple[int, int] | None = None
@@ -281,7 +281,7 @@ def _as_json(clocks: Comparison) -> dict[str, object]:
 def _counting(lidar: Lidar) -> _Count:
     """Nothing counted yet."""
     packet_ns = lidar.columns_per_packet * lidar.column_period_ns
-    ring = RawRing(lidar.packet_size, lidar.records)
+    ring = PacketRing(lidar.packet_size, lidar.records)
     return _Count(ring, PacketLoss(lidar.sequence_modulus, packet_ns), clock_watch(lidar))
 
 

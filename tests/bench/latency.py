@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.decode.decoder import Decoder, Due, Label
+from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import Wishes
 from mlbatch.pipeline.conversion import Conversion
@@ -66,11 +66,11 @@ class Driver:
         fed = self.run.feeder.feed(batch, places)
         scans = 0
         for window in batcher.push(fed.arrivals, batch.host_ns):
-            label = Label(
+            label = ScanHeader(
                 *(window.index, window.slice, window.start_ns, window.end_ns),
                 *(window.complete, window.ready_host_ns),
             )
-            due = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
+            due = WindowColumns(window.stamp_ns, window.sensor, window.place, window.encoder)
             self.decoder.scan(due, label)
             scans += 1
         return scans
