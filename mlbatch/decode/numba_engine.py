@@ -21,7 +21,7 @@ from mlbatch.decode.projector import Extras, Projector
 from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 from mlbatch.lidar.geometry import SECTORS, Tabled, Turning, rotor_angles
 from mlbatch.lidar.interface import Lidar
-from mlbatch.lidar.pixel_table import Bits, PixelTable
+from mlbatch.lidar.pixel_table import BitField, PixelTable
 
 # Abilities of CPUs that pack eight lanes of a register by a mask.
 _LANES, _PACKS = 8, ("avx512f", "avx512bw", "avx512vl", "bmi2", "popcnt")
@@ -55,7 +55,7 @@ class SensorGroup:
         self._turns = isinstance(projection, Turning)
         self._extras = extras
         self._seat = seat
-        word = table.echoes[0].distance.word
+        word = table.returns[0].distance.word
         kind = "tabled" if isinstance(projection, Tabled) else "turning"
         lanes = _LANES if has_features(*_PACKS) else 1
         self.kernel = load(
@@ -343,21 +343,21 @@ def _is_read(lidar: Lidar, table: PixelTable) -> bool:
     records = lidar.records
     if any(channel >= lidar.channels for channel in table.dark):
         return False
-    for echo in table.echoes:
-        fields = [one for one in (echo.distance, echo.intensity, echo.reflectivity) if one]
-        ends = [run.first_byte + run.channels * table.step for run in echo.runs]
-        if echo.distance.word == "<u4":
-            begins = (records.start, records.stride, records.step, echo.runs[0].first_byte)
+    for one in table.returns:
+        fields = [one for one in (one.distance, one.intensity, one.reflectivity) if one]
+        ends = [run.first_byte + run.channels * table.step for run in one.runs]
+        if one.distance.word == "<u4":
+            begins = (records.start, records.stride, records.step, one.runs[0].first_byte)
             aligned = all(number % _WORD_BYTES == 0 for number in (*begins, table.step))
-            good = aligned and len(echo.runs) == 1 and not table.dark
+            good = aligned and len(one.runs) == 1 and not table.dark
             good &= all(
                 one.word == "<u4" and one.first + _WORD_BYTES <= table.step for one in fields
             )
         else:
-            level = Bits(2, "u1")
-            good = echo.distance.first == 0 and echo.intensity == level and len(fields) == 2
+            level = BitField(2, "u1")
+            good = one.distance.first == 0 and one.intensity == level and len(fields) == 2
             ends = [end - table.step + _READING_BYTES for end in ends]
-        good &= all(run.channel + run.channels <= lidar.channels for run in echo.runs)
+        good &= all(run.channel + run.channels <= lidar.channels for run in one.runs)
         if not good or max(ends) > records.size:
             return False
     return True
@@ -408,11 +408,11 @@ def described(projectors: Sequence[Projector], table: PixelTable, wide: int) -> 
 def _put_pixels(tables: Tables, projector: Projector, table: PixelTable) -> None:
     lidar = projector.lidar
     runs = [
-        [(run.first_byte, run.channel, run.channels) for run in echo.runs] for echo in table.echoes
+        [(run.first_byte, run.channel, run.channels) for run in one.runs] for one in table.returns
     ]
     fields = [
-        [*_field(echo.distance), *_field(echo.intensity), *_field(echo.reflectivity)]
-        for echo in table.echoes
+        [*_field(one.distance), *_field(one.intensity), *_field(one.reflectivity)]
+        for one in table.returns
     ]
     tables.set(at.RUNS, np.array(runs, np.int64))
     tables.set(at.FIELDS, np.array(fields, np.int64))
@@ -426,7 +426,7 @@ def _put_pixels(tables: Tables, projector: Projector, table: PixelTable) -> None
             at.RUN_COUNT: len(runs[0]),
             at.SILENT: table.silent,
             at.DARK_COUNT: len(table.dark),
-            at.HAS_REFLECTIVITY: wanted and table.echoes[0].reflectivity is not None,
+            at.HAS_REFLECTIVITY: wanted and table.returns[0].reflectivity is not None,
         }
     )
 
@@ -504,7 +504,7 @@ def _typed(lidar: Lidar) -> int:
     return _TYPED[lidar.typed_by] if lidar.returns == 2 else 0
 
 
-def _field(field: Bits | None) -> tuple[int, int, int]:
+def _field(field: BitField | None) -> tuple[int, int, int]:
     return (0, 0, 0) if field is None else (field.first // _WORD_BYTES, field.shift, field.mask)
 
 

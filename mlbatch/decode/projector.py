@@ -158,14 +158,14 @@ class Projector:
         lidar = self.lidar
         own = blocks(member, len(self.sources))
         records = self._gathered(own, place)
-        self.projection.aim(member, encoder)
+        self.projection.prepare(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
             # One return fills its plane in one piece; of several, each is every n-th slot.
             range_m = part.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
             reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
-            self.projection.points(range_m, part.point[:, slots, :3])
+            self.projection.project(range_m, part.point[:, slots, :3])
             if lidar.returns > 1 and self._needs_range:
                 part.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:

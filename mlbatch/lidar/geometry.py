@@ -154,11 +154,11 @@ def sectors(encoder: I64Array, positions: int | None) -> I64Array:
 class Projection(Protocol):
     """Ranges to points in the body frame, for columns of sensors that are decoded together."""
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Prepare for n columns; member: (n,) which of the sensors, rising; encoder: of Columns."""
         ...
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Points (n, B, 3), m, of one return of these columns; range_m: (n, B); out may stride."""
         ...
 
@@ -183,7 +183,7 @@ class Tabled:
         self._reached_m = np.empty((columns, beams), np.float32)
         self._runs: list[_Run] = []
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Look up directions and origins."""
         position = encoder + self.first_position[member]
         is_next = position[1:] - position[:-1] == 1
@@ -204,7 +204,7 @@ class Tabled:
             run = _Run(slice(begin, end), self.direction[turn], self.origin[turn], reach_m)
             self._runs.append(run)
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
         for run in self._runs:
             count = len(run.towards)
@@ -262,7 +262,7 @@ class Turning:
         self._towards, self._from = np.empty((2, 3, columns, beams), np.float32)
         self._aimed: list[_Aimed] = []
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Cosine and sine of every beam at the angle at which it fires; directions, origins."""
         angle, speed, table = read_rotor_words(encoder)
         count = len(encoder)
@@ -279,7 +279,7 @@ class Turning:
                 origin = self._origins[number].turned(*turn, self._from[:, own])
                 self._aimed.append(_Aimed(own, towards, origin, self._reaches_m[number]))
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
         for one in self._aimed:
             own = one.columns

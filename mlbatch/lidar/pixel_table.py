@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Bits:
+class BitField:
     """A whole number in a pixel: `(word >> shift) & mask` of the word that begins at byte `first`.
 
     word: type of numpy, "u1", "<u2", ">u2" or "<u4".
@@ -22,7 +22,7 @@ class Bits:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ChannelRun:
     """Channels whose pixels lie evenly; first_byte: of the first of them, in a record."""
 
     first_byte: int
@@ -31,13 +31,13 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Echo:
+class ReturnLayout:
     """The pixels of one return; reflectivity: None where the sensor has none beside intensity."""
 
-    runs: tuple[Run, ...]
-    distance: Bits
-    intensity: Bits
-    reflectivity: Bits | None = None
+    runs: tuple[ChannelRun, ...]
+    distance: BitField
+    intensity: BitField
+    reflectivity: BitField | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class PixelTable:
     """
 
     step: int
-    echoes: tuple[Echo, ...]
+    returns: tuple[ReturnLayout, ...]
     divisor: float
     factor: float = 1.0
     silent: int = 0
@@ -58,16 +58,16 @@ class PixelTable:
 
 def readings(
     first_bytes: tuple[tuple[int, ...], ...], channels: int, word: str, mask: int = 0xFFFFFFFF
-) -> tuple[Echo, ...]:
+) -> tuple[ReturnLayout, ...]:
     """Returns whose pixels are a distance of two bytes, and a level of one behind it.
 
     first_bytes: for each return, where its runs of equally many channels begin.
     """
-    distance, level = Bits(0, word, 0, mask), Bits(2, "u1")
+    distance, level = BitField(0, word, 0, mask), BitField(2, "u1")
     return tuple(
-        Echo(
+        ReturnLayout(
             tuple(
-                Run(first, number * (channels // len(firsts)), channels // len(firsts))
+                ChannelRun(first, number * (channels // len(firsts)), channels // len(firsts))
                 for number, first in enumerate(firsts)
             ),
             distance,

@@ -43,7 +43,7 @@ class _Corrected:
         self._cosine = np.empty((columns, len(self._flat)), np.float32)
         self._sine = np.empty_like(self._cosine)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Cosine and sine of every beam's azimuth as it fires; `member` is always 0.
 
         The rotor's angle, back by rot_correction, on by d = speed * firing: c - d (s + d c / 2).
@@ -65,7 +65,7 @@ class _Corrected:
         )
         np.add(first_sine, turned * (first_cosine - half * first_sine), out=self._sine[:count])
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Corrected along right, forward and up, then moved into the body frame."""
         count = len(range_m)
         cosine, sine = self._cosine[:count], self._sine[:count]

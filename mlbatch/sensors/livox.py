@@ -174,10 +174,10 @@ class Carried:
         self._lidar = lidar
         self._body_from_sensor = body_from_sensor
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Nothing turns."""
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """The points that the lidar has just read, summed in a fixed order (see geometry.py)."""
         x, y, z = self._lidar.last_xyz_m.T
         for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):

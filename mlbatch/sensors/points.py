@@ -188,10 +188,10 @@ class _Moved:
         self._rotation = body_from_sensor[:3, :3].astype(np.float32)
         self._translation_m = body_from_sensor[:3, 3].astype(np.float32)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Nothing turns."""
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Rotation and translation, axis by axis in a fixed order; empty slots mean nothing."""
         reals = self._places.reals
         x, y, z = (reals[:, axis] for axis in range(3))

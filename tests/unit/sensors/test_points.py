@@ -162,9 +162,9 @@ def _decoded(pose: F64Array) -> tuple[F32Array, F32Array, F32Array]:
     projection = lidar.projection(pose, len(packets))
     assert projection is not None
     none = np.zeros(len(packets), np.int64)
-    projection.aim(none, none)
+    projection.prepare(none, none)
     lidar.read(records, 0, Pixels(range_m, point[..., 3], None))
-    projection.points(range_m, point[..., :3])
+    projection.project(range_m, point[..., :3])
     return range_m, point[..., :3], point[..., 3]
 
 
