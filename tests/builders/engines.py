@@ -50,7 +50,7 @@ def few_kernels(factory: pytest.TempPathFactory) -> Iterator[None]:
     own = os.environ | {"XDG_CACHE_HOME": str(session / "kernels")}
     with (
         patch.dict(os.environ, own),
-        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
     ):
         yield
 
