@@ -38,7 +38,7 @@ def from_quaternion(translation_m: Sequence[float], xyzw: Sequence[float]) -> F6
     norm = math.sqrt(sum(part * part for part in xyzw))
     if not abs(norm - 1.0) <= TOLERANCE:
         raise RigError(
-            f"wanted a quaternion of norm 1 within {TOLERANCE}, got norm {norm:.6g}; "
+            f"expected a quaternion of norm 1 within {TOLERANCE}, found norm {norm:.6g}; "
             "give x, y, z, w in this order, normalised"
         )
     x, y, z, w = (part / norm for part in xyzw)
@@ -58,13 +58,13 @@ def rigid(matrix: F64Array) -> F64Array:
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise RigError(
-            f"wanted 4 (or 3) rows of 4 finite numbers, got shape {matrix.shape}; "
+            f"expected 4 (or 3) rows of 4 finite numbers, found shape {matrix.shape}; "
             "give the rotation with the translation as last column"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > _ROUNDING:
         shown = ", ".join(f"{value:.6g}" for value in matrix[3])
         raise RigError(
-            f"wanted 0, 0, 0, 1 as last row, got {shown}; "
+            f"expected 0, 0, 0, 1 as last row, found {shown}; "
             "give the translation as last column, metres"
         )
     # Products of numbers much larger than those of a rotation would overflow.
@@ -72,12 +72,12 @@ def rigid(matrix: F64Array) -> F64Array:
     skew = np.abs(_gram(rotation) - np.eye(3)).max()
     if not skew <= TOLERANCE:
         raise RigError(
-            f"wanted orthonormal axes within {TOLERANCE}, got axes off by {skew:.3g}; "
+            f"expected orthonormal axes within {TOLERANCE}, found axes off by {skew:.3g}; "
             "give a rotation without scale or shear"
         )
     if _determinant(rotation) < 0:
         raise RigError(
-            "wanted a rotation (determinant 1), got a mirror image (determinant -1); "
+            "expected a rotation (determinant 1), found a mirror image (determinant -1); "
             "check the signs of the axes"
         )
     return _joined(_nearest_rotation(rotation), matrix[:3, 3])

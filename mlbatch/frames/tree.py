@@ -74,7 +74,7 @@ def edge_of(
     where = f"{source}: transform {clean(parent)} -> {clean(child)}"
     if len(translation_m) != 3 or not all(map(math.isfinite, translation_m)):
         shown = ", ".join(f"{value:g}" for value in translation_m)
-        raise RigError(f"{where}: wanted 3 finite metres, got {shown}; {_REMEDY}")
+        raise RigError(f"{where}: expected 3 finite metres, found {shown}; {_REMEDY}")
     try:
         matrix = from_quaternion(translation_m, xyzw)
     except RigError as err:
@@ -110,10 +110,10 @@ class FrameTree:
     def add(self, edge: Edge) -> None:
         """Add an edge; RigError if it is none."""
         if not edge.parent or not edge.child or edge.parent == edge.child:
-            got = "an empty name" if edge.parent != edge.child else "the same twice"
+            found = "an empty name" if edge.parent != edge.child else "the same twice"
             raise RigError(
-                f"{edge.source}: transform {edge.parent!r} -> {edge.child!r}: wanted two frames, "
-                f"got {got}; {_REMEDY}"
+                f"{edge.source}: transform {edge.parent!r} -> {edge.child!r}: expected two frames, "
+                f"found {found}; {_REMEDY}"
             )
         self._above.setdefault(edge.child, {})[edge.parent] = edge
         self._frames.update(dict.fromkeys((edge.parent, edge.child)))
@@ -161,7 +161,7 @@ class FrameTree:
         """What to say of a frame that is not in the tree."""
         near = difflib.get_close_matches(frame, self._frames, 1)
         hint = f"did you mean {near[0]}?" if near else f"it has {some(self.frames) or 'none'}"
-        return f"wanted a frame of the recording's transforms, got {frame!r}; {hint}"
+        return f"expected a frame of the recording's transforms, found {frame!r}; {hint}"
 
     def _climb(self, frame: str) -> _Climb:
         if frame not in self._frames:
@@ -173,7 +173,7 @@ class FrameTree:
             if first is not None:
                 down = [one.child for one in reversed([*edges[first:], edge])]
                 text = (
-                    f"{edge.source}: wanted frames that form a tree, got the circle "
+                    f"{edge.source}: expected frames that form a tree, found the circle "
                     f"{' -> '.join([edge.parent, *down])}; {_REMEDY}"
                 )
                 # Whatever hangs on the circle is still well placed relative to where it hangs.
@@ -213,7 +213,7 @@ def _two_parents(frame: str, parents: Mapping[str, Edge]) -> str:
         return ""
     sources = " and ".join(dict.fromkeys(edge.source for edge in parents.values()))
     return (
-        f"{sources}: frame {frame}: wanted one parent, got {' and '.join(sorted(parents))}; "
+        f"{sources}: frame {frame}: expected one parent, found {' and '.join(sorted(parents))}; "
         f"{_REMEDY}"
     )
 

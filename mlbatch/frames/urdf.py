@@ -132,9 +132,9 @@ def _three(text: str | None, key: str, where: str) -> list[float]:
     return numbers
 
 
-def _error(wanted: str, got: str, where: str = "") -> RigError:
-    shown = " ".join(got.split()) or "nothing"
+def _error(expected: str, found: str, where: str = "") -> RigError:
+    shown = " ".join(found.split()) or "nothing"
     if len(shown) > _SHOWN_CHARS:
         shown = shown[: _SHOWN_CHARS - 3] + "..."
     place = f"robot_description (URDF){', ' if where else ''}{where}"
-    return RigError(f"{place}: wanted {wanted}, got {shown}; {_REMEDY}")
+    return RigError(f"{place}: expected {expected}, found {shown}; {_REMEDY}")

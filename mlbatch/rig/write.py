@@ -1,4 +1,4 @@
-"""Text of a rig file that `read_rig` reads back."""
+"""Writing a rig file that `read_rig` reads back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector
 from mlbatch.units import NS_PER_S, rate_text
 
-# Text that needs no quotes, neither here nor for other readers of YAML.
+# Text that needs no quotes, for any reader of YAML.
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./-]*", re.ASCII)
 _RESERVED = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
 _HEADER = """\
@@ -28,17 +28,19 @@ _NO_EXTRINSICS = (
 
 
 def write_rig(rig: Rig, folder: Path, notes: Mapping[str, str] | None = None) -> str:
-    """Text of a rig file that `read_rig` reads back from `folder`; notes are remarks by sensor."""
+    """Return the text of a rig file in `folder`; notes: comments by sensor name."""
     lines = [f"body_frame: {_text(rig.body_frame)}"]
     if rig.rate is not None:
         lines.append(f"rate_hz: {rate_text(rig.rate)}")
     lines.append("sensors:")
     for sensor in rig.sensors:
-        remark = " ".join((notes or {}).get(sensor.name, "").split())
-        # What is not printable is no YAML, not even in a comment.
-        lines += [f"  # {''.join(filter(str.isprintable, remark))}"] if remark else []
+        note = " ".join((notes or {}).get(sensor.name, "").split())
+        if note:
+            # YAML allows printable characters only, in comments too.
+            lines.append(f"  # {''.join(filter(str.isprintable, note))}")
         first, *others = _sensor_lines(sensor, folder)
-        lines += [f"  - {first}", *(f"    {line}" for line in others)]
+        lines.append(f"  - {first}")
+        lines += [f"    {line}" for line in others]
     if len(rig.exclude_boxes_m):
         lines.append("exclude_boxes_m:")
         lines += [f"  - {_floats(box)}" for box in rig.exclude_boxes_m]
@@ -60,10 +62,10 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
     }
     if any(clock.values()):
         yield "clock: " + _braces(clock)
-    for key in ("min_range_m", "max_range_m"):
-        limit_m = getattr(sensor, key)
-        if limit_m is not None:
-            yield f"{key}: {float(limit_m)!r}"
+    if sensor.min_range_m is not None:
+        yield f"min_range_m: {float(sensor.min_range_m)!r}"
+    if sensor.max_range_m is not None:
+        yield f"max_range_m: {float(sensor.max_range_m)!r}"
     if sensor.optional:
         yield "optional: true"
     if sensor.decode:
@@ -84,27 +86,27 @@ def _stream_text(stream: StreamSelector) -> str:
 def _extrinsics_lines(extrinsics: F64Array | str | None) -> Iterator[str]:
     if extrinsics is None:
         yield from _NO_EXTRINSICS
-    elif isinstance(extrinsics, str):
+        return
+    if isinstance(extrinsics, str):
         yield f"extrinsics: {{frame: {_text(extrinsics)}}}"
-    else:
-        origin = extrinsics[:3, 3]
-        angles = [round(angle, 9) + 0.0 for angle in rpy_deg(extrinsics)]
-        # Angles are what people edit; but only where they say the same to the last bit.
-        if from_rpy_deg(origin.tolist(), angles).tobytes() == extrinsics.tobytes():
-            yield (
-                f"extrinsics: {{translation_m: {_floats(origin)}, "
-                f"rotation_rpy_deg: {_floats(angles)}}}"
-            )
-            return
-        yield "extrinsics:"
-        yield f"  # about: translation_m: {_floats(origin)}, rotation_rpy_deg: {_floats(angles)}"
-        yield "  matrix:"
-        for row in extrinsics:
-            yield f"    - {_floats(row)}"
+        return
+    origin = extrinsics[:3, 3]
+    # Adding 0.0 makes 0.0 of -0.0.
+    angles = [round(angle, 9) + 0.0 for angle in rpy_deg(extrinsics)]
+    pose = f"translation_m: {_floats(origin)}, rotation_rpy_deg: {_floats(angles)}"
+    # Angles are easier to edit; written only if they give the same matrix to the last bit.
+    if from_rpy_deg(origin.tolist(), angles).tobytes() == extrinsics.tobytes():
+        yield f"extrinsics: {{{pose}}}"
+        return
+    yield "extrinsics:"
+    yield f"  # about: {pose}"
+    yield "  matrix:"
+    for row in extrinsics:
+        yield f"    - {_floats(row)}"
 
 
 def _path_from(folder: Path, path: Path) -> str:
-    """The path as seen from `folder`, or in full where it lies on another drive."""
+    """Return the path relative to `folder`, or absolute if it is on another drive."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:
@@ -112,12 +114,16 @@ def _path_from(folder: Path, path: Path) -> str:
 
 
 def _seconds(offset_ns: int) -> str:
-    """Seconds with all nine decimals, empty for none."""
+    """Return seconds with nine decimals; empty for 0."""
+    if not offset_ns:
+        return ""
+    sign = "-" if offset_ns < 0 else ""
     whole, rest = divmod(abs(offset_ns), NS_PER_S)
-    return f"{'-' if offset_ns < 0 else ''}{whole}.{rest:09d}" if offset_ns else ""
+    return f"{sign}{whole}.{rest:09d}"
 
 
 def _braces(pairs: Mapping[str, str]) -> str:
+    """Return a mapping on one line, without empty values."""
     return "{" + ", ".join(f"{key}: {value}" for key, value in pairs.items() if value) + "}"
 
 
@@ -126,7 +132,7 @@ def _floats(numbers: F64Array | list[float]) -> str:
 
 
 def _text(text: str) -> str:
-    """Text as a YAML scalar, in quotes unless it is a plain word."""
+    """Return text as a YAML scalar, in quotes unless it is a plain word."""
     if _PLAIN.fullmatch(text) and text.lower() not in _RESERVED:
         return text
     escaped = (

@@ -394,8 +394,8 @@ def test_the_rig_names_a_lidar_frame() -> None:
         (
             (_at("base_link", "os_left"),),
             "os_lef",
-            ": wanted a frame of the recording's transforms, got 'os_lef'; did you mean os_left?; "
-            "correct it, or give translation_m and a rotation",
+            ": expected a frame of the recording's transforms, found 'os_lef'; did you mean "
+            "os_left?; correct it, or give translation_m and a rotation",
         ),
         (
             (_at("base_link", "a"), _at("turret", "os_left")),
@@ -415,7 +415,7 @@ def test_frames_of_the_rig_that_lead_nowhere(
 
 def test_a_body_frame_that_the_recording_lacks() -> None:
     text = _refusal(_static(*SIDES), _pair(), body="base_lnk")
-    assert "got 'base_lnk'; did you mean base_link?" in text
+    assert "found 'base_lnk'; did you mean base_link?" in text
 
 
 def test_what_is_wrong_elsewhere_does_not_matter() -> None:
@@ -440,7 +440,7 @@ def test_a_bad_transform_of_a_sensor_is_the_reason_told() -> None:
     driver = _at("right/os_sensor", "right/os_lidar")
     text = _refusal(_static(SIDES[0], bad, driver), _pair(), body="base_link")
     assert (
-        "tf_static: transform base_link -> right/os_sensor: wanted a quaternion of norm 1" in text
+        "tf_static: transform base_link -> right/os_sensor: expected a quaternion of norm 1" in text
     )
 
 
@@ -448,7 +448,7 @@ def test_two_parents_of_a_sensor_are_the_reason_told() -> None:
     # A person states the lidar frame, and so does the driver.
     edges = (_at("base_link", "left/os_lidar"), _at("left/os_sensor", "left/os_lidar"))
     text = _refusal(_static(*edges, SIDES[1]), _pair(), body="base_link")
-    assert "frame left/os_lidar: wanted one parent, got base_link and left/os_sensor" in text
+    assert "frame left/os_lidar: expected one parent, found base_link and left/os_sensor" in text
 
 
 def test_a_urdf_that_cannot_be_read_is_a_finding() -> None:
@@ -456,7 +456,7 @@ def test_a_urdf_that_cannot_be_read_is_a_finding() -> None:
     knowledge.add_urdf("<robot>")
     (finding,) = _mount(knowledge, _pair()).findings
     assert (finding.code, finding.sensor) == ("urdf", "")
-    assert finding.message.startswith("robot_description (URDF): wanted an XML document")
+    assert finding.message.startswith("robot_description (URDF): expected an XML document")
 
 
 def test_a_urdf_that_is_unclear_contradicts_nobody() -> None:

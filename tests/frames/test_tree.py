@@ -106,14 +106,14 @@ def test_a_missing_frame_is_told_with_the_nearest() -> None:
     with pytest.raises(RigError) as caught:
         _tree(_edge("base_link", "os_left")).chain("base_link", "os_lefft")
     assert str(caught.value) == (
-        "wanted a frame of the recording's transforms, got 'os_lefft'; did you mean os_left?"
+        "expected a frame of the recording's transforms, found 'os_lefft'; did you mean os_left?"
     )
 
 
 def test_a_missing_frame_that_resembles_none() -> None:
-    with pytest.raises(RigError, match=r"got 'zz'; it has a, b$"):
+    with pytest.raises(RigError, match=r"found 'zz'; it has a, b$"):
         _tree(_edge("a", "b")).chain("a", "zz")
-    with pytest.raises(RigError, match=r"got 'zz'; it has none$"):
+    with pytest.raises(RigError, match=r"found 'zz'; it has none$"):
         FrameTree().chain("zz", "zz")
 
 
@@ -122,7 +122,7 @@ def test_two_parents_are_refused_where_they_matter() -> None:
     with pytest.raises(RigError) as caught:
         tree.chain("base", "imu")
     assert str(caught.value) == (
-        "tf_static: frame lidar: wanted one parent, got base and os_sensor; "
+        "tf_static: frame lidar: expected one parent, found base and os_sensor; "
         "give the extrinsics in a rig file (--rig)"
     )
     # Below that frame nothing is unclear.
@@ -142,7 +142,7 @@ def test_two_parents_above_both_frames_do_not_matter() -> None:
 def test_circles_are_refused_in_any_order(first: int) -> None:
     circle = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a")]
     tree = _tree(*circle[first:], *circle[:first], _edge("c", "lidar", (1.0, 0.0, 0.0)))
-    with pytest.raises(RigError, match="wanted frames that form a tree, got the circle"):
+    with pytest.raises(RigError, match="expected frames that form a tree, found the circle"):
         tree.chain("a", "b")
     with pytest.raises(RigError, match="circle"):
         tree.chain("a", "lidar")
@@ -155,33 +155,33 @@ def test_the_text_of_a_circle() -> None:
     with pytest.raises(RigError) as caught:
         tree.chain("a", "b")
     assert str(caught.value) == (
-        "tf_static: wanted frames that form a tree, got the circle b -> a -> b; "
+        "tf_static: expected frames that form a tree, found the circle b -> a -> b; "
         "give the extrinsics in a rig file (--rig)"
     )
 
 
 @pytest.mark.parametrize(
-    ("parent", "child", "xyz", "turn", "wanted"),
+    ("parent", "child", "xyz", "turn", "expected"),
     [
-        ("a", "b", (0, math.nan, 0), NO_TURN, "wanted 3 finite metres, got 0, nan, 0"),
-        ("a", "b", (math.inf, 0, 0), NO_TURN, "wanted 3 finite metres, got inf, 0, 0"),
-        ("a", "b", (0, 0), NO_TURN, "wanted 3 finite metres, got 0, 0"),
-        ("a", "b", (0, 0, 0), (0, 0, 0, 0), "wanted a quaternion of norm 1 within 0.001, got"),
+        ("a", "b", (0, math.nan, 0), NO_TURN, "expected 3 finite metres, found 0, nan, 0"),
+        ("a", "b", (math.inf, 0, 0), NO_TURN, "expected 3 finite metres, found inf, 0, 0"),
+        ("a", "b", (0, 0), NO_TURN, "expected 3 finite metres, found 0, 0"),
+        ("a", "b", (0, 0, 0), (0, 0, 0, 0), "expected a quaternion of norm 1 within 0.001, found"),
         ("a", "b", (0, 0, 0), (0, 0, 0, 1.002), "norm 1.002"),
         ("a", "b", (0, 0, 0), (0, 0, math.nan, 1), "norm nan"),
-        ("a", "/a", (0, 0, 0), NO_TURN, "wanted two frames, got the same twice"),
-        ("/", "b", (0, 0, 0), NO_TURN, "wanted two frames, got an empty name"),
-        ("a", " ", (0, 0, 0), NO_TURN, "wanted two frames, got an empty name"),
+        ("a", "/a", (0, 0, 0), NO_TURN, "expected two frames, found the same twice"),
+        ("/", "b", (0, 0, 0), NO_TURN, "expected two frames, found an empty name"),
+        ("a", " ", (0, 0, 0), NO_TURN, "expected two frames, found an empty name"),
     ],
 )
 def test_edges_that_are_none(
-    parent: str, child: str, xyz: Sequence[float], turn: Sequence[float], wanted: str
+    parent: str, child: str, xyz: Sequence[float], turn: Sequence[float], expected: str
 ) -> None:
     with pytest.raises(RigError) as caught:
         FrameTree().add(edge_of(parent, child, xyz, turn, "tf_static"))
     text = str(caught.value)
     assert text.startswith("tf_static: transform ")
-    assert wanted in text
+    assert expected in text
     assert "\n" not in text
 
 

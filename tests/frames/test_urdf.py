@@ -27,8 +27,8 @@ def test_a_fixed_joint_by_hand() -> None:
     text = _robot(_joint(LINKS + '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'))
     ((parent, child, matrix),) = fixed_joints(text)
     assert (parent, child) == ("base_link", "os_left")
-    wanted = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-    assert matrix.tolist() == wanted
+    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    assert matrix.tolist() == expected
 
 
 def test_roll_comes_before_pitch_and_yaw() -> None:
@@ -89,31 +89,34 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name=
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOMB, ": wanted a document without a document type, got <!DOCTYPE robot"),
+        (BOMB, ": expected a document without a document type, found <!DOCTYPE robot"),
         (
             '<!DOCTYPE robot SYSTEM "file:///etc/passwd"><robot/>',
-            ": wanted a document without a document type, got <!DOCTYPE robot",
+            ": expected a document without a document type, found <!DOCTYPE robot",
         ),
-        ("<sdf/>", ": wanted the element <robot> first, got <sdf>"),
-        ("", ": wanted an XML document, got no element found: line 1, column 0"),
-        ("base_link", ": wanted an XML document, got syntax error: line 1, column 0"),
-        ("<robot>", ": wanted an XML document, got no element found: line 1, column 7"),
-        ("<robot>&x;</robot>", ": wanted an XML document, got undefined entity: line 1, column 7"),
+        ("<sdf/>", ": expected the element <robot> first, found <sdf>"),
+        ("", ": expected an XML document, found no element found: line 1, column 0"),
+        ("base_link", ": expected an XML document, found syntax error: line 1, column 0"),
+        ("<robot>", ": expected an XML document, found no element found: line 1, column 7"),
+        (
+            "<robot>&x;</robot>",
+            ": expected an XML document, found undefined entity: line 1, column 7",
+        ),
         (
             _robot(_joint('<parent link="a"/>')),
-            ", joint mount: wanted a parent link and a child link, got none",
+            ", joint mount: expected a parent link and a child link, found none",
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="1 2"/>')),
-            ", joint mount, origin xyz: wanted 3 numbers of at most 1e+09, got 1 2",
+            ", joint mount, origin xyz: expected 3 numbers of at most 1e+09, found 1 2",
         ),
         (
             _robot(_joint(LINKS + '<origin rpy="0 0 ${pi/2}"/>')),
-            ", joint mount, origin rpy: wanted 3 numbers of at most 1e+09, got 0 0 ${pi/2}",
+            ", joint mount, origin rpy: expected 3 numbers of at most 1e+09, found 0 0 ${pi/2}",
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="0 0 nan"/>', name="")),
-            ", joint (no name), origin xyz: wanted 3 numbers of at most 1e+09, got 0 0 nan",
+            ", joint (no name), origin xyz: expected 3 numbers of at most 1e+09, found 0 0 nan",
         ),
     ],
 )
@@ -124,7 +127,7 @@ def test_descriptions_that_cannot_be_used(text: str, message: str) -> None:
 
 
 def test_halves_of_characters_are_told_in_one_line() -> None:
-    with pytest.raises(RigError, match="wanted an XML document") as caught:
+    with pytest.raises(RigError, match="expected an XML document") as caught:
         joints("<robot name='\ud800'/>")
     assert "\n" not in str(caught.value)
 
@@ -132,8 +135,8 @@ def test_halves_of_characters_are_told_in_one_line() -> None:
 def test_what_is_too_large_is_not_even_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(urdf, "MAX_BYTES", 20)
     assert joints("<robot name='1234'/>") == []
-    with pytest.raises(RigError, match="wanted at most 20 bytes, got more"):
+    with pytest.raises(RigError, match="expected at most 20 bytes, found more"):
         joints("<robot name='12345'/>")
     # Bytes, not characters, are counted.
-    with pytest.raises(RigError, match="wanted at most 20 bytes, got more"):
+    with pytest.raises(RigError, match="expected at most 20 bytes, found more"):
         joints("<robot name='123\xe9'/>")

@@ -127,7 +127,7 @@ NOTHING: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "rate that is none": (
         "ply",
         text("head.ply", "rate_hz 10", "rate_hz ten"),
-        "wanted a positive number of Hz",
+        "expected a positive number of Hz",
     ),
     "report that is no JSON": ("npz", text("report.json", "{", "["), "a report in JSON"),
     "empty file": ("scans.mcap", raw("", lambda data: b""), "an empty file"),
