@@ -1,4 +1,7 @@
-"""Names that drivers and people give to the frames of sensors."""
+"""Frame names of the vendors' drivers and of people, and topics of one driver.
+
+Source: docs/sources/messages.md section 6.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,9 @@ from mlbatch.frames.tree import clean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A frame that may be a sensor's; lower ranks are tried first.
+    """A possible frame of a sensor; lower ranks are tried first.
 
-    sensor_from_frame: (4, 4), where the frame is not the one points are in; None where it is.
+    sensor_from_frame: (4, 4), m, if the frame is not that of the points; else None.
     """
 
     frame: str
@@ -23,10 +26,10 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """What a maker's driver calls its frames.
+    """Frame names of a vendor's driver.
 
-    points: frames that points are in; lidar: frames turned against it as the metadata say; nick:
-    words that people add to the place to name a whole sensor.
+    points: frames of the points; lidar: frames rotated against them by the metadata; nick: words
+    that people combine with the place of a sensor to name it.
     """
 
     points: tuple[str, ...]
@@ -34,8 +37,8 @@ class Naming:
     nick: tuple[str, ...] = ("lidar",)
 
 
-# Points of an Ouster leave our decoder in os_sensor: its lidar-to-sensor transform is applied.
-# `left_lidar` could be either of its frames, so `lidar` is no nick of an Ouster.
+# Decoded points of an Ouster are in os_sensor, as its lidar-to-sensor transform is applied.
+# `left_lidar` could be either of its frames: `lidar` is no nick of an Ouster.
 NAMINGS: Mapping[str, Naming] = {
     "ouster": Naming(("os_sensor",), ("os_lidar",), ("os", "ouster")),
     "velodyne": Naming(("velodyne",), nick=("velodyne", "lidar")),
@@ -43,15 +46,29 @@ NAMINGS: Mapping[str, Naming] = {
     "robosense": Naming(("rslidar",), nick=("rslidar", "robosense", "lidar")),
 }
 _OTHER = Naming(("lidar",))
-# p: place of the sensor, such as left; n: nick; f: the driver's own name of the frame.
+# p: place of the sensor, as left; n: nick; f: the driver's name of the frame.
 OWN_PATTERNS = ("{p}/{f}", "{p}_{f}", "{f}_{p}", "{n}_{p}/{f}", "{n}_{p}_{f}")
 WHOLE_PATTERNS = ("{p}", "{n}_{p}", "{p}_{n}")
-# Parts of topics that say what a sensor is, not where.
+# Parts of topics that name the kind of a sensor, not its place.
 GENERIC = (
-    *("ouster", "os", "os_node", "os1_node", "os_cloud_node", "velodyne", "hesai", "pandar"),
-    *("robosense", "rslidar", "sensing", "sensor", "sensors", "lidar", "lidars", "driver"),
+    "ouster",
+    "os",
+    "os_node",
+    "os1_node",
+    "os_cloud_node",
+    "velodyne",
+    "hesai",
+    "pandar",
+    "robosense",
+    "rslidar",
+    "sensing",
+    "sensor",
+    "sensors",
+    "lidar",
+    "lidars",
+    "driver",
 )
-# Ranks: the kind of a frame first, then how closely its place is the sensor's.
+# Ranks: by the kind of a frame, then by the precision of its place.
 _KINDS = ("stated", "points", "lidar", "whole")
 _CLOSENESS = ("namespace", "place", "word", "plain")
 
@@ -64,10 +81,10 @@ def candidates(
     frame_id: str = "",
     sensor_from_lidar: F64Array | None = None,
 ) -> tuple[Candidate, ...]:
-    """Frames that may be those of a sensor, by what is known of it.
+    """Return the possible frames of a sensor, the most certain first.
 
-    places: topics of its packets, or its name in the rig; alone: no other sensor of this maker;
-    frame_id: as its own messages state it; sensor_from_lidar: (4, 4), metres, of its metadata.
+    places: topics of its packets, or its name in the rig; alone: the only sensor of this vendor;
+    frame_id: of its own messages; sensor_from_lidar: (4, 4), m, of its metadata.
     """
     naming = NAMINGS.get(maker.lower(), _OTHER)
     found: dict[str, Candidate] = {}
@@ -89,11 +106,11 @@ def candidates(
 
 
 def named_frame(frame: str, among: Sequence[Candidate]) -> Candidate:
-    """The frame that a rig names for a sensor whose candidates are `among`."""
+    """Return the frame that a rig names for a sensor; among: its candidates."""
     name = clean(frame)
-    turned = any(word in name for naming in NAMINGS.values() for word in naming.lidar)
+    is_lidar = any(word in name for naming in NAMINGS.values() for word in naming.lidar)
     corrections = (one.sensor_from_frame for one in among if one.sensor_from_frame is not None)
-    return Candidate(name, 0, next(corrections, None) if turned else None)
+    return Candidate(name, 0, next(corrections, None) if is_lidar else None)
 
 
 def _rank(kind: str, closeness: str) -> int:
@@ -110,41 +127,42 @@ def _names(
 
 
 def _places(places: Sequence[str], nicks: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Words for where a sensor sits, with how close they are to its own namespace."""
+    """Yield words for the place of a sensor, each with its precision."""
     for text in places:
         parts = namespace(text) if "/" in text else [text]
         if parts:
             yield "namespace", "/".join(parts)
-        telling = [part for part in parts if part not in GENERIC]
-        if telling:
-            yield "place", "/".join(telling)
-            yield "place", "_".join(telling)
-            yield "word", telling[-1]
+        specific = [part for part in parts if part not in GENERIC]
+        if specific:
+            yield "place", "/".join(specific)
+            yield "place", "_".join(specific)
+            yield "word", specific[-1]
             for nick in nicks:
-                yield "word", telling[-1].removeprefix(f"{nick}_").removesuffix(f"_{nick}")
+                yield "word", specific[-1].removeprefix(f"{nick}_").removesuffix(f"_{nick}")
 
 
 def namespace(topic: str) -> list[str]:
-    """Parts of a topic before its last one."""
+    """Return the parts of a topic before its last one."""
     return [part for part in topic.split("/") if part][:-1]
 
 
 def same_namespace(topic_a: str, topic_b: str) -> bool:
-    """Whether two topics differ in their last part only, as those of one driver do."""
+    """Return whether two topics differ in their last part only, as those of one driver do."""
     return namespace(topic_a) == namespace(topic_b)
 
 
 def nearest_topic(topic: str, others: Iterable[str]) -> str | None:
-    """The topic that shares the longest namespace with `topic`; None if none or several do.
+    """Return the topic that shares the longest namespace with `topic`; None if none or several do.
 
-    One of the two namespaces must hold the other: /left and /right of one car are not related.
+    One of the two namespaces must contain the other: /left and /right of one car are not related.
     """
-    own, shared = namespace(topic), dict[int, list[str]]()
+    own = namespace(topic)
+    shared: dict[int, list[str]] = {}
     for other in others:
         theirs = namespace(other)
         common = min(len(own), len(theirs))
         if own[:common] == theirs[:common] and (common or own == theirs):
-            # The same namespace is closer than any part of it.
+            # An equal namespace is nearer than any part of it.
             shared.setdefault(2 * common + (own == theirs), []).append(other)
     best = shared[max(shared)] if shared else []
     return best[0] if len(best) == 1 else None

@@ -1,8 +1,8 @@
-"""Coordinate frames of a recording: how they hang together, and which of them is a sensor's.
+"""Trees of the coordinate frames of a recording, and the transforms between frames.
 
-Facts: facts/messages.md section 6 (tf2_msgs/TFMessage, frames of the makers' drivers). An edge maps
-coordinates of its child into its parent. What is wrong with an edge matters only to those who walk
-over it: a recording holds many frames that no lidar needs.
+An edge maps coordinates of its child into its parent. A contradiction is an error only for chains
+that contain it: recordings have many frames that no lidar needs. Source: docs/sources/messages.md
+section 6 (tf2_msgs/TFMessage).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _REMEDY = "give the extrinsics in a rig file (--rig)"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A transform as a source states it; matrix: (4, 4) float64 parent_from_child, metres."""
+    """A transform of a source; matrix: (4, 4) float64 parent_from_child, m."""
 
     parent: str
     child: str
@@ -36,9 +36,9 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """The way from frame a to frame b; matrix: (4, 4) float64 a_from_b, metres.
+    """The transforms from frame a to frame b; matrix: (4, 4) float64 a_from_b, m.
 
-    frames: all that were walked, a first; edges: those between them.
+    frames: all from a to b; edges: between them.
     """
 
     matrix: F64Array
@@ -51,7 +51,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True)
 class _Climb:
-    """The way up from a frame; problem: why it cannot go on, "" at a root."""
+    """The path from a frame to its root; problem: why it ends before, "" at a root."""
 
     frames: list[str]
     edges: list[Edge]
@@ -59,7 +59,7 @@ class _Climb:
 
 
 def clean(frame: str) -> str:
-    """A frame's name without the slash in front that ROS 1 allowed."""
+    """Return a frame name without the leading slash that ROS 1 allowed."""
     return frame.strip().lstrip("/")
 
 
@@ -70,7 +70,7 @@ def edge_of(
     xyzw: Sequence[float],
     source: str,
 ) -> Edge:
-    """The edge of a geometry_msgs/TransformStamped; RigError if it cannot be a transform."""
+    """Return the edge of a geometry_msgs/TransformStamped; RigError if it is no rigid transform."""
     where = f"{source}: transform {clean(parent)} -> {clean(child)}"
     if len(translation_m) != 3 or not all(map(math.isfinite, translation_m)):
         shown = ", ".join(f"{value:g}" for value in translation_m)
@@ -83,7 +83,7 @@ def edge_of(
 
 
 class FrameTree:
-    """Edges by child; of one child and parent, the edge that was added last counts."""
+    """Edges by child; an edge replaces an earlier one of the same child and parent."""
 
     __slots__ = ("_above", "_frames")
 
@@ -93,22 +93,22 @@ class FrameTree:
 
     @classmethod
     def merged(cls, trees: Iterable[FrameTree]) -> FrameTree:
-        """All edges of several trees, each of one source; for a child the first that has one wins.
+        """Merge trees, each of one source; the edges of a child come from the first that has some.
 
-        An edge that would close a circle with those of earlier trees is left out: sources may
-        describe the same rig from opposite ends.
+        Edges that close a circle with edges of earlier trees are skipped: one source may have the
+        sensor as root, another the vehicle.
         """
-        whole = cls()
+        merged = cls()
         for tree in trees:
             for child, parents in tree._above.items():
-                if child not in whole._above:
+                if child not in merged._above:
                     for edge in parents.values():
-                        if not whole._is_turned_round(edge):
-                            whole.add(edge)
-        return whole
+                        if not merged._closes_circle(edge):
+                            merged.add(edge)
+        return merged
 
     def add(self, edge: Edge) -> None:
-        """Add an edge; RigError if it is none."""
+        """Add an edge; RigError unless it connects two named frames."""
         if not edge.parent or not edge.child or edge.parent == edge.child:
             found = "an empty name" if edge.parent != edge.child else "the same twice"
             raise RigError(
@@ -127,8 +127,9 @@ class FrameTree:
         return tuple(sorted(self._frames))
 
     def chain(self, a: str, b: str) -> Chain | None:
-        """The transform a_from_b; None if nothing connects the two, RigError if it is unclear."""
-        up_a, up_b = self._climb(a), self._climb(b)
+        """Return the chain a_from_b; None if not connected, RigError if ambiguous."""
+        up_a = self._climb(a)
+        up_b = self._climb(b)
         above_b = set(up_b.frames)
         meeting = next((frame for frame in up_a.frames if frame in above_b), None)
         if meeting is None:
@@ -145,7 +146,7 @@ class FrameTree:
         return Chain(matrix, frames, (*edges_a, *reversed(edges_b)))
 
     def ancestor(self, frames: Sequence[str]) -> str | None:
-        """The nearest frame that all `frames` hang on; it may be one of them."""
+        """Return the nearest common ancestor of `frames`, which may be one of them."""
         if not frames:
             return None
         paths = [self._climb(frame).frames for frame in frames]
@@ -153,12 +154,12 @@ class FrameTree:
         return next((frame for frame in paths[0] if frame in shared), None)
 
     def top(self, frame: str) -> tuple[str, str]:
-        """The last frame above `frame` that is beyond doubt, and why it ends there ("": a root)."""
+        """Return the highest certain ancestor of `frame`, and why it is the last ("": a root)."""
         up = self._climb(frame)
         return up.frames[-1], up.problem
 
     def unknown(self, frame: str) -> str:
-        """What to say of a frame that is not in the tree."""
+        """Return the error text for a frame that is not in the tree."""
         near = difflib.get_close_matches(frame, self._frames, 1)
         hint = f"did you mean {near[0]}?" if near else f"it has {some(self.frames) or 'none'}"
         return f"expected a frame of the recording's transforms, found {frame!r}; {hint}"
@@ -166,7 +167,9 @@ class FrameTree:
     def _climb(self, frame: str) -> _Climb:
         if frame not in self._frames:
             raise RigError(self.unknown(frame))
-        place, edges = {frame: 0}, list[Edge]()
+        # Number of edges from the first frame to each.
+        place = {frame: 0}
+        edges: list[Edge] = []
         while len(parents := self._above.get(frame, {})) == 1:
             (edge,) = parents.values()
             first = place.get(edge.parent)
@@ -176,32 +179,34 @@ class FrameTree:
                     f"{edge.source}: expected frames that form a tree, found the circle "
                     f"{' -> '.join([edge.parent, *down])}; {_REMEDY}"
                 )
-                # Whatever hangs on the circle is still well placed relative to where it hangs.
+                # Frames below the circle keep their transforms up to it.
                 return _Climb(list(place)[: first + 1], edges[:first], text)
             edges.append(edge)
             frame = edge.parent
             place[frame] = len(edges)
         return _Climb(list(place), edges, _two_parents(frame, parents))
 
-    def _is_turned_round(self, edge: Edge) -> bool:
-        """Whether an edge closes a circle with edges of other sources."""
-        frame, seen, foreign = edge.parent, {edge.child}, False
+    def _closes_circle(self, edge: Edge) -> bool:
+        """Return whether an edge closes a circle with edges of other sources."""
+        frame = edge.parent
+        seen = {edge.child}
+        has_others = False
         while frame not in seen and len(parents := self._above.get(frame, {})) == 1:
             seen.add(frame)
             (above,) = parents.values()
-            foreign |= above.source != edge.source
+            has_others |= above.source != edge.source
             frame = above.parent
-        return frame == edge.child and foreign
+        return frame == edge.child and has_others
 
 
 def difference(first: F64Array, second: F64Array) -> tuple[float, float]:
-    """How far two poses of one frame are apart: metres, and radians of the turn between them."""
+    """Return the distance of two poses of one frame in m, and the angle between them in rad."""
     x, y, z, w = quaternion(compose(inverse(first), second)).tolist()
     return math.dist(first[:3, 3], second[:3, 3]), 2 * math.atan2(math.hypot(x, y, z), w)
 
 
 def _product(edges: Sequence[Edge]) -> F64Array:
-    """The transform from the first edge's child into the last one's parent."""
+    """Return the transform from the child of the first edge into the parent of the last."""
     matrix = np.eye(4)
     for edge in reversed(edges):
         matrix = compose(matrix, edge.matrix)
@@ -219,6 +224,6 @@ def _two_parents(frame: str, parents: Mapping[str, Edge]) -> str:
 
 
 def some(words: Sequence[str], most: int = 8) -> str:
-    """The first few words of a list that may be long."""
+    """Return the first `most` words of a list as text."""
     text = ", ".join(words[:most])
     return text if len(words) <= most else f"{text} and {len(words) - most} more"

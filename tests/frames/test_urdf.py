@@ -6,7 +6,7 @@ import pytest
 
 from mlbatch.errors import RigError
 from mlbatch.frames import urdf
-from mlbatch.frames.urdf import fixed_joints, joints
+from mlbatch.frames.urdf import joints
 
 REMEDY = "; give the extrinsics in a rig file (--rig)"
 
@@ -25,16 +25,16 @@ LINKS = '<parent link="base_link"/><child link="os_left"/>'
 def test_a_fixed_joint_by_hand() -> None:
     # Yaw of 90 degrees: the sensor looks to the left of the car, its left is the car's back.
     text = _robot(_joint(LINKS + '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'))
-    ((parent, child, matrix),) = fixed_joints(text)
-    assert (parent, child) == ("base_link", "os_left")
+    (joint,) = joints(text)
+    assert (joint.parent, joint.child, joint.is_fixed) == ("base_link", "os_left", True)
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-    assert matrix.tolist() == expected
+    assert joint.matrix.tolist() == expected
 
 
 def test_roll_comes_before_pitch_and_yaw() -> None:
     # About fixed axes: roll takes y to z; then yaw leaves z and takes x to y.
     text = _robot(_joint(LINKS + '<origin rpy="1.5707963267948966 0 1.5707963267948966"/>'))
-    ((_, _, matrix),) = fixed_joints(text)
+    matrix = joints(text)[0].matrix
     assert matrix[:3, :3].tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
 
 
@@ -48,7 +48,7 @@ def test_roll_comes_before_pitch_and_yaw() -> None:
     ],
 )
 def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) -> None:
-    ((_, _, matrix),) = fixed_joints(_robot(_joint(LINKS + origin)))
+    matrix = joints(_robot(_joint(LINKS + origin)))[0].matrix
     assert matrix[:3, 3].tolist() == place
     assert matrix[:3, :3].tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
@@ -56,7 +56,6 @@ def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) 
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic", "floating", "planar", ""])
 def test_joints_that_move_are_told_apart(kind: str) -> None:
     text = _robot(_joint(LINKS, kind, "turret"))
-    assert fixed_joints(text) == []
     (joint,) = joints(text)
     assert (joint.name, joint.kind, joint.is_fixed) == ("turret", kind, False)
     assert (joint.parent, joint.child) == ("base_link", "os_left")
@@ -69,14 +68,12 @@ def test_other_elements_named_joint_are_none() -> None:
         _joint(LINKS),
         "<gazebo><joint name='x' type='fixed'><parent>a</parent></joint></gazebo>",
     )
-    assert [(parent, child) for parent, child, _ in fixed_joints(text)] == [
-        ("base_link", "os_left")
-    ]
+    assert [(joint.parent, joint.child) for joint in joints(text)] == [("base_link", "os_left")]
 
 
 def test_a_default_name_space_changes_nothing() -> None:
     text = f'<robot xmlns="http://example.org/urdf">{_joint(LINKS)}</robot>'
-    assert len(fixed_joints(text)) == 1
+    assert len(joints(text)) == 1
 
 
 def test_an_empty_robot_has_no_joints() -> None:
