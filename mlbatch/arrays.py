@@ -1,4 +1,4 @@
-"""The median, as numpy has it."""
+"""Names of array types, and a median that loads no masked arrays."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 
 def median(values: F64Array | I64Array) -> float:
-    """Of all values of an array: that of `numpy.median`, bit by bit; NaN where one of them is.
+    """Return the value of `numpy.median` over all elements, bit by bit; NaN if one of them is.
 
-    numpy's loads all of its masked arrays to look for NaN: a thirtieth of a short run.
+    `numpy.median` imports `numpy.ma` to look for NaN, a thirtieth of the time of a short run.
     """
     count = values.size
     if not count:
         return math.nan
-    low, high = (count - 1) // 2, count // 2
-    # NaN comes last.
+    low = (count - 1) // 2
+    high = count // 2
+    # NaN is sorted to the end.
     ordered = np.partition(values, (low, high, count - 1), axis=None)
     if ordered[-1] != ordered[-1]:
         return math.nan

@@ -1,13 +1,15 @@
-"""Errors that users see: each message says what, where, wanted, got and what to do, on one line."""
+"""Errors for users: one line each, with what, where, expected, found and the remedy."""
 
 from __future__ import annotations
 
-# The longest line: what a file said may be quoted in it, and files say anything.
-_LINE_CHARACTERS, _CUT_FROM, _CUT_TO = 1600, 1000, -500
+# Messages may quote untrusted files: longer lines lose their middle.
+_MOST_CHARACTERS = 1600
+_FIRST_CHARACTERS = 1000
+_LAST_CHARACTERS = 500
 
 
 class MlbatchError(Exception):
-    """Root of all errors that mlbatch raises on purpose."""
+    """Root of all errors that mlbatch raises."""
 
     def __str__(self) -> str:
         """The message, as one line of bounded length."""
@@ -15,27 +17,27 @@ class MlbatchError(Exception):
 
 
 class UsageError(MlbatchError):
-    """Options that do not fit each other or have impossible values (exit code 2)."""
+    """Options with impossible values, or that contradict each other (exit code 2)."""
 
 
 class RigError(MlbatchError):
-    """A rig file, calibration file or set of extrinsics that cannot be used."""
+    """An unusable rig file, calibration file or set of extrinsics."""
 
 
 class RecordingError(MlbatchError):
-    """A recording that cannot be read, or in which nothing usable was found."""
+    """An unreadable recording, or one without usable packets."""
 
 
 class NoScanError(RecordingError):
-    """A recording of which no scan came out, with the reason."""
+    """A run that made no scan, with the reason."""
 
 
 class ClockError(RecordingError):
-    """Sensor clocks that cannot be compared, or that were reset within the recording."""
+    """Sensor clocks that cannot be compared, or that were reset during the recording."""
 
 
 class ClockJump(ClockError):
-    """A sensor's clock that jumped within the recording; host_ns: arrival of the first packet."""
+    """A sensor clock that jumped; host_ns: receive time of the first packet after the jump."""
 
     def __init__(self, message: str, host_ns: int) -> None:
         super().__init__(message)
@@ -43,7 +45,7 @@ class ClockJump(ClockError):
 
 
 class PacketError(MlbatchError):
-    """A packet that had to be rejected while `--strict` was given."""
+    """A rejected packet, with `--strict`."""
 
 
 class ExportError(MlbatchError):
@@ -51,18 +53,18 @@ class ExportError(MlbatchError):
 
 
 class Interrupted(MlbatchError):
-    """A run that was interrupted, and left what another can go on with (exit code 130)."""
+    """An interrupted run that `--resume` can continue (exit code 130)."""
 
 
 def one_line(text: str) -> str:
-    """Text that may quote untrusted words, fit for a terminal: on one line and not too long.
+    """Return untrusted text as one line of bounded length, safe for a terminal.
 
-    What is not printable (line breaks, escape sequences, marks of direction) is shown by its code.
+    Line breaks, escape sequences, direction marks and others that cannot be printed become codes.
     """
     if not text.isprintable():
         text = "".join(char if char.isprintable() else _code(char) for char in text)
-    if len(text) > _LINE_CHARACTERS:
-        text = f"{text[:_CUT_FROM]} ... {text[_CUT_TO:]}"
+    if len(text) > _MOST_CHARACTERS:
+        text = f"{text[:_FIRST_CHARACTERS]} ... {text[-_LAST_CHARACTERS:]}"
     return text
 
 

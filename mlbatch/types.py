@@ -169,7 +169,7 @@ class WrappedRecording(Recording):
 class Columns:
     """Columns of one sensor: small fixed records; their pixels stay raw in the sensor's ring.
 
-    stamp_ns: (n,) int64, common clock; place: (n,) int64, row of the sensor's `RawRing`;
+    stamp_ns: (n,) int64, common clock; place: (n,) int64, row of the sensor's `PacketRing`;
     encoder: (n,) int64, rotor position (index into the sensor's angle table).
     """
 

@@ -1,4 +1,4 @@
-"""All conversion factors, in one place."""
+"""Conversion factors, and scan rates as exact rational numbers."""
 
 from __future__ import annotations
 
@@ -14,45 +14,43 @@ NS_PER_US = 1_000
 M_PER_MM = 1e-3
 MM_PER_M = 1000
 RAD_PER_DEG = math.pi / 180.0
-# Standard gravity, CGPM 1901; Ouster's legacy IMU packets count in it.
+# m/s2, CGPM 1901; the unit of Ouster's legacy IMU packets.
 STANDARD_GRAVITY = 9.80665
-
-
-# Scan rates as exact rationals, equal to the number that the user wrote (docs/batching.md).
 
 MIN_RATE_HZ = Fraction(1, 4)
 MAX_RATE_HZ = Fraction(1_000_000)
-# `Fraction` alone would also take "1e999999999" and then compute for hours.
+# `Fraction` alone accepts "1e999999999" and computes for hours.
 _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,2})?|\d+/\d+", re.ASCII)
 _MAX_CHARACTERS = 100
 _MAX_DECIMALS = 9
 
 
 def parse_rate(text: str) -> Fraction:
-    """Rate in Hz from text as `10`, `29.97`, `10/3` or `1e1`; UsageError if it is none."""
+    """Return the exact rate in Hz of text as `10`, `29.97`, `10/3` or `1e1`; UsageError if none."""
     cleaned = text.strip()
     shown = cleaned if len(cleaned) <= 40 else cleaned[:40] + "..."
     if len(cleaned) > _MAX_CHARACTERS or _NUMBER.fullmatch(cleaned) is None:
         raise UsageError(
-            f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got {shown!r}; "
+            f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found {shown!r}; "
             "write a decimal number or a fraction"
         )
     try:
         rate = Fraction(cleaned)
     except ZeroDivisionError:
         raise UsageError(
-            f"rate: wanted a fraction with a denominator above 0, got {shown!r}; write it as 10/3"
+            f"rate: expected a fraction with a denominator above 0, found {shown!r}; "
+            "write it as 10/3"
         ) from None
     if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:
         raise UsageError(
-            f"rate: wanted {rate_text(MIN_RATE_HZ)} to {rate_text(MAX_RATE_HZ)} Hz, "
-            f"got {shown!r}; lidars turn at 5 to 20 Hz"
+            f"rate: expected {rate_text(MIN_RATE_HZ)} to {rate_text(MAX_RATE_HZ)} Hz, "
+            f"found {shown!r}; lidars run at 5 to 20 Hz"
         )
     return rate
 
 
 def rate_text(rate: Fraction) -> str:
-    """The exact number as text: `10`, `29.97`, or a fraction where a short decimal is not exact."""
+    """Return exact text: `10`, `29.97`, or a fraction if up to 9 decimals are not exact."""
     for decimals in range(_MAX_DECIMALS + 1):
         scaled = rate * 10**decimals
         if scaled.denominator == 1:

@@ -40,22 +40,31 @@ FORM = "write a decimal number or a fraction"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got ''; {FORM}"),
-        ("ten", f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got 'ten'; {FORM}"),
-        ("-10", f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got '-10'; {FORM}"),
-        ("nan", f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got 'nan'; {FORM}"),
-        ("inf", f"rate: wanted a positive number of Hz (10, 29.97 or 10/3), got 'inf'; {FORM}"),
+        ("", f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found ''; {FORM}"),
+        ("ten", f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found 'ten'; {FORM}"),
+        ("-10", f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found '-10'; {FORM}"),
+        ("nan", f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found 'nan'; {FORM}"),
+        ("inf", f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found 'inf'; {FORM}"),
         (
             "10/0",
-            "rate: wanted a fraction with a denominator above 0, got '10/0'; write it as 10/3",
+            "rate: expected a fraction with a denominator above 0, found '10/0'; write it as 10/3",
         ),
-        ("0", "rate: wanted 0.25 to 1000000 Hz, got '0'; lidars turn at 5 to 20 Hz"),
+        (
+            "0",
+            "rate: expected 0.25 to 1000000 Hz, found '0'; lidars run at 5 to 20 Hz",
+        ),
         (
             "0.2499999",
-            "rate: wanted 0.25 to 1000000 Hz, got '0.2499999'; lidars turn at 5 to 20 Hz",
+            "rate: expected 0.25 to 1000000 Hz, found '0.2499999'; lidars run at 5 to 20 Hz",
         ),
-        ("1000001", "rate: wanted 0.25 to 1000000 Hz, got '1000001'; lidars turn at 5 to 20 Hz"),
-        ("1e99", "rate: wanted 0.25 to 1000000 Hz, got '1e99'; lidars turn at 5 to 20 Hz"),
+        (
+            "1000001",
+            "rate: expected 0.25 to 1000000 Hz, found '1000001'; lidars run at 5 to 20 Hz",
+        ),
+        (
+            "1e99",
+            "rate: expected 0.25 to 1000000 Hz, found '1e99'; lidars run at 5 to 20 Hz",
+        ),
     ],
 )
 def test_other_text_is_refused(text: str, message: str) -> None:

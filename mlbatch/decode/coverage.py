@@ -1,4 +1,4 @@
-"""What the columns of a scan are, sensor by sensor: how many, their gaps, how much of a turn."""
+"""Statistics of the columns of a scan: their number, gaps, coverage and overlap, by sensor."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.decode.scan_buffer import Due
+from mlbatch.decode.scan_buffer import WindowColumns
 from mlbatch.lidar.geometry import SECTORS, sectors
 
 
 @dataclass(frozen=True, slots=True)
-class Outline:
-    """The columns of a sensor in a scan, but for its points; shares are those of Scan."""
+class ColumnStats:
+    """Columns of one sensor in a scan; all fields but the number as in `Scan`."""
 
     columns: int
     max_gap_ns: int
@@ -22,39 +22,43 @@ class Outline:
     overlap: float
 
 
-NO_COLUMNS = Outline(0, 0, 0.0, 0.0)
+NO_COLUMNS = ColumnStats(0, 0, 0.0, 0.0)
 
 
-class Outliner:
-    """Tells the outlines of scans, by passes of numpy."""
+class ColumnStatistics:
+    """Column statistics of every sensor, by numpy."""
 
     def __init__(self, positions: Sequence[int | None]) -> None:
-        """positions: rotor positions of a turn of each sensor; None: rotor words."""
+        """positions: rotor positions of a revolution by sensor; None: columns have rotor words."""
         self._positions = positions
 
-    def outlines(self, due: Due) -> list[Outline]:
-        """Of each sensor."""
+    def measure(self, columns: WindowColumns) -> list[ColumnStats]:
+        """Statistics by sensor."""
         if len(self._positions) == 1:
-            return [_outline(due.stamp_ns, due.encoder, self._positions[0])]
-        # Sorted once, and as bytes: masks of each sensor cost more.
-        order = due.sensor.astype(np.uint8).argsort(kind="stable")
-        stamp_ns, encoder = due.stamp_ns[order], due.encoder[order]
-        ends = np.bincount(due.sensor, minlength=len(self._positions)).cumsum().tolist()
+            return [_stats(columns.stamp_ns, columns.encoder, self._positions[0])]
+        # One sort of bytes costs less than a mask for each sensor.
+        order = columns.sensor.astype(np.uint8).argsort(kind="stable")
+        stamp_ns = columns.stamp_ns[order]
+        encoder = columns.encoder[order]
+        counts = np.bincount(columns.sensor, minlength=len(self._positions))
+        ends = counts.cumsum().tolist()
+        begins = [0, *ends[:-1]]
         return [
-            _outline(stamp_ns[begin:end], encoder[begin:end], positions)
-            for begin, end, positions in zip([0, *ends], ends, self._positions, strict=False)
+            _stats(stamp_ns[begin:end], encoder[begin:end], positions)
+            for begin, end, positions in zip(begins, ends, self._positions, strict=True)
         ]
 
 
-def _outline(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> Outline:
-    """Of the columns of one sensor, (n,) each; positions: see `sectors`."""
+def _stats(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> ColumnStats:
+    """Statistics of the columns (n,) of one sensor; positions: see `sectors`."""
     if not len(stamp_ns):
         return NO_COLUMNS
     gap_ns = int((stamp_ns[1:] - stamp_ns[:-1]).max(initial=0))
-    # How often the rotor entered each sector.
     sector = sectors(encoder, positions)
+    # A sector counts once each time that the rotor enters it.
     entered = sector[1:][sector[1:] != sector[:-1]]
     passes = np.bincount(entered, minlength=SECTORS)
     passes[sector[0]] += 1
-    once, again = np.count_nonzero(passes), np.count_nonzero(passes > 1)
-    return Outline(len(stamp_ns), gap_ns, once / SECTORS, again / SECTORS)
+    passed = int(np.count_nonzero(passes))
+    passed_again = int(np.count_nonzero(passes > 1))
+    return ColumnStats(len(stamp_ns), gap_ns, passed / SECTORS, passed_again / SECTORS)

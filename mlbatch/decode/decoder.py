@@ -1,35 +1,36 @@
-"""Raw columns of a window to the arrays of a scan: every pixel is written once, to its final row.
+"""Columns of a window to the arrays of a scan; every pixel is written once, to its final row.
 
-Sensors whose pixels look alike are decoded together, by passes of numpy (`tiles.py`) or by compiled
-loops (`compiled.py`); both give the same bytes.
+Sensors with equal pixel layouts are decoded together, by numpy (`numpy_engine.py`) or by compiled
+loops (`numba_engine.py`); both give the same bytes.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import F64Array, U8Array
-from mlbatch.decode.coverage import NO_COLUMNS, Outline, Outliner
-from mlbatch.decode.numpy_engine import Tiles
+from mlbatch.decode.coverage import NO_COLUMNS, ColumnStats
+from mlbatch.decode.engine import Engine, EngineSetup
+from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
-from mlbatch.decode.scan_buffer import Buffer, Due
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import EXTRAS, RunInfo, Scan
 
-__all__ = ["Decoder", "Due", "Label", "Source"]
+__all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
-# What became of the slots of every sensor of a run, in the order of `ledger.POINT_FATES`.
-Fates: TypeAlias = Sequence[Sequence[int]]
+# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_FATES`.
+PointOutcomes: TypeAlias = Sequence[Sequence[int]]
 
 
 @dataclass(frozen=True, slots=True)
-class Label:
-    """What a scan says of itself; see Scan."""
+class ScanHeader:
+    """Fields of a scan that do not depend on its points; see `Scan`."""
 
     index: int
     slice: int
@@ -39,8 +40,32 @@ class Label:
     ready_host_ns: int
 
 
+class _EngineChoice(NamedTuple):
+    """How to make an engine.
+
+    joins_rotors: one projector may have several sensors whose columns have rotor words.
+    """
+
+    make: Callable[[EngineSetup], Engine]
+    joins_rotors: bool
+
+
+def _numba_engine(setup: EngineSetup) -> Engine:
+    # Imported on demand: numba is an optional dependency.
+    from mlbatch.decode.numba_engine import NumbaEngine
+
+    return NumbaEngine(setup)
+
+
+_ENGINES: Mapping[str, _EngineChoice] = {
+    "numpy": _EngineChoice(NumpyEngine, joins_rotors=True),
+    # Its groups join what its projectors do not; a compiled loop follows one rotor.
+    "numba": _EngineChoice(_numba_engine, joins_rotors=False),
+}
+
+
 class Decoder:
-    """Turns the columns of windows into scans; `only` (a sensor) serves `--split`."""
+    """Decodes windows of columns into scans."""
 
     def __init__(
         self,
@@ -52,107 +77,110 @@ class Decoder:
         buffers: int = 1,
         engine: str = "numpy",
     ) -> None:
-        """buffers: the arrays of so many scans are valid at a time; engine: numpy or numba."""
+        """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
+
+        only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
+        whose arrays are valid at a time; engine: numpy or numba.
+        """
         self._info = info
         self._only = only
         self._extras = extras
         self._slots = max(source.slots for source in sources)
+        self._is_organized = info.layout == "organized"
+        self._has_reflectivity = "reflectivity" in extras and any(
+            source.lidar.has_reflectivity for source in sources
+        )
+        choice = _ENGINES[engine]
         columns = tile_columns(self._slots)
-        # Rotor positions of a turn, None for those that columns tell themselves.
-        angles = [source.lidar.beams.angle_rad for source in sources]
-        positions = [None if one is None else len(one) for one in angles]
-        groups = _alike(sources, together=engine == "numpy")
-        first = only or 0
+        first_sensor = only or 0
+        groups = _groups(sources, choice.joins_rotors)
         self._projectors = [
             Projector(
-                [(first + number, sources[number]) for number in group],
+                [(first_sensor + number, sources[number]) for number in group],
                 columns,
                 boxes_m,
                 extras,
             )
             for group in groups
         ]
-        # Of each sensor: its projector, and its number there.
         self._seat = np.empty((len(sources), 2), np.int64)
         for which, group in enumerate(groups):
             self._seat[group] = [(which, member) for member in range(len(group))]
-        self._organized = info.layout == "organized"
-        self._has_reflectivity = "reflectivity" in extras and any(
-            source.lidar.has_reflectivity for source in sources
+        setup = EngineSetup(
+            projectors=self._projectors,
+            seat=self._seat,
+            tile_columns=columns,
+            first_sensor=first_sensor,
+            extras=extras if self._has_reflectivity else extras - {"reflectivity"},
+            organized_slots=self._slots if self._is_organized else 0,
         )
-        shown = extras if self._has_reflectivity else extras - {"reflectivity"}
-        wide = self._slots if self._organized else 0
-        if engine == "numba":
-            # Loaded only here, as what it needs may not be there.
-            from mlbatch.decode.numba_engine import CompiledOutliner, Kinds
-
-            self._outliner: Outliner = CompiledOutliner(positions)
-            self._kinds: Tiles | Kinds = Kinds(
-                self._projectors, self._seat, columns, first, shown, wide
-            )
-        else:
-            self._outliner = Outliner(positions)
-            self._kinds = Tiles(self._projectors, self._seat, columns, first, shown)
+        self._engine = choice.make(setup)
+        angles = [source.lidar.beams.angle_rad for source in sources]
+        positions = [None if one is None else len(one) for one in angles]
+        self._statistics = self._engine.column_statistics(positions)
         self._buffer = self._new_buffer(0)
-        self._others = deque(self._new_buffer(0) for _ in range(buffers - 1))
+        self._other_buffers = deque(self._new_buffer(0) for _ in range(buffers - 1))
 
     @property
     def counts(self) -> list[PointCounts]:
-        """The ledger of pixels of each sensor."""
+        """Point counters of each sensor."""
         return [self._projectors[which].counts[member] for which, member in self._seat]
 
-    def scan(self, due: Due, label: Label, fates: Fates | None = None) -> Scan:
-        """Decode the columns of one window; the arrays are valid until as many calls as buffers.
+    def scan(
+        self,
+        columns: WindowColumns,
+        header: ScanHeader,
+        outcomes: PointOutcomes | None = None,
+    ) -> Scan:
+        """Decode the columns of a window; the arrays are valid for as many calls as buffers.
 
-        fates: given where an output already holds the points; their arrays then mean nothing.
+        outcomes: of a scan that an output already contains: its slots are counted and not decoded,
+        and the contents of its arrays are undefined.
         """
-        if fates is not None:
-            return self._outline(due, label, fates)
-        self._others.append(self._buffer)
-        self._buffer = self._others.popleft()
-        self._fit(len(due))
-        points = self._kinds.decode(due, label.start_ns, 0, self._buffer)
-        return self._scan(due, label, points)
+        if outcomes is not None:
+            return self._scan_without_points(columns, header, outcomes)
+        self._other_buffers.append(self._buffer)
+        self._buffer = self._other_buffers.popleft()
+        self._reserve(len(columns))
+        points = self._engine.decode(columns, header.start_ns, 0, self._buffer)
+        return self._scan(columns, header, points)
 
-    def _outline(self, due: Due, label: Label, fates: Fates) -> Scan:
-        """All of a scan but its points; organized, its arrays have their shapes."""
-        if self._organized:
-            self._fit(len(due))
+    def _scan_without_points(
+        self, columns: WindowColumns, header: ScanHeader, outcomes: PointOutcomes
+    ) -> Scan:
+        """Return the scan with all but its points; arrays of organized scans have their shapes."""
+        if self._is_organized:
+            self._reserve(len(columns))
         counts = self.counts
         before = sum(one.written for one in counts)
-        own = fates if self._only is None else fates[self._only : self._only + 1]
+        own = outcomes if self._only is None else outcomes[self._only : self._only + 1]
         for one, numbers in zip(counts, own, strict=True):
             one.add(numbers)
         points = sum(one.written for one in counts) - before
-        return replace(self._scan(due, label, 0), points=points)
+        return replace(self._scan(columns, header, 0), points=points)
 
-    def _fit(self, columns: int) -> None:
-        rows = columns if self._organized else columns * self._slots
+    def _reserve(self, columns: int) -> None:
+        """Make the buffer large enough for so many columns."""
+        rows = columns if self._is_organized else columns * self._slots
         if rows > self._buffer.rows:
             self._buffer = self._new_buffer(rows)
 
-    def _new_buffer(self, rows: int) -> Buffer:
-        return Buffer(rows, self._slots if self._organized else None)
+    def _new_buffer(self, rows: int) -> ScanBuffer:
+        return ScanBuffer(rows, self._slots if self._is_organized else None)
 
-    def _lidar_id(self, due: Due, columns: slice) -> U8Array:
-        sensor = due.sensor[columns]
-        if self._only is not None:
-            return np.full(len(sensor), self._only, np.uint8)
-        return sensor.astype(np.uint8)
-
-    def _scan(self, due: Due, label: Label, points: int) -> Scan:
-        rows, buffer = slice(0, len(due) if self._organized else points), self._buffer
-        lidar_id = self._lidar_id(due, slice(None))
-        own = self._outlines(due)
-        has_column = "column" in self._extras and not self._organized
+    def _scan(self, columns: WindowColumns, header: ScanHeader, points: int) -> Scan:
+        rows = slice(0, len(columns) if self._is_organized else points)
+        buffer = self._buffer
+        stats = self._column_stats(columns)
+        has_column = "column" in self._extras and not self._is_organized
         return Scan(
             info=self._info,
-            index=label.index,
-            slice=label.slice,
-            start_ns=label.start_ns,
-            end_ns=label.end_ns,
-            complete=label.complete,
-            ready_host_ns=label.ready_host_ns,
+            index=header.index,
+            slice=header.slice,
+            start_ns=header.start_ns,
+            end_ns=header.end_ns,
+            complete=header.complete,
+            ready_host_ns=header.ready_host_ns,
             xyz=buffer.point[rows, ..., :3],
             intensity=buffer.point[rows, ..., 3],
             reflectivity=buffer.reflectivity[rows] if self._has_reflectivity else None,
@@ -162,43 +190,49 @@ class Decoder:
             return_type=buffer.label["return_type"][rows],
             lidar_id=buffer.label["lidar_id"][rows],
             column=buffer.column[rows] if has_column else None,
-            column_stamp_ns=due.stamp_ns,
-            column_lidar_id=lidar_id,
+            column_stamp_ns=columns.stamp_ns,
+            column_lidar_id=self._lidar_id(columns),
             points=points,
-            columns_per_sensor=tuple(one.columns for one in own),
-            max_gap_ns=tuple(one.max_gap_ns for one in own),
-            coverage=tuple(one.coverage for one in own),
-            overlap=tuple(one.overlap for one in own),
+            columns_per_sensor=tuple(one.columns for one in stats),
+            max_gap_ns=tuple(one.max_gap_ns for one in stats),
+            coverage=tuple(one.coverage for one in stats),
+            overlap=tuple(one.overlap for one in stats),
         )
 
-    def _outlines(self, due: Due) -> list[Outline]:
-        """What the columns of each sensor are."""
-        outlines = self._outliner.outlines(due)
+    def _lidar_id(self, columns: WindowColumns) -> U8Array:
+        if self._only is not None:
+            return np.full(len(columns), self._only, np.uint8)
+        return columns.sensor.astype(np.uint8)
+
+    def _column_stats(self, columns: WindowColumns) -> list[ColumnStats]:
+        """Return the column statistics of all sensors of the run."""
+        stats = self._statistics.measure(columns)
         if self._only is None:
-            return outlines
-        nothing = [NO_COLUMNS] * (len(self._info.sensors) - 1)
-        return [*nothing[: self._only], *outlines, *nothing[self._only :]]
+            return stats
+        others = [NO_COLUMNS] * (len(self._info.sensors) - 1)
+        return [*others[: self._only], *stats, *others[self._only :]]
 
 
-def _alike(sources: Sequence[Source], *, together: bool) -> list[list[int]]:
-    """Numbers of the sensors, grouped by what their pixels look like.
-
-    together: also those that say their angle themselves, if their beams fire at the same times;
-    compiled loops follow the rotor of one sensor only.
-    """
+def _groups(sources: Sequence[Source], joins_rotors: bool) -> list[list[int]]:
+    """Group the sensors whose pixels one projector can decode; joins_rotors: `_EngineChoice`."""
     groups: dict[tuple[str | int | bool | bytes, ...], list[int]] = {}
     for number, source in enumerate(sources):
-        kind: tuple[str | int | bool | bytes, ...] = source.lidar.pixel_layout
+        key: tuple[str | int | bool | bytes, ...] = source.lidar.pixel_layout
         if source.lidar.beams.angle_rad is None:
-            kind = (*kind, *_firing(source)) if together else (number,)
+            key = (*key, *_firing(source)) if joins_rotors else (number,)
         if source.lidar.projection(source.body_from_sensor, 1) is not None:
-            kind = (number,)
-        groups.setdefault(kind, []).append(number)
+            key = (number,)
+        groups.setdefault(key, []).append(number)
     return list(groups.values())
 
 
 def _firing(source: Source) -> tuple[str | bool | bytes, ...]:
-    """What sensors have in common whose beams fire alike, and whose returns mean the same."""
+    """Return what sensors with rotor words must share to be decoded together."""
     lidar = source.lidar
-    tables = lidar.firing_ns.tobytes(), lidar.channel.tobytes()
-    return (*tables, lidar.typed_by, lidar.sends_twice, source.keep_repeated)
+    return (
+        lidar.firing_ns.tobytes(),
+        lidar.channel.tobytes(),
+        lidar.typed_by,
+        lidar.sends_twice,
+        source.keep_repeated,
+    )

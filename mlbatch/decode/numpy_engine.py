@@ -1,7 +1,7 @@
-"""The engine `numpy`: a window tile by tile, few passes over planes that stay in the caches.
+"""The engine `numpy`: decodes a window tile by tile, by passes over arrays that fit the caches.
 
-The columns of a tile are decoded sensor by sensor, those of one kind in one go (`projection.py`);
-the index by which the valid points leave the tile puts them in the order of the scan.
+The columns of a tile are decoded sensor by sensor, those of one projector in one call
+(`projector.py`); the index by which points are copied out of the tile has the order of the scan.
 """
 
 from __future__ import annotations
@@ -13,183 +13,196 @@ from itertools import pairwise
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.decode.projector import Extras, Part, Projector, Tile, wanted_points
-from mlbatch.decode.scan_buffer import Buffer, Due
+from mlbatch.decode.coverage import ColumnStatistics
+from mlbatch.decode.engine import EngineSetup
+from mlbatch.decode.projector import Projector, Tile, TileView, points_by_column
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
 
 
 @dataclass(slots=True)
-class _Laid:
-    """Columns of a tile that are decoded together.
+class _TilePart:
+    """Columns of a tile that one projector decoded.
 
-    rows: in the scan's order; begin: first element in the tile's planes; encoder: of each.
+    rows: (n,) their positions in the tile's share of the scan; begin: first element in the arrays
+    of the tile; encoder: (n,).
     """
 
     projector: Projector
-    part: Part
+    view: TileView
     rows: I64Array
     begin: int
     encoder: I64Array
 
 
-class Tiles:
-    """Decodes the columns of some kinds of sensors; those of others are passed over."""
+class NumpyEngine:
+    """Decodes the columns of the sensors of some projectors; skips those of other sensors."""
 
-    def __init__(
-        self,
-        projectors: Sequence[Projector],
-        seat: I64Array,
-        columns: int,
-        first_sensor: int,
-        extras: Extras,
-    ) -> None:
-        """seat: (sensors, 2), projector of each and number there, -1 for other kinds.
-
-        columns: of a tile; first_sensor: number of the first one in the scan; extras: those that
-        the scan has, of any sensor.
-        """
+    def __init__(self, setup: EngineSetup) -> None:
+        projectors = setup.projectors
+        seat = setup.seat
         self._projectors = projectors
-        self._columns = columns
-        self._first_sensor = first_sensor
-        self._extras = extras
+        self._columns = setup.tile_columns
+        self._first_sensor = setup.first_sensor
+        self._extras = setup.extras
         self._slots = max(projector.slots for projector in projectors)
-        self._tile = Tile(columns * self._slots)
-        self._keep = np.zeros((columns, self._slots), np.bool_)
-        self._element = np.arange(columns * self._slots)
+        self._tile = Tile(self._columns * self._slots)
+        self._keep = np.zeros((self._columns, self._slots), np.bool_)
+        self._element = np.arange(self._columns * self._slots)
         self._is_ordered = any(projector.order is not None for projector in projectors)
-        self._member = np.concatenate([np.arange(len(one.sources)) for one in projectors])
-        self._ends = np.cumsum([len(one.sources) for one in projectors])
-        # Of each sensor: its place among those that are decoded here, beyond all of them if not.
+        # All members of all projectors, one after the other.
+        members = [len(one.sources) for one in projectors]
+        self._member = np.concatenate([np.arange(count) for count in members])
+        self._ends = np.cumsum(members)
+        self._is_alone = len(self._member) == 1
+        # By sensor: its index in that order; skipped sensors come after all others.
         self._is_partial = bool((seat < 0).any())
-        seats = len(self._member)
         first = np.array([0, *self._ends])[seat[:, 0]]
-        self._seat = np.where(seat[:, 0] < 0, seats, first + seat[:, 1]).astype(np.uint8)
-        self._is_alone = seats == 1
+        skipped = len(self._member)
+        self._seat = np.where(seat[:, 0] < 0, skipped, first + seat[:, 1]).astype(np.uint8)
+
+    def column_statistics(self, positions: Sequence[int | None]) -> ColumnStatistics:
+        """See `Engine`."""
+        return ColumnStatistics(positions)
 
     def decode(
-        self, due: Due, start_ns: int, first: int, out: Buffer, points: I64Array | None = None
+        self,
+        columns: WindowColumns,
+        start_ns: int,
+        first_number: int,
+        out: ScanBuffer,
+        points: I64Array | None = None,
     ) -> int:
-        """As `compiled.CompiledKind.decode`."""
+        """See `Engine`; points: (n,), receives the number of points of each decoded column."""
         count = 0
-        # Of equal size, since what a small one costs is mostly its calls.
-        tiles = max(1, -(-len(due) // self._columns))
-        bounds = [len(due) * part // tiles for part in range(tiles + 1)]
+        # Tiles of equal size: the cost of a small one is mostly that of its calls.
+        tiles = max(1, -(-len(columns) // self._columns))
+        bounds = [len(columns) * tile // tiles for tile in range(tiles + 1)]
         for begin, end in pairwise(bounds):
-            number: I64Array = np.arange(first + begin, first + end)
-            columns = due.part(slice(begin, end))
+            number: I64Array = np.arange(first_number + begin, first_number + end)
+            some = columns.take(slice(begin, end))
             own: I64Array | None = None
             if self._is_partial:
-                own = (self._seat[columns.sensor] < len(self._member)).nonzero()[0]
-                columns, number = columns.part(own), number[own]
-            if not len(columns):
+                own = (self._seat[some.sensor] < len(self._member)).nonzero()[0]
+                some = some.take(own)
+                number = number[own]
+            if not len(some):
                 continue
-            laid = self._project(columns, start_ns)
+            parts = self._project(some, start_ns)
             if out.is_organized:
-                count += self._place(laid, columns, number, out)
+                count += self._write_organized(parts, some, number, out)
                 continue
-            index, keep = self._index(laid, len(columns))
-            self._move(index, out, count)
+            index, keep = self._index(parts, len(some))
+            self._write_dense(index, out, count)
             if points is not None:
-                points[begin:end][slice(None) if own is None else own] = wanted_points(keep)
+                points[begin:end][slice(None) if own is None else own] = points_by_column(keep)
             elif "column" in self._extras:
-                out.column[count : count + len(index)] = number.repeat(wanted_points(keep))
+                out.column[count : count + len(index)] = number.repeat(points_by_column(keep))
             count += len(index)
         return count
 
-    def _project(self, due: Due, start_ns: int) -> list[_Laid]:
-        """Decode the columns of one tile, sensor by sensor."""
-        seat = self._seat[due.sensor]
-        rows = self._element[: len(due)]
+    def _project(self, columns: WindowColumns, start_ns: int) -> list[_TilePart]:
+        """Decode the columns of one tile, projector by projector."""
+        seat = self._seat[columns.sensor]
+        rows = self._element[: len(columns)]
         if not self._is_alone:
             rows = seat.argsort(kind="stable")
-            due, seat = due.part(rows), seat[rows]
-        member, offset_ns = self._member[seat], due.stamp_ns - start_ns
-        laid: list[_Laid] = []
-        element = begin = 0
+            columns = columns.take(rows)
+            seat = seat[rows]
+        member = self._member[seat]
+        offset_ns = columns.stamp_ns - start_ns
+        parts: list[_TilePart] = []
+        element = 0
+        begin = 0
         ends = np.searchsorted(seat, self._ends).tolist()
         for projector, end in zip(self._projectors, ends, strict=True):
             if begin == end:
                 continue
             own = slice(begin, end)
-            part = self._tile.part(element, end - begin, projector.slots)
-            encoder = due.encoder[own]
-            projector.project(member[own], due.place[own], encoder, offset_ns[own], part)
-            laid.append(_Laid(projector, part, rows[own], element, encoder))
+            view = self._tile.view(element, end - begin, projector.slots)
+            encoder = columns.encoder[own]
+            projector.project(member[own], columns.place[own], encoder, offset_ns[own], view)
+            parts.append(_TilePart(projector, view, rows[own], element, encoder))
             element += (end - begin) * projector.slots
             begin = end
-        return laid
+        return parts
 
-    def _index(self, laid: Sequence[_Laid], columns: int) -> tuple[I64Array, BoolArray]:
-        """Elements of the tile's planes in the order of the scan; wanted slots (columns, slots)."""
-        if len(laid) == 1:
-            return self._index_one(laid[0])
-        wide = self._keep[:columns]
+    def _index(self, parts: Sequence[_TilePart], columns: int) -> tuple[I64Array, BoolArray]:
+        """Return tile elements of the points in scan order, and marked slots (columns, slots)."""
+        if len(parts) == 1:
+            return self._index_of_one(parts[0])
+        marked = self._keep[:columns]
         shift = np.empty(columns, np.int64)
         elements = np.empty(columns * self._slots, np.int64) if self._is_ordered else None
-        for one in laid:
-            count, slots = one.part.keep.shape
-            keep, element = one.projector.in_firing_order(one.part.keep, one.encoder)
+        for part in parts:
+            count, slots = part.view.keep.shape
+            keep, element = part.projector.in_firing_order(part.view.keep, part.encoder)
             if elements is not None:
-                own = slice(one.begin, one.begin + count * slots)
+                own = slice(part.begin, part.begin + count * slots)
                 within = self._element[: count * slots] if element is None else element
-                np.add(within, one.begin, out=elements[own])
-            wide[one.rows, :slots] = keep
-            wide[one.rows, slots:] = False
-            shift[one.rows] = self._element[one.begin : one.begin + count * slots : slots]
+                np.add(within, part.begin, out=elements[own])
+            marked[part.rows, :slots] = keep
+            marked[part.rows, slots:] = False
+            shift[part.rows] = self._element[part.begin : part.begin + count * slots : slots]
         shift -= self._element[: columns * self._slots : self._slots]
-        index = wide.reshape(-1).nonzero()[0]
-        index += shift.repeat(wanted_points(wide))
-        return index if elements is None else elements.take(index), wide
+        index = marked.reshape(-1).nonzero()[0]
+        index += shift.repeat(points_by_column(marked))
+        return index if elements is None else elements.take(index), marked
 
-    def _index_one(self, laid: _Laid) -> tuple[I64Array, BoolArray]:
-        """The same, where all columns were decoded together."""
-        keep, element = laid.projector.in_firing_order(laid.part.keep, laid.encoder)
+    def _index_of_one(self, part: _TilePart) -> tuple[I64Array, BoolArray]:
+        """Do the same for a tile of one projector."""
+        keep, element = part.projector.in_firing_order(part.view.keep, part.encoder)
         if self._is_alone:
             index = keep.reshape(-1).nonzero()[0]
         else:
             count, slots = keep.shape
-            place, number = np.empty(count, np.int64), self._element[:count]
-            place[laid.rows] = number
-            keep = keep.take(place, axis=0)
+            position = np.empty(count, np.int64)
+            number = self._element[:count]
+            position[part.rows] = number
+            keep = keep.take(position, axis=0)
             index = keep.reshape(-1).nonzero()[0]
-            place -= number
-            place *= slots
-            index += place.repeat(wanted_points(keep))
+            position -= number
+            position *= slots
+            index += position.repeat(points_by_column(keep))
         return index if element is None else element.take(index), keep
 
-    def _move(self, index: I64Array, buffer: Buffer, at: int) -> None:
-        """Copy the wanted points of a tile to their final rows, from row `at` on.
+    def _write_dense(self, index: I64Array, out: ScanBuffer, first_row: int) -> None:
+        """Copy the tile elements at `index` to rows from `first_row`.
 
-        No index is out of bounds; of what `take` might do then, to wrap is the fastest.
+        No index is out of bounds; of the modes of `take`, "wrap" is the fastest.
         """
         tile = self._tile
-        rows = slice(at, at + len(index))
-        whole = tile.point.view(np.complex128).reshape(-1)
-        whole.take(index, out=buffer.point[rows].view(np.complex128).reshape(-1), mode="wrap")
-        words = tile.label.view(np.uint64)
-        words.take(index, out=buffer.label[rows].view(np.uint64), mode="wrap")
+        rows = slice(first_row, first_row + len(index))
+        # Four float32 move as one element of 16 bytes.
+        points = tile.point.view(np.complex128).reshape(-1)
+        points.take(index, out=out.point[rows].view(np.complex128).reshape(-1), mode="wrap")
+        labels = tile.label.view(np.uint64)
+        labels.take(index, out=out.label[rows].view(np.uint64), mode="wrap")
         if "range_m" in self._extras:
-            tile.range_m.take(index, out=buffer.range_m[rows], mode="wrap")
+            tile.range_m.take(index, out=out.range_m[rows], mode="wrap")
         if "reflectivity" in self._extras:
-            tile.reflectivity.take(index, out=buffer.reflectivity[rows], mode="wrap")
+            tile.reflectivity.take(index, out=out.reflectivity[rows], mode="wrap")
 
-    def _place(self, laid: Sequence[_Laid], due: Due, number: I64Array, buffer: Buffer) -> int:
-        """Lay a tile down as it is, NaN and 0 where a slot is empty; gives its valid points.
-
-        number: (n,) of the columns in the scan.
-        """
+    def _write_organized(
+        self,
+        parts: Sequence[_TilePart],
+        columns: WindowColumns,
+        number: I64Array,
+        out: ScanBuffer,
+    ) -> int:
+        """Write a tile to rows `number` (n,), empty slots included; return its points."""
         points = 0
-        for one in laid:
-            part, keep = one.part, one.part.keep
-            points += int(np.count_nonzero(keep))
-            row, slot = np.nonzero(keep)
-            order = number[one.rows]
-            buffer.clear(order)
-            sensor = due.sensor[one.rows] + self._first_sensor
-            buffer.label["lidar_id"][order] = sensor[:, None]
-            at = (order[row], one.projector.number[slot])
-            buffer.point[at] = part.point[keep]
+        for part in parts:
+            view = part.view
+            points += int(np.count_nonzero(view.keep))
+            row, slot = np.nonzero(view.keep)
+            order = number[part.rows]
+            out.clear(order)
+            sensor = columns.sensor[part.rows] + self._first_sensor
+            out.label["lidar_id"][order] = sensor[:, None]
+            target = (order[row], part.projector.number[slot])
+            out.point[target] = view.point[view.keep]
             if "range_m" in self._extras:
-                buffer.range_m[at] = part.range_m[keep]
-            buffer.label[at] = part.label[keep]
-            buffer.reflectivity[at] = part.reflectivity[keep]
+                out.range_m[target] = view.range_m[view.keep]
+            out.label[target] = view.label[view.keep]
+            out.reflectivity[target] = view.reflectivity[view.keep]
         return points

@@ -1,4 +1,4 @@
-"""Raw packets of one sensor, kept until the window that holds their last column closes."""
+"""Raw packets of one sensor, kept until all windows with their columns are decoded."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from mlbatch.lidar.interface import Records
 _FIRST_PACKETS = 64
 
 
-class RawRing:
-    """Whole packets in a reused buffer; their columns lie in rows of equal length.
+class PacketRing:
+    """Ring buffer of whole packets, read column by column.
 
-    A packet takes a whole number of rows, so row r of the packet in slot p begins at byte
-    `(p * rows + r) * stride + start`: gathering columns is one `take` of rows (or of pieces of
-    them), and a packet is copied once. Places number columns and count up for ever; the buffer
-    holds the newest. One thread may `store` while others `gather` places that are still needed.
+    A packet takes a whole number of rows of `Records.stride` bytes: row r of the packet in slot p
+    begins at byte `(p * rows + r) * stride + start`. A packet is copied once; columns are gathered
+    by one indexed copy of rows or parts of rows. Every column has a place, an int64 that counts up
+    and is never reused; the buffer contains the newest. One thread may `store` while others
+    `gather` places that are still needed.
     """
 
     def __init__(self, packet_size: int, records: Records) -> None:
@@ -32,34 +33,38 @@ class RawRing:
 
     @property
     def pieces(self) -> npt.NDArray[np.void]:
-        """Columns where they lie, (rows, columns of a row); that at `place` is number `place`.
+        """View of all columns, (rows, columns of a row), one element of `records.size` bytes each.
 
-        Counted row by row, and modulo their number. Another thread may put a larger one in place.
+        The column at `place` has the flat index `place` modulo the size. `store` may replace the
+        view by a larger one at any time: take it once, then use that.
         """
         pieces: npt.NDArray[np.void] = self._pieces
         return pieces
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """Size of the buffer in bytes."""
         return self._bytes.nbytes
 
     def store(
         self, data: U8Array, start: I64Array, oldest_place: int | None
     ) -> tuple[U8Array, I64Array]:
-        """Copy packets in; give a view of them, (P, packet_size), and the places of their columns.
+        """Copy packets in; return a view (P, packet_size) and each packet's first place (P,).
 
-        data, start: as in a PacketBatch; oldest_place: first place that is still needed.
-        The view and the columns are valid until the next call.
+        data, start: as in `PacketBatch`; oldest_place: first place that is still needed, None if
+        none is. The view is valid until the next call.
         """
         count = len(start)
         oldest = self._next if oldest_place is None else oldest_place // self._places
         slot = self._reserve(count, oldest)
-        stride, size = self._rows_per_packet * self._records.stride, self._packet_size
+        stride = self._rows_per_packet * self._records.stride
+        size = self._packet_size
         first = (slot % self._capacity) * stride
         packets = self._bytes[first : first + count * stride].reshape(count, stride)[:, :size]
         if not _copy_evenly(data, start, packets):
-            target, source, at = self._bytes.data, data.data, first
+            target = self._bytes.data
+            source = data.data
+            at = first
             for begin in start.tolist():
                 target[at : at + size] = source[begin : begin + size]
                 at += stride
@@ -68,13 +73,13 @@ class RawRing:
 
     def gather(self, place: I64Array, out: U8Array) -> None:
         """Copy the columns at `place` (n,) to the rows of `out` (n, records.size)."""
-        # Looked up once, since another thread may put larger ones in their place.
+        # Each view is read once: another thread may replace it by a larger one.
         if self._is_plain:
             rows = self._rows
             rows.take(place % len(rows), axis=0, out=out, mode="clip")
             return
         count, windows = self._windows
-        # A quotient of numbers by one other is much faster than a remainder.
+        # numpy divides by a scalar much faster than it takes the remainder.
         per_row = self._records.per_row
         row = place // per_row
         at = (place - row * per_row) * self._records.step
@@ -83,19 +88,23 @@ class RawRing:
         out.view(windows.dtype)[:, 0] = windows[at]
 
     def _allocate(self, packets: int) -> U8Array:
-        """Room for so many packets, all zero."""
-        rows, records = packets * self._rows_per_packet, self._records
-        # More than the slots need, since rows begin later and columns may be longer than rows.
+        """Return a buffer for so many packets, all zero."""
+        rows = packets * self._rows_per_packet
+        records = self._records
+        # Spare bytes: rows begin at `start`, and columns may be longer than rows.
         spare = records.start + records.size + records.per_row * records.step
         return np.zeros(rows * records.stride + spare, np.uint8)
 
     def _use(self, data: U8Array, packets: int) -> None:
-        """Look for packets in `data` from now on."""
-        self._bytes, self._capacity = data, packets
-        rows, records = packets * self._rows_per_packet, self._records
-        begin, end = records.start, records.start + rows * records.stride
+        """Switch to the buffer `data` for so many packets."""
+        self._bytes = data
+        self._capacity = packets
+        records = self._records
+        rows = packets * self._rows_per_packet
+        begin = records.start
+        end = begin + rows * records.stride
         self._rows = self._bytes[begin:end].reshape(rows, -1)
-        # As bytes of one element each, pieces may overlap and still move in one go.
+        # Elements of a void type may overlap and are still copied as a whole.
         self._pieces: npt.NDArray[np.void] = np.ndarray(
             (rows, records.per_row),
             np.dtype((np.void, records.size)),
@@ -103,7 +112,7 @@ class RawRing:
             offset=begin,
             strides=(records.stride, records.step),
         )
-        # All that begins at any byte of so many rows: one index instead of two.
+        # The same for a column at any byte, so that one index is enough.
         windows: npt.NDArray[np.void] = np.ndarray(
             ((rows - 1) * records.stride + (records.per_row - 1) * records.step + 1,),
             self._pieces.dtype,
@@ -114,9 +123,10 @@ class RawRing:
         self._windows = rows, windows
 
     def _reserve(self, count: int, oldest: int) -> int:
-        """First of `count` slots in one piece; what is older than slot `oldest` may go."""
+        """Return the first of `count` contiguous slots; slots before `oldest` may be reused."""
         while True:
-            slot, room = self._next, self._capacity - self._next % self._capacity
+            slot = self._next
+            room = self._capacity - slot % self._capacity
             if count > room:
                 slot += room
             if slot + count - min(oldest, slot) <= self._capacity:
@@ -124,7 +134,8 @@ class RawRing:
             self._grow(oldest, count)
 
     def _grow(self, oldest: int, count: int) -> None:
-        old, capacity = self._bytes, self._capacity
+        old = self._bytes
+        capacity = self._capacity
         live = np.arange(oldest, self._next)
         larger = max(2 * capacity, 1 << int(np.ceil(np.log2(2 * count + 1))))
         new = self._allocate(larger)
@@ -132,14 +143,14 @@ class RawRing:
         before = old[: capacity * stride].reshape(capacity, stride)
         after = new[: larger * stride].reshape(larger, stride)
         after[live % larger] = before[live % capacity]
-        # Only now, since other threads gather columns all the time.
+        # Last, since other threads gather columns meanwhile.
         self._use(new, larger)
 
 
 def _copy_evenly(data: U8Array, start: I64Array, packets: U8Array) -> bool:
-    """Copy payloads to the rows of `packets` (n, size) at once, if they are evenly spaced.
+    """Copy evenly spaced payloads, as captures of a single lidar have, to `packets` (n, size).
 
-    As in the capture of a single lidar; else nothing is done.
+    Return whether they are; else nothing is copied.
     """
     step = int(start[1] - start[0]) if len(start) > 1 else 0
     if step <= 0 or not bool((start[1:] - start[:-1] == step).all()):

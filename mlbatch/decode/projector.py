@@ -1,7 +1,7 @@
-"""Raw columns of sensors of one kind to points in the body frame: every pixel is read once.
+"""Raw columns of sensors of one kind to points in the body frame, in numpy; pixels are read once.
 
-Work is done in tiles of columns, whose planes are few and reused. The formulas are those of
-`geometry.py`; what a pixel holds is the sensor's own business (`Lidar.read`).
+Columns are processed in tiles with few, reused arrays. Formulas: `lidar/geometry.py`; contents of
+a pixel: `Lidar.read`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, Labels
 from mlbatch.lidar.geometry import Projection, Tabled, Turning, blocks, read_rotor_words
 from mlbatch.lidar.interface import Lidar
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Pixels
 
-# Enough work for a call to be cheap, little enough for the planes to stay in the caches.
+# Large enough to make calls cheap, small enough for the arrays to stay in the CPU caches.
 TILE_SLOTS = 3 << 15
-_NONE = np.float32(0)
-_ONLY, _FIRST_STRONG, _BOTH = np.uint8(7), np.uint8(3), np.uint8(9)
+_NO_RETURN_M = np.float32(0)
+# Return types, docs/sources/outputs.md section 3.
+_STRONGEST_FIRST = np.uint8(3)
+_SINGLE = np.uint8(7)
+_SUM_OF_TYPES = np.uint8(9)
 _MOST_OF_A_BYTE = 255
 Extras: TypeAlias = frozenset[str]
 Counts: TypeAlias = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -32,10 +35,14 @@ Counts: TypeAlias = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 @dataclass(slots=True)
 class Source:
-    """A sensor, its raw packets, and what of its points is wanted; ranges in m, 0 and inf: all."""
+    """A sensor as decoding sees it: lidar, raw packets, pose and limits.
+
+    body_from_sensor: (4, 4) float64, m; ring_base: number of its first channel in the output;
+    keep_repeated: keep duplicate returns.
+    """
 
     lidar: Lidar
-    ring: RawRing
+    ring: PacketRing
     body_from_sensor: F64Array
     ring_base: int
     min_range_m: float = 0.0
@@ -44,20 +51,21 @@ class Source:
 
     @property
     def slots(self) -> int:
-        """Readings of a column: channels times returns."""
+        """Slots of a column: channels times returns."""
         return self.lidar.channels * self.lidar.returns
 
 
 def tile_columns(slots: int) -> int:
-    """Columns of a tile, for columns of up to `slots` slots."""
+    """Return the columns of a tile, for columns of up to `slots` slots."""
     return max(16, TILE_SLOTS // slots)
 
 
 class Tile:
-    """Points of a tile of columns, as flat planes; each sensor has a part of them, row by row.
+    """Scratch arrays for the slots of a tile of columns, flat: one projector after the other.
 
-    `point` is x, y, z, intensity. Sensors lie one after the other; the order of the scan comes
-    from the index by which points leave the tile, so that no plane has to be reordered.
+    point: (size, 4) float32, x, y, z in m and intensity; range_m: float32; reflectivity: uint16;
+    label: LABEL; keep: bool, whether the slot becomes a point. The order of the scan comes from
+    the index by which points are copied out, so that no array is reordered.
     """
 
     def __init__(self, size: int) -> None:
@@ -67,21 +75,22 @@ class Tile:
         self.label = np.zeros(size, LABEL)
         self.keep = np.zeros(size, np.bool_)
 
-    def part(self, begin: int, count: int, slots: int) -> Part:
-        """`count` columns of `slots` slots each, from element `begin` on."""
-        place, shape = slice(begin, begin + count * slots), (count, slots)
-        return Part(
-            self.point[place].reshape(*shape, 4),
-            self.range_m[place].reshape(shape),
-            self.reflectivity[place].reshape(shape),
-            self.label[place].reshape(shape),
-            self.keep[place].reshape(shape),
+    def view(self, begin: int, count: int, slots: int) -> TileView:
+        """Return `count` columns of `slots` slots each, from element `begin`."""
+        elements = slice(begin, begin + count * slots)
+        shape = (count, slots)
+        return TileView(
+            self.point[elements].reshape(*shape, 4),
+            self.range_m[elements].reshape(shape),
+            self.reflectivity[elements].reshape(shape),
+            self.label[elements].reshape(shape),
+            self.keep[elements].reshape(shape),
         )
 
 
 @dataclass(slots=True)
-class Part:
-    """The part of one sensor in a tile: (n, slots) views, `point` (n, slots, 4)."""
+class TileView:
+    """Columns of one projector in a tile: (n, slots) views of its arrays, `point` (n, slots, 4)."""
 
     point: F32Array
     range_m: F32Array
@@ -91,36 +100,33 @@ class Part:
 
 
 class Projector:
-    """Sensors whose pixels decode alike: from places in their rings to points in the body frame.
+    """Raw columns of sensors with equal pixel layouts to points in the body frame.
 
-    They are decoded together, one after the other; `counts` has one ledger for each. Slots of a
-    column are beams, in the order of the wire, times returns; `firing_order` and `number` tell
-    where they belong.
+    The sensors are its members. Slots of a column are beams in wire order times returns.
 
-    labels: what the points of a column are, a row for each sensor or firing table; order: slots in
-    the order of firing, (tables, slots), None if that is the order of the wire; limits_m: of each
-    sensor.
+    counts: point counters by member; labels: (members * firing tables, slots) uint64, label words
+    without the time of the column; number: (slots,) output slot of each slot; order: (firing
+    tables, slots), slots in firing order, None if that is wire order; limits_m: (members, 2)
+    float32, minimum and maximum range.
     """
 
     def __init__(
         self, members: Sequence[tuple[int, Source]], columns: int, boxes_m: F64Array, extras: Extras
     ) -> None:
-        """members: number of each sensor in the scan, and how to read it.
-
-        columns: the most that are projected at once.
-        """
+        """members: index in the scan and source of each sensor; columns: most in one call."""
         sources = [source for _, source in members]
         self.counts = [PointCounts() for _ in sources]
         self.slots = sources[0].slots
         self.extras = extras
         self.sources = sources
-        self.lidar = lidar = sources[0].lidar
+        lidar = sources[0].lidar
+        self.lidar = lidar
         self.boxes_m = boxes_m.astype(np.float32)
         self.projection = _projection(sources, columns)
         labels = [_labels(source, number) for number, source in members]
         self.labels = np.concatenate(labels).view(np.uint64)
         self._tables = len(lidar.firing_ns)
-        # Those of sensors that fire alike differ by one number for all slots.
+        # Labels of members with equal firing tables differ by one number in all slots.
         steps = self.labels - self.labels[0]
         self._label_steps = steps[:, 0].copy()
         self._repeated_labels: npt.NDArray[np.uint64] | None = None
@@ -137,153 +143,163 @@ class Projector:
         self.limits_m = np.array(limits, np.float32)
         self.is_limited = any(low > 0 or high < float("inf") for low, high in limits)
         self._needs_range = "range_m" in extras or self.is_limited
-        self.drops_repeated = lidar.sends_twice and not sources[0].keep_repeated
+        self.drops_duplicates = lidar.sends_twice and not sources[0].keep_repeated
         self._records = np.empty((columns, lidar.records.size), np.uint8)
         self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
     def project(
-        self, member: I64Array, place: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part
+        self,
+        member: I64Array,
+        place: I64Array,
+        encoder: I64Array,
+        offset_ns: I64Array,
+        view: TileView,
     ) -> None:
-        """Decode the columns at `place` into `part`, and mark the wanted points.
+        """Decode the columns at `place` into `view`; mark and count the points to keep.
 
-        member: (n,) which of the sensors each column is of, rising; place, encoder: as in Columns;
-        offset_ns: (n,) stamp minus start of the scan.
+        member: (n,) member of each column, ascending; place, encoder: (n,), as in `Columns`;
+        offset_ns: (n,) timestamp minus start of the scan.
         """
         lidar = self.lidar
         own = blocks(member, len(self.sources))
-        records = self._gathered(own, place)
-        self.projection.aim(member, encoder)
+        records = self._gather(own, place)
+        self.projection.prepare(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
-            # One return fills its plane in one piece; of several, each is every n-th slot.
-            range_m = part.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
-            reflectivity = part.reflectivity[:, slots] if self._has_reflectivity else None
-            lidar.read(records, which, Pixels(range_m, part.point[:, slots, 3], reflectivity))
-            self.projection.points(range_m, part.point[:, slots, :3])
+            # Return i of n is every n-th slot; a single return is read in place.
+            range_m = view.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
+            reflectivity = view.reflectivity[:, slots] if self._has_reflectivity else None
+            lidar.read(records, which, Pixels(range_m, view.point[:, slots, 3], reflectivity))
+            self.projection.project(range_m, view.point[:, slots, :3])
             if lidar.returns > 1 and self._needs_range:
-                part.range_m[:, slots] = range_m
+                view.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
-            part.reflectivity[:] = 0
-        self._label(member, encoder, offset_ns, part)
+            view.reflectivity[:] = 0
+        self._label(member, encoder, offset_ns, view)
         if lidar.returns == 2:
-            self._type_returns(part)
-        self._keep(own, part)
+            self._type_returns(view)
+        self._keep(own, view)
 
-    def _label(self, member: I64Array, encoder: I64Array, offset_ns: I64Array, part: Part) -> None:
-        """What the points are, their times included."""
-        words, offset = part.label.view(np.uint64), offset_ns.astype(np.uint64)
+    def _label(
+        self, member: I64Array, encoder: I64Array, offset_ns: I64Array, view: TileView
+    ) -> None:
+        """Write the labels, times included."""
+        words = view.label.view(np.uint64)
+        offset = offset_ns.astype(np.uint64)
         if self._repeated_labels is None:
-            self.labels.take(self._row(member, encoder), axis=0, out=words, mode="clip")
+            self.labels.take(self._label_row(member, encoder), axis=0, out=words, mode="clip")
             words += offset[:, None]
             return
-        # A sum of whole planes costs less than one that repeats a row.
+        # Adding whole arrays costs less than broadcasting a row.
         np.copyto(words, (offset + self._label_steps[member])[:, None])
         words += self._repeated_labels[: len(words)]
 
     def in_firing_order(
         self, keep: BoolArray, encoder: I64Array
     ) -> tuple[BoolArray, I64Array | None]:
-        """Wanted slots (n, slots) in the order of firing, and the elements where they lie.
+        """Return `keep` (n, slots) in firing order, and the tile elements (n * slots,) in it.
 
-        (n * slots,); None where the order of the wire is that of firing.
+        The second is None where firing order is wire order.
         """
         if self.order is None:
             return keep, None
         if self._tables == 1:
             return keep.take(self.order[0], axis=1), self._elements[: keep.size]
-        _, _, table = read_rotor_words(encoder)
+        table = read_rotor_words(encoder)[2]
         order = self.order[table]
         return np.take_along_axis(keep, order, axis=1), self._ordered(table).reshape(-1)
 
     def _ordered(self, table: I64Array) -> I64Array:
-        """Elements of a tile of these columns, each column in the order of firing."""
+        """Return tile elements (n, slots), each column in firing order; table: (n,)."""
         order = np.arange(self.slots)[None] if self.order is None else self.order[table]
         return order + np.arange(len(table))[:, None] * self.slots
 
-    def _row(self, member: I64Array, encoder: I64Array) -> I64Array:
+    def _label_row(self, member: I64Array, encoder: I64Array) -> I64Array:
         if self._tables == 1:
             return member
         return member * self._tables + read_rotor_words(encoder)[2]
 
-    def _gathered(self, blocks: Sequence[slice], place: I64Array) -> U8Array:
-        """Records of all columns, in their order."""
+    def _gather(self, blocks: Sequence[slice], place: I64Array) -> U8Array:
+        """Return the records (n, records.size) of all columns, in their order."""
         for source, own in zip(self.sources, blocks, strict=True):
             source.ring.gather(place[own], self._records[own])
         return self._records[: len(place)]
 
-    def _type_returns(self, part: Part) -> None:
-        """Numbering of docs/sources/outputs.md section 3, by the nearer and stronger return.
+    def _type_returns(self, view: TileView) -> None:
+        """Write the types of dual returns, by which is nearer and which is stronger.
 
-        3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: there is only one.
+        3 and 4: strongest, first and last; 5 and 6: weak, first and last; 7: single return.
+        Source: docs/sources/outputs.md section 3.
         """
         lidar = self.lidar
         if not lidar.typed_by:
             return
-        types = part.label["return_type"]
+        types = view.label["return_type"]
         first, second = self._range_m[:, : len(types)]
-        # The types of two returns that differ add up to 9.
-        kind = np.add(first > second, _FIRST_STRONG, dtype=np.uint8)
+        # The types of the two returns of a shot add up to 9.
+        kind = np.add(first > second, _STRONGEST_FIRST, dtype=np.uint8)
         if lidar.typed_by == "level":
-            weaker = part.point[:, 0::2, 3] < part.point[:, 1::2, 3]
+            weaker = view.point[:, 0::2, 3] < view.point[:, 1::2, 3]
             kind += np.left_shift(weaker.view(np.uint8), np.uint8(1))
-        alone = (first == 0) | (second == 0)
+        is_single = (first == 0) | (second == 0)
         if lidar.sends_twice:
-            alone |= first == second
-        # All bits of 3 to 6 are bits of 7, so that it wins by a plain "or".
-        only = alone.view(np.uint8) * _ONLY
-        np.bitwise_or(kind, only, out=types[:, 0::2])
-        np.bitwise_or(np.subtract(_BOTH, kind, out=kind), only, out=types[:, 1::2])
+            is_single |= first == second
+        # 7 has all bits of 3 to 6: "or" replaces them.
+        single = is_single.view(np.uint8) * _SINGLE
+        np.bitwise_or(kind, single, out=types[:, 0::2])
+        np.bitwise_or(np.subtract(_SUM_OF_TYPES, kind, out=kind), single, out=types[:, 1::2])
 
-    def _keep(self, blocks: Sequence[slice], part: Part) -> None:
-        """Mark the points that are wanted, and count the others under their reason."""
-        keep = part.keep
-        found, left = self._mark(blocks, part)
-        for counts, own, points, wanted in zip(self.counts, blocks, found, left, strict=True):
+    def _keep(self, blocks: Sequence[slice], view: TileView) -> None:
+        """Mark the points to keep; count the other slots by reason."""
+        keep = view.keep
+        found, left = self._mark(blocks, view)
+        for counts, own, returns, distinct in zip(self.counts, blocks, found, left, strict=True):
             slots = (own.stop - own.start) * self.slots
             counts.slots += slots
-            counts.no_return += slots - points
-            counts.repeated += points - wanted
+            counts.no_return += slots - returns
+            counts.repeated += returns - distinct
         if self.is_limited:
             for own, (low, high) in zip(blocks, self.limits_m, strict=True):
-                keep[own] &= part.range_m[own] >= low
-                keep[own] &= part.range_m[own] <= high
-            left = self._drop("range", blocks, keep, left)
+                keep[own] &= view.range_m[own] >= low
+                keep[own] &= view.range_m[own] <= high
+            now = _count_by_member(blocks, keep)
+            for counts, before, after in zip(self.counts, left, now, strict=True):
+                counts.range += before - after
+            left = now
         if len(self.boxes_m):
-            self._cut_boxes(part.point[..., :3], keep)
-            left = self._drop("box", blocks, keep, left)
+            self._cut_boxes(view.point[..., :3], keep)
+            now = _count_by_member(blocks, keep)
+            for counts, before, after in zip(self.counts, left, now, strict=True):
+                counts.box += before - after
+            left = now
         for counts, points in zip(self.counts, left, strict=True):
             counts.written += points
 
-    def _drop(
-        self, reason: str, blocks: Sequence[slice], keep: BoolArray, before: list[int]
-    ) -> list[int]:
-        left = _left(blocks, keep)
-        for counts, had, has in zip(self.counts, before, left, strict=True):
-            setattr(counts, reason, getattr(counts, reason) + had - has)
-        return left
+    def _mark(self, blocks: Sequence[slice], view: TileView) -> tuple[list[int], list[int]]:
+        """Mark the slots with a return that is no duplicate; count both by member.
 
-    def _mark(self, blocks: Sequence[slice], part: Part) -> tuple[list[int], list[int]]:
-        """Mark the slots with a return; how many there are, and how many equal no earlier one.
-
-        Both for each sensor. A return that equals an earlier one of the same shot is not marked.
+        A duplicate equals an earlier return of the same shot. Return the number of returns, and
+        the number without duplicates.
         """
-        keep, returns = part.keep, self.lidar.returns
+        keep = view.keep
+        returns = self.lidar.returns
         if returns == 1:
-            np.greater(part.range_m, _NONE, out=keep)
-            found = _left(blocks, keep)
+            np.greater(view.range_m, _NO_RETURN_M, out=keep)
+            found = _count_by_member(blocks, keep)
             return found, found
         ranges_m = self._range_m[:, : len(keep)]
-        found, left = [0] * len(self.sources), [0] * len(self.sources)
+        found = [0] * len(self.sources)
+        distinct = [0] * len(self.sources)
         for which, range_m in enumerate(ranges_m):
-            own = range_m > _NONE
-            found = list(map(int.__add__, found, _left(blocks, own)))
-            if self.drops_repeated:
+            own = range_m > _NO_RETURN_M
+            found = list(map(int.__add__, found, _count_by_member(blocks, own)))
+            if self.drops_duplicates:
                 for earlier in ranges_m[:which]:
                     own &= range_m != earlier
-            left = list(map(int.__add__, left, _left(blocks, own)))
+            distinct = list(map(int.__add__, distinct, _count_by_member(blocks, own)))
             keep[:, which::returns] = own
-        return found, left
+        return found, distinct
 
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self.boxes_m:
@@ -291,21 +307,22 @@ class Projector:
             keep &= ~inside.all(axis=2)
 
 
-def _left(blocks: Sequence[slice], keep: BoolArray) -> list[int]:
-    """Points that are still wanted, of each sensor."""
+def _count_by_member(blocks: Sequence[slice], keep: BoolArray) -> list[int]:
+    """Return the number of marked slots by member."""
     return [int(np.count_nonzero(keep[own])) for own in blocks]
 
 
-def wanted_points(keep: BoolArray) -> Counts:
-    """How many points of each column (n, slots) are wanted: (n,)."""
-    # Short rows are where sums along an axis cost most; einsum's cost least.
+def points_by_column(keep: BoolArray) -> Counts:
+    """Return the number of marked slots of each column: keep (n, slots) to (n,)."""
+    # Along short rows numpy's sum costs several times what einsum does.
     narrow = np.uint8 if keep.shape[1] <= _MOST_OF_A_BYTE else np.uint16
     return np.asarray(np.einsum("ij->i", keep.view(np.uint8), dtype=narrow))
 
 
 def _projection(sources: Sequence[Source], columns: int) -> Projection:
-    """How the ranges of these sensors become points in the body frame."""
-    lidar, pose = sources[0].lidar, sources[0].body_from_sensor
+    """Return the projection of ranges of these sensors to points in the body frame."""
+    lidar = sources[0].lidar
+    pose = sources[0].body_from_sensor
     own = lidar.projection(pose, columns)
     if own is not None:
         return own
@@ -316,7 +333,7 @@ def _projection(sources: Sequence[Source], columns: int) -> Projection:
 
 
 def _firing_order(lidar: Lidar) -> I64Array | None:
-    """Slots in the order of firing, channel, return: (T, slots); None if it is that of the wire."""
+    """Return slots by firing time, channel, return: (T, slots); None if that is wire order."""
     firing_ns = np.maximum(lidar.firing_ns, 0)
     channels = np.broadcast_to(lidar.channel, firing_ns.shape)
     beams = [np.lexsort(keys) for keys in zip(channels, firing_ns, strict=True)]
@@ -326,15 +343,14 @@ def _firing_order(lidar: Lidar) -> I64Array | None:
 
 
 def _labels(source: Source, lidar_id: int) -> Labels:
-    """What the points of a column are, apart from its own time: (T, slots)."""
+    """Return labels of a column whose timestamp is 0: (T, slots); T: firing tables."""
     lidar = source.lidar
     slot = np.arange(source.slots)
     beam = slot // lidar.returns
     label = np.zeros((len(lidar.firing_ns), source.slots), LABEL)
     label["time_ns"] = np.maximum(lidar.firing_ns, 0)[:, beam]
-    label["ring"] = (
-        source.ring_base + np.broadcast_to(lidar.channel, lidar.firing_ns.shape)[:, beam]
-    )
+    channel = np.broadcast_to(lidar.channel, lidar.firing_ns.shape)
+    label["ring"] = source.ring_base + channel[:, beam]
     label["return_type"] = np.array(lidar.return_types, np.uint8)[slot % lidar.returns]
     label["lidar_id"] = lidar_id
     return label

@@ -1,4 +1,4 @@
-"""What decoding starts from and fills: the columns of a window, the arrays of a scan."""
+"""Input and output of decoding: the columns of a window, the arrays of a scan."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array
 
-# What a point is, in the bytes of one word, so that it moves as one: its time (ns after the start
-# of the scan, added as a number to the low half), ring, return type and sensor.
+# All of a point but its readings, in one word of 8 bytes that is copied as one. The time, in ns
+# after the start of the scan, is the low half, so that it can be added as a number.
 LABEL = np.dtype([("time_ns", "<u4"), ("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
 Labels: TypeAlias = npt.NDArray[np.void]
 _NAN = np.float32("nan")
 
 
 @dataclass(slots=True)
-class Due:
-    """Columns of a scan in their final order; all (n,) int64, stamps in ns."""
+class WindowColumns:
+    """Columns of a window in their final order; all arrays (n,) int64, fields as in `Columns`."""
 
     stamp_ns: I64Array
     sensor: I64Array
@@ -29,20 +29,26 @@ class Due:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def part(self, columns: slice | I64Array) -> Due:
-        """Some of them."""
-        return Due(
-            self.stamp_ns[columns], self.sensor[columns], self.place[columns], self.encoder[columns]
+    def take(self, index: slice | I64Array) -> WindowColumns:
+        """Return the columns at `index`."""
+        return WindowColumns(
+            self.stamp_ns[index],
+            self.sensor[index],
+            self.place[index],
+            self.encoder[index],
         )
 
 
-class Buffer:
-    """Arrays of one scan, reused by the next; rows beyond a scan's points are stale.
+class ScanBuffer:
+    """Arrays of one scan, reused by later ones; rows beyond the points of a scan are stale.
 
-    slots: of a row, for organized scans; None: a row is a point.
+    point: (rows, 4) or (rows, slots, 4) float32, x, y, z in m and intensity; range_m: float32;
+    reflectivity: uint16; label: LABEL; column: (rows,) uint32, number of the column in the scan,
+    empty if organized.
     """
 
     def __init__(self, rows: int, slots: int | None) -> None:
+        """slots: slots of a row of an organized scan; None: dense, a row is a point."""
         shape = (rows,) if slots is None else (rows, slots)
         self.rows = rows
         self.is_organized = slots is not None
@@ -53,8 +59,8 @@ class Buffer:
         self.column = np.empty(rows if slots is None else 0, np.uint32)
 
     def clear(self, rows: I64Array) -> None:
-        """Empty slots: NaN for what is measured in metres or as a level, else 0."""
-        for real in (self.point, self.range_m):
-            real[rows] = _NAN
-        for whole in (self.reflectivity, self.label.view(np.uint64)):
-            whole[rows] = 0
+        """Empty all slots of some rows: NaN in float arrays, 0 in integer arrays."""
+        self.point[rows] = _NAN
+        self.range_m[rows] = _NAN
+        self.reflectivity[rows] = 0
+        self.label.view(np.uint64)[rows] = 0

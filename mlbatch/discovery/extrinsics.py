@@ -18,19 +18,9 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.discovery.types import DetectedSensor, Note, Pose
 from mlbatch.errors import RigError
+from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
-from mlbatch.frames.tree import (
-    Candidate,
-    Chain,
-    Edge,
-    FrameTree,
-    candidates,
-    clean,
-    difference,
-    edge_of,
-    named_frame,
-    some,
-)
+from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig
 from mlbatch.types import StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG

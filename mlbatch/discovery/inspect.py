@@ -13,7 +13,7 @@ from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.discover import (
     Discovery,
     SensorSelection,
@@ -31,7 +31,8 @@ from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.readers import merge, open_recording
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, write_rig
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector
+from mlbatch.rig.write import write_rig
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -241,7 +242,7 @@ class _Measured:
     def __init__(self, sensor: DetectedSensor) -> None:
         lidar = sensor.lidar
         packet_ns = lidar.columns_per_packet * lidar.column_period_ns
-        self.ring = RawRing(lidar.packet_size, lidar.records)
+        self.ring = PacketRing(lidar.packet_size, lidar.records)
         self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
         self.watch: ClockWatch = clock_watch(lidar)
         self.first: tuple[int, int] | None = None

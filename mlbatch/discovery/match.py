@@ -19,7 +19,7 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
-from mlbatch.frames.tree import GENERIC, namespace
+from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import READABLE, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import RigSensor, StreamSelector

@@ -16,7 +16,7 @@ from mlbatch import readers, ros, sensors
 from mlbatch.discovery.extrinsics import ExtrinsicsSources
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
-from mlbatch.frames.tree import nearest_topic
+from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import has_packets, merge
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic

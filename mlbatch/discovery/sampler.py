@@ -10,7 +10,7 @@ import numpy as np
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.discovery.types import DetectedSensor, PacketKind
-from mlbatch.frames.tree import same_namespace
+from mlbatch.frames.naming import same_namespace
 from mlbatch.lidar.interface import Beside, Evidence, Lidar
 from mlbatch.types import PacketBatch, Stream, StreamTable
 from mlbatch.units import NS_PER_S

@@ -1,8 +1,8 @@
 """Rigid transforms as (4, 4) float64 matrices, metres: `body_from_sensor @ xyz_sensor`.
 
-Angles as in URDF: roll, pitch, yaw turn about the fixed axes x, y, z, so R = Rz Ry Rx. Quaternions
-are x, y, z, w as in geometry_msgs. Sums are written out: no dot product, so that results depend
-neither on the CPU nor on a library's version.
+Angles as in URDF: roll, pitch, yaw about the fixed axes x, y, z, so R = Rz Ry Rx. Quaternions are
+x, y, z, w as in geometry_msgs. Sums are written out instead of dot products, so that results depend
+neither on the CPU nor on library versions.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.units import RAD_PER_DEG
 
+# Deviation from a rotation that is accepted and corrected.
 TOLERANCE = 1e-3
-# Far above the rounding of a matrix that was computed, far below what a person types.
+# Above the rounding errors of computed matrices, below those of numbers with few digits.
 _ROUNDING = 1e-12
-_MOST = 1e100
+# Products of larger numbers overflow.
+_LARGEST = 1e100
 
 
 def from_rpy_deg(translation_m: Sequence[float], rpy_deg: Sequence[float]) -> F64Array:
-    """Transform from a translation and roll, pitch, yaw about the fixed axes x, y, z."""
+    """Return the transform of a translation and roll, pitch, yaw about the fixed axes x, y, z."""
     (cx, sx), (cy, sy), (cz, sz) = (_cos_sin_deg(angle) for angle in rpy_deg)
     rotation = (
         (cy * cz, sx * sy * cz - cx * sz, cx * sy * cz + sx * sz),
@@ -34,11 +36,11 @@ def from_rpy_deg(translation_m: Sequence[float], rpy_deg: Sequence[float]) -> F6
 
 
 def from_quaternion(translation_m: Sequence[float], xyzw: Sequence[float]) -> F64Array:
-    """Transform from a translation and a unit quaternion x, y, z, w; RigError if it is not unit."""
+    """Return the transform of a translation and a unit quaternion x, y, z, w; else RigError."""
     norm = math.sqrt(sum(part * part for part in xyzw))
     if not abs(norm - 1.0) <= TOLERANCE:
         raise RigError(
-            f"wanted a quaternion of norm 1 within {TOLERANCE}, got norm {norm:.6g}; "
+            f"expected a quaternion of norm 1 within {TOLERANCE}, found norm {norm:.6g}; "
             "give x, y, z, w in this order, normalised"
         )
     x, y, z, w = (part / norm for part in xyzw)
@@ -51,42 +53,40 @@ def from_quaternion(translation_m: Sequence[float], xyzw: Sequence[float]) -> F6
 
 
 def rigid(matrix: F64Array) -> F64Array:
-    """The transform of a (4, 4) or (3, 4) matrix; RigError if it does more than turn and move.
+    """Return the transform of a (4, 4) or (3, 4) matrix; RigError if it is not rigid.
 
-    A rotation that was typed with few digits is replaced by the nearest exact one, so that
-    extrinsics keep distances.
+    A rotation with few digits is replaced by the nearest exact one, so that distances are kept.
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise RigError(
-            f"wanted 4 (or 3) rows of 4 finite numbers, got shape {matrix.shape}; "
+            f"expected 4 (or 3) rows of 4 finite numbers, found shape {matrix.shape}; "
             "give the rotation with the translation as last column"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > _ROUNDING:
         shown = ", ".join(f"{value:.6g}" for value in matrix[3])
         raise RigError(
-            f"wanted 0, 0, 0, 1 as last row, got {shown}; "
+            f"expected 0, 0, 0, 1 as last row, found {shown}; "
             "give the translation as last column, metres"
         )
-    # Products of numbers much larger than those of a rotation would overflow.
-    rotation = np.clip(matrix[:3, :3], -_MOST, _MOST).astype(np.float64)
+    rotation = np.clip(matrix[:3, :3], -_LARGEST, _LARGEST).astype(np.float64)
     skew = np.abs(_gram(rotation) - np.eye(3)).max()
     if not skew <= TOLERANCE:
         raise RigError(
-            f"wanted orthonormal axes within {TOLERANCE}, got axes off by {skew:.3g}; "
+            f"expected orthonormal axes within {TOLERANCE}, found axes off by {skew:.3g}; "
             "give a rotation without scale or shear"
         )
     if _determinant(rotation) < 0:
         raise RigError(
-            "wanted a rotation (determinant 1), got a mirror image (determinant -1); "
+            "expected a rotation (determinant 1), found a mirror image (determinant -1); "
             "check the signs of the axes"
         )
     return _joined(_nearest_rotation(rotation), matrix[:3, 3])
 
 
 def quaternion(matrix: F64Array) -> F64Array:
-    """Unit quaternion (4,) x, y, z, w of a transform; of the two, the one with w >= 0."""
+    """Return the unit quaternion (4,) x, y, z, w of a transform, with w >= 0."""
     m = matrix
-    # Four times the outer product of the quaternion with itself; its longest row is the best one.
+    # Four times the outer product of the quaternion with itself; its longest row is most accurate.
     outer = np.array(
         [
             [1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], 0.0],
@@ -95,7 +95,8 @@ def quaternion(matrix: F64Array) -> F64Array:
             [0.0, 0.0, 0.0, 1 + m[0, 0] + m[1, 1] + m[2, 2]],
         ]
     )
-    outer[3, :3] = outer[:3, 3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    outer[3, :3] = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    outer[:3, 3] = outer[3, :3]
     row: F64Array = outer[int(np.argmax(np.diagonal(outer)))]
     x, y, z, w = (float(value) for value in row)
     sign = -1.0 if (w, x, y, z) < (0.0, 0.0, 0.0, 0.0) else 1.0
@@ -103,18 +104,19 @@ def quaternion(matrix: F64Array) -> F64Array:
 
 
 def rpy_deg(matrix: F64Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in degrees; where the pitch is +-90 degrees, any yaw will do."""
+    """Return roll, pitch, yaw in degrees; at a pitch of +-90 degrees one of the solutions."""
     m = matrix.tolist()
     yaw = math.atan2(m[1][0], m[0][0])
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    # The yaw taken back, Ry Rx is left: well defined whatever the pitch.
+    cosine = math.cos(yaw)
+    sine = math.sin(yaw)
+    # Without the yaw, Ry Rx is left, whose angles are well defined for any pitch.
     pitch = math.atan2(-m[2][0], cosine * m[0][0] + sine * m[1][0])
     roll = math.atan2(sine * m[0][2] - cosine * m[1][2], cosine * m[1][1] - sine * m[0][1])
     return roll / RAD_PER_DEG, pitch / RAD_PER_DEG, yaw / RAD_PER_DEG
 
 
 def compose(a_from_b: F64Array, b_from_c: F64Array) -> F64Array:
-    """The transform a_from_c."""
+    """Return the transform a_from_c."""
     columns = [
         a_from_b[:, 0] * x + a_from_b[:, 1] * y + a_from_b[:, 2] * z + a_from_b[:, 3] * w
         for x, y, z, w in b_from_c.T
@@ -123,8 +125,9 @@ def compose(a_from_b: F64Array, b_from_c: F64Array) -> F64Array:
 
 
 def inverse(a_from_b: F64Array) -> F64Array:
-    """The transform b_from_a of a rigid transform."""
-    (x, y, z), axes = a_from_b[:3, 3], a_from_b[:3, :3]
+    """Return the transform b_from_a of a rigid transform."""
+    x, y, z = a_from_b[:3, 3]
+    axes = a_from_b[:3, :3]
     return _joined(axes.T, -(axes[0] * x + axes[1] * y + axes[2] * z))
 
 
@@ -138,12 +141,13 @@ def _joined(
 
 
 def _cos_sin_deg(angle_deg: float) -> tuple[float, float]:
-    """Cosine and sine, exact at multiples of 90 degrees."""
-    turn_deg = math.remainder(angle_deg, 360.0)
-    quarter = round(turn_deg / 90.0)
-    rest = (turn_deg - 90.0 * quarter) * RAD_PER_DEG
-    cosine, sine = math.cos(rest), math.sin(rest)
-    # Adding 0.0 turns -0.0 into 0.0.
+    """Return cosine and sine, exact at multiples of 90 degrees."""
+    within_deg = math.remainder(angle_deg, 360.0)
+    quarter = round(within_deg / 90.0)
+    rest = (within_deg - 90.0 * quarter) * RAD_PER_DEG
+    cosine = math.cos(rest)
+    sine = math.sin(rest)
+    # Subtracting from 0.0 makes no -0.0.
     return (
         (cosine, sine),
         (0.0 - sine, cosine),
@@ -153,8 +157,8 @@ def _cos_sin_deg(angle_deg: float) -> tuple[float, float]:
 
 
 def _gram(rotation: F64Array) -> F64Array:
-    """Products of all pairs of axes: the identity for a rotation."""
-    x, y, z = rotation[0], rotation[1], rotation[2]
+    """Return the products of all pairs of axes, the identity for a rotation."""
+    x, y, z = rotation
     products: F64Array = x[:, None] * x + y[:, None] * y + z[:, None] * z
     return products
 
@@ -165,7 +169,7 @@ def _determinant(rotation: F64Array) -> float:
 
 
 def _nearest_rotation(rotation: F64Array) -> F64Array:
-    """The polar factor by Newton-Schulz steps R (3 - R'R) / 2; the error is squared each time."""
+    """Return the polar factor by Newton-Schulz steps R (3 - R'R) / 2; convergence is quadratic."""
     for _ in range(4):
         step = (3.0 * np.eye(3) - _gram(rotation)) / 2.0
         if np.abs(step - np.eye(3)).max() <= _ROUNDING:

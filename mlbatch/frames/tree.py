@@ -1,15 +1,15 @@
-"""Coordinate frames of a recording: how they hang together, and which of them is a sensor's.
+"""Trees of the coordinate frames of a recording, and the transforms between frames.
 
-Facts: docs/sources/messages.md section 6 (tf2_msgs/TFMessage, frames of the makers' drivers). An
-edge maps coordinates of its child into its parent. What is wrong with an edge matters only to those
-who walk over it: a recording holds many frames that no lidar needs.
+An edge maps coordinates of its child into its parent. A contradiction is an error only for chains
+that contain it: recordings have many frames that no lidar needs. Source: docs/sources/messages.md
+section 6 (tf2_msgs/TFMessage).
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ _REMEDY = "give the extrinsics in a rig file (--rig)"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A transform as a source states it; matrix: (4, 4) float64 parent_from_child, metres."""
+    """A transform of a source; matrix: (4, 4) float64 parent_from_child, m."""
 
     parent: str
     child: str
@@ -36,9 +36,9 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """The way from frame a to frame b; matrix: (4, 4) float64 a_from_b, metres.
+    """The transforms from frame a to frame b; matrix: (4, 4) float64 a_from_b, m.
 
-    frames: all that were walked, a first; edges: those between them.
+    frames: all from a to b; edges: between them.
     """
 
     matrix: F64Array
@@ -51,7 +51,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True)
 class _Climb:
-    """The way up from a frame; problem: why it cannot go on, "" at a root."""
+    """The path from a frame to its root; problem: why it ends before, "" at a root."""
 
     frames: list[str]
     edges: list[Edge]
@@ -59,7 +59,7 @@ class _Climb:
 
 
 def clean(frame: str) -> str:
-    """A frame's name without the slash in front that ROS 1 allowed."""
+    """Return a frame name without the leading slash that ROS 1 allowed."""
     return frame.strip().lstrip("/")
 
 
@@ -70,11 +70,11 @@ def edge_of(
     xyzw: Sequence[float],
     source: str,
 ) -> Edge:
-    """The edge of a geometry_msgs/TransformStamped; RigError if it cannot be a transform."""
+    """Return the edge of a geometry_msgs/TransformStamped; RigError if it is no rigid transform."""
     where = f"{source}: transform {clean(parent)} -> {clean(child)}"
     if len(translation_m) != 3 or not all(map(math.isfinite, translation_m)):
         shown = ", ".join(f"{value:g}" for value in translation_m)
-        raise RigError(f"{where}: wanted 3 finite metres, got {shown}; {_REMEDY}")
+        raise RigError(f"{where}: expected 3 finite metres, found {shown}; {_REMEDY}")
     try:
         matrix = from_quaternion(translation_m, xyzw)
     except RigError as err:
@@ -83,7 +83,7 @@ def edge_of(
 
 
 class FrameTree:
-    """Edges by child; of one child and parent, the edge that was added last counts."""
+    """Edges by child; an edge replaces an earlier one of the same child and parent."""
 
     __slots__ = ("_above", "_frames")
 
@@ -93,27 +93,27 @@ class FrameTree:
 
     @classmethod
     def merged(cls, trees: Iterable[FrameTree]) -> FrameTree:
-        """All edges of several trees, each of one source; for a child the first that has one wins.
+        """Merge trees, each of one source; the edges of a child come from the first that has some.
 
-        An edge that would close a circle with those of earlier trees is left out: sources may
-        describe the same rig from opposite ends.
+        Edges that close a circle with edges of earlier trees are skipped: one source may have the
+        sensor as root, another the vehicle.
         """
-        whole = cls()
+        merged = cls()
         for tree in trees:
             for child, parents in tree._above.items():
-                if child not in whole._above:
+                if child not in merged._above:
                     for edge in parents.values():
-                        if not whole._is_turned_round(edge):
-                            whole.add(edge)
-        return whole
+                        if not merged._closes_circle(edge):
+                            merged.add(edge)
+        return merged
 
     def add(self, edge: Edge) -> None:
-        """Add an edge; RigError if it is none."""
+        """Add an edge; RigError unless it connects two named frames."""
         if not edge.parent or not edge.child or edge.parent == edge.child:
-            got = "an empty name" if edge.parent != edge.child else "the same twice"
+            found = "an empty name" if edge.parent != edge.child else "the same twice"
             raise RigError(
-                f"{edge.source}: transform {edge.parent!r} -> {edge.child!r}: wanted two frames, "
-                f"got {got}; {_REMEDY}"
+                f"{edge.source}: transform {edge.parent!r} -> {edge.child!r}: expected two frames, "
+                f"found {found}; {_REMEDY}"
             )
         self._above.setdefault(edge.child, {})[edge.parent] = edge
         self._frames.update(dict.fromkeys((edge.parent, edge.child)))
@@ -127,8 +127,9 @@ class FrameTree:
         return tuple(sorted(self._frames))
 
     def chain(self, a: str, b: str) -> Chain | None:
-        """The transform a_from_b; None if nothing connects the two, RigError if it is unclear."""
-        up_a, up_b = self._climb(a), self._climb(b)
+        """Return the chain a_from_b; None if not connected, RigError if ambiguous."""
+        up_a = self._climb(a)
+        up_b = self._climb(b)
         above_b = set(up_b.frames)
         meeting = next((frame for frame in up_a.frames if frame in above_b), None)
         if meeting is None:
@@ -145,7 +146,7 @@ class FrameTree:
         return Chain(matrix, frames, (*edges_a, *reversed(edges_b)))
 
     def ancestor(self, frames: Sequence[str]) -> str | None:
-        """The nearest frame that all `frames` hang on; it may be one of them."""
+        """Return the nearest common ancestor of `frames`, which may be one of them."""
         if not frames:
             return None
         paths = [self._climb(frame).frames for frame in frames]
@@ -153,55 +154,59 @@ class FrameTree:
         return next((frame for frame in paths[0] if frame in shared), None)
 
     def top(self, frame: str) -> tuple[str, str]:
-        """The last frame above `frame` that is beyond doubt, and why it ends there ("": a root)."""
+        """Return the highest certain ancestor of `frame`, and why it is the last ("": a root)."""
         up = self._climb(frame)
         return up.frames[-1], up.problem
 
     def unknown(self, frame: str) -> str:
-        """What to say of a frame that is not in the tree."""
+        """Return the error text for a frame that is not in the tree."""
         near = difflib.get_close_matches(frame, self._frames, 1)
         hint = f"did you mean {near[0]}?" if near else f"it has {some(self.frames) or 'none'}"
-        return f"wanted a frame of the recording's transforms, got {frame!r}; {hint}"
+        return f"expected a frame of the recording's transforms, found {frame!r}; {hint}"
 
     def _climb(self, frame: str) -> _Climb:
         if frame not in self._frames:
             raise RigError(self.unknown(frame))
-        place, edges = {frame: 0}, list[Edge]()
+        # Number of edges from the first frame to each.
+        place = {frame: 0}
+        edges: list[Edge] = []
         while len(parents := self._above.get(frame, {})) == 1:
             (edge,) = parents.values()
             first = place.get(edge.parent)
             if first is not None:
                 down = [one.child for one in reversed([*edges[first:], edge])]
                 text = (
-                    f"{edge.source}: wanted frames that form a tree, got the circle "
+                    f"{edge.source}: expected frames that form a tree, found the circle "
                     f"{' -> '.join([edge.parent, *down])}; {_REMEDY}"
                 )
-                # Whatever hangs on the circle is still well placed relative to where it hangs.
+                # Frames below the circle keep their transforms up to it.
                 return _Climb(list(place)[: first + 1], edges[:first], text)
             edges.append(edge)
             frame = edge.parent
             place[frame] = len(edges)
         return _Climb(list(place), edges, _two_parents(frame, parents))
 
-    def _is_turned_round(self, edge: Edge) -> bool:
-        """Whether an edge closes a circle with edges of other sources."""
-        frame, seen, foreign = edge.parent, {edge.child}, False
+    def _closes_circle(self, edge: Edge) -> bool:
+        """Return whether an edge closes a circle with edges of other sources."""
+        frame = edge.parent
+        seen = {edge.child}
+        has_others = False
         while frame not in seen and len(parents := self._above.get(frame, {})) == 1:
             seen.add(frame)
             (above,) = parents.values()
-            foreign |= above.source != edge.source
+            has_others |= above.source != edge.source
             frame = above.parent
-        return frame == edge.child and foreign
+        return frame == edge.child and has_others
 
 
 def difference(first: F64Array, second: F64Array) -> tuple[float, float]:
-    """How far two poses of one frame are apart: metres, and radians of the turn between them."""
+    """Return the distance of two poses of one frame in m, and the angle between them in rad."""
     x, y, z, w = quaternion(compose(inverse(first), second)).tolist()
     return math.dist(first[:3, 3], second[:3, 3]), 2 * math.atan2(math.hypot(x, y, z), w)
 
 
 def _product(edges: Sequence[Edge]) -> F64Array:
-    """The transform from the first edge's child into the last one's parent."""
+    """Return the transform from the child of the first edge into the parent of the last."""
     matrix = np.eye(4)
     for edge in reversed(edges):
         matrix = compose(matrix, edge.matrix)
@@ -213,153 +218,12 @@ def _two_parents(frame: str, parents: Mapping[str, Edge]) -> str:
         return ""
     sources = " and ".join(dict.fromkeys(edge.source for edge in parents.values()))
     return (
-        f"{sources}: frame {frame}: wanted one parent, got {' and '.join(sorted(parents))}; "
+        f"{sources}: frame {frame}: expected one parent, found {' and '.join(sorted(parents))}; "
         f"{_REMEDY}"
     )
 
 
 def some(words: Sequence[str], most: int = 8) -> str:
-    """The first few words of a list that may be long."""
+    """Return the first `most` words of a list as text."""
     text = ", ".join(words[:most])
     return text if len(words) <= most else f"{text} and {len(words) - most} more"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A frame that may be a sensor's; lower ranks are tried first.
-
-    sensor_from_frame: (4, 4), where the frame is not the one points are in; None where it is.
-    """
-
-    frame: str
-    rank: int = 0
-    sensor_from_frame: F64Array | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Naming:
-    """What a maker's driver calls its frames.
-
-    points: frames that points are in; lidar: frames turned against it as the metadata say; nick:
-    words that people add to the place to name a whole sensor.
-    """
-
-    points: tuple[str, ...]
-    lidar: tuple[str, ...] = ()
-    nick: tuple[str, ...] = ("lidar",)
-
-
-# Points of an Ouster leave our decoder in os_sensor: its lidar-to-sensor transform is applied.
-# `left_lidar` could be either of its frames, so `lidar` is no nick of an Ouster.
-NAMINGS: Mapping[str, Naming] = {
-    "ouster": Naming(("os_sensor",), ("os_lidar",), ("os", "ouster")),
-    "velodyne": Naming(("velodyne",), nick=("velodyne", "lidar")),
-    "hesai": Naming(("hesai_lidar", "hesai", "pandar"), nick=("hesai", "pandar", "lidar")),
-    "robosense": Naming(("rslidar",), nick=("rslidar", "robosense", "lidar")),
-}
-_OTHER = Naming(("lidar",))
-# p: place of the sensor, such as left; n: nick; f: the driver's own name of the frame.
-OWN_PATTERNS = ("{p}/{f}", "{p}_{f}", "{f}_{p}", "{n}_{p}/{f}", "{n}_{p}_{f}")
-WHOLE_PATTERNS = ("{p}", "{n}_{p}", "{p}_{n}")
-# Parts of topics that say what a sensor is, not where.
-GENERIC = (
-    *("ouster", "os", "os_node", "os1_node", "os_cloud_node", "velodyne", "hesai", "pandar"),
-    *("robosense", "rslidar", "sensing", "sensor", "sensors", "lidar", "lidars", "driver"),
-)
-# Ranks: the kind of a frame first, then how closely its place is the sensor's.
-_KINDS = ("stated", "points", "lidar", "whole")
-_CLOSENESS = ("namespace", "place", "word", "plain")
-
-
-def candidates(
-    maker: str,
-    places: Sequence[str],
-    *,
-    alone: bool,
-    frame_id: str = "",
-    sensor_from_lidar: F64Array | None = None,
-) -> tuple[Candidate, ...]:
-    """Frames that may be those of a sensor, by what is known of it.
-
-    places: topics of its packets, or its name in the rig; alone: no other sensor of this maker;
-    frame_id: as its own messages state it; sensor_from_lidar: (4, 4), metres, of its metadata.
-    """
-    naming = NAMINGS.get(maker.lower(), _OTHER)
-    found: dict[str, Candidate] = {}
-    if clean(frame_id):
-        found[clean(frame_id)] = Candidate(clean(frame_id), _rank("stated", "plain"))
-    kinds: list[tuple[str, Sequence[str], F64Array | None]] = [("points", naming.points, None)]
-    if sensor_from_lidar is not None:
-        kinds.append(("lidar", naming.lidar, sensor_from_lidar))
-    steps = list(_places(places, naming.nick))
-    for kind, frames, correction in kinds:
-        for closeness, place in [*steps, *([("plain", "")] if alone else [])]:
-            for frame in _names(OWN_PATTERNS if place else ("{f}",), place, naming.nick, frames):
-                rank = _rank(kind, closeness)
-                found.setdefault(frame, Candidate(frame, rank, correction))
-    for closeness, place in steps:
-        for frame in _names(WHOLE_PATTERNS, place, naming.nick, ("",)):
-            found.setdefault(frame, Candidate(frame, _rank("whole", closeness)))
-    return tuple(sorted(found.values(), key=lambda one: one.rank))
-
-
-def named_frame(frame: str, among: Sequence[Candidate]) -> Candidate:
-    """The frame that a rig names for a sensor whose candidates are `among`."""
-    name = clean(frame)
-    turned = any(word in name for naming in NAMINGS.values() for word in naming.lidar)
-    corrections = (one.sensor_from_frame for one in among if one.sensor_from_frame is not None)
-    return Candidate(name, 0, next(corrections, None) if turned else None)
-
-
-def _rank(kind: str, closeness: str) -> int:
-    return len(_CLOSENESS) * _KINDS.index(kind) + _CLOSENESS.index(closeness)
-
-
-def _names(
-    patterns: Sequence[str], place: str, nicks: Sequence[str], frames: Sequence[str]
-) -> Iterator[str]:
-    for pattern in patterns:
-        for nick in nicks:
-            for frame in frames:
-                yield pattern.format(p=place, n=nick, f=frame)
-
-
-def _places(places: Sequence[str], nicks: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Words for where a sensor sits, with how close they are to its own namespace."""
-    for text in places:
-        parts = namespace(text) if "/" in text else [text]
-        if parts:
-            yield "namespace", "/".join(parts)
-        telling = [part for part in parts if part not in GENERIC]
-        if telling:
-            yield "place", "/".join(telling)
-            yield "place", "_".join(telling)
-            yield "word", telling[-1]
-            for nick in nicks:
-                yield "word", telling[-1].removeprefix(f"{nick}_").removesuffix(f"_{nick}")
-
-
-def namespace(topic: str) -> list[str]:
-    """Parts of a topic before its last one."""
-    return [part for part in topic.split("/") if part][:-1]
-
-
-def same_namespace(topic_a: str, topic_b: str) -> bool:
-    """Whether two topics differ in their last part only, as those of one driver do."""
-    return namespace(topic_a) == namespace(topic_b)
-
-
-def nearest_topic(topic: str, others: Iterable[str]) -> str | None:
-    """The topic that shares the longest namespace with `topic`; None if none or several do.
-
-    One of the two namespaces must hold the other: /left and /right of one car are not related.
-    """
-    own, shared = namespace(topic), dict[int, list[str]]()
-    for other in others:
-        theirs = namespace(other)
-        common = min(len(own), len(theirs))
-        if own[:common] == theirs[:common] and (common or own == theirs):
-            # The same namespace is closer than any part of it.
-            shared.setdefault(2 * common + (own == theirs), []).append(other)
-    best = shared[max(shared)] if shared else []
-    return best[0] if len(best) == 1 else None

@@ -1,10 +1,9 @@
-"""Joints of a robot description (URDF), as `robot_description` holds it.
+"""Joints of a robot description (URDF), the content of `robot_description`.
 
 Source: docs/sources/messages.md section 6; ROS URDF/XML specification, elements `joint` and
-`origin`: origin maps the child link's frame into the parent's, xyz in metres, rpy in radians about
-the fixed axes x, y, z, both 0 where absent. Documents come with a recording, so they are not
-trusted: no document types (and thus no entities), no more than 16 MB, and no tree of elements is
-built.
+`origin`: origin maps the frame of the child link into that of the parent, xyz in m, rpy in rad
+about the fixed axes x, y, z, both 0 by default. Documents are untrusted: no document types (thus no
+entities), at most 16 MB, and no tree of elements is built.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from mlbatch.units import RAD_PER_DEG
 MAX_BYTES = 16 * 1024 * 1024
 _REMEDY = "give the extrinsics in a rig file (--rig)"
 _SHOWN_CHARS = 60
-# No robot is larger (m), no angle needs more turns (rad); NaN is not less.
-_MOST = 1e9
+# Limit of lengths (m) and angles (rad).
+_LARGEST = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """One joint; kind: fixed, revolute, ...; matrix: (4, 4) parent_from_child, metres.
+    """One joint; kind: fixed, revolute, ...; matrix: (4, 4) parent_from_child, m.
 
-    Of a joint that moves, the matrix is where it stands at its zero position.
+    The matrix of a moving joint is that of its zero position.
     """
 
     name: str
@@ -39,15 +38,15 @@ class Joint:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the child never moves against its parent."""
+        """True if the child never moves against its parent."""
         return self.kind == "fixed"
 
 
 def joints(text: str) -> list[Joint]:
-    """All joints of a URDF, in its order; RigError names what cannot be used."""
+    """Return all joints of a URDF, in its order; RigError names what is unusable."""
     if len(text) > MAX_BYTES or len(text.encode("utf-8", "replace")) > MAX_BYTES:
         raise _error(f"at most {MAX_BYTES} bytes", "more")
-    # Hardly any recording holds a description.
+    # Imported on demand: few recordings have a description.
     import xml.etree.ElementTree as ET
 
     collector = _Collector()
@@ -60,21 +59,16 @@ def joints(text: str) -> list[Joint]:
     return [_joint(element) for element in collector.joints]
 
 
-def fixed_joints(text: str) -> list[tuple[str, str, F64Array]]:
-    """Parent link, child link and parent_from_child (4, 4), metres, of all fixed joints."""
-    return [(one.parent, one.child, one.matrix) for one in joints(text) if one.is_fixed]
-
-
 @dataclass(slots=True)
 class _Element:
-    """A `joint` element: its attributes, and those of the elements in it."""
+    """A `joint` element: its attributes, and those of its child elements by name."""
 
     attributes: Mapping[str, str]
     inner: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 class _Collector:
-    """Keeps the joints right under `robot`: transmissions have elements of the same name."""
+    """Collects the joints directly under `robot`; other elements have children of that name too."""
 
     def __init__(self) -> None:
         self.joints: list[_Element] = []
@@ -82,11 +76,11 @@ class _Collector:
         self._is_in_joint = False
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        """Refuse: entities of a document type may grow without bounds or name files."""
+        """Refuse document types: their entities may grow without bounds or name files."""
         raise _error("a document without a document type", f"<!DOCTYPE {name}")
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Keep the element if it is a joint or a part of one."""
+        """Collect the element if it is a joint or a child of one."""
         name = tag.rpartition("}")[2]
         if self._depth == 0 and name != "robot":
             raise _error("the element <robot> first", f"<{name}>")
@@ -99,14 +93,14 @@ class _Collector:
         self._depth += 1
 
     def end(self, tag: str) -> None:
-        """Count the levels."""
+        """Leave a level."""
         self._depth -= 1
 
     def data(self, text: str) -> None:
-        """URDF says nothing in text."""
+        """Ignore text."""
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Do nothing; part of the parser's interface."""
 
 
 def _joint(element: _Element) -> Joint:
@@ -116,7 +110,8 @@ def _joint(element: _Element) -> Joint:
     if not all(links):
         raise _error("a parent link and a child link", "none", where)
     origin = element.inner.get("origin", {})
-    xyz_m, rpy_rad = (_three(origin.get(key), key, where) for key in ("xyz", "rpy"))
+    xyz_m = _three(origin.get("xyz"), "xyz", where)
+    rpy_rad = _three(origin.get("rpy"), "rpy", where)
     matrix = from_rpy_deg(xyz_m, [angle / RAD_PER_DEG for angle in rpy_rad])
     return Joint(name, element.attributes.get("type", ""), links[0], links[1], matrix)
 
@@ -128,14 +123,14 @@ def _three(text: str | None, key: str, where: str) -> list[float]:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    if len(numbers) != 3 or not all(abs(number) <= _MOST for number in numbers):
-        raise _error(f"3 numbers of at most {_MOST:g}", text, f"{where}, origin {key}")
+    if len(numbers) != 3 or not all(abs(number) <= _LARGEST for number in numbers):
+        raise _error(f"3 numbers of at most {_LARGEST:g}", text, f"{where}, origin {key}")
     return numbers
 
 
-def _error(wanted: str, got: str, where: str = "") -> RigError:
-    shown = " ".join(got.split()) or "nothing"
+def _error(expected: str, found: str, where: str = "") -> RigError:
+    shown = " ".join(found.split()) or "nothing"
     if len(shown) > _SHOWN_CHARS:
         shown = shown[: _SHOWN_CHARS - 3] + "..."
     place = f"robot_description (URDF){', ' if where else ''}{where}"
-    return RigError(f"{place}: wanted {wanted}, got {shown}; {_REMEDY}")
+    return RigError(f"{place}: expected {expected}, found {shown}; {_REMEDY}")

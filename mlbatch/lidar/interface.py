@@ -1,4 +1,4 @@
-"""The face that every maker's module gives to the rest: a `Calibration` that becomes a `Lidar`."""
+"""The interface of a sensor module: a `Calibration`, from which a `Lidar` is made."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ FAULTS = ("", "bad_size", "bad_header", "bad_crc")
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """A row of `mlbatch sensors`: what is supported, and how it was verified.
+    """A row of `mlbatch sensors`: a supported model.
 
-    same_packets_as: the model whose packets equal those of this one, under whose name it is found.
+    returns: supported numbers of returns; clock, calibration: their sources; verified: how the
+    model was tested; same_packets_as: the model
+    that is reported instead, if packets do not differ.
     """
 
     name: str
@@ -35,9 +37,9 @@ class SensorModel:
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """Other packets from the same source (its IP, or topics of its namespace), as Evidence.
+    """Packets of another stream with the same source IP or topic namespace; as `Evidence`.
 
-    Position packets, device packets, IMU packets: what says more of a lidar than its own packets.
+    Position, device and IMU packets contain facts that the packets of a lidar lack.
     """
 
     stream: Stream
@@ -48,10 +50,11 @@ class Beside:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one kind of packets of a stream looks like; used to tell where they come from.
+    """A sample of the packets of one stream and size, from which the sensor is identified.
 
-    size: bytes of a payload; sample: (k, size) uint8, the first few of them, then some of every
-    quarter of a second; host_ns: (k,) their arrival.
+    size: bytes of a payload; sample: (k, size) uint8, the first packets, then some of each quarter
+    of a second; host_ns: (k,) int64, their receive times; beside: samples of other streams of the
+    same source.
     """
 
     stream: Stream
@@ -61,15 +64,15 @@ class Evidence:
     beside: tuple[Beside, ...] = ()
 
 
-# What `Calibration.fit` gives for packets that could be read with it, though they name another
-# model: taken only where the rig names this one.
+# `Calibration.fit` of packets that can be read with it but name another model: the calibration is
+# used only if the rig names its model.
 READABLE = -1
 
 
 class Calibration(Protocol):
-    """What is known of one sensor, or (`is_shared`) of all sensors of a model.
+    """Calibration of one sensor, or (`is_shared`) of all sensors of a model.
 
-    path: of the file it comes from, None where it is built in.
+    path: of its file; None: built in.
     """
 
     path: Path | None
@@ -78,29 +81,29 @@ class Calibration(Protocol):
     is_shared: bool
 
     def fit(self, evidence: Evidence) -> int:
-        """How well the packets fit: 0 cannot be this sensor, more is surer; see READABLE."""
+        """Score the match with packets: 0: none; larger: more certain; see READABLE."""
         ...
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
-        """The sensor; options are those of `--decode`; evidence None: it was not seen yet.
+        """Make the lidar; options: of `--decode`; evidence: None before any packet.
 
-        Raises RigError where the file cannot be used, or packets are needed to say more.
+        Raises RigError if the file is unusable, or if packets are needed first.
         """
         ...
 
 
 @runtime_checkable
 class ModelFile(Calibration, Protocol):
-    """A calibration file that does not say exactly which model it is of."""
+    """A calibration file that does not name its model exactly."""
 
     def for_model(self, name: str) -> Calibration | None:
-        """The same as one of the model that the rig names; None if it cannot be one."""
+        """Return the calibration for the model that the rig names; None if it does not match."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """Where the columns of a packet lie.
+    """Positions of the columns of a packet.
 
     Column c begins `start + (c // per_row) * stride + (c % per_row) * step` bytes from the start
     of the packet, and is `size` bytes long; columns may overlap.
@@ -114,99 +117,107 @@ class Records:
 
 
 class Lidar(Protocol):
-    """One physical sensor: how its packets are read, nothing of windows or files.
-
-    `records`: where its `columns_per_packet` columns lie. `channels`: beams of a column, in the
-    order of the wire; `channel`: (channels,) the number of each in the output, or (T, channels) by
-    the same rows as `firing_ns`:
-    (T, channels) when each beam fires after its column's stamp, >= 0; rotor words choose the row,
-    all else uses row 0. `sequence_modulus`: the sequence number wraps there (0: packets carry no
-    count). `pixel_layout`: equal for sensors whose records `read` decodes alike; `pixels`: where
-    they lie, None where only `read` knows. `carries_serial`:
-    the packets name the sensor; `imu_port`: where its IMU packets go, 0 unknown. `return_types`:
-    numbering of docs/sources/outputs.md section 3 per return; `typed_by`: how those of two returns
-    are told: "order" (the first is the stronger), "level" (by range and intensity), "" (not at
-    all). `column_period_ns`: from column to column where nothing is left out, 0 unknown.
-    `sends_twice`: a single return is sent once for each return of the mode. `extrinsics`: (4, 4)
-    body_from_sensor if the calibration knows it; `sensor_from_lidar`: (4, 4), where the maker's
-    driver has a lidar frame of its own. `timestamp_mode`: the maker's word or "";
-    `clock_period_ns`: what its stamps leave out and the recorder's clock gave (an hour), or 0.
-    """
+    """Decoder of the packets of one physical sensor."""
 
     vendor: str
     model: str
+    # "" if unknown.
     serial: str
+    # The packets contain the serial number.
     carries_serial: bool
+    # Return mode or profile, for people.
     mode: str
+    # Beams of a column, in wire order.
     channels: int
+    # Returns of a shot.
     returns: int
     has_reflectivity: bool
+    # Bytes of a payload.
     packet_size: int
     columns_per_packet: int
+    # From column to column without gaps; 0: unknown.
     column_period_ns: float
+    # Positions of the columns in a packet.
     records: Records
+    # Equal for sensors whose records `read` decodes in the same way.
     pixel_layout: tuple[str | int | bool, ...]
+    # The layout for compiled decoding; None: only `read` decodes it.
     pixels: PixelTable | None
+    # The sequence number wraps there; 0: packets have none.
     sequence_modulus: int
+    # Destination port of IMU packets; 0: unknown.
     imu_port: int
+    # By return; numbers of docs/sources/outputs.md section 3.
     return_types: tuple[int, ...]
+    # How dual returns get their types: "order" (the first is the stronger), "level" (by range and
+    # intensity), "" (they keep `return_types`).
     typed_by: str
+    # A single return is sent once for each return of the mode.
     sends_twice: bool
+    # (channels,) or (T, channels), output number of each beam; rows as of `firing_ns`.
     channel: I64Array
+    # (T, channels), delay of each beam after the timestamp of its column, ns, >= 0. Rotor words
+    # select the row; columns without them use row 0.
     firing_ns: I64Array
     beams: BeamTable
+    # (4, 4) body_from_sensor, m, if the calibration contains it.
     extrinsics: F64Array | None
+    # (4, 4), m, if the vendor's driver has a lidar frame besides the sensor frame.
     sensor_from_lidar: F64Array | None
+    # The vendor's name, or "".
     timestamp_mode: str
+    # Period of incomplete timestamps (an hour), completed by the receive time; 0: complete.
     clock_period_ns: int
+    # Source of the calibration, for people.
     calibration: str
     notes: tuple[str, ...]
 
     def owns(self, packets: U8Array) -> BoolArray:
-        """Which of the packets (P, packet_size) are this sensor's, by the serial number in them.
+        """Return which packets (P, packet_size) have this sensor's serial number: (P,) bool.
 
-        True where packets carry none.
+        True for packets without a serial number.
         """
         ...
 
     def faults(self, packets: U8Array) -> U8Array:
-        """Index into FAULTS for each of the packets (P, packet_size)."""
+        """Return indices into FAULTS (P,) of packets (P, packet_size)."""
         ...
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) number of each packet in the sensor's own count, below `sequence_modulus`.
+        """Return the sequence numbers (P,) of packets, below `sequence_modulus`.
 
-        Without a count: a number that only packets of equal content share. Negative: no identity.
+        Without sequence numbers: a number that only packets of equal content share, or a negative
+        one if packets cannot be compared.
         """
         ...
 
     def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
-        """Stamps, rotor positions and validity of all columns; no pixel is touched.
+        """Return timestamps, rotor positions and validity of all columns, without reading pixels.
 
-        host_ns: (P,) arrival, for clocks that leave out the hour or the date. The answer for a
-        packet depends on it alone, not on those before it.
+        host_ns: (P,) receive times, for clocks without hour or date. The result for a packet does
+        not depend on other packets.
         """
         ...
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n gathered columns (n, records.size) into `out`."""
+        """Decode return `which` of n columns (n, records.size) into `out`."""
         ...
 
     def is_imu(self, size: int) -> bool:
-        """Whether a payload of this size on the sensor's streams is an IMU packet."""
+        """Return whether a payload of this size on the sensor's streams is an IMU packet."""
         ...
 
     def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
-        """Samples of IMU packets (P, size), in their order."""
+        """Return the samples of IMU packets (P, size), in their order; sensor: its index."""
         ...
 
     def sensor_from_imu(self) -> F64Array:
-        """Pose of the IMU in the sensor frame, (4, 4), metres; identity where unknown."""
+        """Return the pose of the IMU in the sensor frame, (4, 4), m; identity if unknown."""
         ...
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """What makes points of ranges where the beams' vectors do not suffice; else None.
+        """Return the projection of a sensor that `beams` cannot describe; else None.
 
-        columns: the most that are aimed at once.
+        columns: most columns of a call of `Projection.prepare`.
         """
         ...

@@ -1,6 +1,6 @@
-"""Where the readings of a column lie in its record, as a table that compiled loops can follow.
+"""Layouts of the pixels of a column as data, for compiled loops.
 
-`Lidar.read` says the same in numpy; the engines are compared pixel by pixel in the tests.
+`Lidar.read` decodes the same in numpy; tests compare the engines pixel by pixel.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Bits:
-    """A whole number in a pixel: `(word >> shift) & mask` of the word that begins at byte `first`.
+class BitField:
+    """An unsigned integer in a pixel: `(word >> shift) & mask` of the word at byte `first`.
 
-    word: type of numpy, "u1", "<u2", ">u2" or "<u4".
+    word: numpy type, "u1", "<u2", ">u2" or "<u4".
     """
 
     first: int
@@ -22,8 +22,11 @@ class Bits:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """Channels whose pixels lie evenly; first_byte: of the first of them, in a record."""
+class ChannelRun:
+    """Channels with evenly spaced pixels.
+
+    first_byte: offset of the first pixel in a record; channel: its channel; channels: their number.
+    """
 
     first_byte: int
     channel: int
@@ -31,25 +34,25 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Echo:
-    """The pixels of one return; reflectivity: None where the sensor has none beside intensity."""
+class ReturnLayout:
+    """The pixels of one return; reflectivity: None if the sensor has none besides intensity."""
 
-    runs: tuple[Run, ...]
-    distance: Bits
-    intensity: Bits
-    reflectivity: Bits | None = None
+    runs: tuple[ChannelRun, ...]
+    distance: BitField
+    intensity: BitField
+    reflectivity: BitField | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PixelTable:
-    """The pixels of a record; a pixel of the same channel and return takes `step` bytes.
+    """The pixels of a record, `step` bytes from channel to channel.
 
-    The range in m is `distance * factor / divisor`, each step rounded to float32; 0 where the
-    distance is not above `silent`, and for channels that are `dark`.
+    The range in m is `distance * factor / divisor`, each step rounded to float32; 0 (no return) if
+    the distance is at most `silent`, and for the channels `dark`.
     """
 
     step: int
-    echoes: tuple[Echo, ...]
+    returns: tuple[ReturnLayout, ...]
     divisor: float
     factor: float = 1.0
     silent: int = 0
@@ -58,20 +61,21 @@ class PixelTable:
 
 def readings(
     first_bytes: tuple[tuple[int, ...], ...], channels: int, word: str, mask: int = 0xFFFFFFFF
-) -> tuple[Echo, ...]:
-    """Returns whose pixels are a distance of two bytes, and a level of one behind it.
+) -> tuple[ReturnLayout, ...]:
+    """Return layouts of pixels with 2 bytes of distance, then 1 byte of intensity.
 
-    first_bytes: for each return, where its runs of equally many channels begin.
+    first_bytes: by return, the first bytes of runs of equally many channels.
     """
-    distance, level = Bits(0, word, 0, mask), Bits(2, "u1")
+    distance = BitField(0, word, 0, mask)
+    intensity = BitField(2, "u1")
     return tuple(
-        Echo(
+        ReturnLayout(
             tuple(
-                Run(first, number * (channels // len(firsts)), channels // len(firsts))
+                ChannelRun(first, number * (channels // len(firsts)), channels // len(firsts))
                 for number, first in enumerate(firsts)
             ),
             distance,
-            level,
+            intensity,
         )
         for firsts in first_bytes
     )

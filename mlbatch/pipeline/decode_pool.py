@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.batching.windows import Window
-from mlbatch.decode.decoder import Decoder, Due, Label, Source
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Scan
 
@@ -27,8 +27,8 @@ class DecodeTask:
     only: with `--split` the index of their sensor; outcomes: as in `Decoder.scan`.
     """
 
-    columns: Due
-    label: Label
+    columns: WindowColumns
+    label: ScanHeader
     only: int | None
     outcomes: Outcomes | None
     is_decoded: bool = False
@@ -114,7 +114,7 @@ class DecodePool:
 
         earlier: outcomes of the scans that a resumed output already contains.
         """
-        label = Label(
+        label = ScanHeader(
             window.index,
             window.slice,
             window.start_ns,
@@ -122,18 +122,24 @@ class DecodePool:
             window.complete,
             window.ready_host_ns,
         )
-        columns = Due(window.stamp_ns, window.sensor, window.place, window.encoder)
+        columns = WindowColumns(window.stamp_ns, window.sensor, window.place, window.encoder)
         if not self._split:
             yield self._task(columns, label, None, earlier)
             return
         for number in np.unique(window.sensor).tolist():
             own = window.sensor == number
             first = np.zeros(int(np.count_nonzero(own)), np.int64)
-            part = Due(columns.stamp_ns[own], first, columns.place[own], columns.encoder[own])
+            part = WindowColumns(
+                columns.stamp_ns[own], first, columns.place[own], columns.encoder[own]
+            )
             yield self._task(part, label, number, earlier)
 
     def _task(
-        self, columns: Due, label: Label, only: int | None, earlier: Iterator[Outcomes]
+        self,
+        columns: WindowColumns,
+        label: ScanHeader,
+        only: int | None,
+        earlier: Iterator[Outcomes],
     ) -> DecodeTask:
         task = DecodeTask(columns, label, only, next(earlier, None))
         self._open.append(task)

@@ -9,7 +9,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.projector import Source
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
@@ -74,7 +74,7 @@ class Sensor:
     limits: Limits
     ring_base: int
     columns_per_s: float | None
-    ring: RawRing
+    ring: PacketRing
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property
@@ -130,6 +130,6 @@ class Sensor:
         return replace(self, ring=new_ring(self.lidar), ledger=SensorLedger())
 
 
-def new_ring(lidar: Lidar) -> RawRing:
+def new_ring(lidar: Lidar) -> PacketRing:
     """An empty ring for the packets of a lidar."""
-    return RawRing(lidar.packet_size, lidar.records)
+    return PacketRing(lidar.packet_size, lidar.records)

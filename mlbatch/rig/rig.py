@@ -1,14 +1,7 @@
-"""The rig file: which sensors a vehicle carries, where they sit and how they are told apart.
-
-Format: docs/rig.md. Every mistake is told with file, line, key path, what was wanted and
-what was got; all user units are converted here.
-"""
+"""The rig: which sensors a vehicle has, where they are, and which packets are theirs."""
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -16,43 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.errors import RigError
-from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
-from mlbatch.rig import schema as values
-from mlbatch.rig.yaml_tree import Node
 from mlbatch.types import Stream
-from mlbatch.units import NS_PER_S, rate_text
 
 DEFAULT_BODY_FRAME = "base_link"
-# `lidar_id` is a uint8.
-MAX_SENSORS = 256
-
-RIG_KEYS = ("body_frame", "rate_hz", "sensors", "exclude_boxes_m")
-SENSOR_KEYS = (
-    *("name", "model", "stream", "metadata", "extrinsics", "clock"),
-    *("min_range_m", "max_range_m", "optional", "decode"),
-)
-STREAM_KEYS = ("source_ip", "port", "topic", "serial")
-CLOCK_KEYS = ("source", "epoch", "offset_s")
-
-# Text that needs no quotes, neither here nor for other readers of YAML.
-_PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./-]*", re.ASCII)
-_RESERVED = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
-_HEADER = """\
-# Rig of mlbatch: which sensors there are and where they sit. Edit it, then
-#   mlbatch convert RECORDING --rig THIS_FILE -o OUTPUT
-# Lengths in metres, angles in degrees; extrinsics map the sensor frame into the body frame,
-# rotations turn about the fixed axes x, y, z: R = Rz Ry Rx, as in URDF.
-"""
-_NO_EXTRINSICS = (
-    "# extrinsics are not known: measure them and remove the # of the next line",
-    "# extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}",
-)
+# Fields of `StreamSelector`, and keys of `stream` in the file.
+STREAM_FIELDS = ("source_ip", "port", "topic", "serial")
 
 
 @dataclass(frozen=True, slots=True)
 class StreamSelector:
-    """Which packets are a sensor's; what is empty or 0 may be anything."""
+    """The packets of a sensor; an empty string or 0 matches anything."""
 
     source_ip: str = ""
     port: int = 0
@@ -60,26 +26,25 @@ class StreamSelector:
     serial: str = ""
 
     def selects(self, stream: Stream) -> bool:
-        """Whether a stream fits, as far as can be told without its packets' serial numbers."""
-        pairs = zip(
-            (self.source_ip, self.port, self.topic),
-            (stream.source_ip, stream.port, stream.topic),
-            strict=True,
+        """Return whether a stream matches, apart from the serial numbers in its packets."""
+        return (
+            self.source_ip in ("", stream.source_ip)
+            and self.port in (0, stream.port)
+            and self.topic in ("", stream.topic)
         )
-        return all(not wanted or wanted == got for wanted, got in pairs)
 
     def __str__(self) -> str:
-        parts = {key: getattr(self, key) for key in STREAM_KEYS}
-        return ", ".join(f"{key} {value}" for key, value in parts.items() if value)
+        parts = {name: getattr(self, name) for name in STREAM_FIELDS}
+        return ", ".join(f"{name} {value}" for name, value in parts.items() if value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
-    """One sensor of the rig; None where the file leaves it to the recording.
+    """One sensor of the rig; None: as the recording says.
 
-    extrinsics: (4, 4) float64 body_from_sensor in metres, or the name of a frame of the recording;
-    clock: sensor or host; epoch: what the sensor's clock counts (utc, tai or gps); offset_ns is
-    added to the stamps; decode: options as for `--decode`.
+    extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording; clock:
+    sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the
+    timestamps; decode: options as for `--decode`.
     """
 
     name: str
@@ -96,13 +61,14 @@ class RigSensor:
     decode: dict[str, str] = field(default_factory=dict)
 
 
-def _no_boxes() -> F64Array:
+def no_boxes() -> F64Array:
+    """Return an array of no boxes, (0, 6)."""
     return np.zeros((0, 6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """The sensors in the order of `lidar_id`, and what they share.
+    """The sensors in the order of `lidar_id`, and settings of all.
 
     exclude_boxes_m: (k, 6) float64, x0, y0, z0, x1, y1, z1 in the body frame.
     """
@@ -110,198 +76,13 @@ class Rig:
     sensors: tuple[RigSensor, ...]
     body_frame: str = DEFAULT_BODY_FRAME
     rate: Fraction | None = None
-    exclude_boxes_m: F64Array = field(default_factory=_no_boxes)
+    exclude_boxes_m: F64Array = field(default_factory=no_boxes)
 
 
 def read_rig(path: Path) -> Rig:
-    """Read a rig file; RigError names file, line and key of the first thing that is wrong."""
-    # Most runs have no rig, and need no parser.
+    """Read a rig file; RigError names file, line and key of the first mistake."""
+    # Imported on demand: most runs have no rig and need no YAML parser.
+    from mlbatch.rig.schema import rig_from
     from mlbatch.rig.yaml_tree import read_yaml
 
-    root = read_yaml(Path(path))
-    fields = root.fields(RIG_KEYS, required=("sensors",))
-    rig = Rig(
-        body_frame=values.take(fields, "body_frame", values.frame_name, DEFAULT_BODY_FRAME),
-        rate=values.take(fields, "rate_hz", values.rate, None),
-        sensors=_sensors(fields["sensors"]),
-        exclude_boxes_m=values.take(fields, "exclude_boxes_m", values.boxes, _no_boxes()),
-    )
-    _check_distinct(fields["sensors"], rig)
-    return rig
-
-
-def _sensors(node: Node) -> tuple[RigSensor, ...]:
-    items = node.elements("sensors")
-    if not 1 <= len(items) <= MAX_SENSORS:
-        raise node.error(
-            f"1 to {MAX_SENSORS} sensors", node.shown, "list each sensor with `- name:`"
-        )
-    return tuple(_sensor(item) for item in items)
-
-
-def _sensor(node: Node) -> RigSensor:
-    fields = node.fields(SENSOR_KEYS, required=("name",))
-    clock = fields["clock"].fields(CLOCK_KEYS) if "clock" in fields else {}
-    sensor = RigSensor(
-        name=values.sensor_name(fields["name"]),
-        model=values.take(fields, "model", values.model, None),
-        stream=values.take(fields, "stream", _stream, None),
-        metadata=values.take(fields, "metadata", values.existing_file, None),
-        extrinsics=values.take(fields, "extrinsics", values.extrinsics, None),
-        clock=values.take(clock, "source", values.clock_source, None),
-        epoch=values.take(clock, "epoch", values.clock_epoch, None),
-        offset_ns=values.take(clock, "offset_s", values.offset_ns, 0),
-        min_range_m=values.take(fields, "min_range_m", values.range_m, None),
-        max_range_m=values.take(fields, "max_range_m", values.range_m, None),
-        optional=values.take(fields, "optional", Node.flag, False),
-        decode=values.take(fields, "decode", values.options, {}),
-    )
-    low, high = sensor.min_range_m or 0.0, sensor.max_range_m
-    if high is not None and high <= low:
-        place = fields["max_range_m"]
-        raise place.error(f"more than {low:g} m", place.shown, "give the larger range as maximum")
-    return sensor
-
-
-def _check_distinct(node: Node, rig: Rig) -> None:
-    """Refuse two sensors of one name or one stream; frames must form a tree."""
-    seen: dict[str | StreamSelector, Node] = {}
-    for item, sensor in zip(node.items, rig.sensors, strict=True):
-        name = item.entries["name"]
-        if sensor.name == rig.body_frame:
-            raise name.error("another name than the body frame's", name.shown, "rename the sensor")
-        if sensor.name in seen:
-            raise _twice(name, "a name", seen[sensor.name], "rename one of the two sensors")
-        seen[sensor.name] = name
-        if sensor.stream is not None:
-            stream = item.entries["stream"]
-            if sensor.stream in seen:
-                remedy = "give each sensor its own source_ip, port, topic or serial"
-                raise _twice(stream, "a stream", seen[sensor.stream], remedy)
-            seen[sensor.stream] = stream
-
-
-def _twice(node: Node, what: str, first: Node, remedy: str) -> RigError:
-    got = f"the one of {first.path} (line {first.line}) again"
-    return node.error(f"{what} of its own", got, remedy)
-
-
-def _stream(node: Node) -> StreamSelector:
-    fields = node.fields(STREAM_KEYS)
-    if not fields:
-        raise node.error(f"at least one of {', '.join(STREAM_KEYS)}", "none", "add one of them")
-    values.check_exclusive(fields)
-    return StreamSelector(
-        source_ip=values.take(fields, "source_ip", values.ip_address, ""),
-        port=values.take(fields, "port", values.port, 0),
-        topic=values.take(fields, "topic", values.topic, ""),
-        serial=values.take(fields, "serial", values.serial, ""),
-    )
-
-
-def write_rig(rig: Rig, folder: Path, notes: Mapping[str, str] | None = None) -> str:
-    """Text of a rig file that `read_rig` reads back from `folder`; notes are remarks by sensor."""
-    lines = [f"body_frame: {_text(rig.body_frame)}"]
-    if rig.rate is not None:
-        lines.append(f"rate_hz: {rate_text(rig.rate)}")
-    lines.append("sensors:")
-    for sensor in rig.sensors:
-        remark = " ".join((notes or {}).get(sensor.name, "").split())
-        # What is not printable is no YAML, not even in a comment.
-        lines += [f"  # {''.join(filter(str.isprintable, remark))}"] if remark else []
-        first, *others = _sensor_lines(sensor, folder)
-        lines += [f"  - {first}", *(f"    {line}" for line in others)]
-    if len(rig.exclude_boxes_m):
-        lines.append("exclude_boxes_m:")
-        lines += [f"  - {_floats(box)}" for box in rig.exclude_boxes_m]
-    return _HEADER + "\n".join(lines) + "\n"
-
-
-def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
-    yield f"name: {_text(sensor.name)}"
-    yield f"model: {_text(sensor.model or 'auto')}"
-    if sensor.stream is not None:
-        yield f"stream: {_stream_text(sensor.stream)}"
-    if sensor.metadata is not None:
-        yield f"metadata: {_text(_path_from(folder, sensor.metadata))}"
-    yield from _extrinsics_lines(sensor.extrinsics)
-    clock = {
-        "source": sensor.clock or "",
-        "epoch": sensor.epoch or "",
-        "offset_s": _seconds(sensor.offset_ns),
-    }
-    if any(clock.values()):
-        yield "clock: " + _braces(clock)
-    for key in ("min_range_m", "max_range_m"):
-        limit_m = getattr(sensor, key)
-        if limit_m is not None:
-            yield f"{key}: {float(limit_m)!r}"
-    if sensor.optional:
-        yield "optional: true"
-    if sensor.decode:
-        yield "decode: " + _braces({_text(k): _text(v) for k, v in sensor.decode.items()})
-
-
-def _stream_text(stream: StreamSelector) -> str:
-    return _braces(
-        {
-            "source_ip": stream.source_ip and _text(stream.source_ip),
-            "port": str(stream.port or ""),
-            "topic": stream.topic and _text(stream.topic),
-            "serial": stream.serial and _text(stream.serial),
-        }
-    )
-
-
-def _extrinsics_lines(extrinsics: F64Array | str | None) -> Iterator[str]:
-    if extrinsics is None:
-        yield from _NO_EXTRINSICS
-    elif isinstance(extrinsics, str):
-        yield f"extrinsics: {{frame: {_text(extrinsics)}}}"
-    else:
-        origin = extrinsics[:3, 3]
-        angles = [round(angle, 9) + 0.0 for angle in rpy_deg(extrinsics)]
-        # Angles are what people edit; but only where they say the same to the last bit.
-        if from_rpy_deg(origin.tolist(), angles).tobytes() == extrinsics.tobytes():
-            yield (
-                f"extrinsics: {{translation_m: {_floats(origin)}, "
-                f"rotation_rpy_deg: {_floats(angles)}}}"
-            )
-            return
-        yield "extrinsics:"
-        yield f"  # about: translation_m: {_floats(origin)}, rotation_rpy_deg: {_floats(angles)}"
-        yield "  matrix:"
-        for row in extrinsics:
-            yield f"    - {_floats(row)}"
-
-
-def _path_from(folder: Path, path: Path) -> str:
-    """The path as seen from `folder`, or in full where it lies on another drive."""
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:
-        return str(path.absolute())
-
-
-def _seconds(offset_ns: int) -> str:
-    """Seconds with all nine decimals, empty for none."""
-    whole, rest = divmod(abs(offset_ns), NS_PER_S)
-    return f"{'-' if offset_ns < 0 else ''}{whole}.{rest:09d}" if offset_ns else ""
-
-
-def _braces(pairs: Mapping[str, str]) -> str:
-    return "{" + ", ".join(f"{key}: {value}" for key, value in pairs.items() if value) + "}"
-
-
-def _floats(numbers: F64Array | list[float]) -> str:
-    return "[" + ", ".join(repr(float(number)) for number in numbers) + "]"
-
-
-def _text(text: str) -> str:
-    """Text as a YAML scalar, in quotes unless it is a plain word."""
-    if _PLAIN.fullmatch(text) and text.lower() not in _RESERVED:
-        return text
-    escaped = (
-        char if char.isprintable() and char not in '"\\' else f"\\U{ord(char):08x}" for char in text
-    )
-    return '"' + "".join(escaped) + '"'
+    return rig_from(read_yaml(Path(path)))

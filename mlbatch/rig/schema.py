@@ -1,6 +1,6 @@
-"""Single values of a rig file: each function reads one, checks it and converts its units.
+"""Keys of a rig file: how each value is read, checked and converted, and its default.
 
-Format: docs/rig.md.
+Format: docs/rig.md. All units of users are converted here.
 """
 
 from __future__ import annotations
@@ -8,73 +8,80 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, no_boxes
 from mlbatch.rig.yaml_tree import Node
 from mlbatch.units import NS_PER_S, parse_rate
 
-# Beyond, float32 coordinates no longer resolve a millimetre.
+# `lidar_id` is a uint8.
+MAX_SENSORS = 256
+# Beyond, float32 coordinates resolve no millimetre.
 MAX_TRANSLATION_M = 10_000.0
 MAX_OFFSET_S = 2**31
-
-EXTRINSICS_KEYS = ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix", "frame")
-# What each key of the extrinsics or of a stream already says, so that it cannot be given as well.
-EXCLUDES = {
-    "rotation_xyzw": ("rotation_rpy_deg",),
-    "matrix": ("translation_m", "rotation_rpy_deg", "rotation_xyzw"),
-    "frame": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
-    "topic": ("source_ip", "port"),
-}
 
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _FRAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _TEXT = re.compile(r"\S(.*\S)?")
-# Neither blanks nor control characters, nor halves of characters, which no output could hold.
+# No blanks, no control characters, no surrogates (which no output can store).
 _WORD = re.compile(r"[^\s\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
 
 T = TypeVar("T")
-D = TypeVar("D")
 
 
-def take(fields: Mapping[str, Node], key: str, read: Callable[[Node], T], default: D) -> T | D:
-    """The value under `key`, or the default where the key is absent."""
-    return read(fields[key]) if key in fields else default
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
 
 
-def sensor_name(node: Node) -> str:
-    """A name that fits ROS topics, frames and file names."""
-    return node.word("a name of letters, digits and _ that begins with no digit", _NAME)
+@dataclass(frozen=True, slots=True)
+class Key(Generic[T]):
+    """A key of a mapping: its name, the reader of its value, and the value without the key."""
+
+    name: str
+    read: Callable[[Node], T]
+    default: T
+
+    def of(self, fields: Mapping[str, Node]) -> T:
+        """Return the value in a mapping."""
+        return self.read(fields[self.name]) if self.name in fields else self.default
 
 
-def frame_name(node: Node) -> str:
-    """Name of the body frame; robots in a fleet put theirs before a slash."""
-    return node.word("a frame name of letters, digits, _ and / that begins with no digit", _FRAME)
+def _names(*keys: _Named) -> list[str]:
+    return [key.name for key in keys]
 
 
-def model(node: Node) -> str | None:
-    """Name of a sensor model; None for auto."""
+def _word(what: str, pattern: re.Pattern[str] = _WORD) -> Callable[[Node], str]:
+    return lambda node: node.word(what, pattern)
+
+
+def _choice(*words: str) -> Callable[[Node], str]:
+    return lambda node: node.choice(words)
+
+
+def _model(node: Node) -> str | None:
     name = node.word("auto or a name from `mlbatch sensors`", _TEXT)
     return None if name == "auto" else name
 
 
-def rate(node: Node) -> Fraction:
-    """Scan rate, exactly the number in the text."""
+def _rate(node: Node) -> Fraction:
     try:
         return parse_rate(node.word("a number of Hz", _TEXT))
     except UsageError as err:
-        raise node.fault(str(err).removeprefix("rate: ")) from err
+        raise node.error_here(str(err).removeprefix("rate: ")) from err
 
 
-def ip_address(node: Node) -> str:
-    """An IP address in its usual spelling."""
+def _ip_address(node: Node) -> str:
+    """Return an IP address in its usual spelling."""
     text = node.word("an IP address", _WORD)
     try:
         return str(ipaddress.ip_address(text))
@@ -82,23 +89,7 @@ def ip_address(node: Node) -> str:
         raise node.error("an IP address", node.shown, "write it as 192.168.1.201") from err
 
 
-def port(node: Node) -> int:
-    """A UDP port."""
-    return node.whole(1, 65535)
-
-
-def topic(node: Node) -> str:
-    """Name of a topic, whatever its recorder allowed."""
-    return node.word("a topic without spaces", _WORD)
-
-
-def serial(node: Node) -> str:
-    """A serial number as it is written: leading zeros count."""
-    return node.word("a serial number without spaces", _WORD)
-
-
-def existing_file(node: Node) -> Path:
-    """Path of a file, given relative to the rig file."""
+def _existing_file(node: Node) -> Path:
     path = node.file.parent / node.word("a file name", _TEXT)
     if not os.path.isfile(path):
         remedy = "give its path relative to the rig file"
@@ -106,123 +97,245 @@ def existing_file(node: Node) -> Path:
     return path
 
 
-# Epochs that a rig may name; leap_seconds.py has how far they are ahead of UTC.
-EPOCHS = ("utc", "tai", "gps")
-
-
-def clock_source(node: Node) -> str:
-    """Which clock stamps the columns."""
-    return node.choice(("sensor", "host"))
-
-
-def clock_epoch(node: Node) -> str:
-    """What a sensor's clock counts."""
-    return node.choice(EPOCHS)
-
-
-def offset_ns(node: Node) -> int:
-    """Clock offset in ns: exact to the digit, rounded once below 1 ns."""
+def _offset_ns(node: Node) -> int:
+    """Return a clock offset in ns, exact but for digits below 1 ns, which are rounded once."""
     offset_s = node.exact()
     if abs(offset_s) > MAX_OFFSET_S:
         raise node.error(f"at most {MAX_OFFSET_S} s either way", node.shown, "give seconds")
     return round(offset_s * NS_PER_S)
 
 
-def range_m(node: Node) -> float:
-    """A limit of the range."""
+def _range_m(node: Node) -> float:
     value = node.number()
     if value < 0:
         raise node.error("a range of 0 m or more", node.shown, "give metres from the sensor")
     return value
 
 
-def options(node: Node) -> dict[str, str]:
-    """A maker's options; their makers check them, so `on` stays `on`."""
+def _options(node: Node) -> dict[str, str]:
+    """Return decoder options as text; the sensor modules check them, so `on` stays `on`."""
     if node.kind != "mapping":
         raise node.error("a mapping of options", node.shown, "write {option: value}")
     return {key: value.word("one word", _WORD) for key, value in node.entries.items()}
 
 
-def extrinsics(node: Node) -> F64Array | str:
-    """(4, 4) body_from_sensor in metres, or the name of a frame of the recording."""
-    fields = node.fields(EXTRINSICS_KEYS)
-    if not fields:
-        raise node.error(f"at least one of {', '.join(EXTRINSICS_KEYS)}", "none", "add one of them")
-    check_exclusive(fields)
-    if "frame" in fields:
-        return fields["frame"].word("a frame of the recording", _WORD)
-    origin = take(fields, "translation_m", _translation, [0.0, 0.0, 0.0])
-    for key, read in _ROTATIONS.items():
-        if key in fields:
-            return read(fields[key], origin)
-    return from_rpy_deg(origin, (0.0, 0.0, 0.0))
+def _stream(node: Node) -> StreamSelector:
+    fields = _some_fields(node, _STREAM_KEYS)
+    return StreamSelector(
+        source_ip=_SOURCE_IP.of(fields),
+        port=_PORT.of(fields),
+        topic=_TOPIC.of(fields),
+        serial=_SERIAL.of(fields),
+    )
 
 
-def check_exclusive(fields: Mapping[str, Node]) -> None:
-    """Refuse two keys that say the same."""
-    for key, others in EXCLUDES.items():
-        for other in others:
-            if key in fields and other in fields:
-                got = f"{other} as well (line {fields[other].line})"
-                raise fields[key].error(f"{key} without {other}", got, "keep one of the two")
+def _clock(node: Node) -> Mapping[str, Node]:
+    return node.fields(_CLOCK_KEYS)
+
+
+def _extrinsics(node: Node) -> F64Array | str:
+    """Return (4, 4) body_from_sensor, m, or the name of a frame of the recording."""
+    fields = _some_fields(node, _EXTRINSICS_KEYS)
+    frame = _FRAME_OF_RECORDING.of(fields)
+    if frame:
+        return frame
+    origin = _TRANSLATION.of(fields)
+    if "rotation_xyzw" in fields:
+        xyzw = fields["rotation_xyzw"].numbers(4)
+        return _located(fields["rotation_xyzw"], lambda: from_quaternion(origin, xyzw))
+    if "matrix" in fields:
+        return _matrix(fields["matrix"])
+    return from_rpy_deg(origin, _ROTATION_RPY.of(fields))
 
 
 def _translation(node: Node) -> list[float]:
-    return [_near(item, value) for item, value in zip(node.items, node.numbers(3), strict=True)]
+    values = node.numbers(3)
+    for item, value in zip(node.items, values, strict=True):
+        _check_near(item, value)
+    return values
 
 
-def _near(node: Node, value: float) -> float:
-    if abs(value) > MAX_TRANSLATION_M:
-        wanted = f"at most {MAX_TRANSLATION_M:g} m from the body origin"
-        raise node.error(wanted, node.shown, "give metres in the body frame, not in the world")
-    return value
-
-
-def _from_rpy(node: Node, origin: list[float]) -> F64Array:
-    return from_rpy_deg(origin, node.numbers(3))
-
-
-def _from_xyzw(node: Node, origin: list[float]) -> F64Array:
-    xyzw = node.numbers(4)
-    return _placed(node, lambda: from_quaternion(origin, xyzw))
-
-
-def _from_matrix(node: Node, origin: list[float]) -> F64Array:
-    del origin  # The matrix holds its own.
+def _matrix(node: Node) -> F64Array:
     rows = node.elements("4 rows of 4 numbers")
     if len(rows) not in (3, 4):
         raise node.error("4 rows (or 3, without 0, 0, 0, 1)", node.shown, "give all rows")
     matrix = np.array([row.numbers(4) for row in rows])
-    transform = _placed(node, lambda: rigid(matrix))
+    transform = _located(node, lambda: rigid(matrix))
     for row in rows[:3]:
-        _near(row.items[3], float(row.items[3].text))
+        _check_near(row.items[3], row.items[3].number())
     return transform
 
 
-_ROTATIONS: dict[str, Callable[[Node, list[float]], F64Array]] = {
-    "rotation_rpy_deg": _from_rpy,
-    "rotation_xyzw": _from_xyzw,
-    "matrix": _from_matrix,
-}
-
-
-def _placed(node: Node, build: Callable[[], F64Array]) -> F64Array:
-    """What `build` gives; its error is told with the place of `node`."""
-    try:
-        return build()
-    except RigError as err:
-        raise node.fault(str(err)) from err
-
-
-def boxes(node: Node) -> F64Array:
-    """(k, 6) boxes: x0, y0, z0, x1, y1, z1 in metres."""
+def _boxes(node: Node) -> F64Array:
+    """Return boxes (k, 6): x0, y0, z0, x1, y1, z1 in m."""
     return np.array([_box(item) for item in node.elements("boxes")]).reshape(-1, 6)
 
 
 def _box(node: Node) -> list[float]:
     values = node.numbers(6)
-    for axis, (low, high) in enumerate(zip(values[:3], values[3:], strict=True)):
+    for axis, low, high in zip("xyz", values[:3], values[3:], strict=True):
         if low >= high:
-            wanted = f"{'xyz'[axis]}0 < {'xyz'[axis]}1 in metres (x0, y0, z0, x1, y1, z1)"
-            raise node.error(wanted, f"{low:g} and {high:g}", "swap the corners")
+            expected = f"{axis}0 < {axis}1 in metres (x0, y0, z0, x1, y1, z1)"
+            raise node.error(expected, f"{low:g} and {high:g}", "swap the corners")
     return values
+
+
+def _sensors(node: Node) -> tuple[RigSensor, ...]:
+    items = node.elements("sensors")
+    if not 1 <= len(items) <= MAX_SENSORS:
+        remedy = "list each sensor with `- name:`"
+        raise node.error(f"1 to {MAX_SENSORS} sensors", node.shown, remedy)
+    return tuple(_sensor(item) for item in items)
+
+
+# The keys of each mapping.
+
+_SOURCE_IP = Key("source_ip", _ip_address, "")
+_PORT = Key("port", lambda node: node.whole(1, 65535), 0)
+_TOPIC = Key("topic", _word("a topic without spaces"), "")
+# Text, since leading zeros count.
+_SERIAL = Key("serial", _word("a serial number without spaces"), "")
+_STREAM_KEYS = _names(_SOURCE_IP, _PORT, _TOPIC, _SERIAL)
+
+_CLOCK_SOURCE: Key[str | None] = Key("source", _choice("sensor", "host"), None)
+_CLOCK_EPOCH: Key[str | None] = Key("epoch", _choice("utc", "tai", "gps"), None)
+_CLOCK_OFFSET = Key("offset_s", _offset_ns, 0)
+_CLOCK_KEYS = _names(_CLOCK_SOURCE, _CLOCK_EPOCH, _CLOCK_OFFSET)
+
+_TRANSLATION = Key("translation_m", _translation, [0.0, 0.0, 0.0])
+_ROTATION_RPY = Key("rotation_rpy_deg", lambda node: node.numbers(3), [0.0, 0.0, 0.0])
+_FRAME_OF_RECORDING = Key("frame", _word("a frame of the recording"), "")
+_EXTRINSICS_KEYS = ["translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix", "frame"]
+# Keys of streams and extrinsics that exclude others.
+_EXCLUDES = {
+    "rotation_xyzw": ("rotation_rpy_deg",),
+    "matrix": ("translation_m", "rotation_rpy_deg", "rotation_xyzw"),
+    "frame": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
+    "topic": ("source_ip", "port"),
+}
+
+# A name fits ROS topics, frames and file names.
+_SENSOR_NAME = Key(
+    "name", _word("a name of letters, digits and _ that does not start with a digit", _NAME), ""
+)
+_MODEL: Key[str | None] = Key("model", _model, None)
+_STREAM: Key[StreamSelector | None] = Key("stream", _stream, None)
+_METADATA: Key[Path | None] = Key("metadata", _existing_file, None)
+_EXTRINSICS: Key[F64Array | str | None] = Key("extrinsics", _extrinsics, None)
+_CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {})
+_MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None)
+_MAX_RANGE: Key[float | None] = Key("max_range_m", _range_m, None)
+_OPTIONAL = Key("optional", Node.flag, False)
+_DECODE: Key[dict[str, str]] = Key("decode", _options, {})
+_SENSOR_KEYS = _names(
+    _SENSOR_NAME,
+    _MODEL,
+    _STREAM,
+    _METADATA,
+    _EXTRINSICS,
+    _CLOCK,
+    _MIN_RANGE,
+    _MAX_RANGE,
+    _OPTIONAL,
+    _DECODE,
+)
+
+# Fleets put the name of the robot before a slash.
+_BODY_FRAME = Key(
+    "body_frame",
+    _word("a frame name of letters, digits, _ and / that does not start with a digit", _FRAME),
+    DEFAULT_BODY_FRAME,
+)
+_RATE: Key[Fraction | None] = Key("rate_hz", _rate, None)
+_SENSORS: Key[tuple[RigSensor, ...]] = Key("sensors", _sensors, ())
+_BOXES = Key("exclude_boxes_m", _boxes, no_boxes())
+_RIG_KEYS = _names(_BODY_FRAME, _RATE, _SENSORS, _BOXES)
+
+
+def rig_from(root: Node) -> Rig:
+    """Return the rig that a tree describes; RigError for the first mistake."""
+    fields = root.fields(_RIG_KEYS, required=("sensors",))
+    rig = Rig(
+        body_frame=_BODY_FRAME.of(fields),
+        rate=_RATE.of(fields),
+        sensors=_SENSORS.of(fields),
+        exclude_boxes_m=_BOXES.of(fields),
+    )
+    _check_distinct(fields["sensors"], rig)
+    return rig
+
+
+def _sensor(node: Node) -> RigSensor:
+    fields = node.fields(_SENSOR_KEYS, required=("name",))
+    clock = _CLOCK.of(fields)
+    sensor = RigSensor(
+        name=_SENSOR_NAME.of(fields),
+        model=_MODEL.of(fields),
+        stream=_STREAM.of(fields),
+        metadata=_METADATA.of(fields),
+        extrinsics=_EXTRINSICS.of(fields),
+        clock=_CLOCK_SOURCE.of(clock),
+        epoch=_CLOCK_EPOCH.of(clock),
+        offset_ns=_CLOCK_OFFSET.of(clock),
+        min_range_m=_MIN_RANGE.of(fields),
+        max_range_m=_MAX_RANGE.of(fields),
+        optional=_OPTIONAL.of(fields),
+        decode=_DECODE.of(fields),
+    )
+    low_m = sensor.min_range_m or 0.0
+    high_m = sensor.max_range_m
+    if high_m is not None and high_m <= low_m:
+        value = fields["max_range_m"]
+        remedy = "give the larger range as maximum"
+        raise value.error(f"more than {low_m:g} m", value.shown, remedy)
+    return sensor
+
+
+def _check_distinct(node: Node, rig: Rig) -> None:
+    """Refuse two sensors with one name or stream, and a sensor named as the body frame."""
+    seen: dict[str | StreamSelector, Node] = {}
+    for item, sensor in zip(node.items, rig.sensors, strict=True):
+        name = item.entries["name"]
+        if sensor.name == rig.body_frame:
+            raise name.error("a name that is not the body frame", name.shown, "rename the sensor")
+        if sensor.name in seen:
+            raise _repeated(name, "a name", seen[sensor.name], "rename one of the two sensors")
+        seen[sensor.name] = name
+        if sensor.stream is not None:
+            stream = item.entries["stream"]
+            if sensor.stream in seen:
+                remedy = "give each sensor its own source_ip, port, topic or serial"
+                raise _repeated(stream, "a stream", seen[sensor.stream], remedy)
+            seen[sensor.stream] = stream
+
+
+def _repeated(node: Node, what: str, first: Node, remedy: str) -> RigError:
+    found = f"that of {first.path} (line {first.line}) again"
+    return node.error(f"{what} of its own", found, remedy)
+
+
+def _some_fields(node: Node, known: Sequence[str]) -> Mapping[str, Node]:
+    """Return the entries of a mapping that must not be empty; check keys that exclude others."""
+    fields = node.fields(known)
+    if not fields:
+        raise node.error(f"at least one of {', '.join(known)}", "none", "add one of them")
+    for key, others in _EXCLUDES.items():
+        for other in others:
+            if key in fields and other in fields:
+                found = f"{other} as well (line {fields[other].line})"
+                raise fields[key].error(f"{key} without {other}", found, "keep one of the two")
+    return fields
+
+
+def _check_near(node: Node, value_m: float) -> None:
+    if abs(value_m) > MAX_TRANSLATION_M:
+        expected = f"at most {MAX_TRANSLATION_M:g} m from the body origin"
+        raise node.error(expected, node.shown, "give metres in the body frame, not in the world")
+
+
+def _located(node: Node, build: Callable[[], F64Array]) -> F64Array:
+    """Return the result of `build`; its error gets the position of `node`."""
+    try:
+        return build()
+    except RigError as err:
+        raise node.error_here(str(err)) from err

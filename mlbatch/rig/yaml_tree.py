@@ -1,6 +1,7 @@
-"""YAML files as trees of `Node`, built from parser events.
+"""YAML files as trees of values that know their file, key path and line, for precise errors.
 
-Nothing is constructed from tags, and aliases cannot multiply.
+Scalars keep their text: 29.97 is exactly 2997/100, `on` stays `on`, and 0012 stays a serial number.
+Nothing is constructed from tags, and aliases are refused, so that they cannot multiply.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,142 +18,24 @@ import yaml
 
 from mlbatch.errors import RigError
 
-
-def read_yaml(file: Path) -> Node:
-    """The tree of a YAML file; RigError for anything that is not one plain document."""
-    text = _text(file)
-    composer = _Composer(file, yaml.parse(text, Loader=yaml.SafeLoader))
-    try:
-        return composer.document()
-    except yaml.MarkedYAMLError as err:
-        line = err.problem_mark.line + 1 if err.problem_mark else 1
-        remedy = "check indentation, colons and brackets here and one line above"
-        raise fault(file, line, "", f"wanted YAML, got {err.problem}; {remedy}") from err
-    except yaml.reader.ReaderError as err:
-        line = text.count("\n", 0, int(err.position)) + 1
-        got = f"the control character {ord(text[int(err.position)]):#04x}"
-        raise fault(file, line, "", f"wanted YAML, got {got}; remove it") from err
-
-
-def _text(file: Path) -> str:
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as err:
-        reason = (getattr(err, "strerror", None) or str(err)).lower()
-        raise RigError(f"{file}: wanted a readable file, got {reason}; check the path") from err
-    if len(data) > MAX_BYTES:
-        raise RigError(
-            f"{file}: wanted at most {MAX_BYTES} bytes, got more; "
-            "check that this is a rig file and not a recording"
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as err:
-        line = data.count(b"\n", 0, err.start) + 1
-        got = f"the byte {data[err.start]:#04x}"
-        raise fault(file, line, "", f"wanted UTF-8 text, got {got}; save it as UTF-8") from err
-
-
-def _line(event: yaml.Event) -> int:
-    return event.start_mark.line + 1 if event.start_mark else 1
-
-
-class _Composer:
-    """Builds the tree from parser events."""
-
-    def __init__(self, file: Path, events: Iterator[yaml.Event]) -> None:
-        self.file = file
-        self.events = events
-        self.values = 0
-
-    def document(self) -> Node:
-        """The only document of the stream; an empty file is a scalar without text."""
-        root = Node(self.file, "", 1, "scalar", plain=True)
-        documents = 0
-        for event in self.events:
-            if not isinstance(event, yaml.DocumentStartEvent):
-                continue
-            documents += 1
-            if documents > 1:
-                message = "wanted one document, got a second one; remove what follows `---`"
-                raise fault(self.file, _line(event), "", message)
-            root = self.node(next(self.events), "", 0)
-        return root
-
-    def node(self, event: yaml.Event, path: str, depth: int) -> Node:
-        """The value that begins with `event`."""
-        line = _line(event)
-        self.values += 1
-        self._check(event, path, line, depth)
-        if isinstance(event, yaml.ScalarEvent):
-            plain = event.style is None
-            return Node(self.file, path, line, "scalar", text=str(event.value), plain=plain)
-        if isinstance(event, yaml.SequenceStartEvent):
-            return Node(self.file, path, line, "list", items=tuple(self._items(path, depth)))
-        return Node(self.file, path, line, "mapping", entries=self._entries(path, depth))
-
-    def _check(self, event: yaml.Event, path: str, line: int, depth: int) -> None:
-        message = ""
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            message = "wanted plain values, got an anchor or alias; write the value out"
-        elif (tag := getattr(event, "tag", None)) is not None:
-            message = f"wanted plain values, got the tag {short(tag)}; remove it"
-        elif depth > MAX_DEPTH:
-            message = f"wanted at most {MAX_DEPTH} levels, got more; remove brackets"
-        elif self.values > MAX_VALUES:
-            message = f"wanted at most {MAX_VALUES} values, got more; check that this is a rig file"
-        if message:
-            raise fault(self.file, line, path, message)
-
-    def _items(self, path: str, depth: int) -> Iterator[Node]:
-        for index, event in enumerate(self.events):
-            if isinstance(event, yaml.SequenceEndEvent):
-                return
-            yield self.node(event, f"{path}[{index}]", depth + 1)
-
-    def _entries(self, path: str, depth: int) -> Mapping[str, Node]:
-        entries: dict[str, Node] = {}
-        for event in self.events:
-            if isinstance(event, yaml.MappingEndEvent):
-                break
-            line = _line(event)
-            self._check(event, path, line, depth)
-            if not isinstance(event, yaml.ScalarEvent):
-                message = "wanted a word as key, got brackets; put the brackets after the colon"
-                raise fault(self.file, line, path, message)
-            name = str(event.value)
-            key = name if KEY.fullmatch(name) else short(name)
-            here = f"{path}.{key}" if path else key
-            if name in entries:
-                message = f"wanted each key once, got it again (first on line {entries[name].line})"
-                raise fault(self.file, line, here, message + "; remove one of the two")
-            # The line of the key: that of the value is one further down where it is a block.
-            entries[name] = replace(self.node(next(self.events), here, depth + 1), line=line)
-        return entries
-
-
-# YAML as a tree of places: each value knows its file, key path and line, for errors that help.
-#
-# Scalars keep their text: 29.97 is exactly 2997/100, `on` stays `on`, and 0012 stays a serial
-# number. `_yaml_tree.py` builds the tree.
-
-# Of both, the 256 sensors that a rig may have need less; a parser takes its time for each value.
-MAX_BYTES, MAX_VALUES = 300_000, 20_000
+# Limits for untrusted files; a rig of 256 sensors needs less.
+MAX_BYTES = 300_000
+MAX_VALUES = 20_000
 MAX_DEPTH = 16
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _MAX_DIGITS = 100
-KEY = re.compile(r"\w{1,40}", re.ASCII)
-# The spellings of YAML 1.1, which people know.
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
+_KEY = re.compile(r"\w{1,40}", re.ASCII)
+# Spellings of YAML 1.1.
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-_NOTHING = ("", "~", "null", "Null", "NULL")
+_NULLS = ("", "~", "null", "Null", "NULL")
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
     """A value of the file: a scalar (`text`), a list (`items`) or a mapping (`entries`).
 
-    path: keys that lead here, as `sensors[1].name`; line: from 1; plain: written without quotes.
+    path: keys from the root, as `sensors[1].name`; line: counts from 1; kind: scalar, list or
+    mapping; plain: a scalar without quotes.
     """
 
     file: Path
@@ -164,29 +47,31 @@ class Node:
     items: tuple[Node, ...] = ()
     entries: Mapping[str, Node] = field(default_factory=dict)
 
-    def error(self, wanted: str, got: str, remedy: str) -> RigError:
-        """The error for a value that cannot be used."""
-        return self.fault(f"wanted {wanted}, got {got}; {remedy}")
+    def error(self, expected: str, found: str, remedy: str) -> RigError:
+        """Return the error for an unusable value."""
+        return self.error_here(f"expected {expected}, found {found}; {remedy}")
 
-    def fault(self, message: str) -> RigError:
-        """An error that says where this value stands."""
-        return fault(self.file, self.line, self.path, message)
+    def error_here(self, message: str) -> RigError:
+        """Return an error with the position of this value."""
+        return _error(self.file, self.line, self.path, message)
 
     @property
     def shown(self) -> str:
-        """What stands here, in a few words."""
-        if self.kind == "scalar":
-            if self.is_nothing():
-                return "nothing"
-            return short(self.text) if self.plain else f"the text {short(self.text)}"
-        return f"a list of {len(self.items)}" if self.kind == "list" else "a mapping"
+        """The value in a few words, for errors."""
+        if self.kind == "list":
+            return f"a list of {len(self.items)}"
+        if self.kind == "mapping":
+            return "a mapping"
+        if self.is_null():
+            return "nothing"
+        return short(self.text) if self.plain else f"the text {short(self.text)}"
 
-    def is_nothing(self) -> bool:
-        """Whether the value was left out or is null."""
-        return self.kind == "scalar" and self.plain and self.text in _NOTHING
+    def is_null(self) -> bool:
+        """Return whether the value is missing or null."""
+        return self.kind == "scalar" and self.plain and self.text in _NULLS
 
     def fields(self, known: Sequence[str], required: Sequence[str] = ()) -> Mapping[str, Node]:
-        """The entries of a mapping that has no other keys than the known ones."""
+        """Return the entries of a mapping; RigError for unknown and missing keys."""
         if self.kind != "mapping":
             keys = ", ".join(known)
             raise self.error(f"a mapping with keys of {keys}", self.shown, "write `key: value`")
@@ -201,67 +86,189 @@ class Node:
         return self.entries
 
     def elements(self, what: str) -> tuple[Node, ...]:
-        """The values of a list."""
+        """Return the values of a list."""
         if self.kind != "list":
             raise self.error(f"a list of {what}", self.shown, "write [a, b] or lines with `- `")
         return self.items
 
     def word(self, what: str, pattern: re.Pattern[str]) -> str:
-        """Text of the given form."""
-        if self.kind != "scalar" or self.is_nothing() or not pattern.fullmatch(self.text):
+        """Return text of the given form."""
+        if self.kind != "scalar" or self.is_null() or not pattern.fullmatch(self.text):
             raise self.error(what, self.shown, "correct it or remove the key")
         return self.text
 
     def choice(self, words: Sequence[str]) -> str:
-        """One of some words."""
+        """Return one of some words."""
         if self.kind != "scalar" or self.text not in words:
             raise self.error(" or ".join(words), self.shown, "use one of these words")
         return self.text
 
     def flag(self) -> bool:
-        """True or false."""
+        """Return true or false."""
         value = _FLAGS.get(self.text.lower()) if self.plain else None
         if value is None:
             raise self.error("true or false", self.shown, "write one of the two, without quotes")
         return value
 
     def exact(self) -> Fraction:
-        """A number, as it is written."""
+        """Return the number that the text is, exactly."""
         if not (self.plain and len(self.text) <= _MAX_DIGITS and _NUMBER.fullmatch(self.text)):
             remedy = "write a decimal number, without quotes or unit"
             raise self.error("a finite number", self.shown, remedy)
         return Fraction(self.text)
 
     def number(self) -> float:
-        """A number in float64."""
+        """Return a number in float64."""
         self.exact()
         value = float(self.text)
         if not math.isfinite(value):
-            raise self.error("a finite number", self.shown, "give one that float64 can hold")
+            raise self.error("a finite number", self.shown, "give one within the range of float64")
         return value
 
     def whole(self, low: int, high: int) -> int:
-        """An integer in [low, high]."""
+        """Return an integer in [low, high]."""
         exact = self.exact()
         if exact.denominator != 1 or not low <= exact <= high:
-            wanted = f"a whole number from {low} to {high}"
-            raise self.error(wanted, self.shown, "correct it or remove the key")
+            expected = f"a whole number from {low} to {high}"
+            raise self.error(expected, self.shown, "correct it or remove the key")
         return int(exact)
 
     def numbers(self, count: int) -> list[float]:
-        """A list of so many numbers."""
+        """Return a list of `count` numbers."""
         items = self.elements(f"{count} numbers")
         if len(items) != count:
             raise self.error(f"{count} numbers", self.shown, f"give all {count} and no more")
         return [item.number() for item in items]
 
 
+def read_yaml(file: Path) -> Node:
+    """Read a YAML file; RigError unless it is one document of plain values."""
+    text = _text(file)
+    try:
+        loader = _Loader(file, text)
+        # An empty file has no node.
+        root = loader.get_node() if loader.check_node() else None
+        if loader.check_node():
+            line = _line(loader.next_event())
+            message = "expected one document, found a second one; remove what follows `---`"
+            raise _error(file, line, "", message)
+    except yaml.MarkedYAMLError as err:
+        line = err.problem_mark.line + 1 if err.problem_mark else 1
+        remedy = "check indentation, colons and brackets here and one line above"
+        message = f"expected YAML, found a mistake ({err.problem}); {remedy}"
+        raise _error(file, line, "", message) from err
+    except yaml.reader.ReaderError as err:
+        line = text.count("\n", 0, int(err.position)) + 1
+        found = f"the control character {ord(text[int(err.position)]):#04x}"
+        raise _error(file, line, "", f"expected YAML, found {found}; remove it") from err
+    if root is None:
+        return Node(file, "", 1, "scalar", plain=True)
+    return _tree(file, root, "", _line(root))
+
+
+class _Loader(yaml.SafeLoader):
+    """Composes plain values; refuses anchors, aliases, tags, and more values than the limits."""
+
+    def __init__(self, file: Path, text: str) -> None:
+        super().__init__(text)
+        self._file = file
+        self._paths: list[str] = []
+        self._values = 0
+
+    def next_event(self) -> yaml.Event:
+        """Return the next event of the parser without consuming it."""
+        # Declared here, as the type stubs of PyYAML leave it out.
+        peek: Callable[[], yaml.Event] = self.peek_event
+        return peek()
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Compose the next value; index: position in a list, key node in a mapping, None: a key."""
+        event = self.next_event()
+        path = self._paths[-1] if self._paths else ""
+        is_key = parent is not None and index is None
+        if not is_key:
+            path = _below(path, index)
+            self._values += 1
+        message = ""
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            message = "expected plain values, found an anchor or alias; write the value out"
+        elif (tag := getattr(event, "tag", None)) is not None:
+            message = f"expected plain values, found the tag {short(tag)}; remove it"
+        elif is_key and not isinstance(event, yaml.ScalarEvent):
+            message = "expected a word as key, found brackets; put the brackets after the colon"
+        elif len(self._paths) > MAX_DEPTH:
+            message = f"expected at most {MAX_DEPTH} levels, found more; remove brackets"
+        elif self._values > MAX_VALUES:
+            remedy = "check that this is a rig file"
+            message = f"expected at most {MAX_VALUES} values, found more; {remedy}"
+        if message:
+            raise _error(self._file, _line(event), path, message)
+        self._paths.append(path)
+        node = super().compose_node(parent, index)
+        self._paths.pop()
+        return node
+
+
+def _below(path: str, index: object) -> str:
+    """Return the path of an element; index: as of `_Loader.compose_node`."""
+    if isinstance(index, yaml.ScalarNode):
+        name = str(index.value)
+        key = name if _KEY.fullmatch(name) else short(name)
+        return f"{path}.{key}" if path else key
+    return path if index is None else f"{path}[{index}]"
+
+
+def _tree(file: Path, node: yaml.Node, path: str, line: int) -> Node:
+    """Convert a composed value; line: that of its key in a mapping, as a block begins below."""
+    if isinstance(node, yaml.ScalarNode):
+        return Node(file, path, line, "scalar", text=str(node.value), plain=node.style is None)
+    if isinstance(node, yaml.SequenceNode):
+        items = [
+            _tree(file, item, _below(path, index), _line(item))
+            for index, item in enumerate(node.value)
+        ]
+        return Node(file, path, line, "list", items=tuple(items))
+    entries: dict[str, Node] = {}
+    for key, value in node.value:
+        name = str(key.value)
+        own_path = _below(path, key)
+        if name in entries:
+            found = f"it again (first on line {entries[name].line})"
+            message = f"expected each key once, found {found}; remove one of the two"
+            raise _error(file, _line(key), own_path, message)
+        entries[name] = _tree(file, value, own_path, _line(key))
+    return Node(file, path, line, "mapping", entries=entries)
+
+
+def _text(file: Path) -> str:
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as err:
+        reason = (getattr(err, "strerror", None) or str(err)).lower()
+        raise RigError(f"{file}: expected a readable file, found {reason}; check the path") from err
+    if len(data) > MAX_BYTES:
+        raise RigError(
+            f"{file}: expected at most {MAX_BYTES} bytes, found more; "
+            "check that this is a rig file and not a recording"
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as err:
+        line = data.count(b"\n", 0, err.start) + 1
+        message = f"expected UTF-8 text, found the byte {data[err.start]:#04x}; save it as UTF-8"
+        raise _error(file, line, "", message) from err
+
+
+def _line(place: yaml.Event | yaml.Node) -> int:
+    return place.start_mark.line + 1 if place.start_mark else 1
+
+
 def short(text: str) -> str:
-    """Text in quotes, on one line and not too long."""
+    """Return text in quotes, on one line, cut to 40 characters."""
     return repr(text if len(text) <= 40 else text[:40] + "...")
 
 
-def fault(file: Path, line: int, path: str, message: str) -> RigError:
-    """The error about a place in a file."""
+def _error(file: Path, line: int, path: str, message: str) -> RigError:
     place = f"{file}:{line}: {path}: " if path else f"{file}:{line}: "
     return RigError(place + message)

@@ -47,14 +47,14 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "topic and port": (
         "drive.mcap --rig both.yaml",
         1,
-        "both.yaml:2: sensors[0].stream.topic: wanted topic without port, got port as well "
+        "both.yaml:2: sensors[0].stream.topic: expected topic without port, found port as well "
         "(line 2); keep one of the two",
     ),
     "frame of the rig": (
         "drive.mcap --rig frame.yaml",
         1,
-        "sensor left: extrinsics by frame (os_lft): wanted a frame of the recording's "
-        "transforms, got 'os_lft'; it has base_link, left/os_sensor, right/os_sensor; correct"
+        "sensor left: extrinsics by frame (os_lft): expected a frame of the recording's "
+        "transforms, found 'os_lft'; it has base_link, left/os_sensor, right/os_sensor; correct"
         " it, or give translation_m and a rotation",
     ),
     "folder without a bag": (

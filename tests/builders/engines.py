@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.decode import numba_engine
-from mlbatch.decode.decoder import Decoder, Due, Label
+from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.kernels import is_installed
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
@@ -50,7 +50,7 @@ def few_kernels(factory: pytest.TempPathFactory) -> Iterator[None]:
     own = os.environ | {"XDG_CACHE_HOME": str(session / "kernels")}
     with (
         patch.dict(os.environ, own),
-        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
     ):
         yield
 
@@ -61,7 +61,7 @@ class Pair:
     def __init__(self, one: Decoder, other: Decoder) -> None:
         self.one, self.other = one, other
 
-    def check(self, due: Due, label: Label) -> Scan:
+    def check(self, due: WindowColumns, label: ScanHeader) -> Scan:
         """Decode a window by both; all that they say is the same, byte by byte."""
         one, other = self.one.scan(due, label), self.other.scan(due, label)
         assert_same(one, other)

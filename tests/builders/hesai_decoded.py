@@ -49,9 +49,9 @@ class Decoded:
             self.lidar.beams, np.maximum(self.lidar.firing_ns, 0), count
         )
         points = np.empty((count, channels, returns, 3), np.float32)
-        projection.aim(np.zeros(count, np.int64), self.encoder)
+        projection.prepare(np.zeros(count, np.int64), self.encoder)
         for which in range(returns):
-            projection.points(np.ascontiguousarray(self.range_m[..., which]), points[:, :, which])
+            projection.project(np.ascontiguousarray(self.range_m[..., which]), points[:, :, which])
         return points
 
 

@@ -155,13 +155,13 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "rate no number": (
         f"{FIX} --rate fast",
         2,
-        "--rate: wanted a positive number of Hz (10, 29.97 or 10/3), got 'fast'; write a decimal "
-        "number or a fraction",
+        "--rate: expected a positive number of Hz (10, 29.97 or 10/3), found 'fast'; write a "
+        "decimal number or a fraction",
     ),
     "rate too low": (
         f"{FIX} --rate 0.1",
         2,
-        "--rate: wanted 0.25 to 1000000 Hz, got '0.1'; lidars turn at 5 to 20 Hz",
+        "--rate: expected 0.25 to 1000000 Hz, found '0.1'; lidars run at 5 to 20 Hz",
     ),
     "no slices": (
         f"{FIX} --slices 0",
@@ -291,19 +291,19 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "rig missing": (
         "fix/two_lidars.pcap --rig none.yaml",
         1,
-        "none.yaml: wanted a readable file, got no such file or directory; check the path",
+        "none.yaml: expected a readable file, found no such file or directory; check the path",
     ),
     "rig without sensors": (
         "fix/two_lidars.pcap --rig empty.yaml",
         1,
-        "empty.yaml:1: sensors: wanted 1 to 256 sensors, got a list of 0; list each sensor with "
-        "`- name:`",
+        "empty.yaml:1: sensors: expected 1 to 256 sensors, found a list of 0; list each sensor "
+        "with `- name:`",
     ),
     "misspelt key": (
         "fix/two_lidars.pcap --rig misspelt.yaml",
         1,
-        "misspelt.yaml:2: sensors[0].extrinsic: wanted a key of name, model, stream, metadata, "
-        "extrinsics, clock, min_range_m, max_range_m, optional, decode, got 'extrinsic'; the "
+        "misspelt.yaml:2: sensors[0].extrinsic: expected a key of name, model, stream, metadata, "
+        "extrinsics, clock, min_range_m, max_range_m, optional, decode, found 'extrinsic'; the "
         "nearest known key is extrinsics",
     ),
     "rig sensor of no stream": (

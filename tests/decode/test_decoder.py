@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.decode.decoder import Decoder, Due, Label, Source
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.projector import tile_columns
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.sensors import read_calibration
@@ -57,7 +57,7 @@ class Bench:
         mids = np.arange(TURN)
         payloads = encode_packets(self.spec, mids, mids, np.zeros(TURN, np.int64), self.fields)
         data = np.frombuffer(b"".join(payloads), np.uint8)
-        ring = RawRing(lidar.packet_size, lidar.records)
+        ring = PacketRing(lidar.packet_size, lidar.records)
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
         _, first = ring.store(data.copy(), start, None)
         self.place = (first[:, None] + np.arange(16)).ravel()
@@ -98,8 +98,8 @@ def _scan(decoder: Decoder, benches: Sequence[Bench], columns: Sequence[tuple[in
     mids = np.array([mid for _, mid in columns], np.int64)
     place = np.array([benches[s].place[mid] for s, mid in columns], np.int64)
     stamps = START_NS + np.arange(len(columns), dtype=np.int64) * 100_000
-    label = Label(3, 0, START_NS, START_NS + 10**8, True, 17)
-    return decoder.scan(Due(stamps, sensor, place, mids), label)
+    label = ScanHeader(3, 0, START_NS, START_NS + 10**8, True, 17)
+    return decoder.scan(WindowColumns(stamps, sensor, place, mids), label)
 
 
 def _xyz(scan: Scan) -> list[list[float]]:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import U8Array
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.interface import Records
 
 
@@ -22,12 +22,12 @@ class Stored:
     record_start: int
     record_size: int
     columns: int
-    ring: RawRing = field(init=False)
+    ring: PacketRing = field(init=False)
     records: dict[int, bytes] = field(default_factory=dict)
     count: int = 0
 
     def __post_init__(self) -> None:
-        self.ring = RawRing(
+        self.ring = PacketRing(
             self.packet_size, Records(self.record_start, self.record_size, self.record_size)
         )
 
@@ -91,7 +91,7 @@ def test_a_ring_that_is_emptied_does_not_grow() -> None:
 
 
 def test_places_never_come_twice() -> None:
-    ring, seen = RawRing(36, Records(0, 12, 12)), set[int]()
+    ring, seen = PacketRing(36, Records(0, 12, 12)), set[int]()
     for count in (3, 64, 1, 70, 5, 64):
         data = np.zeros(count * 36, np.uint8)
         _, place = ring.store(data, np.arange(count, dtype=np.int64) * 36, None)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from mlbatch.arrays import F64Array
 from mlbatch.discovery.extrinsics import Extrinsics, ExtrinsicsSources, Transform
 from mlbatch.errors import RigError
+from mlbatch.frames.naming import Candidate, candidates
 from mlbatch.frames.transforms import compose, from_rpy_deg, quaternion
-from mlbatch.frames.tree import Candidate, candidates
 
 Frames = Mapping[str, Sequence[Candidate]]
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)

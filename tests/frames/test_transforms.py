@@ -124,21 +124,21 @@ X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 @pytest.mark.parametrize(
     ("matrix", "wanted_and_got"),
     [
-        (_matrix(X, Y), "wanted 4 (or 3) rows of 4 finite numbers, got shape (2, 4)"),
-        (_matrix(X, Y, (0, 0, math.nan, 0), W), "wanted 4 (or 3) rows of 4 finite numbers, got"),
-        (_matrix(X, Y, Z, (1, 2, 3, 1)), "wanted 0, 0, 0, 1 as last row, got 1, 2, 3, 1"),
+        (_matrix(X, Y), "expected 4 (or 3) rows of 4 finite numbers, found shape (2, 4)"),
+        (_matrix(X, Y, (0, 0, math.nan, 0), W), "expected 4 (or 3) rows of 4 finite numbers, "),
+        (_matrix(X, Y, Z, (1, 2, 3, 1)), "expected 0, 0, 0, 1 as last row, found 1, 2, 3, 1"),
         # Scaled by 1.1: its axes have a squared length of 1.21.
         (
             _matrix((1.1, 0, 0, 0), (0, 1.1, 0, 0), (0, 0, 1.1, 0), W),
-            "wanted orthonormal axes within 0.001, got axes off by 0.21",
+            "expected orthonormal axes within 0.001, found axes off by 0.21",
         ),
         # Two axes that meet at the cosine 0.01.
         (
             _matrix((1, 0.01, 0, 0), Y, Z, W),
-            "wanted orthonormal axes within 0.001, got axes off by 0.01",
+            "expected orthonormal axes within 0.001, found axes off by 0.01",
         ),
-        (_matrix(Y, X, Z, W), "wanted a rotation (determinant 1), got a mirror image"),
-        (_matrix((-1, 0, 0, 0), Y, Z), "wanted a rotation (determinant 1), got a mirror image"),
+        (_matrix(Y, X, Z, W), "expected a rotation (determinant 1), found a mirror image"),
+        (_matrix((-1, 0, 0, 0), Y, Z), "expected a rotation (determinant 1), found a mirror image"),
     ],
 )
 def test_what_is_not_rigid_is_refused(matrix: F64Array, wanted_and_got: str) -> None:
@@ -152,7 +152,9 @@ def test_what_is_not_rigid_is_refused(matrix: F64Array, wanted_and_got: str) -> 
     "xyzw", [(0, 0, 0, 0), (0, 0, 0, 1.002), (1, 1, 0, 0), (0, 0, 0, math.nan)]
 )
 def test_quaternion_that_is_not_unit_is_refused(xyzw: tuple[float, ...]) -> None:
-    with pytest.raises(RigError, match=r"^wanted a quaternion of norm 1 within 0.001, got norm "):
+    with pytest.raises(
+        RigError, match=r"^expected a quaternion of norm 1 within 0.001, found norm "
+    ):
         from_quaternion(ORIGIN, xyzw)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from mlbatch.errors import RigError
 from mlbatch.frames import urdf
-from mlbatch.frames.urdf import fixed_joints, joints
+from mlbatch.frames.urdf import joints
 
 REMEDY = "; give the extrinsics in a rig file (--rig)"
 
@@ -25,16 +25,16 @@ LINKS = '<parent link="base_link"/><child link="os_left"/>'
 def test_a_fixed_joint_by_hand() -> None:
     # Yaw of 90 degrees: the sensor looks to the left of the car, its left is the car's back.
     text = _robot(_joint(LINKS + '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'))
-    ((parent, child, matrix),) = fixed_joints(text)
-    assert (parent, child) == ("base_link", "os_left")
-    wanted = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-    assert matrix.tolist() == wanted
+    (joint,) = joints(text)
+    assert (joint.parent, joint.child, joint.is_fixed) == ("base_link", "os_left", True)
+    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    assert joint.matrix.tolist() == expected
 
 
 def test_roll_comes_before_pitch_and_yaw() -> None:
     # About fixed axes: roll takes y to z; then yaw leaves z and takes x to y.
     text = _robot(_joint(LINKS + '<origin rpy="1.5707963267948966 0 1.5707963267948966"/>'))
-    ((_, _, matrix),) = fixed_joints(text)
+    matrix = joints(text)[0].matrix
     assert matrix[:3, :3].tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
 
 
@@ -48,7 +48,7 @@ def test_roll_comes_before_pitch_and_yaw() -> None:
     ],
 )
 def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) -> None:
-    ((_, _, matrix),) = fixed_joints(_robot(_joint(LINKS + origin)))
+    matrix = joints(_robot(_joint(LINKS + origin)))[0].matrix
     assert matrix[:3, 3].tolist() == place
     assert matrix[:3, :3].tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
@@ -56,7 +56,6 @@ def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) 
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic", "floating", "planar", ""])
 def test_joints_that_move_are_told_apart(kind: str) -> None:
     text = _robot(_joint(LINKS, kind, "turret"))
-    assert fixed_joints(text) == []
     (joint,) = joints(text)
     assert (joint.name, joint.kind, joint.is_fixed) == ("turret", kind, False)
     assert (joint.parent, joint.child) == ("base_link", "os_left")
@@ -69,14 +68,12 @@ def test_other_elements_named_joint_are_none() -> None:
         _joint(LINKS),
         "<gazebo><joint name='x' type='fixed'><parent>a</parent></joint></gazebo>",
     )
-    assert [(parent, child) for parent, child, _ in fixed_joints(text)] == [
-        ("base_link", "os_left")
-    ]
+    assert [(joint.parent, joint.child) for joint in joints(text)] == [("base_link", "os_left")]
 
 
 def test_a_default_name_space_changes_nothing() -> None:
     text = f'<robot xmlns="http://example.org/urdf">{_joint(LINKS)}</robot>'
-    assert len(fixed_joints(text)) == 1
+    assert len(joints(text)) == 1
 
 
 def test_an_empty_robot_has_no_joints() -> None:
@@ -89,31 +86,34 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name=
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOMB, ": wanted a document without a document type, got <!DOCTYPE robot"),
+        (BOMB, ": expected a document without a document type, found <!DOCTYPE robot"),
         (
             '<!DOCTYPE robot SYSTEM "file:///etc/passwd"><robot/>',
-            ": wanted a document without a document type, got <!DOCTYPE robot",
+            ": expected a document without a document type, found <!DOCTYPE robot",
         ),
-        ("<sdf/>", ": wanted the element <robot> first, got <sdf>"),
-        ("", ": wanted an XML document, got no element found: line 1, column 0"),
-        ("base_link", ": wanted an XML document, got syntax error: line 1, column 0"),
-        ("<robot>", ": wanted an XML document, got no element found: line 1, column 7"),
-        ("<robot>&x;</robot>", ": wanted an XML document, got undefined entity: line 1, column 7"),
+        ("<sdf/>", ": expected the element <robot> first, found <sdf>"),
+        ("", ": expected an XML document, found no element found: line 1, column 0"),
+        ("base_link", ": expected an XML document, found syntax error: line 1, column 0"),
+        ("<robot>", ": expected an XML document, found no element found: line 1, column 7"),
+        (
+            "<robot>&x;</robot>",
+            ": expected an XML document, found undefined entity: line 1, column 7",
+        ),
         (
             _robot(_joint('<parent link="a"/>')),
-            ", joint mount: wanted a parent link and a child link, got none",
+            ", joint mount: expected a parent link and a child link, found none",
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="1 2"/>')),
-            ", joint mount, origin xyz: wanted 3 numbers of at most 1e+09, got 1 2",
+            ", joint mount, origin xyz: expected 3 numbers of at most 1e+09, found 1 2",
         ),
         (
             _robot(_joint(LINKS + '<origin rpy="0 0 ${pi/2}"/>')),
-            ", joint mount, origin rpy: wanted 3 numbers of at most 1e+09, got 0 0 ${pi/2}",
+            ", joint mount, origin rpy: expected 3 numbers of at most 1e+09, found 0 0 ${pi/2}",
         ),
         (
             _robot(_joint(LINKS + '<origin xyz="0 0 nan"/>', name="")),
-            ", joint (no name), origin xyz: wanted 3 numbers of at most 1e+09, got 0 0 nan",
+            ", joint (no name), origin xyz: expected 3 numbers of at most 1e+09, found 0 0 nan",
         ),
     ],
 )
@@ -124,7 +124,7 @@ def test_descriptions_that_cannot_be_used(text: str, message: str) -> None:
 
 
 def test_halves_of_characters_are_told_in_one_line() -> None:
-    with pytest.raises(RigError, match="wanted an XML document") as caught:
+    with pytest.raises(RigError, match="expected an XML document") as caught:
         joints("<robot name='\ud800'/>")
     assert "\n" not in str(caught.value)
 
@@ -132,8 +132,8 @@ def test_halves_of_characters_are_told_in_one_line() -> None:
 def test_what_is_too_large_is_not_even_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(urdf, "MAX_BYTES", 20)
     assert joints("<robot name='1234'/>") == []
-    with pytest.raises(RigError, match="wanted at most 20 bytes, got more"):
+    with pytest.raises(RigError, match="expected at most 20 bytes, found more"):
         joints("<robot name='12345'/>")
     # Bytes, not characters, are counted.
-    with pytest.raises(RigError, match="wanted at most 20 bytes, got more"):
+    with pytest.raises(RigError, match="expected at most 20 bytes, found more"):
         joints("<robot name='123\xe9'/>")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.discovery.probe import probe, with_clouds
-from mlbatch.frames.tree import Candidate
+from mlbatch.frames.naming import Candidate
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.ros.definitions import definition_text

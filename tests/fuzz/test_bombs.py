@@ -168,7 +168,7 @@ def test_a_gigabyte_beside_the_recording_is_not_read(
 
 def test_a_gigabyte_rig_is_not_read(tmp_path: Path) -> None:
     def run(data: bytes, folder: Path) -> None:
-        with pytest.raises(RigError, match="wanted at most"):
+        with pytest.raises(RigError, match="expected at most"):
             read_rig(_sparse(tmp_path / "rig.yaml", 1 << 30, data))
 
     _sound(_examined(b"sensors:\n", run))

@@ -178,7 +178,7 @@ def test_a_rig_may_name_files_beside_its_folder_and_nothing_else(tmp_path: Path)
     assert metadata.samefile(tmp_path / "left.json")
     for path in ("/dev/zero", "/dev/stdin", "..", "/dev/fd/0", "a\\0b"):
         rig.write_text(f'sensors: [{{name: left, metadata: "{path}"}}]\n', encoding="utf-8")
-        with pytest.raises(RigError, match="wanted an existing file"):
+        with pytest.raises(RigError, match="expected an existing file"):
             read_rig(rig)
 
 

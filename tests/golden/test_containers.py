@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.frames.tree import NAMINGS
+from mlbatch.frames.naming import NAMINGS
 from mlbatch.readers import open_recording
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.types import StreamTable

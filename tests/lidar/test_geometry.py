@@ -54,10 +54,10 @@ def test_beams_fire_while_the_rotor_goes_on(axis: str, lens_m: float, rotor_hz: 
     turning = Turning(_beams(axis, lens_m).moved(POSE), FIRING_NS, 64)
     turns = np.linspace(-0.3, 1.4, 41, dtype=np.float64)
     table = np.arange(41) % 2
-    turning.aim(np.zeros(41, np.int64), rotor_words(turns, np.full(41, rotor_hz), table))
+    turning.prepare(np.zeros(41, np.int64), rotor_words(turns, np.full(41, rotor_hz), table))
     range_m = np.linspace(0.5, 120, 41 * 4).reshape(41, 4).astype(np.float32)
     points = np.empty((41, 4, 4), np.float32)
-    turning.points(range_m, points[:, :, :3])
+    turning.project(range_m, points[:, :, :3])
     for column in range(41):
         for beam in range(4):
             fired_s = float(FIRING_NS[table[column], beam]) * 1e-9
@@ -75,9 +75,9 @@ def test_a_beam_to_the_right_at_a_quarter_turn() -> None:
             spherical(np.zeros(1), np.zeros(1), axis), np.zeros((3, 1, 3)), np.zeros(1)
         )
         turning = Turning(table, np.zeros((1, 1), np.int64), 1)
-        turning.aim(np.zeros(1, np.int64), rotor_words(np.array([0.25]), np.zeros(1)))
+        turning.prepare(np.zeros(1, np.int64), rotor_words(np.array([0.25]), np.zeros(1)))
         out = np.empty((1, 1, 3), np.float32)
-        turning.points(np.full((1, 1), 2.0, np.float32), out)
+        turning.project(np.full((1, 1), 2.0, np.float32), out)
         np.testing.assert_allclose(out[0, 0], wanted, atol=1e-6)
 
 
@@ -85,8 +85,8 @@ def _points(projection: Projection, member: I64Array, encoder: I64Array) -> F32A
     """Points (n, 4, 3) at ranges of their own; 0 is one of them."""
     range_m = np.linspace(0, 120, len(member) * 4).reshape(-1, 4).astype(np.float32)
     points = np.empty((len(member), 4, 4), np.float32)
-    projection.aim(member, encoder)
-    projection.points(range_m, points[:, :, :3])
+    projection.prepare(member, encoder)
+    projection.project(range_m, points[:, :, :3])
     return points[:, :, :3]
 
 
@@ -126,8 +126,8 @@ def test_positions_looked_up_in_a_row_are_those_looked_up_alone(positions: list[
             projection = Tabled(tables, 1)
             range_m = np.linspace(0, 120, 240).reshape(-1, 4).astype(np.float32)[one]
             alone = np.empty((1, 4, 3), np.float32)
-            projection.aim(member[one], encoder[one])
-            projection.points(range_m, alone)
+            projection.prepare(member[one], encoder[one])
+            projection.project(range_m, alone)
             assert together[one].tobytes() == alone.tobytes()
 
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig, write_rig
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.rig.write import write_rig
 from mlbatch.types import Stream
 
 FULL = """\

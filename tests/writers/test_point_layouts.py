@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.decode.scan_buffer import Buffer
+from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import Scan
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, Records, points_of
 from tests.builders.scans import dense_scan, organized_scan, point_scan
@@ -82,7 +82,7 @@ def test_float32_times_never_exceed_the_true_time() -> None:
 def side_by_side(scan: Scan) -> Scan:
     """Return the same scan in the arrays of a decoder, which are longer than their content."""
     rows, *slots = scan.time_ns.shape
-    buffer = Buffer(rows + SPARE, *slots or (None,))
+    buffer = ScanBuffer(rows + SPARE, *slots or (None,))
     buffer.point[:rows, ..., :3] = scan.xyz
     buffer.point[:rows, ..., 3] = scan.intensity
     for name in ("time_ns", "ring", "return_type", "lidar_id"):

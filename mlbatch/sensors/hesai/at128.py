@@ -40,7 +40,7 @@ class _At128Projection:
         self._towards = np.empty((columns, 3, beams), np.float32)
         self._moved = np.empty_like(self._towards)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Directions of all beams; `member` is always 0."""
         angle, speed, table = read_rotor_words(encoder)
         rotated = speed.astype(np.float32)[:, None] * self._firing_ns[table]
@@ -58,7 +58,7 @@ class _At128Projection:
             towards += from_forward * forward
             towards += from_up * up
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Range times direction, from one origin."""
         count = len(range_m)
         moved = self._moved[:count]

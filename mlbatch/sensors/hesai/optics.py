@@ -47,21 +47,21 @@ class OffAxis:
         self._miss_m2 = miss_m2.astype(np.float32)
         self._aimed: tuple[I64Array, I64Array] = np.empty(0, np.int64), np.empty(0, np.int64)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Prepare directions of columns."""
         self._aimed = member, encoder
-        self._beams.aim(member, encoder)
+        self._beams.prepare(member, encoder)
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Points (n, B, 3), m."""
         behind_m = np.maximum(range_m * range_m - self._miss_m2, np.float32(0))
-        self._beams.points(np.sqrt(behind_m, out=behind_m), out)
+        self._beams.project(np.sqrt(behind_m, out=behind_m), out)
         near = range_m <= _NEAREST_M
         near &= range_m > 0
         if near.any():
-            self._on_axis.aim(*self._aimed)
+            self._on_axis.prepare(*self._aimed)
             plain = np.empty((*range_m.shape, 3), np.float32)
-            self._on_axis.points(range_m, plain)
+            self._on_axis.project(range_m, plain)
             out[near] = plain[near]
 
 

@@ -169,10 +169,10 @@ class MovedPoints:
         self._lidar = lidar
         self._body_from_sensor = body_from_sensor
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """No rotor: nothing to prepare."""
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Rotate and translate, summed in a fixed order (see geometry.py)."""
         x, y, z = self._lidar.last_xyz_m.T
         for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, I32Array, U8Array, U32Array
-from mlbatch.lidar.pixel_table import Bits, Echo, PixelTable, Run
+from mlbatch.lidar.pixel_table import BitField, ChannelRun, PixelTable, ReturnLayout
 from mlbatch.sensors.ouster.profiles import Field, PacketLayout, Profile
 from mlbatch.types import Pixels
 from mlbatch.units import MM_PER_M
@@ -113,12 +113,12 @@ def pixel_table(layout: PacketLayout) -> PixelTable:
     """Pixel layout for compiled decoding."""
     fields = layout.profile.fields
     returns = layout.profile.returns
-    runs = (Run(layout.column_header_size, 0, layout.beams),)
-    echoes = []
+    runs = (ChannelRun(layout.column_header_size, 0, layout.beams),)
+    layouts = []
     for suffix in ("", "2")[:returns]:
         reflectivity = fields[f"REFLECTIVITY{suffix}"]
-        echoes.append(
-            Echo(
+        layouts.append(
+            ReturnLayout(
                 runs,
                 _bits(fields[f"RANGE{suffix}"]),
                 _bits(fields.get(f"SIGNAL{suffix}", reflectivity)),
@@ -126,13 +126,13 @@ def pixel_table(layout: PacketLayout) -> PixelTable:
             )
         )
     return PixelTable(
-        layout.profile.pixel_size, tuple(echoes), MM_PER_M / (1 << fields["RANGE"].shift)
+        layout.profile.pixel_size, tuple(layouts), MM_PER_M / (1 << fields["RANGE"].shift)
     )
 
 
-def _bits(field: Field) -> Bits:
+def _bits(field: Field) -> BitField:
     word, shift = divmod(field.first_bit, _WORD_BITS)
-    return Bits(word * _WORD_BYTES, "<u4", shift, (1 << field.width) - 1)
+    return BitField(word * _WORD_BYTES, "<u4", shift, (1 << field.width) - 1)
 
 
 def _fields_of(profile: Profile, suffix: str) -> _Return:

@@ -192,10 +192,10 @@ class _MovedPoints:
         self._rotation = body_from_sensor[:3, :3].astype(np.float32)
         self._translation_m = body_from_sensor[:3, 3].astype(np.float32)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """No rotor: nothing to prepare."""
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Rotate and translate, axis by axis in a fixed order; empty slots get any value."""
         reals = self._last_read.reals
         x, y, z = (reals[:, axis] for axis in range(3))

@@ -176,8 +176,8 @@ class PacketReader:
             )
             for which in range(shape.returns)
         )
-        echoes = readings(firsts, model.channels, ">u2", model.range_mask)
-        return PixelTable(READING, echoes, float(self._units_per_m))
+        returns = readings(firsts, model.channels, ">u2", model.range_mask)
+        return PixelTable(READING, returns, float(self._units_per_m))
 
     def _azimuths(self, packets: U8Array) -> tuple[I64Array, BoolArray]:
         """Azimuths of the rows (P, rows), 0.01 degree, and whether the rows are valid."""

@@ -43,7 +43,7 @@ class _Hdl64Projection:
         self._cosine = np.empty((columns, len(self._flat)), np.float32)
         self._sine = np.empty_like(self._cosine)
 
-    def aim(self, member: I64Array, encoder: I64Array) -> None:
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Cosine and sine of every beam's azimuth when it fires; `member` is always 0.
 
         Rotor angle minus rot_correction plus d = speed * firing time: c - d (s + d c / 2). The
@@ -65,7 +65,7 @@ class _Hdl64Projection:
         )
         np.add(first_sine, rotated * (first_cosine - half * first_sine), out=self._sine[:count])
 
-    def points(self, range_m: F32Array, out: F32Array) -> None:
+    def project(self, range_m: F32Array, out: F32Array) -> None:
         """Correct along right, forward and up, then transform into the body frame."""
         count = len(range_m)
         cosine = self._cosine[:count]

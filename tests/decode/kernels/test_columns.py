@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from mlbatch.arrays import I64Array
 from mlbatch.decode import decoder as decode
 from mlbatch.decode import numba_engine
-from mlbatch.decode.decoder import Decoder, Due, Label, Source
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.decode.kernels import native
-from mlbatch.decode.packet_ring import RawRing
-from mlbatch.decode.scan_buffer import LABEL, Buffer
+from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
@@ -104,7 +104,7 @@ cases = st.builds(
 )
 
 
-class Guarded(Buffer):
+class Guarded(ScanBuffer):
     """A buffer amid memory that nobody may touch."""
 
     def __init__(self, rows: int, slots: int | None) -> None:
@@ -132,9 +132,9 @@ def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArra
     return data
 
 
-def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[RawRing, I64Array]:
+def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array]:
     """A ring that was gone around, and the places of columns that it still holds."""
-    ring = RawRing(lidar.packet_size, lidar.records)
+    ring = PacketRing(lidar.packet_size, lidar.records)
     places: I64Array = np.empty(0, np.int64)
     for _ in range(4):
         count = int(rng.integers(20, 45))
@@ -177,7 +177,10 @@ def check(lidars: list[Lidar], case: Case) -> None:
             place[own] = rng.choice(places, int(own.sum()))
             word[own] = words_of(lidar, rng, int(own.sum()))
         stamp_ns = np.sort(rng.integers(START_NS, END_NS, case.columns))
-        pair.check(Due(stamp_ns, sensor, place, word), Label(0, 0, START_NS, END_NS, True, 0))
+        pair.check(
+            WindowColumns(stamp_ns, sensor, place, word),
+            ScanHeader(0, 0, START_NS, END_NS, True, 0),
+        )
 
 
 @given(cases, st.sampled_from(NAMES), st.sampled_from((16, 32, 64, 128)))
@@ -212,8 +215,8 @@ def test_nothing_is_written_beyond_the_arrays(
         made.append(Guarded(rows, slots))
         return made[-1]
 
-    monkeypatch.setattr(decode, "Buffer", guarded)
-    monkeypatch.setattr(numba_engine, "Buffer", guarded)
+    monkeypatch.setattr(decode, "ScanBuffer", guarded)
+    monkeypatch.setattr(numba_engine, "ScanBuffer", guarded)
     full = [ouster("RNG15_RFL8_NIR8", 16), ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)]
     lidars = [[*others, *full][number] for number in chosen]
     for seed in range(3):
@@ -245,8 +248,8 @@ def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> No
     sources = [Source(lidar, ring, POSES[0], 0)]
     decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine="numba")
     stamp_ns, nothing = np.full(len(places), START_NS), np.zeros(len(places), np.int64)
-    due = Due(stamp_ns, nothing, places, nothing)
-    assert decoder.scan(due, Label(0, 0, START_NS, END_NS, True, 0)).points > 0
+    due = WindowColumns(stamp_ns, nothing, places, nothing)
+    assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
 
 
 def test_cpus_without_wide_registers_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

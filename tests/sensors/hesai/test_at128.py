@@ -41,10 +41,10 @@ def words(rotor_deg: list[float], turns_per_s: float = 0.0) -> I64Array:
 
 
 def points(projection: Projection, encoder: I64Array, range_m: F32Array) -> F32Array:
-    projection.aim(np.zeros(len(encoder), np.int64), encoder)
+    projection.prepare(np.zeros(len(encoder), np.int64), encoder)
     # As the core calls it: x, y, z are strided by the intensity.
     wide = np.zeros((*range_m.shape, 4), np.float32)
-    projection.points(range_m, wide[:, :, :3])
+    projection.project(range_m, wide[:, :, :3])
     assert not wide[:, :, 3].any()
     return wide[:, :, :3]
 

@@ -245,7 +245,7 @@ def test_optical_centre(body: F64Array | None) -> None:
     column, centre = 17, np.array([-0.012, 0.03873, 0.0])
     range_m = np.linspace(0.3, 60, 64).astype(np.float32)
     range_m[5] = 0.085
-    elevation, azimuth = np.radians(beams.aim(np.zeros((1, 64)))[::-1])[:, 0]
+    elevation, azimuth = np.radians(beams.prepare(np.zeros((1, 64)))[::-1])[:, 0]
     unit = np.stack(
         [
             np.cos(elevation) * np.sin(azimuth),
@@ -265,8 +265,8 @@ def test_optical_centre(body: F64Array | None) -> None:
     projection = found.lidar.projection(body, 1)
     assert projection is not None
     points = np.empty((1, 64, 3), np.float32)
-    projection.aim(np.zeros(1, np.int64), found.encoder[column : column + 1])
-    projection.points(range_m[None], points)
+    projection.prepare(np.zeros(1, np.int64), found.encoder[column : column + 1])
+    projection.project(range_m[None], points)
     assert np.abs(points[0] - expected).max() < 1e-5
     plain = decode(packets, content, {"firing_azimuth": "off"}).lidar
     assert plain.projection(body, 1) is None
@@ -278,8 +278,8 @@ def test_optical_centre_of_a_jt16_is_where_its_ranges_begin() -> None:
     assert lidar.projection(np.eye(4), 1) is None
     projection = Turning(lidar.beams, lidar.firing_ns, 1)
     points = np.empty((1, 16, 3), np.float32)
-    projection.aim(np.zeros(1, np.int64), np.array([1 << 30]))  # a quarter turn to the right
-    projection.points(np.full((1, 16), 2.0, np.float32), points)
+    projection.prepare(np.zeros(1, np.int64), np.array([1 << 30]))  # a quarter turn to the right
+    projection.project(np.full((1, 16), 2.0, np.float32), points)
     assert points[0, 3].tolist() == pytest.approx([2.010955, 0.00625, 0.003911], abs=1e-6)
 
 

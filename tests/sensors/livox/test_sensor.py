@@ -74,9 +74,9 @@ def decoded(
     point = np.zeros((count, lidar.returns, 4), np.float32)
     out = Pixels(np.zeros((count, 1), np.float32), point[:, which : which + 1, 3], None)
     projection = lidar.projection(pose, count)
-    projection.aim(np.zeros(count, np.int64), np.zeros(count, np.int64))
+    projection.prepare(np.zeros(count, np.int64), np.zeros(count, np.int64))
     lidar.read(records, which, out)
-    projection.points(out.range_m, point[:, which : which + 1, :3])
+    projection.project(out.range_m, point[:, which : which + 1, :3])
     return point[:, which, :3], out.range_m[:, 0], out.intensity[:, 0]
 
 

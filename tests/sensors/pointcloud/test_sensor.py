@@ -11,7 +11,7 @@ import pytest
 import mlbatch
 from mlbatch import sensors
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
@@ -154,7 +154,7 @@ def _decoded(pose: F64Array) -> tuple[F32Array, F32Array, F32Array]:
     """Ranges (n, B), places (n, B, 3) and levels (n, B) by way of the ring."""
     packets, layout = _packets()
     lidar = _lidar()
-    ring = RawRing(lidar.packet_size, lidar.records)
+    ring = PacketRing(lidar.packet_size, lidar.records)
     data = packets.reshape(-1)
     _, place = ring.store(data, np.arange(len(packets)) * layout.size, None)
     records = np.empty((len(packets), lidar.records.size), np.uint8)
@@ -164,9 +164,9 @@ def _decoded(pose: F64Array) -> tuple[F32Array, F32Array, F32Array]:
     projection = lidar.projection(pose, len(packets))
     assert projection is not None
     none = np.zeros(len(packets), np.int64)
-    projection.aim(none, none)
+    projection.prepare(none, none)
     lidar.read(records, 0, Pixels(range_m, point[..., 3], None))
-    projection.points(range_m, point[..., :3])
+    projection.project(range_m, point[..., :3])
     return range_m, point[..., :3], point[..., 3]
 
 

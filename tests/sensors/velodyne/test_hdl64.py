@@ -66,10 +66,10 @@ def project(
     count = len(azimuth_deg)
     projection = hdl64_projection(file, firing_ns, np.eye(4) if pose is None else pose, count + 3)
     words = rotor_words(azimuth_deg / 360, np.full(count, hz), np.full(count, table))
-    projection.aim(np.zeros(count, np.int64), words)
+    projection.prepare(np.zeros(count, np.int64), words)
     # As in a scan: points lie in rows with other fields behind them.
     out = np.full((count, LASERS, 4), np.nan, np.float32)
-    projection.points(range_m.astype(np.float32), out[..., :3])
+    projection.project(range_m.astype(np.float32), out[..., :3])
     assert np.isnan(out[..., 3]).all()
     return out[..., :3]
 

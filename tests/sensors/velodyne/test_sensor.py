@@ -272,8 +272,8 @@ def test_points_of_a_hdl_64e(model: str, mode: str) -> None:
         projection = lidar.projection(np.eye(4), len(ranges))
         assert projection is not None
         points = np.empty((*met_m.shape, 3), np.float32)
-        projection.aim(np.zeros(len(ranges), np.int64), heads.encoder.reshape(-1))
-        projection.points(np.ascontiguousarray(ranges[..., 0]), points)
+        projection.prepare(np.zeros(len(ranges), np.int64), heads.encoder.reshape(-1))
+        projection.project(np.ascontiguousarray(ranges[..., 0]), points)
         lowered = expected - [0, 0, height] * np.array(spec.table.vertical_m)[:, None]
         away_m = np.linalg.norm(points - lowered, axis=-1)
         assert (away_m / met_m).max() < np.radians(ANGLE_DEG)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mlbatch.decode.coverage import Outline, Outliner
-from mlbatch.decode.numba_engine import CompiledOutliner
-from mlbatch.decode.scan_buffer import Due
+from mlbatch.decode.coverage import ColumnStatistics, ColumnStats
+from mlbatch.decode.numba_engine import CompiledColumnStatistics
+from mlbatch.decode.scan_buffer import WindowColumns
 from tests.builders.engines import few_kernels, needs_numba
 
 pytestmark = needs_numba
@@ -23,7 +23,7 @@ def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def columns(seed: int, count: int, most: int) -> Due:
+def columns(seed: int, count: int, most: int) -> WindowColumns:
     """Rotors that go on by chance, with rotor words of any speed and table."""
     rng = np.random.default_rng(seed)
     sensor = rng.integers(0, len(POSITIONS), count)
@@ -31,36 +31,36 @@ def columns(seed: int, count: int, most: int) -> Due:
     position = rng.integers(0, 7) + np.arange(count) // rng.integers(1, 9) % most
     word = rng.integers(-(1 << 63), (1 << 63) - 1, count)
     encoder = np.where(sensor == 1, word, position)
-    return Due(stamp_ns, sensor, np.arange(count), encoder)
+    return WindowColumns(stamp_ns, sensor, np.arange(count), encoder)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
 @pytest.mark.parametrize("seed", range(4))
 def test_outlines_are_those_of_numpy(seed: int, count: int) -> None:
-    compiled, plain = CompiledOutliner(POSITIONS), Outliner(POSITIONS)
+    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
     for again in range(3):
         due = columns(seed * 10 + again, count, 500)
-        assert compiled.outlines(due) == plain.outlines(due)
+        assert compiled.measure(due) == plain.measure(due)
 
 
 def test_positions_beyond_the_turn_are_left_to_numpy() -> None:
-    compiled, plain = CompiledOutliner(POSITIONS), Outliner(POSITIONS)
+    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
     due = columns(1, 5000, 2000)
     assert (due.encoder[due.sensor == 2] >= 512).any()
-    assert compiled.outlines(due) == plain.outlines(due)
+    assert compiled.measure(due) == plain.measure(due)
     fine = columns(1, 5000, 500)
-    assert compiled.outlines(fine) == plain.outlines(fine)
+    assert compiled.measure(fine) == plain.measure(fine)
 
 
-@pytest.mark.parametrize("outliner", [Outliner, CompiledOutliner])
-def test_an_outline_by_hand(outliner: type[Outliner]) -> None:
+@pytest.mark.parametrize("outliner", [ColumnStatistics, CompiledColumnStatistics])
+def test_an_outline_by_hand(outliner: type[ColumnStatistics]) -> None:
     # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
     stamp_ns = np.array([0, 10, 40, 45, 50, 51])
     encoder = np.array([0, 2, 3, 1, 1 << 31, 359])
     sensor = np.array([0, 0, 0, 0, 1, 0])
-    found = outliner((360, None, 8)).outlines(Due(stamp_ns, sensor, stamp_ns, encoder))
+    found = outliner((360, None, 8)).measure(WindowColumns(stamp_ns, sensor, stamp_ns, encoder))
     assert found == [
-        Outline(5, 30, 3 / 120, 1 / 120),
-        Outline(1, 0, 1 / 120, 0.0),
-        Outline(0, 0, 0.0, 0.0),
+        ColumnStats(5, 30, 3 / 120, 1 / 120),
+        ColumnStats(1, 0, 1 / 120, 0.0),
+        ColumnStats(0, 0, 0.0, 0.0),
     ]

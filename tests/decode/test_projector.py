@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from mlbatch.decode.decoder import Decoder, Due, Label, Source
-from mlbatch.decode.packet_ring import RawRing
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.types import RunInfo, Scan, SensorInfo
 from tests.builders.velodyne import VelodyneSpec
@@ -32,7 +32,7 @@ class Sensor:
 
 def _sensor(number: int, seen: Seen) -> Sensor:
     lidar, sent = seen.lidar, seen.sent
-    ring = RawRing(lidar.packet_size, lidar.records)
+    ring = PacketRing(lidar.packet_size, lidar.records)
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
     _, first = ring.store(sent.payloads.reshape(-1).copy(), start, None)
     place = (first[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
@@ -54,7 +54,7 @@ def _scan(sensors: Sequence[Sensor], only: int | None = None) -> Scan:
     sensor = np.concatenate([np.full(len(one.place), number) for number, one in enumerate(sensors)])
     stamp_ns = np.concatenate([one.stamp_ns for one in sensors])
     order = np.argsort(stamp_ns, kind="stable")
-    due = Due(
+    due = WindowColumns(
         stamp_ns[order],
         sensor[order],
         np.concatenate([one.place for one in sensors])[order],
@@ -62,7 +62,7 @@ def _scan(sensors: Sequence[Sensor], only: int | None = None) -> Scan:
     )
     start_ns = int(stamp_ns.min()) // 10**9 * 10**9
     decoder = Decoder(info, [one.source for one in sensors], _NONE, only=only)
-    return decoder.scan(due, Label(0, 0, start_ns, start_ns + 10**9, True, 0))
+    return decoder.scan(due, ScanHeader(0, 0, start_ns, start_ns + 10**9, True, 0))
 
 
 @pytest.mark.parametrize(
