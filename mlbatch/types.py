@@ -169,12 +169,12 @@ class WrappedRecording(Recording):
 class Columns:
     """Columns of one sensor: small fixed records; their pixels stay raw in the sensor's ring.
 
-    stamp_ns: (n,) int64, common clock; place: (n,) int64, row of the sensor's `PacketRing`;
+    stamp_ns: (n,) int64, common clock; ring_index: (n,) int64, row of the sensor's `PacketRing`;
     encoder: (n,) int64, rotor position (index into the sensor's angle table).
     """
 
     stamp_ns: I64Array
-    place: I64Array
+    ring_index: I64Array
     encoder: I64Array
 
     def __len__(self) -> int:
@@ -182,11 +182,11 @@ class Columns:
 
     def take(self, index: I64Array | BoolArray | slice) -> Columns:
         """The columns at `index`."""
-        return Columns(self.stamp_ns[index], self.place[index], self.encoder[index])
+        return Columns(self.stamp_ns[index], self.ring_index[index], self.encoder[index])
 
 
 @dataclass(slots=True)
-class Heads:
+class ColumnHeaders:
     """What the columns of P packets say of themselves, before any pixel is decoded.
 
     stamp_ns: (P, C) int64, sensor clock, the column's earliest nominal firing;

@@ -52,7 +52,7 @@ class Track:
     gaps: list[tuple[int, int]] = field(default_factory=list)
     waiting: list[Columns] = field(default_factory=list)
     # Lower bound of the ring indices of all waiting columns.
-    oldest_place: int = FOREVER
+    oldest_ring_index: int = FOREVER
     decoded: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -186,11 +186,11 @@ class Batcher:
             for track in self._tracks
         ]
 
-    def oldest_place(self, sensor: int) -> int | None:
+    def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index whose pixels are still needed; None if no column waits."""
         track = self._tracks[sensor]
-        held = track.intake.held_place
-        oldest = track.oldest_place if held is None else min(track.oldest_place, held)
+        held = track.intake.held_ring_index
+        oldest = track.oldest_ring_index if held is None else min(track.oldest_ring_index, held)
         return None if oldest == FOREVER else oldest
 
     @property
@@ -238,11 +238,11 @@ class Batcher:
             if one is None or track.first_ns > NEVER:
                 continue
             arrival = one.packets
-            measured = np.flatnonzero(arrival.heads.valid.any(axis=1))
+            measured = np.flatnonzero(arrival.headers.valid.any(axis=1))
             if len(measured):
                 row = int(measured[0])
-                column = int(np.argmax(arrival.heads.valid[row]))
-                track.first_ns = int(arrival.heads.stamp_ns[row, column])
+                column = int(np.argmax(arrival.headers.valid[row]))
+                track.first_ns = int(arrival.headers.stamp_ns[row, column])
                 track.offset_ns = track.first_ns - int(arrival.host_ns[row])
                 firsts.append((int(ranks[number][row]), number))
         for _, number in sorted(firsts):
@@ -314,16 +314,18 @@ class Batcher:
         published: (P,) watermark before each packet.
         """
         track = self._tracks[number]
-        heads = arrival.heads
-        valid = heads.valid.reshape(-1)
+        headers = arrival.headers
+        valid = headers.valid.reshape(-1)
         count = int(np.count_nonzero(valid))
         track.decoded += len(valid)
         track.drop("invalid", len(valid) - count)
         if not count:
             return
-        per_packet = heads.valid.shape[1]
-        place = arrival.place[:, None] + np.arange(per_packet)
-        columns = Columns(heads.stamp_ns.reshape(-1), place.reshape(-1), heads.encoder.reshape(-1))
+        per_packet = headers.valid.shape[1]
+        ring_index = arrival.ring_index[:, None] + np.arange(per_packet)
+        columns = Columns(
+            headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
+        )
         published = published.repeat(per_packet)
         if count < len(valid):
             columns = columns.take(valid)
@@ -332,7 +334,7 @@ class Batcher:
             columns = self._without_late(track, columns, published)
         if len(columns):
             track.waiting.append(columns)
-            track.oldest_place = min(track.oldest_place, int(columns.place.min()))
+            track.oldest_ring_index = min(track.oldest_ring_index, int(columns.ring_index.min()))
 
     def _is_in_time(self, track: Track, stamp: I64Array, published: int) -> bool:
         """True if no column can be late and none ends a gap: nearly all small batches."""
@@ -409,7 +411,7 @@ class Batcher:
                 ready_host_ns=int(progress.host_ns[closed_by - 1]),
                 stamp_ns=columns.stamp_ns[part],
                 sensor=sensor[part],
-                place=columns.place[part],
+                ring_index=columns.ring_index[part],
                 encoder=columns.encoder[part],
             )
         for track in self._tracks:
@@ -425,7 +427,7 @@ class Batcher:
             due, left = split_at(joined(track.waiting), until)
             taken.append(due)
             track.waiting = [left] if len(left) else []
-            track.oldest_place = int(left.place.min(initial=FOREVER))
+            track.oldest_ring_index = int(left.ring_index.min(initial=FOREVER))
         merged = joined(taken)
         sensor = np.arange(len(taken)).repeat([len(columns) for columns in taken])
         order = merged.stamp_ns.argsort(kind="stable")
@@ -477,6 +479,6 @@ def joined(parts: Sequence[Columns]) -> Columns:
         return Columns(_NONE, _NONE, _NONE)
     return Columns(
         np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.place for part in parts]),
+        np.concatenate([part.ring_index for part in parts]),
         np.concatenate([part.encoder for part in parts]),
     )

@@ -14,7 +14,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.errors import ClockJump
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
 # A packet whose stamps differ more than this from the newest one needs confirmation.
@@ -36,25 +36,25 @@ class Arrival:
     """Packets of one sensor in one batch, in order of receive time.
 
     position: (P,) int64, index in the batch; host_ns: (P,) int64, receive time; key: (P,) int64,
-    equal for duplicates, negative for packets without identity; heads: their columns, sensor clock;
-    place: (P,) int64, ring index of the packet's first column.
+    equal for duplicates, negative for packets without identity; headers: their columns, sensor
+    clock; ring_index: (P,) int64, ring index of the packet's first column.
     """
 
     position: I64Array
     host_ns: I64Array
     key: I64Array
-    heads: Heads
-    place: I64Array
+    headers: ColumnHeaders
+    ring_index: I64Array
 
     def take(self, index: BoolArray | I64Array) -> Arrival:
         """The packets at `index`."""
-        heads = self.heads
+        headers = self.headers
         return Arrival(
             self.position[index],
             self.host_ns[index],
             self.key[index],
-            Heads(heads.stamp_ns[index], heads.encoder[index], heads.valid[index]),
-            self.place[index],
+            ColumnHeaders(headers.stamp_ns[index], headers.encoder[index], headers.valid[index]),
+            self.ring_index[index],
         )
 
 
@@ -69,10 +69,10 @@ class Accepted:
     newest_ns: I64Array
 
 
-def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
+def extremes(headers: ColumnHeaders) -> tuple[I64Array, I64Array]:
     """Smallest and largest valid stamp of each packet; FOREVER and NEVER where none is valid."""
-    stamp = heads.stamp_ns
-    valid = heads.valid
+    stamp = headers.stamp_ns
+    valid = headers.valid
     if valid.size and valid.all():
         return stamp.min(axis=1), stamp.max(axis=1)
     low = np.where(valid, stamp, FOREVER).min(axis=1, initial=FOREVER)
@@ -114,19 +114,19 @@ class Intake:
         fresh = self._distinct(arrival.key)
         if fresh is not None:
             arrival = arrival.take(fresh)
-        heads = arrival.heads
+        headers = arrival.headers
         if self._offset_ns:
-            heads.stamp_ns = heads.stamp_ns + self._offset_ns
-        low, high = extremes(heads)
+            headers.stamp_ns = headers.stamp_ns + self._offset_ns
+        low, high = extremes(headers)
         if self._held is None and len(high) and self._has_no_step(int(low.min()), int(high.max())):
             self._newest = max(self._newest, int(high.max()))
         else:
             arrival, low, high = self._check_stamps(arrival, low, high)
-        self.loss.add(arrival.key, arrival.heads, arrival.host_ns)
+        self.loss.add(arrival.key, arrival.headers, arrival.host_ns)
         if self._host_clock and len(high):
-            stamp = arrival.heads.stamp_ns
+            stamp = arrival.headers.stamp_ns
             measured = high > NEVER
-            arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
+            arrival.headers.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
             high = np.where(measured, arrival.host_ns, NEVER)
         return Accepted(arrival, high)
 
@@ -142,9 +142,9 @@ class Intake:
         return None if self._held is None else int(self._held.host_ns[0])
 
     @property
-    def held_place(self) -> int | None:
+    def held_ring_index(self) -> int | None:
         """Ring index of the packet that is held, if any; its pixels must not be overwritten."""
-        return None if self._held is None else int(self._held.place[0])
+        return None if self._held is None else int(self._held.ring_index[0])
 
     def _reject(self, reason: str, count: int) -> None:
         if count:
@@ -202,7 +202,7 @@ class Intake:
             high = high[sane]
         if self._held is not None or self._steps(low, high).any():
             arrival = self._confirm_steps(arrival)
-            return arrival, *extremes(arrival.heads)
+            return arrival, *extremes(arrival.headers)
         self._newest = max(self._newest, int(high.max(initial=NEVER)))
         return arrival, low, high
 
@@ -223,7 +223,7 @@ class Intake:
         The next packet confirms the step if all of it is within STEP_NS of the held packet.
         """
         rows = arrival if self._held is None else _joined(self._held, arrival)
-        low, high = extremes(rows.heads)
+        low, high = extremes(rows.headers)
         position = rows.position.copy()
         held = None if self._held is None else 0
         newest = self._newest
@@ -263,8 +263,8 @@ class Intake:
 
     @staticmethod
     def _first_stamp(rows: Arrival, row: int) -> int:
-        heads = rows.heads
-        return int(heads.stamp_ns[row][heads.valid[row]][0])
+        headers = rows.headers
+        return int(headers.stamp_ns[row][headers.valid[row]][0])
 
     def _reset(self, newest: int, back: int, host_ns: int) -> ClockJump:
         return ClockJump(
@@ -291,17 +291,17 @@ def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:
 
 
 def _joined(first: Arrival, second: Arrival) -> Arrival:
-    heads = Heads(
-        np.concatenate([first.heads.stamp_ns, second.heads.stamp_ns]),
-        np.concatenate([first.heads.encoder, second.heads.encoder]),
-        np.concatenate([first.heads.valid, second.heads.valid]),
+    headers = ColumnHeaders(
+        np.concatenate([first.headers.stamp_ns, second.headers.stamp_ns]),
+        np.concatenate([first.headers.encoder, second.headers.encoder]),
+        np.concatenate([first.headers.valid, second.headers.valid]),
     )
     return Arrival(
         np.concatenate([first.position, second.position]),
         np.concatenate([first.host_ns, second.host_ns]),
         np.concatenate([first.key, second.key]),
-        heads,
-        np.concatenate([first.place, second.place]),
+        headers,
+        np.concatenate([first.ring_index, second.ring_index]),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, median
 from mlbatch.lidar.geometry import rotor_ticks
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
 
@@ -38,12 +38,12 @@ class PacketLoss:
         """Packets received after a later one."""
         return self._numbers.reordered if self._gaps is None else self._gaps.reordered
 
-    def add(self, sequence: I64Array, heads: Heads, host_ns: I64Array) -> None:
+    def add(self, sequence: I64Array, headers: ColumnHeaders, host_ns: I64Array) -> None:
         """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
         if self._gaps is None:
             self._numbers.add(sequence)
         elif len(host_ns):
-            self._gaps.add(heads, host_ns)
+            self._gaps.add(headers, host_ns)
 
 
 # -- by sequence numbers --------------------------------------------------------------------------
@@ -205,13 +205,13 @@ class GapLoss:
         self._evaluate()
         return self._lost + _missing(self._parts[0], self._packet_ns)
 
-    def add(self, heads: Heads, host_ns: I64Array) -> None:
+    def add(self, headers: ColumnHeaders, host_ns: I64Array) -> None:
         """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
-        measured = np.flatnonzero(heads.valid.any(axis=1))
-        ticks = rotor_ticks(heads.encoder)
+        measured = np.flatnonzero(headers.valid.any(axis=1))
+        ticks = rotor_ticks(headers.encoder)
         packets = _Packets(
             # A copy, so that the stamps of all columns are not kept in memory.
-            heads.stamp_ns[:, 0].copy(),
+            headers.stamp_ns[:, 0].copy(),
             host_ns,
             ticks[:, 0].astype(np.float64) * _TURNS_PER_TICK,
             ticks[:, -1].astype(np.float64) * _TURNS_PER_TICK,

@@ -46,7 +46,7 @@ class Window:
 
     index: number of the window from t_init, -1 for the one before (the head); start_ns, end_ns:
     half open; complete: every sensor covers the window in time; ready_host_ns: receive time of the
-    packet that closed it. stamp_ns, sensor, place, encoder: (n,) int64, as in `Columns`.
+    packet that closed it. stamp_ns, sensor, ring_index, encoder: (n,) int64, as in `Columns`.
     """
 
     index: int
@@ -57,7 +57,7 @@ class Window:
     ready_host_ns: int
     stamp_ns: I64Array
     sensor: I64Array
-    place: I64Array
+    ring_index: I64Array
     encoder: I64Array
 
 

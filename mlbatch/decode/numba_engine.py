@@ -163,7 +163,7 @@ class SensorGroup:
             {
                 at.STAMP_NS: np.asarray(columns.stamp_ns, np.int64),
                 at.SENSOR: np.asarray(columns.sensor, np.int64),
-                at.PLACE: np.asarray(columns.place, np.int64),
+                at.PLACE: np.asarray(columns.ring_index, np.int64),
                 at.ENCODER: np.asarray(columns.encoder, np.int64),
             }
         )

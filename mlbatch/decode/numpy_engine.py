@@ -120,7 +120,7 @@ class NumpyEngine:
             own = slice(begin, end)
             view = self._tile.view(element, end - begin, projector.slots)
             encoder = columns.encoder[own]
-            projector.project(member[own], columns.place[own], encoder, offset_ns[own], view)
+            projector.project(member[own], columns.ring_index[own], encoder, offset_ns[own], view)
             parts.append(_TilePart(projector, view, rows[own], element, encoder))
             element += (end - begin) * projector.slots
             begin = end

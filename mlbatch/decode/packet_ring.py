@@ -16,9 +16,9 @@ class PacketRing:
 
     A packet takes a whole number of rows of `Records.stride` bytes: row r of the packet in slot p
     begins at byte `(p * rows + r) * stride + start`. A packet is copied once; columns are gathered
-    by one indexed copy of rows or parts of rows. Every column has a place, an int64 that counts up
-    and is never reused; the buffer contains the newest. One thread may `store` while others
-    `gather` places that are still needed.
+    by one indexed copy of rows or parts of rows. Every column has a ring index, an int64 that
+    counts up and is never reused; the buffer contains the newest. One thread may `store` while
+    others `gather` ring_indexes that are still needed.
     """
 
     def __init__(self, packet_size: int, records: Records) -> None:
@@ -35,8 +35,8 @@ class PacketRing:
     def pieces(self) -> npt.NDArray[np.void]:
         """View of all columns, (rows, columns of a row), one element of `records.size` bytes each.
 
-        The column at `place` has the flat index `place` modulo the size. `store` may replace the
-        view by a larger one at any time: take it once, then use that.
+        The column at `ring_index` has the flat index `ring_index` modulo the size. `store` may
+        replace the view by a larger one at any time: take it once, then use that.
         """
         pieces: npt.NDArray[np.void] = self._pieces
         return pieces
@@ -47,15 +47,15 @@ class PacketRing:
         return self._bytes.nbytes
 
     def store(
-        self, data: U8Array, start: I64Array, oldest_place: int | None
+        self, data: U8Array, start: I64Array, oldest_ring_index: int | None
     ) -> tuple[U8Array, I64Array]:
-        """Copy packets in; return a view (P, packet_size) and each packet's first place (P,).
+        """Copy packets in; return a view (P, packet_size) and each packet's first ring index (P,).
 
-        data, start: as in `PacketBatch`; oldest_place: first place that is still needed, None if
-        none is. The view is valid until the next call.
+        data, start: as in `PacketBatch`; oldest_ring_index: first ring index that is still needed,
+        None if none is. The view is valid until the next call.
         """
         count = len(start)
-        oldest = self._next if oldest_place is None else oldest_place // self._places
+        oldest = self._next if oldest_ring_index is None else oldest_ring_index // self._places
         slot = self._reserve(count, oldest)
         stride = self._rows_per_packet * self._records.stride
         size = self._packet_size
@@ -71,18 +71,18 @@ class PacketRing:
         self._next = slot + count
         return packets, np.arange(slot, slot + count) * self._places
 
-    def gather(self, place: I64Array, out: U8Array) -> None:
-        """Copy the columns at `place` (n,) to the rows of `out` (n, records.size)."""
+    def gather(self, ring_index: I64Array, out: U8Array) -> None:
+        """Copy the columns at `ring_index` (n,) to the rows of `out` (n, records.size)."""
         # Each view is read once: another thread may replace it by a larger one.
         if self._is_plain:
             rows = self._rows
-            rows.take(place % len(rows), axis=0, out=out, mode="clip")
+            rows.take(ring_index % len(rows), axis=0, out=out, mode="clip")
             return
         count, windows = self._windows
         # numpy divides by a scalar much faster than it takes the remainder.
         per_row = self._records.per_row
-        row = place // per_row
-        at = (place - row * per_row) * self._records.step
+        row = ring_index // per_row
+        at = (ring_index - row * per_row) * self._records.step
         row -= row // count * count
         at += row * self._records.stride
         out.view(windows.dtype)[:, 0] = windows[at]

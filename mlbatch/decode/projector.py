@@ -151,24 +151,26 @@ class Projector:
     def project(
         self,
         member: I64Array,
-        place: I64Array,
+        ring_index: I64Array,
         encoder: I64Array,
         offset_ns: I64Array,
         view: TileView,
     ) -> None:
-        """Decode the columns at `place` into `view`; mark and count the points to keep.
+        """Decode the columns at `ring_index` into `view`; mark and count the points to keep.
 
-        member: (n,) member of each column, ascending; place, encoder: (n,), as in `Columns`;
+        member: (n,) member of each column, ascending; ring_index, encoder: (n,), as in `Columns`;
         offset_ns: (n,) timestamp minus start of the scan.
         """
         lidar = self.lidar
         own = blocks(member, len(self.sources))
-        records = self._gather(own, place)
+        records = self._gather(own, ring_index)
         self.projection.prepare(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
-            # Return i of n is every n-th slot; a single return is read in place.
-            range_m = view.range_m if lidar.returns == 1 else self._range_m[which, : len(place)]
+            # Return i of n is every n-th slot; a single return is read directly.
+            range_m = view.range_m
+            if lidar.returns > 1:
+                range_m = self._range_m[which, : len(ring_index)]
             reflectivity = view.reflectivity[:, slots] if self._has_reflectivity else None
             lidar.read(records, which, Pixels(range_m, view.point[:, slots, 3], reflectivity))
             self.projection.project(range_m, view.point[:, slots, :3])
@@ -220,11 +222,11 @@ class Projector:
             return member
         return member * self._tables + read_rotor_words(encoder)[2]
 
-    def _gather(self, blocks: Sequence[slice], place: I64Array) -> U8Array:
+    def _gather(self, blocks: Sequence[slice], ring_index: I64Array) -> U8Array:
         """Return the records (n, records.size) of all columns, in their order."""
         for source, own in zip(self.sources, blocks, strict=True):
-            source.ring.gather(place[own], self._records[own])
-        return self._records[: len(place)]
+            source.ring.gather(ring_index[own], self._records[own])
+        return self._records[: len(ring_index)]
 
     def _type_returns(self, view: TileView) -> None:
         """Write the types of dual returns, by which is nearer and which is stronger.

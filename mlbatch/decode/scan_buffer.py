@@ -23,7 +23,7 @@ class WindowColumns:
 
     stamp_ns: I64Array
     sensor: I64Array
-    place: I64Array
+    ring_index: I64Array
     encoder: I64Array
 
     def __len__(self) -> int:
@@ -34,7 +34,7 @@ class WindowColumns:
         return WindowColumns(
             self.stamp_ns[index],
             self.sensor[index],
-            self.place[index],
+            self.ring_index[index],
             self.encoder[index],
         )
 

@@ -260,17 +260,17 @@ def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Meas
                 lidar = sensor.lidar
                 one = measured[sensor]
                 packets, _ = one.ring.store(batch.data, batch.start[index], None)
-                good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+                good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
-                heads = lidar.heads(packets[good], host_ns)
-                one.loss.add(lidar.sequence(packets[good]), heads, host_ns)
+                headers = lidar.column_headers(packets[good], host_ns)
+                one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
                 if discovery.sampler.has_receive_times(sensor):
-                    _, newest_ns = extremes(heads)
+                    _, newest_ns = extremes(headers)
                     known = newest_ns > NEVER
                     one.watch.add(newest_ns[known], host_ns[known])
-                if one.first is None and heads.valid.any():
-                    row, column = np.argwhere(heads.valid)[0]
-                    one.first = int(heads.stamp_ns[row, column]), int(host_ns[row])
+                if one.first is None and headers.valid.any():
+                    row, column = np.argwhere(headers.valid)[0]
+                    one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
     return measured
 
 

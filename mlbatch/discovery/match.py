@@ -21,9 +21,9 @@ from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.geometry import rotor_ticks
-from mlbatch.lidar.interface import READABLE, Calibration, Evidence, Lidar, ModelFile
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import RigSensor, StreamSelector
-from mlbatch.types import Heads, StreamTable
+from mlbatch.types import ColumnHeaders, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 
@@ -68,8 +68,8 @@ def best_fits(
     groups: dict[bytes, list[_Candidate]] = {}
     for number, own, part in _parts(evidence, calibrations, options):
         calibration = calibrations[number]
-        score = calibration.fit(part)
-        if score > 0 or (score == READABLE and calibration.model == model):
+        score = calibration.match_score(part)
+        if score > 0 or (score == NAMED_ONLY and calibration.model == model):
             groups.setdefault(own.tobytes(), []).append(_Candidate(score, number, part))
     fits: list[Fit] = []
     failure = ""
@@ -86,7 +86,7 @@ def best_fits(
             fits.append(Fit(score, number, lidar))
         except RigError as err:
             failure = str(err)
-            if score == READABLE:
+            if score == NAMED_ONLY:
                 what = sensors.describe(evidence.size, evidence.sample) or "others"
                 failure = f"its packets are {what}, not {model}, as which they were read: {err}"
     return fits, failure
@@ -114,7 +114,7 @@ def _parts(
             continue  # The output of this sensor is off.
         if evidence.size not in (lidar.packet_size, lidar.packet_size + 1):
             continue
-        own = lidar.owns(evidence.sample[:, : lidar.packet_size])
+        own = lidar.sent_by_me(evidence.sample[:, : lidar.packet_size])
         if own.any():
             part = replace(evidence, sample=evidence.sample[own], host_ns=evidence.host_ns[own])
             yield number, own, part
@@ -348,7 +348,7 @@ def _chosen(
     sampler: Sampler, expected: ExpectedSensor, matches: Sequence[_Match], origin: Path
 ) -> DetectedSensor:
     """The only sensor that matches; merely readable packets count only without others."""
-    sure = [one for one in matches if one.fit.score != READABLE] or matches
+    sure = [one for one in matches if one.fit.score != NAMED_ONLY] or matches
     best = max(sure, key=lambda one: one.fit.score)
     lidar = best.fit.lidar
     units = {one.fit.lidar.serial or str(one.fit.number) for one in sure}
@@ -361,7 +361,7 @@ def _chosen(
             "(source_ip, port, topic or serial)"
         )
     found = DetectedSensor(expected.name, lidar, expected.selector, best.kinds, rig=expected.rig)
-    if best.fit.score == READABLE:
+    if best.fit.score == NAMED_ONLY:
         what = describe(sampler, min(best.kinds)) or "another model"
         found.notes.append(f"read as {lidar.model}, which the rig names; it looks like {what}")
     for kind in sorted(best.kinds):
@@ -507,12 +507,14 @@ def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
     lidar = sensor.lidar
     for kind in sorted(sensor.kinds & sampler.kinds.keys()):
         packets, host_ns = sampler.good_samples(kind, lidar)
-        heads = lidar.heads(packets, host_ns)
-        whole = heads.valid.all(axis=1)
-        heads = Heads(heads.stamp_ns[whole], heads.encoder[whole], heads.valid[whole])
-        step_ns = _foreign_step_ns(heads, lidar)
+        headers = lidar.column_headers(packets, host_ns)
+        whole = headers.valid.all(axis=1)
+        headers = ColumnHeaders(
+            headers.stamp_ns[whole], headers.encoder[whole], headers.valid[whole]
+        )
+        step_ns = _foreign_step_ns(headers, lidar)
         if step_ns is not None:
-            span_ns = median(_spans_ns(heads))
+            span_ns = median(_spans_ns(headers))
             return (
                 f"sensor {sensor.name}: {sampler.table.streams[kind.stream]}: expected packets of "
                 f"one {lidar.model}, found packets of {span_ns / NS_PER_MS:.3f} ms that "
@@ -522,15 +524,15 @@ def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
     return ""
 
 
-def _spans_ns(heads: Heads) -> F64Array:
+def _spans_ns(headers: ColumnHeaders) -> F64Array:
     """(P,) time from the first to the last column of each packet."""
-    return np.asarray(heads.stamp_ns[:, -1] - heads.stamp_ns[:, 0], np.float64)
+    return np.asarray(headers.stamp_ns[:, -1] - headers.stamp_ns[:, 0], np.float64)
 
 
-def _foreign_step_ns(heads: Heads, lidar: Lidar) -> float | None:
+def _foreign_step_ns(headers: ColumnHeaders, lidar: Lidar) -> float | None:
     """Median of the steps that one lidar cannot make; None if there are too few."""
-    span_ns = _spans_ns(heads)
-    step_ns = np.diff(heads.stamp_ns[:, 0]).astype(np.float64)
+    span_ns = _spans_ns(headers)
+    step_ns = np.diff(headers.stamp_ns[:, 0]).astype(np.float64)
     near_ns = np.minimum(span_ns[1:], span_ns[:-1])
     back_and_forth = step_ns < -NS_PER_S
     overlaps = (step_ns != 0) & (np.abs(step_ns) < _OVERLAP * near_ns)
@@ -543,16 +545,18 @@ def _foreign_step_ns(heads: Heads, lidar: Lidar) -> float | None:
     if foreign_count > _ALL * count and not back_and_forth.any():
         # Two lidars half a packet apart, or one whose column period differs from the known one.
         rows = np.flatnonzero(steps)
-        elsewhere = _is_rotor_elsewhere(heads, rows, step_ns[rows], lidar)
+        elsewhere = _is_rotor_elsewhere(headers, rows, step_ns[rows], lidar)
         if np.count_nonzero(elsewhere) < _SEVERAL * count:
             return None
     return median(step_ns[foreign])
 
 
-def _is_rotor_elsewhere(heads: Heads, rows: I64Array, step_ns: F64Array, lidar: Lidar) -> BoolArray:
+def _is_rotor_elsewhere(
+    headers: ColumnHeaders, rows: I64Array, step_ns: F64Array, lidar: Lidar
+) -> BoolArray:
     """(n,) True for steps after packets `rows` (n,) in which the rotor leaves its usual speed."""
     positions = lidar.beams.angle_rad
-    first = heads.encoder[:, 0]
+    first = headers.encoder[:, 0]
     if positions is None:
         revolutions = rotor_ticks(first) / _REVOLUTION_TICKS
     else:

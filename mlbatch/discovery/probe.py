@@ -284,12 +284,12 @@ class TopicCalibration:
         self._topic = topic
         self._topics = topics
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Score of the calibration itself; 0 for packets of another namespace."""
         topic = evidence.stream.topic
         if topic and nearest_topic(topic, self._topics) != self._topic:
             return 0
-        score = self._inner.fit(evidence)
+        score = self._inner.match_score(evidence)
         return score + _RECORDED_SCORE if score and topic else score
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:

@@ -99,7 +99,7 @@ class Router:
             return False
         # Of a later stream, each packet is checked as it is read: one of them may be damaged.
         size = sensor.lidar.packet_size
-        return kind not in self._early or bool(sensor.lidar.owns(payload[None, :size])[0])
+        return kind not in self._early or bool(sensor.lidar.sent_by_me(payload[None, :size])[0])
 
     def _imu_owner(self, stream: Stream, size: int) -> int | None:
         """The sensor whose IMU sends this: a neighbour; of several, by the IMU port of each."""

@@ -11,7 +11,7 @@ from mlbatch.arrays import I64Array, U8Array
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.frames.naming import same_namespace
-from mlbatch.lidar.interface import Beside, Evidence, Lidar
+from mlbatch.lidar.interface import Evidence, Lidar, NeighbourStream
 from mlbatch.types import PacketBatch, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -88,7 +88,9 @@ class Sampler:
             if other != kind and are_neighbours(self.table.streams[other.stream], stream)
         )
         neighbours = tuple(
-            Beside(self.table.streams[other.stream], other.size, *self.kinds[other].arrays())
+            NeighbourStream(
+                self.table.streams[other.stream], other.size, *self.kinds[other].arrays()
+            )
             for other in itertools.islice(near, MAX_NEIGHBOURS)
         )
         return Evidence(stream, kind.size, *self.kinds[kind].arrays(), neighbours)
@@ -97,7 +99,7 @@ class Sampler:
         """Packets (k, packet_size) of a kind that a lidar sent intact, receive times (k,)."""
         packets, host_ns = self.kinds[kind].arrays()
         packets = packets[:, : lidar.packet_size]
-        good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+        good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
         return packets[good], host_ns[good]
 
     def first_host_ns(self, sensor: DetectedSensor) -> int | None:
@@ -114,11 +116,11 @@ class Sampler:
         firsts = []
         for kind in sensor.kinds:
             packets, host_ns = self.good_samples(kind, sensor.lidar)
-            heads = sensor.lidar.heads(packets, host_ns)
-            rows = np.flatnonzero(heads.valid.any(axis=1))
+            headers = sensor.lidar.column_headers(packets, host_ns)
+            rows = np.flatnonzero(headers.valid.any(axis=1))
             if len(rows):
                 row = int(rows[0])
-                stamp_ns = int(heads.stamp_ns[row, int(heads.valid[row].argmax())])
+                stamp_ns = int(headers.stamp_ns[row, int(headers.valid[row].argmax())])
                 firsts.append((int(host_ns[row]), stamp_ns - int(host_ns[row])))
         return min(firsts)[1] if firsts else None
 
@@ -140,7 +142,7 @@ class Sampler:
         packets, host_ns = self.good_samples(kind, lidar)
         if len(packets) < 2 or host_ns[-1] - host_ns[0] < SHORTEST_NS:
             return None
-        heads = lidar.heads(packets, host_ns)
+        headers = lidar.column_headers(packets, host_ns)
         number = lidar.sequence(packets)
         first = 0
         last = len(packets) - 1
@@ -150,8 +152,8 @@ class Sampler:
             first = int(counted[0])
             last = int(counted[-1])
             sent = int(number[last] - number[first]) % lidar.sequence_modulus
-        passed_ns = int(heads.stamp_ns[last].max() - heads.stamp_ns[first].max())
-        valid = float(heads.valid.sum(axis=1).mean())
+        passed_ns = int(headers.stamp_ns[last].max() - headers.stamp_ns[first].max())
+        valid = float(headers.valid.sum(axis=1).mean())
         return sent * valid * lidar.column_period_ns / passed_ns if passed_ns > 0 else None
 
 

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.pixel_table import PixelTable
-from mlbatch.types import Heads, ImuSamples, Pixels, Stream
+from mlbatch.types import ColumnHeaders, ImuSamples, Pixels, Stream
 
 # Verdicts of `Lidar.faults`, in the order of their numbers; 0 is a good packet.
 FAULTS = ("", "bad_size", "bad_header", "bad_crc")
@@ -36,7 +36,7 @@ class SensorModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class NeighbourStream:
     """Packets of another stream with the same source IP or topic namespace; as `Evidence`.
 
     Position, device and IMU packets contain facts that the packets of a lidar lack.
@@ -53,20 +53,20 @@ class Evidence:
     """A sample of the packets of one stream and size, from which the sensor is identified.
 
     size: bytes of a payload; sample: (k, size) uint8, the first packets, then some of each quarter
-    of a second; host_ns: (k,) int64, their receive times; beside: samples of other streams of the
-    same source.
+    of a second; host_ns: (k,) int64, their receive times; neighbours: samples of other streams of
+    the same source.
     """
 
     stream: Stream
     size: int
     sample: U8Array
     host_ns: I64Array
-    beside: tuple[Beside, ...] = ()
+    neighbours: tuple[NeighbourStream, ...] = ()
 
 
 # `Calibration.fit` of packets that can be read with it but name another model: the calibration is
 # used only if the rig names its model.
-READABLE = -1
+NAMED_ONLY = -1
 
 
 class Calibration(Protocol):
@@ -80,8 +80,8 @@ class Calibration(Protocol):
     serial: str
     is_shared: bool
 
-    def fit(self, evidence: Evidence) -> int:
-        """Score the match with packets: 0: none; larger: more certain; see READABLE."""
+    def match_score(self, evidence: Evidence) -> int:
+        """Score the match with packets: 0: none; larger: more certain; see NAMED_ONLY."""
         ...
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
@@ -172,7 +172,7 @@ class Lidar(Protocol):
     calibration: str
     notes: tuple[str, ...]
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """Return which packets (P, packet_size) have this sensor's serial number: (P,) bool.
 
         True for packets without a serial number.
@@ -191,7 +191,7 @@ class Lidar(Protocol):
         """
         ...
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Return timestamps, rotor positions and validity of all columns, without reading pixels.
 
         host_ns: (P,) receive times, for clocks without hour or date. The result for a packet does

@@ -73,7 +73,7 @@ class ClockMonitor:
             arrivals = ingest.columns(batch, nothing_kept).arrivals
             for arrival, watch in zip(arrivals, watches, strict=True):
                 if arrival is not None:
-                    _, newest_ns = extremes(arrival.heads)
+                    _, newest_ns = extremes(arrival.headers)
                     measured = newest_ns > NEVER
                     watch.add(newest_ns[measured], arrival.host_ns[measured])
         for sensor, found in zip(self._sensors, fit(watches, to), strict=True):

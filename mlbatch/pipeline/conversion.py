@@ -171,9 +171,9 @@ class Conversion:
         """First ring place of each sensor that is still needed, to be batched or decoded."""
         oldest = []
         for sensor in self.sensors:
-            places = [self.batcher.oldest_place(sensor.index)]
+            places = [self.batcher.oldest_ring_index(sensor.index)]
             if self._pool is not None:
-                places.append(self._pool.oldest_place(sensor.index))
+                places.append(self._pool.oldest_ring_index(sensor.index))
             oldest.append(min((place for place in places if place is not None), default=None))
         return oldest
 

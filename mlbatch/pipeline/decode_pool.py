@@ -38,15 +38,15 @@ class DecodeTask:
         """End of the window."""
         return self.label.end_ns
 
-    def oldest_place(self, sensor: int) -> int | None:
-        """First ring place of a sensor whose pixels are still needed."""
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor whose pixels are still needed."""
         if self.is_decoded:
             return None
         if self.only is None:
-            place = self.columns.place[self.columns.sensor == sensor]
+            ring_index = self.columns.ring_index[self.columns.sensor == sensor]
         else:
-            place = self.columns.place[: len(self.columns) if self.only == sensor else 0]
-        return int(place.min()) if len(place) else None
+            ring_index = self.columns.ring_index[: len(self.columns) if self.only == sensor else 0]
+        return int(ring_index.min()) if len(ring_index) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class DecodePool:
             window.complete,
             window.ready_host_ns,
         )
-        columns = WindowColumns(window.stamp_ns, window.sensor, window.place, window.encoder)
+        columns = WindowColumns(window.stamp_ns, window.sensor, window.ring_index, window.encoder)
         if not self._split:
             yield self._task(columns, label, None, earlier)
             return
@@ -130,7 +130,7 @@ class DecodePool:
             own = window.sensor == number
             first = np.zeros(int(np.count_nonzero(own)), np.int64)
             part = WindowColumns(
-                columns.stamp_ns[own], first, columns.place[own], columns.encoder[own]
+                columns.stamp_ns[own], first, columns.ring_index[own], columns.encoder[own]
             )
             yield self._task(part, label, number, earlier)
 
@@ -145,11 +145,13 @@ class DecodePool:
         self._open.append(task)
         return task
 
-    def oldest_place(self, sensor: int) -> int | None:
-        """First ring place of a sensor that a task still needs; None: none."""
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor that a task still needs; None: none."""
         self._open = [task for task in self._open if not task.is_decoded]
-        places = [task.oldest_place(sensor) for task in self._open]
-        return min((place for place in places if place is not None), default=None)
+        ring_indexes = [task.oldest_ring_index(sensor) for task in self._open]
+        return min(
+            (ring_index for ring_index in ring_indexes if ring_index is not None), default=None
+        )
 
     def points(self, sensor: int) -> PointCounts:
         """Point counters of a sensor, over all workers."""

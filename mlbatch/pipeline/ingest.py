@@ -48,10 +48,10 @@ class Ingest:
         self._stamp_map = stamp_map
         self._recent_imu: list[I64Array] = [np.empty(0, np.int64) for _ in self._sensors]
 
-    def columns(self, batch: PacketBatch, oldest_places: Sequence[int | None]) -> Ingested:
+    def columns(self, batch: PacketBatch, oldest_ring_indexes: Sequence[int | None]) -> Ingested:
         """Route a batch, copy lidar packets to their rings and read their column headers.
 
-        oldest_places: first ring place that is still needed, of each sensor.
+        oldest_ring_indexes: first ring index that is still needed, of each sensor.
         """
         own: list[list[I64Array]] = [[] for _ in self._sensors]
         ingested = Ingested([None] * len(self._sensors), [])
@@ -71,10 +71,12 @@ class Ingest:
                 packets.reject("bad_size", len(index))
             else:
                 self._unassign(kind, batch, index)
-        for sensor, parts, oldest_place in zip(self._sensors, own, oldest_places, strict=True):
+        for sensor, parts, oldest_ring_index in zip(
+            self._sensors, own, oldest_ring_indexes, strict=True
+        ):
             if parts:
                 index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
-                arrival = self._arrive(sensor, batch, index, owned, oldest_place)
+                arrival = self._arrive(sensor, batch, index, owned, oldest_ring_index)
                 ingested.arrivals[sensor.index] = arrival
         if not owned.all():
             for kind, index in shared:
@@ -93,7 +95,7 @@ class Ingest:
                 lidar = self._sensors[number].lidar
                 left = index[owner[index] < 0]
                 packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
-                owner[left[lidar.owns(packets)]] = number
+                owner[left[lidar.sent_by_me(packets)]] = number
         return owner
 
     def _unassign(self, kind: PacketKind, batch: PacketBatch, index: I64Array) -> None:
@@ -109,13 +111,13 @@ class Ingest:
         batch: PacketBatch,
         index: I64Array,
         owned: BoolArray,
-        oldest_place: int | None,
+        oldest_ring_index: int | None,
     ) -> Arrival:
         """Copy packets that may be of a sensor to its ring; give those that are, and are valid."""
         lidar = sensor.lidar
         counts = sensor.ledger.packets
-        packets, place = sensor.ring.store(batch.data, batch.start[index], oldest_place)
-        good = lidar.owns(packets) & ~owned[index]
+        packets, ring_index = sensor.ring.store(batch.data, batch.start[index], oldest_ring_index)
+        good = lidar.sent_by_me(packets) & ~owned[index]
         counts.read += int(np.count_nonzero(good))
         owned[index] |= good
         faults = lidar.faults(packets)
@@ -125,18 +127,18 @@ class Ingest:
             good &= faults == 0
         if not good.all():
             packets = packets[good]
-            place = place[good]
+            ring_index = ring_index[good]
             index = index[good]
         host_ns = batch.host_ns[index]
-        heads = lidar.heads(packets, host_ns)
+        headers = lidar.column_headers(packets, host_ns)
         if self._stamp_map is not None:
-            heads.stamp_ns = self._stamp_map(sensor, heads.stamp_ns, host_ns)
+            headers.stamp_ns = self._stamp_map(sensor, headers.stamp_ns, host_ns)
         return Arrival(
             position=index,
             host_ns=host_ns,
             key=lidar.sequence(packets),
-            heads=heads,
-            place=place,
+            headers=headers,
+            ring_index=ring_index,
         )
 
     def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:

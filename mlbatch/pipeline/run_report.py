@@ -153,7 +153,7 @@ def why_no_scan(run: Conversion) -> str:
             spans.append(
                 f"{sensor.name} from {span[0] / NS_PER_S:.6f} to {span[1] / NS_PER_S:.6f} s"
             )
-    heads = sum(
+    headers = sum(
         count
         for dropped in run.batcher.dropped
         for reason, count in dropped.items()
@@ -164,7 +164,7 @@ def why_no_scan(run: Conversion) -> str:
     period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
     advice = (
         "write the partial ones with --keep-partial"
-        if heads
+        if headers
         else "choose another --start/--end, or a recording where all sensors run together"
     )
     return (

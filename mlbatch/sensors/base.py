@@ -17,8 +17,8 @@ from mlbatch.types import ImuSamples
 class BaseLidar:
     """Base class of the vendors' lidars.
 
-    A subclass assigns the attributes that are only declared here and implements `faults`, `heads`
-    and `read`.
+    A subclass assigns the attributes that are only declared here and implements `faults`,
+    `column_headers` and `read`.
     """
 
     vendor: str
@@ -51,7 +51,7 @@ class BaseLidar:
     clock_period_ns: int = 0
     notes: tuple[str, ...] = ()
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """All packets: they carry no serial number."""
         return np.ones(len(packets), np.bool_)
 

@@ -17,7 +17,7 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Arrival, Intake, JumpGuard
 from mlbatch.batching.windows import Limit, Policy
 from mlbatch.errors import ClockError, ClockJump
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 from tests.builders.hand import MS
 
 
@@ -27,7 +27,7 @@ def _arrival(position: int, stamp_ms: float, host_ms: float, place: int) -> Arri
         np.array([position]),
         np.array([round(host_ms * MS)], np.int64),
         np.array([-1], np.int64),
-        Heads(stamps, np.zeros_like(stamps), np.ones((1, 1), bool)),
+        ColumnHeaders(stamps, np.zeros_like(stamps), np.ones((1, 1), bool)),
         np.array([place]),
     )
 
@@ -56,18 +56,18 @@ def test_clocks_must_be_comparable(apart_ms: float, comparable: bool) -> None:
 
 def test_the_oldest_place_that_is_needed() -> None:
     batcher = _batcher("left")
-    assert batcher.oldest_place(0) is None
+    assert batcher.oldest_ring_index(0) is None
     for place, stamp_ms in ((7, 50), (8, 150), (9, 205)):
         host_ns = np.array([round(stamp_ms * MS)])
         list(batcher.push([_arrival(0, stamp_ms, stamp_ms, place)], host_ns))
     # At 205 the head [0, 100) has gone; 150 waits until 210.
-    assert batcher.oldest_place(0) == 8
+    assert batcher.oldest_ring_index(0) == 8
     list(batcher.push([_arrival(0, 260, 260, 10)], np.array([260 * MS])))
-    assert batcher.oldest_place(0) == 9
+    assert batcher.oldest_ring_index(0) == 9
     # 9000 is held until the next packet confirms it or not.
     list(batcher.push([_arrival(0, 9000, 261, 11)], np.array([261 * MS])))
     list(batcher.push([_arrival(0, 320, 320, 12)], np.array([320 * MS])))
-    assert batcher.oldest_place(0) == 12
+    assert batcher.oldest_ring_index(0) == 12
 
 
 @pytest.mark.parametrize(("limit", "past_at_ms"), [(Limit(300 * MS), 310), (Limit(MS, True), 210)])
@@ -101,8 +101,8 @@ def _rows(rows: Sequence[tuple[int, int, int, int]]) -> Arrival | None:
         return None
     place, _, host, stamp = np.array(rows, np.int64).T
     stamps = (stamp * MS)[:, None]
-    heads = Heads(stamps, np.zeros_like(stamps), np.ones(stamps.shape, bool))
-    return Arrival(place, host * MS, np.full(len(place), -1), heads, place)
+    headers = ColumnHeaders(stamps, np.zeros_like(stamps), np.ones(stamps.shape, bool))
+    return Arrival(place, host * MS, np.full(len(place), -1), headers, place)
 
 
 def _cut_ms(feed: Feed, *ends: int) -> int:

@@ -9,7 +9,7 @@ import pytest
 
 from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Accepted, Arrival, Intake
 from mlbatch.errors import ClockError
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 
 MS = 10**6
 S = 10**9
@@ -24,17 +24,17 @@ def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps]
         position=np.arange(count),
         host_ns=stamps.max(axis=1) + MS,
         key=np.array(keys or range(count), np.int64),
-        heads=Heads(
+        headers=ColumnHeaders(
             stamps,
             np.zeros_like(stamps),
             np.array(valid, bool) if len(valid) else np.ones(stamps.shape, bool),
         ),
-        place=np.arange(count) * stamps.shape[1],
+        ring_index=np.arange(count) * stamps.shape[1],
     )
 
 
 def _stamps_ms(accepted: Accepted) -> list[list[float]]:
-    rows: list[list[float]] = (accepted.packets.heads.stamp_ns / MS).tolist()
+    rows: list[list[float]] = (accepted.packets.headers.stamp_ns / MS).tolist()
     return rows
 
 
@@ -123,7 +123,7 @@ def test_a_step_of_one_second_needs_no_confirmation(step_ms: float, held: bool) 
     intake = Intake("left")
     accepted = intake.accept(_alone(10, 10 + step_ms))
     assert len(accepted.packets.key) == (1 if held else 2)
-    assert (intake.held_place is not None) == held
+    assert (intake.held_ring_index is not None) == held
 
 
 def test_a_gap_is_confirmed_by_the_next_packet() -> None:
@@ -140,11 +140,11 @@ def test_a_packet_is_held_until_the_next_batch() -> None:
     first = intake.accept(_alone(10, 5000))
     assert _stamps_ms(first) == [[10]]
     # The second packet's pixels must stay where they are.
-    assert intake.held_place == 1
+    assert intake.held_ring_index == 1
     second = intake.accept(_alone(5010, first_key=2))
     assert _stamps_ms(second) == [[5000], [5010]]
     assert second.packets.position.tolist() == [0, 0]
-    assert intake.held_place is None
+    assert intake.held_ring_index is None
 
 
 def test_a_packet_that_is_held_at_the_end_was_never_confirmed() -> None:
@@ -152,7 +152,7 @@ def test_a_packet_that_is_held_at_the_end_was_never_confirmed() -> None:
     intake.accept(_alone(10, 20, 90_000))
     intake.finish()
     assert intake.rejected == {"bad_stamp": 1}
-    assert intake.held_place is None
+    assert intake.held_ring_index is None
 
 
 def test_two_wild_packets_do_not_confirm_each_other() -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import GapLoss, SequenceLoss
 from mlbatch.lidar.geometry import rotor_words
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 
 # -- by sequence numbers --------------------------------------------------------------------------
 
@@ -186,7 +186,9 @@ def counted(rotor: Rotor, came: Sent, cuts: tuple[int, ...] = ()) -> tuple[int, 
     loss = GapLoss(rotor.packet_ns)
     for part in np.split(np.arange(len(came)), sorted(cuts)):
         one = came.take(part)
-        loss.add(Heads(one.stamp_ns, one.words, np.ones(one.words.shape, bool)), one.host_ns)
+        loss.add(
+            ColumnHeaders(one.stamp_ns, one.words, np.ones(one.words.shape, bool)), one.host_ns
+        )
     return loss.lost, loss.reordered
 
 
@@ -395,5 +397,5 @@ def test_a_packet_without_a_column_is_ignored() -> None:
     stamps = packets.stamp_ns.copy()
     stamps[40] = -(2**62)
     loss = GapLoss(FULL.packet_ns)
-    loss.add(Heads(stamps, packets.words, valid), packets.host_ns)
+    loss.add(ColumnHeaders(stamps, packets.words, valid), packets.host_ns)
     assert (loss.lost, loss.reordered) == (1, 0)

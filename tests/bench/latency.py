@@ -61,7 +61,7 @@ class Driver:
     def push(self, batch: PacketBatch) -> int:
         """Push a batch, decode the windows it completes; returns the number of scans."""
         batcher = self.run.batcher
-        oldest = [batcher.oldest_place(sensor.index) for sensor in self.run.sensors]
+        oldest = [batcher.oldest_ring_index(sensor.index) for sensor in self.run.sensors]
         ingested = self.run.session.ingest.columns(batch, oldest)
         scans = 0
         for window in batcher.push(ingested.arrivals, batch.host_ns):

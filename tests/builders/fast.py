@@ -12,7 +12,7 @@ from mlbatch.batching.intake import Accepted, Arrival, Intake
 from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
 from mlbatch.batching.windows import Limit, Policy
 from mlbatch.batching.windows import Window as FastWindow
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 
 
 class _Watched(Intake):
@@ -24,7 +24,7 @@ class _Watched(Intake):
 
     def accept(self, arrival: Arrival) -> Accepted:
         accepted = super().accept(arrival)
-        self.accepted += accepted.packets.place.tolist()
+        self.accepted += accepted.packets.ring_index.tolist()
         return accepted
 
 
@@ -71,7 +71,7 @@ def _arrivals(group: Sequence[FeedPacket], sensors: int, seen: list[int]) -> lis
             arrivals.append(None)
             continue
         stamps = np.array([packet.stamps for _, packet in own], np.int64)
-        heads = Heads(
+        headers = ColumnHeaders(
             stamps, np.zeros_like(stamps), np.array([packet.valid for _, packet in own], bool)
         )
         first = seen[sensor]
@@ -81,7 +81,7 @@ def _arrivals(group: Sequence[FeedPacket], sensors: int, seen: list[int]) -> lis
                 np.array([at for at, _ in own], np.int64),
                 np.array([packet.host_ns for _, packet in own], np.int64),
                 np.array([packet.key for _, packet in own], np.int64),
-                heads,
+                headers,
                 np.arange(first, seen[sensor]) * _WIDEST,
             )
         )
@@ -92,7 +92,7 @@ def _window(window: FastWindow, intakes: Sequence[_Watched]) -> Window:
     rank = [{place: n for n, place in enumerate(intake.accepted)} for intake in intakes]
     columns = [
         (sensor, rank[sensor][place - place % _WIDEST], place % _WIDEST)
-        for sensor, place in zip(window.sensor.tolist(), window.place.tolist(), strict=True)
+        for sensor, place in zip(window.sensor.tolist(), window.ring_index.tolist(), strict=True)
     ]
     return Window(
         window.index,

@@ -12,7 +12,7 @@ from mlbatch.arrays import F32Array, I64Array, U8Array
 from mlbatch.lidar.geometry import Turning
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.sensors.hesai import sensor as hesai
-from mlbatch.types import Heads, Pixels, Stream
+from mlbatch.types import ColumnHeaders, Pixels, Stream
 
 STREAM = Stream("192.168.1.201", 2368)
 EVIDENCE_PACKETS = 16
@@ -23,17 +23,17 @@ class Decoded:
     """All columns of some packets: (n, channels, returns) ranges and levels."""
 
     lidar: Lidar
-    heads: Heads
+    headers: ColumnHeaders
     range_m: F32Array
     intensity: F32Array
 
     @property
     def stamp_ns(self) -> I64Array:
-        return self.heads.stamp_ns.reshape(-1)
+        return self.headers.stamp_ns.reshape(-1)
 
     @property
     def encoder(self) -> I64Array:
-        return self.heads.encoder.reshape(-1)
+        return self.headers.encoder.reshape(-1)
 
     @property
     def time_ns(self) -> I64Array:
@@ -87,5 +87,5 @@ def decode(packets: U8Array, content: bytes, options: Mapping[str, str] | None =
         lidar.read(np.ascontiguousarray(columns), which, Pixels(plane, intensity[..., which], None))
         range_m[..., which] = plane
     return Decoded(
-        lidar, lidar.heads(packets, np.zeros(len(packets), np.int64)), range_m, intensity
+        lidar, lidar.column_headers(packets, np.zeros(len(packets), np.int64)), range_m, intensity
     )

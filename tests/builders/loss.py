@@ -9,7 +9,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.lidar.interface import Lidar
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Came:
 
     lidar: Lidar
     sequence: I64Array
-    heads: Heads
+    headers: ColumnHeaders
     host_ns: I64Array
 
     def counted(self, came: BoolArray | slice = slice(None), size: int = 64) -> tuple[int, int]:
@@ -27,7 +27,9 @@ class Came:
         loss = PacketLoss(self.lidar.sequence_modulus, packet_ns)
         rows = np.arange(len(self.host_ns))[came]
         for part in np.split(rows, range(size, len(rows), size)):
-            heads = self.heads
-            chosen = Heads(heads.stamp_ns[part], heads.encoder[part], heads.valid[part])
+            headers = self.headers
+            chosen = ColumnHeaders(
+                headers.stamp_ns[part], headers.encoder[part], headers.valid[part]
+            )
             loss.add(self.sequence[part], chosen, self.host_ns[part])
         return loss.lost, loss.reordered

@@ -85,7 +85,7 @@ class OusterSpec:
         return list(self.altitude_deg) or np.linspace(20.0, -20.0, self.beams).round(3).tolist()
 
     def azimuths_deg(self) -> list[float]:
-        """Azimuth offsets: four staggered groups, as real heads have them."""
+        """Azimuth offsets: four staggered groups, as real headers have them."""
         pattern = [4.2, 1.4, -1.4, -4.2]
         return list(self.azimuth_deg) or [pattern[beam % 4] for beam in range(self.beams)]
 

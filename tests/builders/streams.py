@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.arrays import U8Array
-from mlbatch.lidar.interface import Beside
+from mlbatch.lidar.interface import NeighbourStream
 from mlbatch.sensors import plugins
 from mlbatch.types import Stream
 
@@ -19,7 +19,7 @@ def named(packets: U8Array) -> str | None:
     return next((name for name in names if name is not None), None)
 
 
-def beside(stream: Stream, payload: bytes) -> Beside:
+def beside(stream: Stream, payload: bytes) -> NeighbourStream:
     """One packet from the same source."""
     sample = np.frombuffer(payload, np.uint8)[None]
-    return Beside(stream, len(payload), sample, np.zeros(1, np.int64))
+    return NeighbourStream(stream, len(payload), sample, np.zeros(1, np.int64))

@@ -91,11 +91,11 @@ def pixels(lidar: VelodyneLidar, packets: U8Array) -> tuple[F32Array, F32Array]:
 
 def fired(lidar: VelodyneLidar, sent: Sent) -> tuple[I64Array, F64Array]:
     """(columns, lasers): when each beam fires, ns, and the angle of the rotor then, rad."""
-    heads = lidar.heads(sent.payloads, sent.host_ns)
-    assert heads.valid.all()
-    angle, speed, table = read_rotor_words(heads.encoder.reshape(-1))
+    headers = lidar.column_headers(sent.payloads, sent.host_ns)
+    assert headers.valid.all()
+    angle, speed, table = read_rotor_words(headers.encoder.reshape(-1))
     assert not table.any()
-    time_ns = heads.stamp_ns.reshape(-1)[:, None] + lidar.firing_ns
+    time_ns = headers.stamp_ns.reshape(-1)[:, None] + lidar.firing_ns
     return time_ns, angle[:, None] + speed[:, None] * lidar.firing_ns
 
 

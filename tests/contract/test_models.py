@@ -21,12 +21,12 @@ from mlbatch.errors import MlbatchError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import (
     FAULTS,
-    READABLE,
-    Beside,
+    NAMED_ONLY,
     Calibration,
     Evidence,
     Lidar,
     ModelFile,
+    NeighbourStream,
     SensorModel,
 )
 from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
@@ -69,15 +69,15 @@ def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
     packets = rows([payload for _, payload in payloads])
     host_ns = np.array([at for at, _ in payloads])
     beside = tuple(
-        Beside(Stream(SOURCE, 7788), len(payload), rows([payload]), np.array([at]))
-        for at, payload in sent.beside
+        NeighbourStream(Stream(SOURCE, 7788), len(payload), rows([payload]), np.array([at]))
+        for at, payload in sent.neighbours
     )
     evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, beside)
     given = parse_calibration(Path(sent.file), sent.content) if sent.file else None
     known = built_in() if given is None else [given]
     found = [calibration for one in known if (calibration := _named(one, sent))]
-    score, best = max(((one.fit(evidence), one) for one in found), key=lambda pair: pair[0])
-    assert score > 0 or (score == READABLE and sent.is_named)
+    score, best = max(((one.match_score(evidence), one) for one in found), key=lambda pair: pair[0])
+    assert score > 0 or (score == NAMED_ONLY and sent.is_named)
     return Stand(best.lidar({}, evidence), packets, host_ns)
 
 
@@ -110,7 +110,7 @@ def _livox(kind: int) -> Stand:
     packets = rows([payload for _, payload in sent])
     host_ns = np.array([at for at, _ in sent])
     evidence = Evidence(Stream(SOURCE, 56301), packets.shape[1], packets, host_ns)
-    best = max(built_in(), key=lambda one: one.fit(evidence))
+    best = max(built_in(), key=lambda one: one.match_score(evidence))
     return Stand(best.lidar({}, evidence), packets, host_ns)
 
 
@@ -198,11 +198,11 @@ def test_a_lidar_keeps_the_laws(name: str) -> None:
     lidar, packets = stand.lidar, stand.packets
     _check_table(lidar)
     shape = (len(packets), lidar.columns_per_packet)
-    heads = lidar.heads(packets, stand.host_ns)
-    assert heads.stamp_ns.shape == heads.encoder.shape == heads.valid.shape == shape
-    kinds = [field.dtype.name for field in (heads.stamp_ns, heads.encoder, heads.valid)]
+    headers = lidar.column_headers(packets, stand.host_ns)
+    assert headers.stamp_ns.shape == headers.encoder.shape == headers.valid.shape == shape
+    kinds = [field.dtype.name for field in (headers.stamp_ns, headers.encoder, headers.valid)]
     assert kinds == ["int64", "int64", "bool"]
-    assert np.ptp(heads.stamp_ns) < NS_PER_S
+    assert np.ptp(headers.stamp_ns) < NS_PER_S
     faults = lidar.faults(packets)
     assert (faults.shape, faults.dtype.name) == ((len(packets),), "uint8")
     assert not faults.any()
@@ -212,7 +212,7 @@ def test_a_lidar_keeps_the_laws(name: str) -> None:
     assert len(np.unique(sequence)) == len(packets)
     if lidar.sequence_modulus:
         assert sequence.max() < lidar.sequence_modulus
-    assert lidar.owns(packets).all()
+    assert lidar.sent_by_me(packets).all()
 
 
 @pytest.mark.parametrize("name", cases())
@@ -220,7 +220,10 @@ def test_a_packet_says_the_same_in_any_company(name: str) -> None:
     stand = cases()[name]()
     lidar, packets, host_ns = stand.lidar, stand.packets, stand.host_ns
     order = np.random.default_rng(2).permutation(len(packets))
-    whole, shuffled = lidar.heads(packets, host_ns), lidar.heads(packets[order], host_ns[order])
+    whole, shuffled = (
+        lidar.column_headers(packets, host_ns),
+        lidar.column_headers(packets[order], host_ns[order]),
+    )
     for field in ("stamp_ns", "encoder", "valid"):
         assert np.array_equal(getattr(whole, field)[order], getattr(shuffled, field))
     records = _records(lidar, packets)

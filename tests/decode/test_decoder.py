@@ -48,7 +48,7 @@ class Bench:
     min_range_m: float = 0.0
     max_range_m: float = math.inf
     source: Source = field(init=False)
-    place: I64Array = field(init=False)
+    ring_index: I64Array = field(init=False)
 
     def __post_init__(self) -> None:
         calibration = read_calibration(write_metadata(self.folder / "lidar.json", self.spec))
@@ -60,7 +60,7 @@ class Bench:
         ring = PacketRing(lidar.packet_size, lidar.records)
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
         _, first = ring.store(data.copy(), start, None)
-        self.place = (first[:, None] + np.arange(16)).ravel()
+        self.ring_index = (first[:, None] + np.arange(16)).ravel()
         self.source = Source(
             lidar,
             ring,
@@ -96,7 +96,7 @@ def _scan(decoder: Decoder, benches: Sequence[Bench], columns: Sequence[tuple[in
     """A scan of (sensor, measurement id), 100 us apart."""
     sensor = np.array([number for number, _ in columns], np.int64)
     mids = np.array([mid for _, mid in columns], np.int64)
-    place = np.array([benches[s].place[mid] for s, mid in columns], np.int64)
+    place = np.array([benches[s].ring_index[mid] for s, mid in columns], np.int64)
     stamps = START_NS + np.arange(len(columns), dtype=np.int64) * 100_000
     label = ScanHeader(3, 0, START_NS, START_NS + 10**8, True, 17)
     return decoder.scan(WindowColumns(stamps, sensor, place, mids), label)

@@ -26,7 +26,7 @@ class Sensor:
 
     source: Source
     stamp_ns: I64Array
-    place: I64Array
+    ring_index: I64Array
     encoder: I64Array
 
 
@@ -36,9 +36,9 @@ def _sensor(number: int, seen: Seen) -> Sensor:
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
     _, first = ring.store(sent.payloads.reshape(-1).copy(), start, None)
     place = (first[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
-    heads = lidar.heads(sent.payloads, sent.host_ns)
+    headers = lidar.column_headers(sent.payloads, sent.host_ns)
     source = Source(lidar, ring, _POSES[number], number * lidar.channels, 1.0 + number, 90.0)
-    return Sensor(source, heads.stamp_ns.reshape(-1), place, heads.encoder.reshape(-1))
+    return Sensor(source, headers.stamp_ns.reshape(-1), place, headers.encoder.reshape(-1))
 
 
 def _scan(sensors: Sequence[Sensor], only: int | None = None) -> Scan:
@@ -51,13 +51,15 @@ def _scan(sensors: Sequence[Sensor], only: int | None = None) -> Scan:
         "10",
         "utc",
     )
-    sensor = np.concatenate([np.full(len(one.place), number) for number, one in enumerate(sensors)])
+    sensor = np.concatenate(
+        [np.full(len(one.ring_index), number) for number, one in enumerate(sensors)]
+    )
     stamp_ns = np.concatenate([one.stamp_ns for one in sensors])
     order = np.argsort(stamp_ns, kind="stable")
     due = WindowColumns(
         stamp_ns[order],
         sensor[order],
-        np.concatenate([one.place for one in sensors])[order],
+        np.concatenate([one.ring_index for one in sensors])[order],
         np.concatenate([one.encoder for one in sensors])[order],
     )
     start_ns = int(stamp_ns.min()) // 10**9 * 10**9

@@ -14,7 +14,7 @@ from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import FAULTS, Calibration, Lidar
-from mlbatch.types import Heads, PacketBatch, Pixels, Stream, StreamTable
+from mlbatch.types import ColumnHeaders, PacketBatch, Pixels, Stream, StreamTable
 from tests.fuzz.framing import Part
 from tests.fuzz.harness import BrokenLaw
 
@@ -85,7 +85,7 @@ def check_lidar(lidar: Lidar, sample: U8Array, host_ns: I64Array) -> None:
     if sample.shape[1] < lidar.packet_size:
         return
     packets = np.ascontiguousarray(sample[:, : lidar.packet_size])
-    faults, owns, keys = lidar.faults(packets), lidar.owns(packets), lidar.sequence(packets)
+    faults, owns, keys = lidar.faults(packets), lidar.sent_by_me(packets), lidar.sequence(packets)
     if not faults.shape == owns.shape == keys.shape == (len(packets),):
         raise BrokenLaw("verdicts of another shape than (packets,)")
     if int(faults.max(initial=0)) >= len(FAULTS):
@@ -93,18 +93,18 @@ def check_lidar(lidar: Lidar, sample: U8Array, host_ns: I64Array) -> None:
     good = packets[faults == 0]
     # A batch of damaged packets alone leaves none.
     nothing = packets[:0]
-    for verdict in (lidar.owns, lidar.faults, lidar.sequence):
+    for verdict in (lidar.sent_by_me, lidar.faults, lidar.sequence):
         verdict(nothing)
-    none = lidar.heads(nothing, host_ns[:0])
+    none = lidar.column_headers(nothing, host_ns[:0])
     if none.stamp_ns.shape != (0, lidar.columns_per_packet):
-        raise BrokenLaw("heads of no packets of another shape than (0, columns)")
+        raise BrokenLaw("headers of no packets of another shape than (0, columns)")
     if lidar.sequence_modulus and int(keys.max(initial=0)) >= lidar.sequence_modulus:
         raise BrokenLaw(f"number {int(keys.max())} of a count below {lidar.sequence_modulus}")
-    heads = lidar.heads(packets, host_ns)
-    _check_heads(lidar, heads, faults == 0)
+    headers = lidar.column_headers(packets, host_ns)
+    _check_heads(lidar, headers, faults == 0)
     if len(packets):
-        alone = lidar.heads(packets[-1:], host_ns[-1:])
-        if not np.array_equal(alone.stamp_ns[0], heads.stamp_ns[-1]):
+        alone = lidar.column_headers(packets[-1:], host_ns[-1:])
+        if not np.array_equal(alone.stamp_ns[0], headers.stamp_ns[-1]):
             raise BrokenLaw("stamps of a packet depend on the packets before it")
     if len(good):
         _check_pixels(lidar, good[:4])
@@ -129,14 +129,14 @@ def _check_description(lidar: Lidar) -> None:
 
 
 def _check_heads(
-    lidar: Lidar, heads: Heads, good: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    lidar: Lidar, headers: ColumnHeaders, good: np.ndarray[tuple[int], np.dtype[np.bool_]]
 ) -> None:
     shape = (len(good), lidar.columns_per_packet)
-    if not heads.stamp_ns.shape == heads.encoder.shape == heads.valid.shape == shape:
-        raise BrokenLaw(f"heads of another shape than {shape}")
-    if heads.stamp_ns.dtype != np.int64 or heads.valid.dtype != np.bool_:
-        raise BrokenLaw("heads of other types than int64 and bool")
-    encoder = heads.encoder[good[:, None] & heads.valid]
+    if not headers.stamp_ns.shape == headers.encoder.shape == headers.valid.shape == shape:
+        raise BrokenLaw(f"headers of another shape than {shape}")
+    if headers.stamp_ns.dtype != np.int64 or headers.valid.dtype != np.bool_:
+        raise BrokenLaw("headers of other types than int64 and bool")
+    encoder = headers.encoder[good[:, None] & headers.valid]
     if lidar.beams.angle_rad is None:
         _, _, table = read_rotor_words(encoder)
         low, high, count = table.min(initial=0), table.max(initial=0), len(lidar.firing_ns)

@@ -55,7 +55,7 @@ def _streams() -> dict[str, Seeds]:
             kind = NAMES.index(Path(sent.file).suffix)
             parts.append(Part(CALIBRATION, kind, sent.content))
         parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.seen.payloads[:_PACKETS]]
-        parts += [Part(_DEVICE_PORT, at, data) for at, data in sent.beside]
+        parts += [Part(_DEVICE_PORT, at, data) for at, data in sent.neighbours]
         found.setdefault(make.__name__.removesuffix("_sent"), []).append(joined(parts))
     spec = velodyne.VelodyneSpec("VLP-16")
     position = velodyne.position_packets(spec, np.arange(4, dtype=np.float64) * 5e5)
@@ -176,7 +176,7 @@ def _calibrate(suffix: str, data: bytes, folder: Path) -> None:
     for one in every:
         try_all(one, rng)
         for evidence in _evidence():
-            if one.fit(evidence):
+            if one.match_score(evidence):
                 with contextlib.suppress(MlbatchError):
                     check_lidar(one.lidar({}, evidence), evidence.sample, evidence.host_ns)
 

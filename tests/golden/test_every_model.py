@@ -61,14 +61,14 @@ RIG_METADATA = "    metadata: {metadata}\n"
 class Sent:
     """What a model sent; types: of its returns, () where they follow from the readings.
 
-    model: as `mlbatch sensors` names it; beside: packets on port 7788; file, content: calibration;
-    is_named: only a rig tells the model.
+    model: as `mlbatch sensors` names it; neighbours: packets on port 7788; file, content:
+    calibration; is_named: only a rig tells the model.
     """
 
     model: str
     seen: Seen
     types: tuple[int, ...]
-    beside: Payloads = field(default_factory=list)
+    neighbours: Payloads = field(default_factory=list)
     file: str = ""
     content: bytes = b""
     is_named: bool = False
@@ -174,7 +174,7 @@ def job_of(sent: Sent, folder: Path) -> Job:
     """A job on a recording of it, which is written into the folder."""
     records = [
         (host_ns, udp_frame(payload, SOURCE, HOST, port, port)[0])
-        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.beside))
+        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.neighbours))
         for host_ns, payload in payloads
     ]
     path = write_pcap(folder / "lidar.pcap", sorted(records))

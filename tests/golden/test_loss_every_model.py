@@ -36,10 +36,10 @@ DARK_DEG = {"": None, "dark": (100.0, 250.5), "dark through zero": (330.3, 29.7)
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """Packets with their arrivals; beside: of the device; content: of a file; model: of a rig."""
+    """Packets; neighbours: device packets; content: of a calibration file; model: of the rig."""
 
     packets: Sequence[tuple[int, bytes]]
-    beside: Sequence[tuple[int, bytes]] = ()
+    neighbours: Sequence[tuple[int, bytes]] = ()
     file: str = ""
     content: bytes = b""
     model: str | None = None
@@ -126,7 +126,7 @@ def found(spoken: Spoken) -> Came:
         assert own is not None
         calibrations.append(own)
     first = [Part(2368, at, data) for at, data in spoken.packets[:FIRST]]
-    sampler = sampled([*first, *(Part(7788, at, data) for at, data in spoken.beside)])
+    sampler = sampled([*first, *(Part(7788, at, data) for at, data in spoken.neighbours)])
     if spoken.model is None:
         (sensor,) = match(sampler, calibrations, {}).sensors
         lidar = sensor.lidar
@@ -139,7 +139,7 @@ def found(spoken: Spoken) -> Came:
     packets = np.frombuffer(b"".join(data for _, data in spoken.packets), np.uint8)
     packets = packets.reshape(len(spoken.packets), -1)
     host_ns = np.array([at for at, _ in spoken.packets], np.int64)
-    return Came(lidar, lidar.sequence(packets), lidar.heads(packets, host_ns), host_ns)
+    return Came(lidar, lidar.sequence(packets), lidar.column_headers(packets, host_ns), host_ns)
 
 
 @pytest.mark.parametrize(

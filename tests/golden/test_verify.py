@@ -164,7 +164,7 @@ def recorded(sent: Sent, folder: Path) -> Path:
     (folder / "rig.yaml").write_text(rig, encoding="utf-8")
     records = [
         (host_ns, udp_frame(payload, SOURCE, HOST, port, port)[0])
-        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.beside))
+        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.neighbours))
         for host_ns, payload in payloads
     ]
     return write_pcap(folder / "lidar.pcap", sorted(records))

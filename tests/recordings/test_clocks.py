@@ -114,9 +114,9 @@ def estimates(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
                     continue
                 lidar = sensor.lidar
                 packets = batch.data[batch.start[index, None] + np.arange(lidar.packet_size)]
-                good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+                good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
-                _, newest_ns = extremes(lidar.heads(packets[good], host_ns))
+                _, newest_ns = extremes(lidar.column_headers(packets[good], host_ns))
                 known = newest_ns > NEVER
                 watches[sensor.name].add(newest_ns[known], host_ns[known])
     found = {name: watch.estimate() for name, watch in watches.items()}

@@ -16,7 +16,7 @@ from mlbatch.discovery.match import match
 from mlbatch.discovery.probe import find_calibrations, probe
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
-from mlbatch.types import Heads, StreamTable
+from mlbatch.types import ColumnHeaders, StreamTable
 from tests.builders.loss import Came
 from tests.recordings import RECORDINGS
 from tests.recordings.test_clocks import CASES, Case
@@ -52,7 +52,7 @@ def _read(maker: str, path: str) -> Came:
                 hosts.append(batch.host_ns[index])
     packets, host_ns = np.concatenate(payloads), np.concatenate(hosts)
     assert (lidar.faults(packets) == 0).all()
-    return Came(lidar, lidar.sequence(packets), lidar.heads(packets, host_ns), host_ns)
+    return Came(lidar, lidar.sequence(packets), lidar.column_headers(packets, host_ns), host_ns)
 
 
 @every_case
@@ -88,11 +88,11 @@ def test_packets_that_cross_are_not_lost(maker: str, case: Case) -> None:
     packets = _read(maker, case.path)
     order = np.arange(case.packets)
     order[4:-4:10], order[5:-3:10] = order[5:-3:10].copy(), order[4:-4:10].copy()
-    heads = packets.heads
+    headers = packets.headers
     crossed = Came(
         packets.lidar,
         packets.sequence[order],
-        Heads(heads.stamp_ns[order], heads.encoder[order], heads.valid[order]),
+        ColumnHeaders(headers.stamp_ns[order], headers.encoder[order], headers.valid[order]),
         packets.host_ns,
     )
     assert crossed.counted() == (0, len(order[4:-4:10]))

@@ -52,7 +52,7 @@ def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) 
     samples = [lidar.imu(payload[None], 0) for payload in case.payloads(48)]
     stamps = np.concatenate([sample.stamp_ns for sample in samples])
     packets = case.payloads(lidar.packet_size)
-    stamp_ns = lidar.heads(packets, np.zeros(len(packets), np.int64)).stamp_ns
+    stamp_ns = lidar.column_headers(packets, np.zeros(len(packets), np.int64)).stamp_ns
     first, last = np.sort(stamp_ns.ravel())[[0, -1]]
     assert len(stamps) >= 10
     assert (np.diff(stamps) > 0).all()
@@ -83,7 +83,7 @@ def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> Non
     for number, size in zip(SOURCES, sizes, strict=True):
         found = evidence(folder / f"same_ports_{kind}.pcap", size, SOURCES[number])
         fits = {
-            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").fit(found)
+            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").match_score(found)
             for other in SOURCES
         }
         assert fits[number] > 0
@@ -92,12 +92,12 @@ def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> Non
 
 def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
     found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
-    assert (7502, 48) in {(one.stream.port, one.size) for one in found.beside}
+    assert (7502, 48) in {(one.stream.port, one.size) for one in found.neighbours}
     shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
     apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
-    assert shared.fit(found) > apart.fit(found) > 0
-    moved = replace(found, beside=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
-    assert apart.fit(moved) > shared.fit(moved) > 0
+    assert shared.match_score(found) > apart.match_score(found) > 0
+    moved = replace(found, neighbours=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
+    assert apart.match_score(moved) > shared.match_score(moved) > 0
 
 
 def test_no_metadata_take_packets_of_another_unit() -> None:
@@ -110,7 +110,7 @@ def test_no_metadata_take_packets_of_another_unit() -> None:
             # Without serial numbers any unit with packets of this size may be the one.
             might = own.serial in ("", other.serial) or own.metadata.layout.legacy
             same = might and other.metadata.layout.packet_size == size
-            assert (other.fit(found) > 0) == same, (case, other.path)
+            assert (other.match_score(found) > 0) == same, (case, other.path)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)

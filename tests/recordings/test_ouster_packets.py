@@ -56,7 +56,7 @@ class TestEveryRecording:
     def test_no_packet_is_faulty_or_foreign(self, case: Case) -> None:
         _, lidar, packets, _ = loaded(case)
         assert not lidar.faults(packets).any()
-        assert lidar.owns(packets).all()
+        assert lidar.sent_by_me(packets).all()
 
     def test_sequence_counts_packets_without_a_gap(self, case: Case) -> None:
         _, lidar, packets, _ = loaded(case)
@@ -67,7 +67,7 @@ class TestEveryRecording:
         calibration, lidar, packets, _ = loaded(case)
         host_ns = np.zeros(4, np.int64)
         seen = Evidence(Stream("", 1), lidar.packet_size, packets[:4], host_ns[: len(packets)])
-        assert calibration.fit(seen) >= 1
+        assert calibration.match_score(seen) >= 1
 
 
 def in_mm(pose: F64Array) -> F64Array:

@@ -51,9 +51,9 @@ def recorded(name: str) -> Recorded:
 
 
 def lidar_for(evidence: Evidence, options: dict[str, str] | None = None) -> VelodyneLidar:
-    best = max(velodyne.BUILT_IN, key=lambda one: one.fit(evidence))
+    best = max(velodyne.BUILT_IN, key=lambda one: one.match_score(evidence))
     assert isinstance(best, velodyne.VelodyneCalibration)
-    assert best.fit(evidence) == 100
+    assert best.match_score(evidence) == 100
     return best.lidar(options or {}, evidence)
 
 
@@ -69,14 +69,16 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
     one, result = recorded(name), reference(name)
     shift_ns = wrong_s * 1_000_000_000
     beside = tuple(
-        replace(other, host_ns=other.host_ns + shift_ns) for other in one.evidence.beside
+        replace(other, host_ns=other.host_ns + shift_ns) for other in one.evidence.neighbours
     )
-    moved = replace(one.evidence, host_ns=one.evidence.host_ns + shift_ns, beside=beside)
+    moved = replace(one.evidence, host_ns=one.evidence.host_ns + shift_ns, neighbours=beside)
     lidar = lidar_for(moved)
     assert lidar.timestamp_mode == pulse
-    heads = lidar.heads(one.sent.payloads, one.sent.host_ns + shift_ns)
-    assert (heads.stamp_ns == one.lidar.heads(one.sent.payloads, one.sent.host_ns).stamp_ns).all()
-    assert abs(heads.stamp_ns[-1, 0] - float(result["device_time_s"]) * 1e9) < US_NS
+    headers = lidar.column_headers(one.sent.payloads, one.sent.host_ns + shift_ns)
+    assert (
+        headers.stamp_ns == one.lidar.column_headers(one.sent.payloads, one.sent.host_ns).stamp_ns
+    ).all()
+    assert abs(headers.stamp_ns[-1, 0] - float(result["device_time_s"]) * 1e9) < US_NS
 
 
 def test_files_of_the_vendors_angles_change_nothing() -> None:
@@ -86,7 +88,7 @@ def test_files_of_the_vendors_angles_change_nothing() -> None:
         read = velodyne.read_calibration(path, path.read_bytes())
         one = recorded(name)
         assert read is not None
-        assert read.fit(one.evidence) == 200
+        assert read.match_score(one.evidence) == 200
         lidar, table = read.lidar({}, one.evidence), one.lidar
         assert lidar.model == table.model
         assert np.abs(lidar.beams.direction - table.beams.direction).max() < 1e-5

@@ -19,7 +19,7 @@ from mlbatch.sensors.hesai.firing import NEVER
 from mlbatch.sensors.hesai.layout import CRC_SIZE, RETURN_MODES, SAFETY, SAFETY_SIZE, Layout
 from mlbatch.sensors.hesai.models import OPERATIONS
 from mlbatch.sensors.packet_bytes import number
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import MM_PER_M, NS_PER_S, NS_PER_US
 
 _CENTURY = 70  # Years below are in this century, others in the last.
@@ -93,7 +93,7 @@ class PacketReader:
         self._checks_crc = checks_crc
         self._record = _record_dtype(layout)
 
-    def heads(self, packets: U8Array) -> Heads:
+    def column_headers(self, packets: U8Array) -> ColumnHeaders:
         """Timestamps, rotor words and validity of all columns."""
         layout = self.layout
         timing = self.layout.model.timing
@@ -110,7 +110,7 @@ class PacketReader:
         revolutions = self._azimuths(body)[:, :: layout.mode.returns] / layout.model.ticks
         speed = np.broadcast_to(self._revolutions_per_s(body)[:, None], revolutions.shape)
         revolutions += speed * (first_ns * _S_PER_NS)
-        return Heads(
+        return ColumnHeaders(
             packet_ns[:, None] + offset_ns + first_ns,
             rotor_words(revolutions, speed, table),
             np.ones(revolutions.shape, np.bool_),

@@ -27,7 +27,7 @@ from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.hesai.optics import OffAxis, off_axis
 from mlbatch.sensors.hesai.packets import PacketReader
 from mlbatch.sensors.options import check_options
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
@@ -78,7 +78,7 @@ class HesaiCalibration:
         self.serial = ""
         self.is_shared = False
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score of packets: by channels, then by the elevations of the outer beams."""
         layout = _layout(evidence)
         if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
@@ -123,7 +123,7 @@ class At128Calibration:
         self.serial = ""
         self.is_shared = False
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score of packets."""
         layout = _layout(evidence)
         return _FITS_BEAMS if layout is not None and layout.model.name == self.model else 0
@@ -192,9 +192,9 @@ class HesaiLidar(BaseLidar):
         found = self._reader.sequence(packets)
         return content_keys(packets) if found is None else found
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps and rotor words; packets carry the date, so host_ns is not used."""
-        return self._reader.heads(packets)
+        return self._reader.column_headers(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, records.size) into `out`."""

@@ -31,7 +31,7 @@ from mlbatch.sensors.livox.packets import (
 )
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import most_common
-from mlbatch.types import Heads, ImuSamples, Pixels
+from mlbatch.types import ColumnHeaders, ImuSamples, Pixels
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
 
@@ -72,7 +72,7 @@ class LivoxCalibration:
     serial = ""
     is_shared = True
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match packets of points."""
         kind = identify(evidence.size, evidence.sample)
         return _FITS_BYTES if kind is not None and kind.returns else 0
@@ -138,10 +138,10 @@ class LivoxLidar(BaseLidar):
             return headers(packets)["counter"].astype(np.int64)
         return content_keys(packets)
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps of all points."""
         stamp_ns = stamps_ns(packets, self.columns_per_packet)
-        return Heads(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
+        return ColumnHeaders(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of n points; keeps their coordinates for the projection."""

@@ -25,7 +25,7 @@ from mlbatch.sensors.ouster.profiles import (
     HeaderLayout,
     PacketLayout,
 )
-from mlbatch.types import Heads
+from mlbatch.types import ColumnHeaders
 
 BAD_HEADER = FAULTS.index("bad_header")
 BAD_CRC = FAULTS.index("bad_crc")
@@ -71,14 +71,14 @@ class LegacyHeaders:
     layout: PacketLayout
     columns_per_frame: int
 
-    def heads(self, packets: U8Array) -> Heads:
+    def column_headers(self, packets: U8Array) -> ColumnHeaders:
         """Timestamps, measurement ids and validity of all columns."""
         columns = self._columns(packets)
         mid = columns["measurement_id"].astype(np.int64)
         valid = self._measured(packets) & (mid < self.columns_per_frame)
-        return Heads(columns["stamp_ns"].astype(np.int64), mid, valid)
+        return ColumnHeaders(columns["stamp_ns"].astype(np.int64), mid, valid)
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) True: packets carry no serial number."""
         return np.ones(len(packets), np.bool_)
 
@@ -129,15 +129,15 @@ class PacketHeaders:
     serial: int
     check_crc: bool = False
 
-    def heads(self, packets: U8Array) -> Heads:
+    def column_headers(self, packets: U8Array) -> ColumnHeaders:
         """Timestamps, measurement ids and validity of all columns."""
         raw = column_bytes(packets, self.layout)[:, :, : COLUMN.itemsize]
         columns = np.ascontiguousarray(raw).view(COLUMN)[..., 0]
         mid = columns["measurement_id"].astype(np.int64)
         valid = ((columns["status"] & 1) != 0) & (mid < self.columns_per_frame)
-        return Heads(columns["stamp_ns"].astype(np.int64), mid, valid)
+        return ColumnHeaders(columns["stamp_ns"].astype(np.int64), mid, valid)
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether the serial number is the sensor's; 0 on either side matches all."""
         found = self.serials(packets)
         owned: BoolArray = found == self.serial

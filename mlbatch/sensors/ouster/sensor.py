@@ -35,7 +35,7 @@ from mlbatch.sensors.ouster.packets import (
 )
 from mlbatch.sensors.ouster.pixels import PixelReader, pixel_table
 from mlbatch.sensors.ouster.profiles import FUSA, LEGACY
-from mlbatch.types import Heads, ImuSamples, Pixels
+from mlbatch.types import ColumnHeaders, ImuSamples, Pixels
 from mlbatch.units import NS_PER_S
 
 __all__ = [
@@ -101,14 +101,14 @@ class OusterCalibration:
         self.is_shared = False
         self._headers = _headers(described, check_crc=False)
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score of packets; old ROS drivers append one byte to payloads."""
         size = self.metadata.layout.packet_size
         is_off = self.metadata.layout.profile.returns == 0
         if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
             return 0
         packets = evidence.sample[:, :size]
-        good = packets[(self._headers.faults(packets) == 0) & self._headers.owns(packets)]
+        good = packets[(self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)]
         if 2 * len(good) <= len(packets):
             return 0
         return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
@@ -134,7 +134,7 @@ class OusterCalibration:
         on_port = evidence.stream.port != 0 and evidence.stream.port == self.metadata.lidar_port
         imu_seen = any(
             port == self.metadata.imu_port and _is_imu(self.metadata, size)
-            for port, size in ((one.stream.port, one.size) for one in evidence.beside)
+            for port, size in ((one.stream.port, one.size) for one in evidence.neighbours)
         )
         return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
 
@@ -189,9 +189,9 @@ class OusterLidar:
         self._packets_per_frame = in_window
         self.sequence_modulus = self._frame_ids * in_window
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether packets carry this sensor's serial number, or none."""
-        return self._headers.owns(packets)
+        return self._headers.sent_by_me(packets)
 
     def faults(self, packets: U8Array) -> U8Array:
         """(P,) index into FAULTS."""
@@ -209,9 +209,9 @@ class OusterLidar:
             return inside
         return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps, measurement ids and validity of all columns."""
-        return self._headers.heads(packets)
+        return self._headers.column_headers(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, record_size) into `out`, which may be strided."""

@@ -22,7 +22,7 @@ from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Record
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 
 VENDOR = "any"
 # In the order of KINDS.
@@ -50,9 +50,9 @@ def _layout(sample: U8Array) -> Layout | None:
     """Layout named by most of the packets (k, size), else None."""
     if sample.shape[1] < HEAD.itemsize or not len(sample):
         return None
-    heads = np.ascontiguousarray(sample[:, : HEAD.itemsize]).view(HEAD)[:, 0]
+    headers = np.ascontiguousarray(sample[:, : HEAD.itemsize]).view(HEAD)[:, 0]
     words = np.ascontiguousarray(sample[:, :_SHARED_BYTES]).view("<u8")[:, 0]
-    first = heads[0]
+    first = headers[0]
     if 2 * int(np.count_nonzero(words == words[0])) <= len(words):
         return None
     kind = int(first["kind"])
@@ -75,7 +75,7 @@ class CloudCalibration:
         self.model = KINDS[kind]
         self._kind = kind
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match cloud packets of this kind; they only come from topics."""
         layout = _layout(evidence.sample) if evidence.stream.topic else None
         return _FITS if layout is not None and layout.kind == self._kind else 0
@@ -147,7 +147,7 @@ class CloudLidar(BaseLidar):
         faults[head != self._shared] = _BAD_HEADER
         return faults
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamp of every column, shared by its points."""
         head = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)
         stamp_ns: I64Array = head["stamp_ns"].astype(np.int64)
@@ -158,7 +158,9 @@ class CloudLidar(BaseLidar):
             ring = (
                 np.ascontiguousarray(packets[:, at : at + 2]).view("<u2").astype(np.int64) % _RINGS
             )
-        return Heads(stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_))
+        return ColumnHeaders(
+            stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_)
+        )
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Ranges and intensities of columns (n, records.size); keeps coordinates for `points`."""

@@ -103,7 +103,10 @@ def find_difop(evidence: Evidence) -> Difop | None:
     On topics it is among the point packets, else it has the same source and another port.
     """
     own = _whole(evidence.sample)
-    for packets in (own, np.concatenate([own, *(_whole(one.sample) for one in evidence.beside)])):
+    for packets in (
+        own,
+        np.concatenate([own, *(_whole(one.sample) for one in evidence.neighbours)]),
+    ):
         units = np.unique(packets[:, _SERIAL], axis=0)
         if len(units) > 1:
             packets = _of_port(packets, evidence.stream.port)

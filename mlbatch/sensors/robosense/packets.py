@@ -16,7 +16,7 @@ from mlbatch.lidar.interface import FAULTS, Records
 from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors.packet_bytes import has_bytes, number
 from mlbatch.sensors.robosense.models import READING, Layout, Model
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CDEG_PER_REVOLUTION = 36000
@@ -133,7 +133,7 @@ class PacketReader:
         good &= times_ns(packets, self._model)[1]
         return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
 
-    def heads(self, packets: U8Array) -> Heads:
+    def column_headers(self, packets: U8Array) -> ColumnHeaders:
         """Timestamps, rotor words and validity of all columns."""
         model = self._model
         shape = self._shape
@@ -149,7 +149,7 @@ class PacketReader:
         revolutions_per_s = (self._sense / _CDEG_PER_REVOLUTION * self._moving) * speed
         words = rotor_words(revolutions, revolutions_per_s[:, None])
         valid = np.repeat(good, shape.columns, axis=1)
-        return Heads(stamp_ns[:, None] + after_ns, words, valid)
+        return ColumnHeaders(stamp_ns[:, None] + after_ns, words, valid)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, record size) into `out`."""

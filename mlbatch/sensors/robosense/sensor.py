@@ -17,7 +17,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
-from mlbatch.lidar.interface import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import majority, number
@@ -43,7 +43,7 @@ from mlbatch.sensors.robosense.identify import (
 )
 from mlbatch.sensors.robosense.models import ROWS, VENDOR, Model
 from mlbatch.sensors.robosense.packets import PacketReader, shape_of, times_ns
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
@@ -91,7 +91,7 @@ class DifopCalibration:
         """The same calibration if the rig names this model; packets may fit two models."""
         return DifopCalibration(self._row, is_named=True) if name == self.model else None
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score: point packets name this model, or can at least be decoded as it."""
         points = point_packets(evidence.sample)
         found = identify(points)
@@ -102,7 +102,7 @@ class DifopCalibration:
         chosen = majority(points, fits(points, self._row.layout))
         if chosen is None:
             return 0
-        return READABLE if majority(chosen, times_ns(chosen, self._row)[1]) is not None else 0
+        return NAMED_ONLY if majority(chosen, times_ns(chosen, self._row)[1]) is not None else 0
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> RobosenseLidar:
         """Decoder of the sensor, with the angles of its device packets."""
@@ -157,10 +157,10 @@ class CsvCalibration:
         rows = [row for row in ROWS if row.name == name and row.channels == count]
         return CsvCalibration(self.path or Path(), self._angles, rows[0]) if rows else None
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score: point packets name a model of as many channels, or can be decoded as it."""
         if self._named is not None:
-            score = DifopCalibration(self._named, is_named=True).fit(evidence)
+            score = DifopCalibration(self._named, is_named=True).match_score(evidence)
             return _FITS_FILE if score == _FITS_MODEL else score
         return _FITS_FILE if self._row(evidence) is not None else 0
 
@@ -184,7 +184,7 @@ class CsvCalibration:
 
     def _row(self, evidence: Evidence) -> Model | None:
         if self._named is not None:
-            return self._named if DifopCalibration(self._named).fit(evidence) else None
+            return self._named if DifopCalibration(self._named).match_score(evidence) else None
         found = identify(point_packets(evidence.sample))
         row = None if found is None else found.model
         return row if row and row.channels == len(self._angles.elevation_deg) else None
@@ -256,7 +256,7 @@ class RobosenseLidar(BaseLidar):
         self._packets.learn_speed(points)
         self.pixels = self._packets.pixels()
 
-    def owns(self, packets: U8Array) -> BoolArray:
+    def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) True for point packets, False for device packets on the same topic."""
         own = ~is_difop(packets)
         at = self._row.layout.point_at
@@ -272,9 +272,9 @@ class RobosenseLidar(BaseLidar):
             return super().sequence(packets)
         return number(packets, self._row.counter_at, 4, ">")
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps, rotor words and validity of all columns."""
-        return self._packets.heads(packets)
+        return self._packets.column_headers(packets)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, record size) into `out`."""

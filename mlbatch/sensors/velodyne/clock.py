@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
-from mlbatch.lidar.interface import Beside
+from mlbatch.lidar.interface import NeighbourStream
 from mlbatch.sensors.packet_bytes import has_bytes, most_common, number
 from mlbatch.sensors.velodyne.models import CIRCLE_CDEG, STAMP_AT
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -52,7 +52,9 @@ def absolute_ns(toh_ns: I64Array, near_ns: I64Array) -> I64Array:
     return toh_ns + (near_ns - toh_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
 
 
-def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside]) -> int:
+def clock_offset_ns(
+    packets: U8Array, host_ns: I64Array, neighbours: Sequence[NeighbourStream]
+) -> int:
     """True time minus receive time, which makes receive times define the hour of all packets.
 
     Constant for a run, so that all packets near a difference of half an hour get the same hour.
@@ -64,7 +66,7 @@ def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside
     spread_ns = (away_ns - away_ns[0] + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     offset_ns = int(away_ns[0]) + round(median(spread_ns))
     offset_ns = (offset_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
-    known_ns = [value for one in beside for value in _position_offsets_ns(one)]
+    known_ns = [value for one in neighbours for value in _position_offsets_ns(one)]
     if known_ns:
         target_ns = round(median(np.array(known_ns)))
         offset_ns += (target_ns - offset_ns + HOUR_NS // 2) // HOUR_NS * HOUR_NS
@@ -73,9 +75,9 @@ def clock_offset_ns(packets: U8Array, host_ns: I64Array, beside: Sequence[Beside
     return offset_ns
 
 
-def pulse(beside: Sequence[Beside]) -> str:
+def pulse(neighbours: Sequence[NeighbourStream]) -> str:
     """State of the pulse per second in position packets; "" without any."""
-    rows = [_positions(one)[0] for one in beside]
+    rows = [_positions(one)[0] for one in neighbours]
     states = np.concatenate([np.zeros(0, np.int64), *(row[:, _PPS_AT] for row in rows if len(row))])
     return _PPS[most_common(states)] if len(states) else ""
 
@@ -148,14 +150,14 @@ def are_positions(packets: U8Array) -> BoolArray:
     return np.asarray(good & (packets[:, _PPS_AT] <= 3))
 
 
-def _positions(one: Beside) -> tuple[U8Array, I64Array]:
+def _positions(one: NeighbourStream) -> tuple[U8Array, I64Array]:
     if one.size != POSITION_SIZE:
         return one.sample[:0], one.host_ns[:0]
     good = are_positions(one.sample)
     return one.sample[good], one.host_ns[good]
 
 
-def _position_offsets_ns(one: Beside) -> list[int]:
+def _position_offsets_ns(one: NeighbourStream) -> list[int]:
     packets, host_ns = _positions(one)
     if not len(packets):
         return []

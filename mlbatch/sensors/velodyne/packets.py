@@ -32,7 +32,7 @@ from mlbatch.sensors.velodyne.models import (
     layout,
     ranks,
 )
-from mlbatch.types import Heads, Pixels
+from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import NS_PER_S
 
 VENDOR = "Velodyne"
@@ -131,7 +131,7 @@ class VelodyneLidar(BaseLidar):
         good = are_good(packets, self._model, self.returns)
         return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
 
-    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps and rotor words of all columns; all are valid."""
         azimuth = first_azimuths(packets, self._layout)
         speed, delay_ns = self._motion(azimuth)
@@ -145,7 +145,7 @@ class VelodyneLidar(BaseLidar):
         ) / CIRCLE_CDEG
         rotor_speed = speed if self._options.firing_azimuth else np.zeros_like(speed)
         revolutions_per_s = (rotor_speed * (NS_PER_S / CIRCLE_CDEG))[:, None]
-        return Heads(
+        return ColumnHeaders(
             stamp_ns, rotor_words(revolutions, revolutions_per_s), np.ones(shape, np.bool_)
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mlbatch.arrays import median
 from mlbatch.errors import RigError
-from mlbatch.lidar.interface import READABLE, Calibration, Evidence, SensorModel
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors.velodyne.clock import (
@@ -92,7 +92,7 @@ class VelodyneCalibration:
         rows = [row for row in ALL if row.name == name and row.lasers == self.row.lasers]
         return VelodyneCalibration(rows[0], self.file, is_named=True) if rows else None
 
-    def fit(self, evidence: Evidence) -> int:
+    def match_score(self, evidence: Evidence) -> int:
         """Match score of packets: by the model that they name, or by layout and pace."""
         seen = identify(evidence.size, evidence.sample)
         if seen is None or seen.banks != self.row.banks:
@@ -100,10 +100,10 @@ class VelodyneCalibration:
         # Only the rig names models that packets do not (Puck LITE, series of the HDL-64E).
         first = next((row for row in ALL if row.reported_as == seen.model), None)
         if first is None or first.reported_as != self.row.reported_as:
-            return READABLE if _is_paced(self.row, seen) else 0
+            return NAMED_ONLY if _is_paced(self.row, seen) else 0
         if self.file is not None:
             return _FITS_FILE
-        return _FITS_BYTES if first is self.row or self.is_named else READABLE
+        return _FITS_BYTES if first is self.row or self.is_named else NAMED_ONLY
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> VelodyneLidar:
         """Decoder of the sensor; RigError if its model needs a file."""
@@ -212,8 +212,8 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
     if where.sequences > 1 and len(packets):
         within = median(mean_step(*steps(azimuth))) / (sequence_ns * row.halves)
     speed = rotor_speed(stamp_ns, azimuth[:, 0], within) or 0.0
-    offset_ns = clock_offset_ns(packets, host_ns, evidence.beside)
-    return Measured(seen.mode, sequence_ns, offset_ns, speed, pulse(evidence.beside)), notes
+    offset_ns = clock_offset_ns(packets, host_ns, evidence.neighbours)
+    return Measured(seen.mode, sequence_ns, offset_ns, speed, pulse(evidence.neighbours)), notes
 
 
 def _identity_notes(row: Model, seen: Identity) -> list[str]:

@@ -198,7 +198,7 @@ def test_damaged_packets_have_a_bad_header(at: int, value: int) -> None:
     damaged[0, at] = value
     assert [FAULTS[number] for number in lidar.faults(damaged)] == ["bad_header", ""]
     # What is damaged is never a reason to stop.
-    assert lidar.heads(damaged, np.zeros(2, np.int64)).stamp_ns.shape == (2, 4)
+    assert lidar.column_headers(damaged, np.zeros(2, np.int64)).stamp_ns.shape == (2, 4)
 
 
 def test_every_block_of_a_pandar40p_bears_its_flag() -> None:
@@ -245,7 +245,7 @@ def test_optical_centre(body: F64Array | None) -> None:
     column, centre = 17, np.array([-0.012, 0.03873, 0.0])
     range_m = np.linspace(0.3, 60, 64).astype(np.float32)
     range_m[5] = 0.085
-    elevation, azimuth = np.radians(beams.prepare(np.zeros((1, 64)))[::-1])[:, 0]
+    elevation, azimuth = np.radians(beams.aim(np.zeros((1, 64)))[::-1])[:, 0]
     unit = np.stack(
         [
             np.cos(elevation) * np.sin(azimuth),
@@ -298,9 +298,9 @@ def test_fit_is_by_channels_then_by_where_beams_look() -> None:
     seen = evidence(packets)
     own = calibration(angles_csv(np.linspace(14.9, -24.9, 64).tolist(), [0.0] * 64))
     qt64 = calibration(angles_csv(np.linspace(-52.1, 52.1, 64).tolist(), [0.0] * 64))
-    assert own.fit(seen) > qt64.fit(seen) > 0
-    assert calibration(_beams(40)[1]).fit(seen) == 0
-    assert calibration(_beams(128, "AT128")[1]).fit(seen) == 0
+    assert own.match_score(seen) > qt64.match_score(seen) > 0
+    assert calibration(_beams(40)[1]).match_score(seen) == 0
+    assert calibration(_beams(128, "AT128")[1]).match_score(seen) == 0
     assert own.lidar({}, seen).notes == ()
     (note,) = qt64.lidar({}, seen).notes
     assert note == (
@@ -312,7 +312,7 @@ def test_fit_is_by_channels_then_by_where_beams_look() -> None:
 def test_packets_without_a_decoder_fit_nothing() -> None:
     packets = _encoded(HesaiSpec("XT32M2X"))[0].copy()
     packets[:, 802] = 0x40
-    assert calibration(_beams(32)[1]).fit(evidence(packets)) == 0
+    assert calibration(_beams(32)[1]).match_score(evidence(packets)) == 0
     assert hesai.describe(820, packets) == "HESAI lidar XT32M2X: no decoder in this version"
     assert hesai.describe(820, packets[:0]) is None
 

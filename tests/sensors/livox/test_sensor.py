@@ -160,18 +160,18 @@ def test_decoding_is_the_inverse_of_encoding(kind: int) -> None:
 def test_times_of_points() -> None:
     """480 us for 96 points: 5 us from one to the next, and on into the next packet."""
     _, _, packets = random_packets(LivoxSpec(), 2)
-    heads = sensor(packets).heads(packets, np.zeros(2, np.int64))
+    headers = sensor(packets).column_headers(packets, np.zeros(2, np.int64))
     wanted_ns = START_NS + 5000 * np.arange(192).reshape(2, 96)
-    assert np.array_equal(heads.stamp_ns, wanted_ns)
-    assert heads.valid.all()
-    assert not heads.encoder.any()
+    assert np.array_equal(headers.stamp_ns, wanted_ns)
+    assert headers.valid.all()
+    assert not headers.encoder.any()
 
 
 def test_times_that_points_do_not_divide_are_cut() -> None:
     """100 ns for 3 points: 0, 33.3, 66.7."""
     _, _, packets = random_packets(LivoxSpec(points=3, interval=1), 1)
-    heads = sensor(packets).heads(packets, np.zeros(1, np.int64))
-    assert (heads.stamp_ns[0] - START_NS).tolist() == [0, 33, 66]
+    headers = sensor(packets).column_headers(packets, np.zeros(1, np.int64))
+    assert (headers.stamp_ns[0] - START_NS).tolist() == [0, 33, 66]
 
 
 def test_attributes() -> None:
@@ -184,7 +184,7 @@ def test_attributes() -> None:
     assert lidar.timestamp_mode == "time since power-on"
     assert (lidar.return_types, lidar.imu_port, lidar.notes) == ((0, 0), 56401, ())
     assert lidar.pixel_layout != sensor(random_packets(LivoxSpec())[2]).pixel_layout
-    assert lidar.owns(packets).all()
+    assert lidar.sent_by_me(packets).all()
     assert [model.name for model in livox.MODELS] == ["Livox SDK2"]
 
 
@@ -236,8 +236,8 @@ def test_damaged_packets_are_rejected() -> None:
 def test_times_beyond_all_clocks_do_not_raise() -> None:
     _, _, packets = random_packets(LivoxSpec(), 2)
     packets[1, 28:36] = 0xFF
-    heads = sensor(packets).heads(packets, np.zeros(2, np.int64))
-    assert heads.stamp_ns[1, 0] == -1
+    headers = sensor(packets).column_headers(packets, np.zeros(2, np.int64))
+    assert headers.stamp_ns[1, 0] == -1
 
 
 def test_imu_samples() -> None:
@@ -262,14 +262,14 @@ def test_imu_samples() -> None:
 
 def test_fit() -> None:
     _, _, packets = random_packets(LivoxSpec(), 3)
-    assert CALIBRATION.fit(evidence(packets)) == 100
+    assert CALIBRATION.match_score(evidence(packets)) == 100
     packets[0] = 0xFF
-    assert CALIBRATION.fit(evidence(packets)) == 100
+    assert CALIBRATION.match_score(evidence(packets)) == 100
     packets[1] = 0xFF
-    assert CALIBRATION.fit(evidence(packets)) == 0
-    assert CALIBRATION.fit(evidence(packets[:0])) == 0
-    assert CALIBRATION.fit(evidence(livox2_packets(0, 24, 1))) == 0
-    assert CALIBRATION.fit(evidence(livox1_packets(2, 1362))) == 0
+    assert CALIBRATION.match_score(evidence(packets)) == 0
+    assert CALIBRATION.match_score(evidence(packets[:0])) == 0
+    assert CALIBRATION.match_score(evidence(livox2_packets(0, 24, 1))) == 0
+    assert CALIBRATION.match_score(evidence(livox1_packets(2, 1362))) == 0
     assert CALIBRATION.is_shared
 
 

@@ -180,12 +180,12 @@ def test_encode_then_decode_is_identity(
     packets = stacked(sent)
     assert packets.shape == (2, SIZES[spec.profile][spec.beams]) == (2, lidar.packet_size)
     assert lidar.faults(packets).tolist() == [0, 0]
-    assert lidar.owns(packets).all()
+    assert lidar.sent_by_me(packets).all()
     assert lidar.sequence(packets).tolist() == [frame * 64 + block, frame * 64 + block + 1]
-    heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
-    assert np.array_equal(heads.stamp_ns.ravel(), stamps)
-    assert np.array_equal(heads.encoder.ravel(), mids)
-    assert np.array_equal(heads.valid.ravel(), valid)
+    headers = lidar.column_headers(packets, np.zeros(len(packets), np.int64))
+    assert np.array_equal(headers.stamp_ns.ravel(), stamps)
+    assert np.array_equal(headers.encoder.ravel(), mids)
+    assert np.array_equal(headers.valid.ravel(), valid)
     for which, suffix in enumerate(("", "2")[: lidar.returns]):
         out = blank(shape)
         lidar.read(records_of(lidar, packets), which, out)
@@ -202,7 +202,7 @@ def two_packets(spec: OusterSpec, frame: int = 7, first: int = 0) -> U8Array:
 
 def test_columns_beyond_the_frame_are_not_valid() -> None:
     spec = OusterSpec(beams=16, columns_per_frame=512)
-    valid = lidar_of(spec).heads(two_packets(spec, first=496), np.zeros(2, np.int64)).valid
+    valid = lidar_of(spec).column_headers(two_packets(spec, first=496), np.zeros(2, np.int64)).valid
     assert valid.tolist() == [[True] * 16, [False] * 16]
 
 
@@ -246,7 +246,7 @@ def test_a_standard_packet_with_the_other_layout_is_read_by_its_serial_number() 
     sent = OusterSpec(beams=16, header="FUSA")
     lidar = lidar_of(result)
     packets = two_packets(sent, frame=65536 + 9)
-    assert lidar.owns(packets).all()
+    assert lidar.sent_by_me(packets).all()
     # The packets hold no checksum, as those of FUSA do.
     assert lidar.faults(packets).tolist() == [0, 0]
     assert lidar.sequence(packets).tolist() == [9 * 64, 9 * 64 + 1]
@@ -257,9 +257,9 @@ def test_packets_of_another_sensor_or_kind_are_distinguished() -> None:
     lidar = lidar_of(spec)
     packets = two_packets(spec)
     packets[1, 7] = 112
-    assert lidar.owns(packets).tolist() == [True, False]
+    assert lidar.sent_by_me(packets).tolist() == [True, False]
     packets[1, 7:12] = 0
-    assert lidar.owns(packets).tolist() == [True, True]
+    assert lidar.sent_by_me(packets).tolist() == [True, True]
     packets[0, 0] = 2
     assert lidar.faults(packets).tolist() == [2, 0]
 

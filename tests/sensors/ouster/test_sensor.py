@@ -52,15 +52,15 @@ def test_serial_numbers_decide_then_configuration_then_ports() -> None:
         replace(spec, serial=0),
         replace(spec, serial=0, init_id=6, lidar_port=7999, imu_port=7999),
     ]
-    fits = [calibration_of(candidate).fit(packets) for candidate in order]
+    fits = [calibration_of(candidate).match_score(packets) for candidate in order]
     assert fits == sorted(set(fits), reverse=True)
     assert fits[-1] > 0
-    assert calibration_of(replace(spec, serial=112)).fit(packets) == 0
+    assert calibration_of(replace(spec, serial=112)).match_score(packets) == 0
 
 
 def test_packets_without_serial_number_fit_any_unit() -> None:
     spec = OusterSpec(beams=16, serial=0, init_id=0)
-    assert calibration_of(replace(spec, serial=111)).fit(seen(packets_of(spec))) > 0
+    assert calibration_of(replace(spec, serial=111)).match_score(seen(packets_of(spec))) > 0
 
 
 def test_size_and_size_plus_one_fit() -> None:
@@ -68,10 +68,10 @@ def test_size_and_size_plus_one_fit() -> None:
     packets = packets_of(spec)
     longer = np.hstack([packets, np.zeros((2, 1), np.uint8)])
     calibration = calibration_of(spec)
-    assert calibration.fit(seen(packets)) == calibration.fit(seen(longer)) > 0
-    assert calibration.fit(seen(np.hstack([longer, longer[:, :1]]))) == 0
-    assert calibration.fit(seen(packets[:, :-1])) == 0
-    assert calibration.fit(seen(packets[:0])) == 0
+    assert calibration.match_score(seen(packets)) == calibration.match_score(seen(longer)) > 0
+    assert calibration.match_score(seen(np.hstack([longer, longer[:, :1]]))) == 0
+    assert calibration.match_score(seen(packets[:, :-1])) == 0
+    assert calibration.match_score(seen(packets[:0])) == 0
 
 
 @pytest.mark.parametrize("profile", ["LEGACY", "RNG15_RFL8_NIR8"])
@@ -79,7 +79,7 @@ def test_other_bytes_of_the_right_size_do_not_fit(profile: str) -> None:
     spec = OusterSpec(profile=profile, beams=16)
     shape = packets_of(spec).shape
     noise = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
-    assert calibration_of(spec).fit(seen(noise)) == 0
+    assert calibration_of(spec).match_score(seen(noise)) == 0
 
 
 def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:
@@ -87,7 +87,7 @@ def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:
     document["lidar_data_format"]["udp_profile_lidar"] = "OFF"
     found = read_content(Path("a.json"), json.dumps(document).encode())
     assert found is not None
-    assert found.fit(seen(np.ones((2, 256), np.uint8))) == 0
+    assert found.match_score(seen(np.ones((2, 256), np.uint8))) == 0
 
 
 @pytest.mark.parametrize("fill", ["zero", "ones", "noise", "counting", "two"])

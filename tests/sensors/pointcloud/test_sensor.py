@@ -56,7 +56,7 @@ def _lidar(calibration: Calibration = CLOUD, kind: int = 0) -> Lidar:
 
 def test_packets_tell_which_clouds_they_come_from() -> None:
     for kind, one in enumerate(BUILT_IN):
-        fits = [c.fit(_evidence(_packets(kind)[0])) for c in sensors.built_in()]
+        fits = [c.match_score(_evidence(_packets(kind)[0])) for c in sensors.built_in()]
         assert [c for c, fit in zip(sensors.built_in(), fits, strict=True) if fit] == [one]
         assert (one.model, one.path, one.serial, one.is_shared) == (
             *(MODELS[kind].name, None, ""),
@@ -72,16 +72,16 @@ def test_other_packets_are_not_recognised() -> None:
         wrong[:, at] = value
         others.append(wrong)
     for other in others:
-        assert CLOUD.fit(_evidence(other)) == 0
+        assert CLOUD.match_score(_evidence(other)) == 0
         assert sensors.describe(other.shape[1], other) is None or not len(other)
     # Whatever a datagram holds, it is no message of a topic.
-    assert CLOUD.fit(_evidence(packets, Stream("10.0.0.1", 2368))) == 0
+    assert CLOUD.match_score(_evidence(packets, Stream("10.0.0.1", 2368))) == 0
 
 
 def test_one_damaged_packet_hides_no_stream() -> None:
     packets, _ = _packets()
     packets[2] = 0
-    assert CLOUD.fit(_evidence(packets)) == 100
+    assert CLOUD.match_score(_evidence(packets)) == 100
 
 
 def test_streams_are_described() -> None:
@@ -109,7 +109,7 @@ def test_no_vendor_claims_cloud_packets(by_ring: bool) -> None:
         words = sensors.describe(packets.shape[1], packets)
         assert words is not None
         assert words.startswith("lidar points")
-        fits = {c.model: c.fit(_evidence(packets)) for c in sensors.built_in()}
+        fits = {c.model: c.match_score(_evidence(packets)) for c in sensors.built_in()}
         assert {model for model, fit in fits.items() if fit} == {"PointCloud2"}
 
 
@@ -125,9 +125,9 @@ def test_a_silent_topic_is_asked_for() -> None:
 def test_columns_have_the_stamp_of_their_points() -> None:
     packets, layout = _packets()
     lidar = _lidar()
-    heads = lidar.heads(packets, np.zeros(3, np.int64))
-    assert (heads.stamp_ns - STAMP_NS).tolist() == [[0], [50], [90]]
-    assert heads.valid.all()
+    headers = lidar.column_headers(packets, np.zeros(3, np.int64))
+    assert (headers.stamp_ns - STAMP_NS).tolist() == [[0], [50], [90]]
+    assert headers.valid.all()
     assert (lidar.packet_size, lidar.columns_per_packet) == (layout.size, 1)
     assert (lidar.channels, lidar.returns, lidar.return_types) == (2, 1, (0,))
     assert not lidar.firing_ns.any()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError, UsageError
-from mlbatch.lidar.interface import READABLE, Beside, Evidence, ModelFile
+from mlbatch.lidar.interface import NAMED_ONLY, Evidence, ModelFile, NeighbourStream
 from mlbatch.sensors import models
 from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.sensors.robosense.difop import Angles, find_difop
@@ -96,7 +96,7 @@ def test_device_packets_between_point_packets() -> None:
     evidence = replace(evidence_of(mixed), stream=Stream(topic="/rslidar_packets"))
     lidar = built_in(evidence).lidar({}, evidence)
     assert lidar.mode == "dual return"
-    assert lidar.owns(evidence.sample).tolist() == [False, *[True] * 4, False, *[True] * 4]
+    assert lidar.sent_by_me(evidence.sample).tolist() == [False, *[True] * 4, False, *[True] * 4]
 
 
 def test_damage_of_one_device_packet_does_no_harm() -> None:
@@ -130,8 +130,8 @@ def test_angles_are_asked_for(name: str) -> None:
         (
             replace(
                 _evidence(name, with_difop=False),
-                beside=(
-                    Beside(
+                neighbours=(
+                    NeighbourStream(
                         DIFOP, 1248, rows([filled(1248, {0: MAGIC, 1246: TAIL})]), np.zeros(1, int)
                     ),
                 ),
@@ -173,17 +173,21 @@ def test_options_are_checked() -> None:
 
 
 def _scores(evidence: Evidence) -> dict[str, int]:
-    return {one.model: one.fit(evidence) for one in robosense.BUILT_IN if one.fit(evidence)}
+    return {
+        one.model: one.match_score(evidence)
+        for one in robosense.BUILT_IN
+        if one.match_score(evidence)
+    }
 
 
 def test_models_that_could_read_packets_of_another() -> None:
     """Of one layout, and with a time that is one in the other's form."""
     assert _scores(_evidence("RS-32")) == {
-        "RS-LiDAR-16": READABLE,
+        "RS-LiDAR-16": NAMED_ONLY,
         "RS-LiDAR-32": 100,
-        "RS-Bpearl v3": READABLE,
+        "RS-Bpearl v3": NAMED_ONLY,
     }
-    assert _scores(_evidence("Ruby Plus 80")) == {"Ruby 80": READABLE, "Ruby Plus 80": 100}
+    assert _scores(_evidence("Ruby Plus 80")) == {"Ruby 80": NAMED_ONLY, "Ruby Plus 80": 100}
     assert _scores(_evidence("Bpearl v4")) == {"RS-Bpearl v4": 100}
     assert _scores(evidence_of([difop(RobosenseSpec("RS-32"), fan(RobosenseSpec("RS-32")))])) == {}
     assert _scores(evidence_of([bytes(1248)] * 3)) == {}
@@ -206,7 +210,7 @@ def test_a_rig_distinguishes_ruby_and_ruby_plus(model: str) -> None:
         assert isinstance(one, ModelFile)
         named = one.for_model(model)
         assert named is not None
-        assert named.fit(evidence) == score
+        assert named.match_score(evidence) == score
         lidar = named.lidar({}, evidence)
         assert (lidar.model, lidar.notes) == (model, ())
         assert one.for_model("Ruby 128") is None
@@ -244,8 +248,8 @@ def test_a_csv_of_angles() -> None:
         file = robosense.read_calibration(Path("folder/a.csv"), content)
         assert file is not None
         assert not file.is_shared
-        assert file.fit(_evidence("Helios 32", with_difop=False)) == 200
-        assert file.fit(_evidence("Helios 16", with_difop=False)) == 0
+        assert file.match_score(_evidence("Helios 32", with_difop=False)) == 200
+        assert file.match_score(_evidence("Helios 16", with_difop=False)) == 0
         evidence = _evidence("Helios 32")
         lidar, own = file.lidar({}, evidence), built_in(evidence).lidar({}, evidence)
         np.testing.assert_allclose(lidar.beams.direction, own.beams.direction, atol=1e-9)

@@ -96,8 +96,8 @@ def test_bytes_of_dual_return_packets(model: str, places: dict[int, str]) -> Non
 def test_dual_packets_of_128_lines_share_a_column() -> None:
     """Blocks: column 0 twice, column 1 | column 1, column 2 twice; times of columns 0 and 1."""
     first, second = packets("Ruby 128", DUAL, count=2)
-    heads = [[payload[at : at + 4].hex() for at in (80, 468, 856)] for payload in (first, second)]
-    assert heads == [["fe012328", "fe022328", "fe01233c"], ["fe02233c", "fe012350", "fe022350"]]
+    headers = [[payload[at : at + 4].hex() for at in (80, 468, 856)] for payload in (first, second)]
+    assert headers == [["fe012328", "fe022328", "fe01233c"], ["fe02233c", "fe012350", "fe022350"]]
     # 12007.999 + 55.55 us = 12063.549 us.
     assert (first[16:20].hex(), second[16:20].hex()) == ("00002ee7", "00002f1f")
     # The 385th reading begins the second packet.

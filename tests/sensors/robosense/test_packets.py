@@ -124,11 +124,11 @@ def test_damaged_packets_and_blocks() -> None:
     packets[4, 42 + 500] = 0  # id of block 5
     packets[5, 42 + 302] = 0xFF  # azimuth of block 3: 655 degrees
     assert lidar.faults(packets).tolist() == [0, 2, 2, 2, 0, 0]
-    heads = lidar.heads(packets, evidence.host_ns)
-    whole = lidar.heads(evidence.sample, evidence.host_ns)
-    assert heads.valid[4].tolist() == [block != 5 for block in range(12)]
-    assert heads.valid[5].tolist() == [block != 3 for block in range(12)]
-    np.testing.assert_array_equal(heads.stamp_ns[4:], whole.stamp_ns[4:])
+    headers = lidar.column_headers(packets, evidence.host_ns)
+    whole = lidar.column_headers(evidence.sample, evidence.host_ns)
+    assert headers.valid[4].tolist() == [block != 5 for block in range(12)]
+    assert headers.valid[5].tolist() == [block != 3 for block in range(12)]
+    np.testing.assert_array_equal(headers.stamp_ns[4:], whole.stamp_ns[4:])
 
 
 def test_an_azimuth_that_is_damaged_moves_no_times() -> None:
@@ -138,9 +138,9 @@ def test_an_azimuth_that_is_damaged_moves_no_times() -> None:
     lidar = built_in(evidence).lidar({}, evidence)
     packets = evidence.sample.copy()
     packets[5, 42 + 302] ^= 0x40
-    heads = lidar.heads(packets, evidence.host_ns)
+    headers = lidar.column_headers(packets, evidence.host_ns)
     np.testing.assert_array_equal(
-        heads.stamp_ns, lidar.heads(evidence.sample, evidence.host_ns).stamp_ns
+        headers.stamp_ns, lidar.column_headers(evidence.sample, evidence.host_ns).stamp_ns
     )
 
 
@@ -148,9 +148,9 @@ def test_heads_depend_on_their_packet_alone() -> None:
     spec = RobosenseSpec("Ruby Plus 80", DUAL, start_deg=359.0)
     evidence = evidence_of(_sent(spec, 9), [difop(spec, fan(spec))])
     lidar = built_in(evidence).lidar({}, evidence)
-    whole = lidar.heads(evidence.sample, evidence.host_ns)
+    whole = lidar.column_headers(evidence.sample, evidence.host_ns)
     for number in range(9):
-        alone = lidar.heads(evidence.sample[number : number + 1], evidence.host_ns[:1])
+        alone = lidar.column_headers(evidence.sample[number : number + 1], evidence.host_ns[:1])
         np.testing.assert_array_equal(alone.stamp_ns[0], whole.stamp_ns[number])
         np.testing.assert_array_equal(alone.encoder[0], whole.encoder[number])
 
@@ -164,7 +164,7 @@ def test_returns_of_128_lines_are_columns_of_one_time(name: str) -> None:
     assert (lidar.returns, lidar.return_types, lidar.columns_per_packet) == (1, (0,), 3)
     assert lidar.mode == "dual return, a column each"
     round_ns = {"Ruby 128": 55_550, "Ruby Plus 128": 55_560}[name]
-    stamp_ns = lidar.heads(evidence.sample, evidence.host_ns).stamp_ns
+    stamp_ns = lidar.column_headers(evidence.sample, evidence.host_ns).stamp_ns
     begun_ns = stamp_ns - stamp_ns[:, :1]
     assert begun_ns.tolist() == [[0, 0, round_ns], [0, round_ns, round_ns]] * 2
 
@@ -279,7 +279,7 @@ def test_point_packets_alone_tell_the_returns(name: str, mode: str) -> None:
     evidence = evidence_of([payload for _, payload in sent])
     file = robosense.read_calibration(Path("unit.csv"), angles_csv(fan(spec)).encode())
     assert file is not None
-    assert file.fit(evidence) == 200
+    assert file.match_score(evidence) == 200
     lidar = file.lidar({}, evidence)
     assert lidar.mode.startswith(f"{'dual' if mode == DUAL else 'single'} return")
     assert set(lidar.return_types) == {0}
@@ -323,7 +323,7 @@ def test_a_gap_in_the_field_of_view_takes_its_time(name: str, rpm: int, mode: st
     lidar = built_in(evidence).lidar({}, evidence)
     found = decoded(lidar, evidence.sample)
     _, columns = _by_shot(found, spec, lidar.returns)
-    within_ns = np.ptp(lidar.heads(evidence.sample, evidence.host_ns).stamp_ns, axis=1)
+    within_ns = np.ptp(lidar.column_headers(evidence.sample, evidence.host_ns).stamp_ns, axis=1)
     assert within_ns.max() > 30e9 / rpm
     late_ns = np.abs(found.time_ns - firing_times_ns(spec, columns))
     # A thousandth of the gap: the speed is known from steps of 0.01 degree.

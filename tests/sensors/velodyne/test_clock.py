@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from mlbatch.lidar.interface import Beside, Evidence
+from mlbatch.lidar.interface import Evidence, NeighbourStream
 from mlbatch.sensors.velodyne import sensor as velodyne
 from mlbatch.sensors.velodyne.clock import (
     HOUR_NS,
@@ -82,7 +82,7 @@ class TestHours:
         lidar = built_in("VLP-16").lidar(
             {}, Evidence(STREAM, 1206, sent.payloads[:16], host_ns[:16])
         )
-        stamp_ns = lidar.heads(sent.payloads, host_ns).stamp_ns.reshape(-1)
+        stamp_ns = lidar.column_headers(sent.payloads, host_ns).stamp_ns.reshape(-1)
         assert (np.diff(stamp_ns) > 0).all()
         away_ns = stamp_ns - firing_times_ns(spec, np.arange(len(stamp_ns)))[:, 0]
         assert set(np.rint(away_ns / HOUR_NS).tolist()) < {0.0, 1.0}
@@ -91,7 +91,9 @@ class TestHours:
         spec = VelodyneSpec("VLP-32C", start_us=3_599_990_000.0, host_ahead_ns=-900 * SECOND_NS)
         sent = random_packets(spec, 60)
         evidence = Evidence(STREAM, 1206, sent.payloads[:16], sent.host_ns[:16])
-        stamp_ns = built_in("VLP-32C").lidar({}, evidence).heads(sent.payloads, sent.host_ns)
+        stamp_ns = (
+            built_in("VLP-32C").lidar({}, evidence).column_headers(sent.payloads, sent.host_ns)
+        )
         wanted_ns = firing_times_ns(spec, np.arange(60 * 12))[:, 0]
         assert np.abs(stamp_ns.stamp_ns.reshape(-1) - wanted_ns).max() <= 500
 
@@ -100,8 +102,8 @@ class TestHours:
             sent = random_packets(VelodyneSpec("VLP-16", start_us=start_us), 30)
             host_ns = np.zeros(30, np.int64)
             evidence = Evidence(STREAM, 1206, sent.payloads[:16], host_ns[:16])
-            heads = built_in("VLP-16").lidar({}, evidence).heads(sent.payloads, host_ns)
-            assert (heads.stamp_ns >= 0).all()
+            headers = built_in("VLP-16").lidar({}, evidence).column_headers(sent.payloads, host_ns)
+            assert (headers.stamp_ns >= 0).all()
 
     def test_position_packets_override_receive_times(self) -> None:
         spec = VelodyneSpec("VLP-16", host_ahead_ns=-7 * HOUR_NS - 1234)
@@ -126,8 +128,8 @@ def test_what_positions_say_of_the_pulse() -> None:
     assert pulse([]) == ""
     # Packets of another size, and of the same size but of another kind.
     noise = np.random.default_rng(2).integers(0, 256, (3, 512), np.uint8)
-    other = Beside(STREAM, 1206, np.zeros((3, 1206), np.uint8), np.zeros(3, np.int64))
-    assert pulse([other, Beside(POSITIONS, 512, noise, np.zeros(3, np.int64))]) == ""
+    other = NeighbourStream(STREAM, 1206, np.zeros((3, 1206), np.uint8), np.zeros(3, np.int64))
+    assert pulse([other, NeighbourStream(POSITIONS, 512, noise, np.zeros(3, np.int64))]) == ""
 
 
 class TestSpeeds:
@@ -165,8 +167,8 @@ def times_ns() -> I64Array:
     return np.array([n * step for n in range(16)] + later, np.int64)
 
 
-def beside_of(sent: Sent) -> Beside:
-    return Beside(POSITIONS, 512, sent.payloads, sent.host_ns)
+def beside_of(sent: Sent) -> NeighbourStream:
+    return NeighbourStream(POSITIONS, 512, sent.payloads, sent.host_ns)
 
 
 def built_in(model: str) -> velodyne.VelodyneCalibration:

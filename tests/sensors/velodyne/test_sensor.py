@@ -11,7 +11,7 @@ import pytest
 
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar.geometry import read_rotor_words
-from mlbatch.lidar.interface import FAULTS, READABLE, Evidence, ModelFile
+from mlbatch.lidar.interface import FAULTS, NAMED_ONLY, Evidence, ModelFile
 from mlbatch.sensors.velodyne import sensor as velodyne
 from tests.builders.velodyne import (
     VelodyneSpec,
@@ -84,19 +84,19 @@ class TestEveryModel:
         order = np.argsort(seen.spec.table.elevation_deg, kind="stable")
         assert (lidar.channel[order] == np.arange(lidar.channels)).all()
         assert (lidar.firing_ns >= 0).all()
-        assert calibration(model).fit(evidence(seen.sent)) > 0
+        assert calibration(model).match_score(evidence(seen.sent)) > 0
         text = velodyne.describe(1206, seen.sent.payloads)
         assert text == f"Velodyne lidar {'HDL-64E' if is_hdl64 else model}, {lidar.mode}"
 
     def test_heads_do_not_depend_on_other_packets(self, model: str, mode: str) -> None:
         seen = made_of(VelodyneSpec(model, mode, blind_deg=(1.0, 200.0)), packets=30)
         packets, host_ns = seen.sent.payloads, seen.sent.host_ns
-        whole = seen.lidar.heads(packets, host_ns)
+        whole = seen.lidar.column_headers(packets, host_ns)
         # As the core keeps them: rows of a wider buffer.
         wide = np.zeros((len(packets), 1300), np.uint8)
         wide[:, :1206] = packets
         for rows in (slice(0, 1), slice(7, 19), slice(29, 30)):
-            part = seen.lidar.heads(wide[rows, :1206], host_ns[rows])
+            part = seen.lidar.column_headers(wide[rows, :1206], host_ns[rows])
             assert (part.stamp_ns == whole.stamp_ns[rows]).all()
             assert (part.encoder == whole.encoder[rows]).all()
 
@@ -104,7 +104,9 @@ class TestEveryModel:
 def test_second_half_of_a_block_is_turned_further() -> None:
     """600 rpm are 0.36 cdeg/us: half a block of the VLP-16 later, 19.9 cdeg further."""
     seen = made_of(VelodyneSpec("VLP-16"))
-    angle, _, _ = read_rotor_words(seen.lidar.heads(seen.sent.payloads, seen.sent.host_ns).encoder)
+    angle, _, _ = read_rotor_words(
+        seen.lidar.column_headers(seen.sent.payloads, seen.sent.host_ns).encoder
+    )
     step_cdeg = np.degrees(angle[:, 1::2] - angle[:, 0::2]) * 100
     assert step_cdeg == pytest.approx(0.36 * 55.296, abs=0.3)
 
@@ -113,12 +115,14 @@ def test_without_motion_during_a_firing() -> None:
     """Columns keep their angles and beams their times; only the speed is gone."""
     on = made_of(VelodyneSpec("VLP-32C"))
     off = made_of(VelodyneSpec("VLP-32C"), options={"firing_azimuth": "off"})
-    heads, still = (one.lidar.heads(one.sent.payloads, one.sent.host_ns) for one in (on, off))
-    (angle, speed, _), (rest, none, _) = map(read_rotor_words, (heads.encoder, still.encoder))
+    headers, still = (
+        one.lidar.column_headers(one.sent.payloads, one.sent.host_ns) for one in (on, off)
+    )
+    (angle, speed, _), (rest, none, _) = map(read_rotor_words, (headers.encoder, still.encoder))
     assert (angle == rest).all()
     assert speed == pytest.approx(2 * math.pi * 10 * 1e-9, rel=0.01)
     assert not none.any()
-    assert (heads.stamp_ns == still.stamp_ns).all()
+    assert (headers.stamp_ns == still.stamp_ns).all()
     assert (on.lidar.firing_ns == off.lidar.firing_ns).all()
 
 
@@ -176,16 +180,16 @@ def test_a_rotor_at_rest_has_no_speed_and_no_blind_sector() -> None:
     packets = seen.sent.payloads.copy()
     # It jitters around zero.
     packets[:, 102:104] = np.frombuffer((35999).to_bytes(2, "little"), np.uint8)
-    heads = seen.lidar.heads(packets, seen.sent.host_ns)
-    assert (np.diff(heads.stamp_ns, axis=1) == 55_296).all()
-    _, speed, _ = read_rotor_words(heads.encoder)
+    headers = seen.lidar.column_headers(packets, seen.sent.host_ns)
+    assert (np.diff(headers.stamp_ns, axis=1) == 55_296).all()
+    _, speed, _ = read_rotor_words(headers.encoder)
     assert np.abs(speed).max() < 2 * math.pi * 1e-9 * 0.1
 
 
 def test_a_rig_may_name_what_packets_do_not() -> None:
     sent = made_of(VelodyneSpec("VLP-16")).sent
-    fits = {one.model: one.fit(evidence(sent)) for one in velodyne.BUILT_IN}
-    readable = dict.fromkeys(("Puck LITE", "Puck Hi-Res"), READABLE)
+    fits = {one.model: one.match_score(evidence(sent)) for one in velodyne.BUILT_IN}
+    readable = dict.fromkeys(("Puck LITE", "Puck Hi-Res"), NAMED_ONLY)
     # Blocks of an HDL-32E and a VLP-32C take half as long.
     others = dict.fromkeys(("HDL-32E", "VLP-32C", "VLS-128", "HDL-64E S2", "HDL-64E S3"), 0)
     assert fits == {"VLP-16": 100, **others, **readable}
@@ -193,9 +197,9 @@ def test_a_rig_may_name_what_packets_do_not() -> None:
     assert lite.lidar({}, evidence(sent)).model == "Puck LITE"
     files = [one for one in velodyne.BUILT_IN if isinstance(one, ModelFile)]
     named = [one.for_model(one.model) for one in files]
-    fits = {one.model: one.fit(evidence(sent)) for one in named if one is not None}
+    fits = {one.model: one.match_score(evidence(sent)) for one in named if one is not None}
     # VLP-16 and Puck LITE send the same; the Puck Hi-Res has its own product byte.
-    assert fits == {"VLP-16": 100, **others, "Puck LITE": 100, "Puck Hi-Res": READABLE}
+    assert fits == {"VLP-16": 100, **others, "Puck LITE": 100, "Puck Hi-Res": NAMED_ONLY}
 
 
 @pytest.mark.parametrize("product", [0x23, 0x31, 0x99])
@@ -204,14 +208,14 @@ def test_models_without_tables_are_never_taken_for_others(product: int) -> None:
     packets = seen.sent.payloads.copy()
     packets[:, 1205] = product
     part = Evidence(STREAM, 1206, packets, seen.sent.host_ns)
-    assert {one.fit(part) for one in velodyne.BUILT_IN} == {0, READABLE}
+    assert {one.match_score(part) for one in velodyne.BUILT_IN} == {0, NAMED_ONLY}
     assert "no decoder in this version" in str(velodyne.describe(1206, packets))
 
 
 def test_a_product_byte_contradicted_by_the_pace_is_noted() -> None:
     spec = VelodyneSpec("VLP-16", product=0x21)
     sent = encode(spec, *np.ones((2, 16 * spec.columns_per_packet, 16, 1), np.int64))
-    fits = {one.model: one.fit(evidence(sent)) for one in velodyne.BUILT_IN}
+    fits = {one.model: one.match_score(evidence(sent)) for one in velodyne.BUILT_IN}
     assert fits["VLP-16"] == 100
     assert fits["HDL-32E"] == 0
     (note,) = calibration("VLP-16").lidar({}, evidence(sent)).notes
@@ -266,13 +270,13 @@ def test_points_of_a_hdl_64e(model: str, mode: str) -> None:
     expected = origins(spec, seen.columns)
     expected = expected + met_m[..., None] * directions(spec, seen.columns)
     ranges, _ = pixels(seen.lidar, seen.sent.payloads)
-    heads = seen.lidar.heads(seen.sent.payloads, seen.sent.host_ns)
+    headers = seen.lidar.column_headers(seen.sent.payloads, seen.sent.host_ns)
     for height, options in ((0.0, {}), (1.0, {"vertical_offset": "off"})):
         lidar = calibration(model).lidar(options, evidence(seen.sent))
         projection = lidar.projection(np.eye(4), len(ranges))
         assert projection is not None
         points = np.empty((*met_m.shape, 3), np.float32)
-        projection.prepare(np.zeros(len(ranges), np.int64), heads.encoder.reshape(-1))
+        projection.prepare(np.zeros(len(ranges), np.int64), headers.encoder.reshape(-1))
         projection.project(np.ascontiguousarray(ranges[..., 0]), points)
         lowered = expected - [0, 0, height] * np.array(spec.table.vertical_m)[:, None]
         away_m = np.linalg.norm(points - lowered, axis=-1)
@@ -309,10 +313,10 @@ def test_the_model_is_the_one_with_the_nearest_angles() -> None:
 
 def test_a_file_beats_the_table_of_its_model() -> None:
     seen = made_of(VelodyneSpec("VLP-16"))
-    for model, fit in (("VLP-16", 200), ("Puck Hi-Res", READABLE), ("VLS-128", 0)):
+    for model, fit in (("VLP-16", 200), ("Puck Hi-Res", NAMED_ONLY), ("VLS-128", 0)):
         read = velodyne.read_calibration(Path("a.yaml"), calibration_yaml(model).encode())
         assert read is not None
-        assert read.fit(evidence(seen.sent)) == fit
+        assert read.match_score(evidence(seen.sent)) == fit
 
 
 def test_its_angles_and_offsets_are_used() -> None:
@@ -369,7 +373,7 @@ def test_a_hdl_64e_is_an_s3_until_the_rig_names_s2() -> None:
     assert read is not None
     sent = made_of(VelodyneSpec("HDL-64E S3")).sent
     assert read.model == "HDL-64E S3"
-    assert read.fit(evidence(sent)) == 200
+    assert read.match_score(evidence(sent)) == 200
     (note,) = read.lidar({}, evidence(sent)).notes
     assert note == "assumed to be an HDL-64E S3; if it is an HDL-64E S2, name its model in the rig"
     other = read.for_model("HDL-64E S2")
@@ -380,10 +384,10 @@ def test_a_hdl_64e_is_an_s3_until_the_rig_names_s2() -> None:
 
 def test_a_hdl_64e_needs_one() -> None:
     sent = made_of(VelodyneSpec("HDL-64E S3")).sent
-    fits = {one.model: one.fit(evidence(sent)) for one in velodyne.BUILT_IN}
+    fits = {one.model: one.match_score(evidence(sent)) for one in velodyne.BUILT_IN}
     assert {model: fit for model, fit in fits.items() if fit} == {
         "HDL-64E S3": 100,
-        "HDL-64E S2": READABLE,
+        "HDL-64E S2": NAMED_ONLY,
     }
     expected = "HDL-64E: expected its calibration, found none; give the unit's YAML or db.xml with"
     for one in velodyne.BUILT_IN:
