@@ -1,4 +1,4 @@
-"""The ring of raw packets: what was stored at a place is found there while it is needed."""
+"""The ring of raw packets: stored columns are found at their ring index while they are needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mlbatch.lidar.interface import Records
 
 @dataclass
 class Stored:
-    """A ring beside a plain dictionary of what each place holds."""
+    """A ring, and the expected column of each ring index in a dictionary."""
 
     packet_size: int
     record_start: int
@@ -32,7 +32,7 @@ class Stored:
         )
 
     def store(self, count: int, gap: int = 0) -> U8Array:
-        """Store packets that lie `gap` bytes apart in a batch; give what the ring shows of them."""
+        """Store packets that are `gap` bytes apart in a batch; return the view of the ring."""
         rng = np.random.default_rng(self.count)
         stride = self.packet_size + gap
         data = rng.integers(0, 256, max(1, count * stride), np.uint8)

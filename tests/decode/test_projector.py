@@ -1,4 +1,4 @@
-"""Turning sensors that are decoded together: their points are those of each one alone."""
+"""Sensors with rotor words decoded together give the same points as each one alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NONE = np.empty((0, 6))
 
 @dataclass
 class Sensor:
-    """A sensor whose columns lie in its ring."""
+    """A sensor with its columns in its ring."""
 
     source: Source
     stamp_ns: I64Array

@@ -325,7 +325,7 @@ def test_packets_of_other_sizes_do_not_matter() -> None:
         assert Counter(alone) <= Counter(together)
 
 
-def test_a_delay_holds_the_packets_of_its_length() -> None:
+def test_a_delay_keeps_the_packets_of_its_length_in_memory() -> None:
     """25 of 1000 packets wait, one per millisecond."""
     replay = FaultReplay([parse_fault("delay:left:25ms")], 0, NAMES)
     most, read, given_packets = 0, 0, 0

@@ -24,7 +24,7 @@ NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # One reading in so many has a return.
 SPARSE = 16
-ARRIVAL_STEP_NS = 10_000
+RECEIVE_STEP_NS = 10_000
 
 OUSTER = OusterSpec(beams=16, columns_per_frame=512, serial=111)
 OUSTER_STEP_NS = 100 * NS_PER_MS // OUSTER.columns_per_frame
@@ -92,8 +92,8 @@ def _sent(
     """A packet is received 0.3 ms after its last column."""
     shape = len(payloads), -1
     stamps = stamp_ns.reshape(shape)
-    arrival = stamps[:, -1] + 300_000 + spell.ahead_ns
-    host_ns = -(-arrival // ARRIVAL_STEP_NS) * ARRIVAL_STEP_NS
+    receive_ns = stamps[:, -1] + 300_000 + spell.ahead_ns
+    host_ns = -(-receive_ns // RECEIVE_STEP_NS) * RECEIVE_STEP_NS
     points = np.count_nonzero(ranges.reshape(len(stamp_ns), -1), axis=1).reshape(shape)
     return Sent(vendor, tuple(payloads), host_ns, stamps, points)
 
@@ -163,8 +163,8 @@ def robosense_helios16(spell: Spell) -> Sent:
 class Vendor:
     """A lidar of the matrix.
 
-    begin_ns: its first turn after the others'; wrap: its own count of packets at the begin of a
-    spell of 0.25 s in which it wraps, 0: it has none.
+    begin_ns: begin of its first revolution after that of the others; wrap: its own count of packets
+    at the begin of a spell of 0.25 s in which it wraps, 0: it has none.
     """
 
     send: Callable[[Spell], Sent]

@@ -1,4 +1,4 @@
-"""Decoding kernels on pixels of any bytes: the same as numpy, and nothing else is written to."""
+"""Decoding kernels on pixels of any bytes: equal to numpy, and no writes beyond the arrays."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
-    """Lidars of other makers."""
+    """Lidars of other vendors."""
     found = []
     for make, words in OTHERS:
         job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
@@ -83,7 +83,7 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is drawn: everything else follows from the seed."""
+    """Drawn values; everything else follows from the seed."""
 
     seed: int
     columns: int
@@ -105,7 +105,7 @@ cases = st.builds(
 
 
 class Guarded(ScanBuffer):
-    """A buffer amid memory that nobody may touch."""
+    """A scan buffer between guard rows that nothing may write to."""
 
     def __init__(self, rows: int, slots: int | None) -> None:
         super().__init__(rows, slots)
@@ -133,7 +133,7 @@ def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArra
 
 
 def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array]:
-    """A ring that was gone around, and the places of columns that it still holds."""
+    """A ring that has wrapped, and the ring indexes of the columns that it contains."""
     ring = PacketRing(lidar.packet_size, lidar.records)
     places: I64Array = np.empty(0, np.int64)
     for _ in range(4):
