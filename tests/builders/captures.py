@@ -203,7 +203,7 @@ class Other:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A pcapng section; interfaces may also stand among the blocks."""
+    """A pcapng section; interface blocks may also be among the others."""
 
     blocks: Sequence[Packet | Other | Interface] = ()
     interfaces: Sequence[Interface] = field(default_factory=lambda: [Interface()])

@@ -30,7 +30,7 @@ _CHANNELS = 128
 # Layers of space, in which every sensor has some points.
 BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
 _CUT = Job((), min_range_m=2.0, max_range_m=5.0, boxes_m=BOXES_M)
-# What may be wanted of the same columns: all layouts, extras, and reasons to leave points out.
+# Jobs on the same columns: all layouts, extras, and reasons to leave points out.
 WANTED = (
     Job((), extras=EXTRAS),
     Job((), extras=frozenset(), keep_repeated=True),
@@ -81,7 +81,7 @@ def assert_same(one: Scan, other: Scan) -> None:
 
 
 def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
-    """Decode all windows of a job by both engines, in all ways that are wanted."""
+    """Decode all windows of a job by both engines, with the settings of each of `wanted`."""
     run = Conversion(job)
     pairs: list[Pair] = []
     for task in run.tasks():

@@ -2,7 +2,7 @@
 
 Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
 (JT16); rows of the models: `hesai_models.py`, angles: `hesai_angles.py`. Column k is the k-th group
-of blocks that share an azimuth; the rotor turns evenly.
+of blocks that share an azimuth; the rotor has constant speed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SINGLE, DUAL, TRIPLE = 0x37, 0x39, 0x3D
 _RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x3D: 3}
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-# From the last shot to the arrival of the packet.
+# From the last shot to the receive time of the packet.
 _TRAVEL_NS = 40_000
 
 
@@ -116,7 +116,7 @@ def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
 
 
 def azimuths_deg(spec: HesaiSpec, columns: int) -> F64Array:
-    """(n,) rotor angles as the packets hold them."""
+    """(n,) rotor angles as in the packets."""
     step_deg = float(spec.row.step_ns) * spec.rpm * 6e-9
     units = np.rint((spec.start_deg + np.arange(columns) * step_deg) * spec.row.units_per_deg)
     wrapped: F64Array = units % (360 * spec.row.units_per_deg) / spec.row.units_per_deg
@@ -138,7 +138,7 @@ def offsets_ns(spec: HesaiSpec, columns: int) -> I64Array:
 def fires(spec: HesaiSpec, columns: int) -> BoolArray:
     """(n, channels) which beams fire in a column."""
     offsets = offsets_ns(spec, columns)
-    # Tables that count back never hold -1 ns.
+    # Tables that count back never contain -1 ns.
     return np.asarray(offsets != NEVER)
 
 
@@ -150,16 +150,16 @@ def firing_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
 
 
 def host_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
-    """(P,) arrival: after the packet's last shot and its time."""
+    """(P,) receive times, ns: after the packet's last shot and its time."""
     last = firing_times_ns(spec, packets * spec.groups).reshape(packets, -1).max(axis=1)
-    arrival: I64Array = np.maximum(last, packet_times_ns(spec, packets)) + _TRAVEL_NS
-    return arrival
+    receive_ns: I64Array = np.maximum(last, packet_times_ns(spec, packets)) + _TRAVEL_NS
+    return receive_ns
 
 
 def directions(spec: HesaiSpec, beams: Beams, columns: int, *, turning: bool = True) -> F64Array:
     """(n, channels, 3) unit vectors at each beam's firing, in HESAI's frame: x right, y forward.
 
-    turning: the rotor goes on while the beams of a column fire.
+    turning: the rotor moves while the beams of a column fire.
     """
     rotor = np.repeat(azimuths_deg(spec, columns)[:, None], spec.row.channels, axis=1)
     if turning:
@@ -190,11 +190,11 @@ def encode_packets(
     blocks[..., row.azimuth_at : row.azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
     if row.lead == 3:
         blocks[..., 2] = fine[:, None]
-    wanted = fires(spec, columns)[:, :, None]
+    fired = fires(spec, columns)[:, :, None]
     body = blocks[..., row.lead :].reshape(columns, spec.returns, row.channels, row.unit)
-    body[..., :2] = _bytes_of(np.where(wanted, ranges, 0).transpose(0, 2, 1), "<u2")
+    body[..., :2] = _bytes_of(np.where(fired, ranges, 0).transpose(0, 2, 1), "<u2")
     if levels is not None:
-        body[..., 2] = np.where(wanted, levels, 0).transpose(0, 2, 1)
+        body[..., 2] = np.where(fired, levels, 0).transpose(0, 2, 1)
     blocks[..., row.lead :] = body.reshape(columns, spec.returns, -1)
     bodies = blocks.reshape(packets, -1)
     assemble = _jt16 if spec.model == "JT16" else _assembled
@@ -260,7 +260,7 @@ def date_field(time_ns: int, form: str) -> bytes:
     year = date.year - (1900 if form == SINCE_1900 else 2000)
     # The reader takes 70 and more as after 1900.
     if not (70 <= year < 256 if form == SINCE_1900 else 0 < year < 70):
-        raise ValueError(f"{date.year} cannot be told as {form}")
+        raise ValueError(f"expected a year that {form} can encode, found {date.year}")
     return bytes([year, date.month, date.day, date.hour, date.minute, date.second])
 
 

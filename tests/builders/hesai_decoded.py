@@ -74,7 +74,7 @@ def calibration(content: bytes, name: str = "unit.csv") -> Calibration:
 
 
 def decode(packets: U8Array, content: bytes, options: Mapping[str, str] | None = None) -> Decoded:
-    """All that packets (P, size) of one sensor hold; content: its angle file."""
+    """All columns of the packets (P, size) of one sensor; content: its angle file."""
     lidar = calibration(content).lidar(options or {}, evidence(packets))
     assert not lidar.faults(packets).any()
     records, count = lidar.records, len(packets) * lidar.columns_per_packet

@@ -172,7 +172,7 @@ TABLES: Mapping[str, I64Array] = {
     "JT128": firing.JT128,
     "JT16": np.zeros(16, np.int64),
 }
-# Models whose packets say which table holds, by operation mode and azimuth state.
+# Models whose packets select the firing table, by operation mode and azimuth state.
 STATES: Mapping[str, Mapping[tuple[str, int], I64Array]] = {
     "Pandar128E3X": firing.E128,
     "OT128": firing.OT128,

@@ -64,7 +64,7 @@ def packet(
 def point_packets(
     spec: LivoxSpec, coordinates: I64Array, levels: I64Array
 ) -> list[tuple[int, bytes]]:
-    """(arrival in ns, payload) of n points, n a multiple of the points of a packet.
+    """(receive time in ns, payload) of n points, n a multiple of the points of a packet.
 
     coordinates: (n, returns, 3) raw; levels: (n, returns).
     """
@@ -81,8 +81,8 @@ def point_packets(
             frame -= counter if spec.shares_stamp else 0
         stamp_ns = spec.start_ns + frame * interval_ns
         payload = packet(spec, data, stamp_ns, counter % 65536, kind=spec.kind, points=spec.points)
-        arrival_ns = spec.start_ns + (number + 1) * interval_ns + spec.latency_ns
-        sent.append((arrival_ns, payload))
+        receive_ns = spec.start_ns + (number + 1) * interval_ns + spec.latency_ns
+        sent.append((receive_ns, payload))
     return sent
 
 

@@ -45,7 +45,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a file is made; ros: 1 or 2; summary: False leaves out all that stands behind the data.
+    """How a file is made; ros: 1 or 2; summary: False omits all sections after the data.
 
     repeat: schemas and channels that the summary names as well.
     """
@@ -98,7 +98,7 @@ class Packet:
 
 @lru_cache(maxsize=1)
 def fixture_packets() -> tuple[Packet, ...]:
-    """Lidar and IMU packets of the fixture's pcap, in the order of their arrival."""
+    """Lidar and IMU packets of the fixture's pcap, in the order of their receive times."""
     streams = StreamTable()
     found = []
     for batch in open_recording(FOLDER / "two_lidars.pcap", streams).packets():

@@ -45,7 +45,7 @@ IMU_MM = [1.0, 0.0, 0.0, 6.253, 0.0, 1.0, 0.0, -11.775, 0.0, 0.0, 1.0, 7.645, 0.
 
 @dataclass(frozen=True)
 class OusterSpec:
-    """A sensor to imitate; angles default to an even fan, window to the whole turn."""
+    """A sensor to imitate; angles default to an even fan, window to the whole revolution."""
 
     profile: str = "RNG15_RFL8_NIR8"
     beams: int = 128
@@ -146,7 +146,7 @@ def _data_format(spec: OusterSpec) -> JsonObject:
 
 
 def flat_json(spec: OusterSpec) -> JsonObject:
-    """The same sensor as firmware 2.2 and 2.3 tells of it: all keys at the top."""
+    """The metadata of the same sensor as of firmware 2.2 and 2.3: all keys at the top."""
     nested = metadata_json(spec)
     document: JsonObject = {
         "lidar_mode": nested["config_params"]["lidar_mode"],
@@ -201,7 +201,7 @@ def encode_packets(
 def encode_frame(
     spec: OusterSpec, first_stamp_ns: int, frame_id: int, ranges_mm: IntLike
 ) -> list[bytes]:
-    """A whole turn of evenly timed columns; ranges_mm: (columns per frame, beams, returns)."""
+    """A revolution of evenly timed columns; ranges_mm: (columns per frame, beams, returns)."""
     columns = spec.columns_per_frame
     mids = np.arange(columns)
     names = ("RANGE", "RANGE2")[: ranges_mm.shape[2]]
@@ -263,6 +263,6 @@ def _write_headers(spec: OusterSpec, payloads: U8Array, kind: int, frame_ids: In
     ):
         for byte in range(size):
             payloads[:, first + byte] = (values >> (8 * byte)) & 0xFF
-    # FUSA footers hold no checksum.
+    # FUSA footers have no checksum.
     if spec.with_crc and spec.header_type != FUSA:
         payloads[:, -8:] = crc64(payloads[:, :-8]).astype("<u8").view(np.uint8).reshape(-1, 8)

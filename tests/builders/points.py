@@ -107,7 +107,7 @@ def custom_message(
 def write_points(
     topic: str, messages: Sequence[bytes], kind: str = CLOUD, step_ns: int = 100_000_000
 ) -> list[Recorded]:
-    """Messages of a topic as a recorder gets them, each `step_ns` after the one before."""
+    """Recorded messages of a topic, each `step_ns` after the one before."""
     return [
         Recorded(topic, kind, STAMP_NS + (number + 1) * step_ns, data)
         for number, data in enumerate(messages)
@@ -138,7 +138,7 @@ class Column:
 
 
 def read_packets(packets: U8Array) -> list[Column]:
-    """What packets (P, size) hold, by the layout that `_cloud_packets` states."""
+    """Contents of packets (P, size), by the layout that `_cloud_packets` states."""
     found = []
     for packet in packets:
         data = packet.tobytes()

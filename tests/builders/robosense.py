@@ -1,8 +1,8 @@
-"""Encoder of ROBOSENSE packets: what a turning lidar would send, from plain raw values.
+"""Encoder of ROBOSENSE packets: packets of a spinning lidar from plain raw values.
 
-Source: docs/sources/robosense.md sections 1 to 7. A rotor that turns evenly fires a round of all
-channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + what the
-rotor turns meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a
+Source: docs/sources/robosense.md sections 1 to 7. A rotor of constant speed fires a round of all
+channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + the
+rotation of the rotor meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a
 decoder.
 """
 
@@ -38,7 +38,7 @@ class RobosenseSpec:
 
     model: a name of MODELS; mode: strongest, last, nearest or dual; start_deg: azimuth of round 0;
     view_deg: where it measures, clockwise from the first to the second; is_reversed: the rotor
-    turns the other way (Bpearl: its packets then count 360 - azimuth); mount: of an Airy.
+    rotates the other way (Bpearl: its packets then count 360 - azimuth); mount: of an Airy.
     """
 
     model: str
@@ -119,9 +119,9 @@ def rounds(spec: RobosenseSpec, columns: I64Array) -> I64Array:
 
 
 def firing_times_ns(spec: RobosenseSpec, columns: I64Array) -> I64Array:
-    """(n, channels) of all firings, as far as packets tell: their time is cut to whole us.
+    """(n, channels) of all firings, as in the packets: their time is cut to whole us.
 
-    The second return of a column that two packets share may be told 1 us apart.
+    The second return of a column that two packets share may differ by 1 us.
     """
     own = rounds(spec, columns)
     first = rounds(spec, _first_columns(spec, columns))
@@ -153,7 +153,7 @@ def origins(spec: RobosenseSpec, columns: I64Array) -> F64Array:
 
 
 def msop(spec: RobosenseSpec, ranges: I64Array, levels: I64Array) -> list[tuple[int, bytes]]:
-    """(arrival in ns, payload) of the packets that hold these columns, in their order.
+    """(receive time in ns, payload) of the packets of these columns, in their order.
 
     ranges, levels: (columns, channels, returns) raw, as on the wire (Airy: with the flag bits);
     columns have to fill whole packets.
@@ -216,13 +216,13 @@ def difop(
 
 
 def angles_csv(angles: Angles) -> str:
-    """The maker's file of angles: a line a channel, elevation and azimuth in degrees."""
+    """The vendor's file of angles: a line a channel, elevation and azimuth in degrees."""
     pairs = np.stack([angles.elevation_deg, angles.azimuth_deg], axis=1).tolist()
     return "".join(f"{up:.4f},{aside:.4f}\n" for up, aside in pairs)
 
 
 def _step_deg(spec: RobosenseSpec) -> float:
-    """What the rotor turns in a round; a minute has 6e10 ns."""
+    """Rotation in a round; a minute has 6e10 ns."""
     return spec.rpm * 360.0 * spec.round_ns / 6e10
 
 

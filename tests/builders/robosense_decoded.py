@@ -24,12 +24,12 @@ def evidence_of(
     """Point packets on port 6699, device packets on port 7788 of one source."""
     sample = rows(points)
     receive_ns = np.arange(len(points)) * 1_000_000 if host_ns is None else host_ns
-    beside = tuple(
+    neighbours = tuple(
         NeighbourStream(DIFOP, len(difop), rows([difop]), receive_ns[:1]) for difop in difops[:1]
     )
     if len(difops) > 1:
-        beside = (NeighbourStream(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
-    return Evidence(MSOP, sample.shape[1], sample, receive_ns, beside)
+        neighbours = (NeighbourStream(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
+    return Evidence(MSOP, sample.shape[1], sample, receive_ns, neighbours)
 
 
 def built_in(evidence: Evidence) -> robosense.DifopCalibration:

@@ -22,17 +22,17 @@ def write_rosbag1(
     chunk_bytes: int = 100_000,
     callers: int = 1,
 ) -> Path:
-    """A bag; callers: publishers that take turns on every topic."""
+    """A bag; callers: publishers that alternate on every topic."""
     writer = Writer(path)
     if compression != "none":
         writer.set_compression(Writer.CompressionFormat[compression.upper()])
     writer.chunk_threshold = chunk_bytes
     connections = {}
-    turns: dict[str, int] = {}
+    written: dict[str, int] = {}
     with writer:
         for message in messages:
-            turn = turns[message.topic] = turns.get(message.topic, -1) + 1
-            key = message.topic, turn % callers
+            number = written[message.topic] = written.get(message.topic, -1) + 1
+            key = message.topic, number % callers
             if key not in connections:
                 package, name = message.type.split("/")
                 connections[key] = writer.add_connection(

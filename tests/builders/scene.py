@@ -2,7 +2,7 @@
 
 Body frame of the machine, metres: x forward, y left, z up, floor at z = 0. All surfaces are
 rectangles or upright cylinders, so a ray meets them in closed form (plane and quadratic equation);
-nothing is sampled. The law for tests: a measured point lies within the sensor's range resolution
+nothing is sampled. The law for tests: a measured point is within the sensor's range resolution
 of a surface (`distance_to_surfaces`).
 """
 
@@ -68,7 +68,7 @@ class Rectangle:
 
 @dataclass(frozen=True, slots=True)
 class Pillar:
-    """The mantle of an upright cylinder that stands on the floor."""
+    """The mantle of an upright cylinder on the floor."""
 
     x: float
     y: float
@@ -77,7 +77,7 @@ class Pillar:
     reflectivity: int
 
     def cast(self, origins: F64Array, directions: F64Array) -> F64Array:
-        """The nearer root of the quadratic equation, if it lies between floor and top."""
+        """The nearer root of the quadratic equation, if it is between floor and top."""
         away = origins[:, :2] - (self.x, self.y)
         flat = directions[:, :2]
         a = (flat**2).sum(axis=1)
@@ -107,7 +107,7 @@ class Pillar:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Surfaces that stand still."""
+    """Static surfaces."""
 
     surfaces: tuple[Surface, ...]
 

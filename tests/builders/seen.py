@@ -1,7 +1,7 @@
-"""What lidars of all makers see of a scene: their packets, and what a conversion must make of them.
+"""Packets of lidars of all vendors in a scene, and the expected points of their conversion.
 
 The encoders (`velodyne.py`, `hesai.py`, `robosense.py`, `two_lidars.py`) lay out bytes; here their
-rays meet the scene, and times are what their packets tell. Nothing of a decoder is used.
+rays meet the scene, and times are those of their packets. Nothing of a decoder is used.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from tests.builders import hesai, robosense, two_lidars, velodyne
 from tests.builders.hesai_angles import Beams
 from tests.builders.scene import Scene
 
-# Arrival in ns, and payload.
+# Receive time in ns, and payload.
 Payloads: TypeAlias = list[tuple[int, bytes]]
 # Behind a near surface every third column sees another one, as a beam does that an edge cuts.
 _EDGE_EVERY, _EDGE_M = 3, 7.0
 _PAST_M = 1e-6
 _HOUR_NS = 3_600_000_000_000
 # Packets count the azimuth in 0.01 degrees. Half of that is its own rounding; as much again may be
-# what the few azimuths of a packet get wrong of the speed at which the rotor goes on from there.
+# the error of the rotor speed that the few azimuths of a packet give.
 ASIDE_PER_M = 1.75e-4
 _AIRY_FLAG = 0x4000
 
@@ -116,10 +116,11 @@ def pose(
     """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (docs/rig.md)."""
     matrix = np.eye(4)
     for (one, other), angle in zip(((1, 2), (2, 0), (0, 1)), np.radians(rpy_deg), strict=True):
-        turn = np.eye(4)
-        turn[one, one] = turn[other, other] = np.cos(angle)
-        turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
-        matrix = turn @ matrix
+        rotation = np.eye(4)
+        rotation[one, one] = rotation[other, other] = np.cos(angle)
+        rotation[other, one] = np.sin(angle)
+        rotation[one, other] = -np.sin(angle)
+        matrix = rotation @ matrix
     matrix[:3, 3] = translation_m
     return matrix
 
@@ -166,7 +167,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
     fires_ns = hesai.firing_times_ns(spec, columns)
     never = np.iinfo(np.int64).max
     payloads = hesai.encode_packets(spec, counts, level)
-    arrivals = hesai.host_times_ns(spec, packets).tolist()
+    receive_ns = hesai.host_times_ns(spec, packets).tolist()
     return Seen(
         np.where(fires, fires_ns, never).min(axis=1),
         fires_ns,
@@ -174,7 +175,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
         level,
         eye.points(origin, direction, np.multiply(counts, unit_m, dtype=np.float64)),
         unit_m,
-        list(zip(arrivals, payloads, strict=True)),
+        list(zip(receive_ns, payloads, strict=True)),
         spec.groups,
     )
 

@@ -1,4 +1,4 @@
-"""The points that scans must hold, made from what encoders sent (`seen.py`), not from a decoder."""
+"""Expected points of scans, from the data of the encoders (`seen.py`), not by a decoder."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Expected:
             ring_base += sight.channels
 
     def points(self, sensor: I64Array, column: I64Array) -> Points:
-        """Points of a scan that holds these columns: (n,), number of each in its sensor's own."""
+        """Points of a scan of these columns: (n,), number of each among those of its sensor."""
         parts = []
         for number, slots in enumerate(self._sensors):
             rows = np.flatnonzero(sensor == number)
@@ -87,7 +87,7 @@ def repeated(counts: I64Array) -> BoolArray:
 
 
 def pair_types(counts: I64Array, level: I64Array) -> npt.NDArray[np.uint8]:
-    """(n, channels, 2) types of two returns that are told by their ranges and levels."""
+    """(n, channels, 2) types of two returns, by their ranges and levels."""
     near_first = counts[..., 0] <= counts[..., 1]
     first_strong = level[..., 0] >= level[..., 1]
     one = np.where(

@@ -1,6 +1,6 @@
 """Sessions as they are recorded: the two lidars of the fixture in every container, or in several.
 
-Messages: bags.py; what the drivers publish beside packets: docs/sources/messages.md, sections 2 and
+Messages: bags.py; other messages of the drivers: docs/sources/messages.md, sections 2 and
 6.
 """
 

@@ -41,7 +41,7 @@ def source(frame: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Datagram:
-    """A UDP datagram and the arrival of the frame that completed it."""
+    """A UDP datagram and the receive time of the frame that completed it."""
 
     host_ns: int
     source: str
@@ -51,7 +51,7 @@ class Datagram:
     payload: bytes
 
     def frame(self, link: int = ETHERNET) -> tuple[int, bytes]:
-        """The record of one frame that holds all of it."""
+        """The record of one frame with all of it."""
         frames = udp_frame(
             self.payload, self.source, self.target, self.source_port, self.port, link=link
         )
@@ -66,7 +66,7 @@ def datagrams(length_ns: int) -> tuple[Datagram, ...]:
     for host_ns, frame in frames(length_ns):
         if frame[12:14] != _IPV4 or frame[23] != _UDP:
             continue
-        # Identification and both addresses tell the fragments of a datagram.
+        # Identification and both addresses identify the fragments of a datagram.
         key = frame[18:20] + frame[26:34]
         parts[key] = parts.get(key, b"") + frame[34:]
         if struct.unpack_from(">H", frame, 20)[0] & 0x2000:
