@@ -85,7 +85,8 @@ STEPS_NS = (10**6, 15 * 10**6, 10**8, 999 * 10**6, 10**9, 2 * 10**9, 10**12)
 
 def damaged_heads(rng: random.Random, sent: Sequence[Datagram]) -> Records:
     """Lidar packets with odd stamps, measurement ids and status words in some columns."""
-    kind, share = rng.randrange(4), rng.choice([0.02, 0.1, 0.4])
+    kind = rng.randrange(4)
+    share = rng.choice([0.02, 0.1, 0.4])
     return [
         (_odd_columns(rng, one, kind) if one.port == 7502 and rng.random() < share else one).frame()
         for one in sent
@@ -111,7 +112,8 @@ def _odd_columns(rng: random.Random, one: Datagram, kind: int) -> Datagram:
 def with_jumps(rng: random.Random, records: Records) -> Records:
     """The same frames with a clock step of the capture host, for one frame or all later ones."""
     seconds = (0.001, 0.5, 2, 40, 10**6)
-    out, shift_ns = [], 0
+    out = []
+    shift_ns = 0
     for host_ns, frame in records:
         jump_ns = int(rng.choice([-1, 1]) * rng.choice(seconds) * 10**9)
         chance = rng.random()

@@ -59,11 +59,13 @@ class Pair:
     """The decoders of both engines, made for the same sensors and wishes."""
 
     def __init__(self, one: Decoder, other: Decoder) -> None:
-        self.one, self.other = one, other
+        self.one = one
+        self.other = other
 
     def check(self, due: WindowColumns, label: ScanHeader) -> Scan:
         """Decode a window by both; all that they say is the same, byte by byte."""
-        one, other = self.one.scan(due, label), self.other.scan(due, label)
+        one = self.one.scan(due, label)
+        other = self.other.scan(due, label)
         assert_same(one, other)
         assert self.one.counts == self.other.counts
         return one
@@ -72,7 +74,8 @@ class Pair:
 def assert_same(one: Scan, other: Scan) -> None:
     """All fields of two scans have the same bytes."""
     for part in fields(Scan):
-        first, second = getattr(one, part.name), getattr(other, part.name)
+        first = getattr(one, part.name)
+        second = getattr(other, part.name)
         if isinstance(first, np.ndarray):
             assert (first.dtype, first.shape) == (second.dtype, second.shape), part.name
             assert first.tobytes() == second.tobytes(), part.name

@@ -34,14 +34,18 @@ from tests.builders.seen import (
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "four_makers"
 HOST_IP = "192.168.1.10"
-NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
 HOUR_NS = int(datetime(2026, 5, 4, 8, 0, 0, tzinfo=timezone.utc).timestamp()) * NS_PER_S
 # The sensors measure from here on, each from another ms, until the recording ends.
-START_NS, END_NS = HOUR_NS - 170 * NS_PER_MS, HOUR_NS + 130 * NS_PER_MS
+START_NS = HOUR_NS - 170 * NS_PER_MS
+END_NS = HOUR_NS + 130 * NS_PER_MS
 MTU = 1500
 # A switch of 1 Gbit/s; the capture host receives one frame after the other.
 NS_PER_BYTE = 8
-DIFOP_STEP_NS, POSITION_STEP_NS = 100 * NS_PER_MS, 100 * NS_PER_MS
+DIFOP_STEP_NS = 100 * NS_PER_MS
+POSITION_STEP_NS = 100 * NS_PER_MS
 
 Records = list[tuple[int, bytes]]
 
@@ -92,7 +96,8 @@ ROBOSENSE = Place(
     90_000,
 )
 PLACES = (OUSTER, VELODYNE, HESAI, ROBOSENSE)
-POSITION_PORT, DIFOP_PORT = 8308, 7788
+POSITION_PORT = 8308
+DIFOP_PORT = 7788
 
 OUSTER_LIDAR = replace(
     two_lidars.RIGHT,
@@ -226,7 +231,8 @@ def _network() -> tuple[_Sent, ...]:
     """All datagrams in the order in which the switch lets them through."""
     waiting = [one for place in PLACES for one in _datagrams(place)]
     waiting.sort(key=lambda one: (one.ready_ns, one.name, one.number))
-    sent, free_ns = [], 0
+    sent = []
+    free_ns = 0
     for one in waiting:
         records = []
         for frame in one.frames:
@@ -242,7 +248,8 @@ def _datagrams(place: Place) -> list[_Datagram]:
         for number, (ready_ns, payload) in enumerate(seen()[place.name].payloads)
     ]
     others = [(ready_ns, port, -1, payload) for ready_ns, port, payload in _others(place)]
-    found, before_ns = [], 0
+    found = []
+    before_ns = 0
     for ident, (ready_ns, port, number, payload) in enumerate(sorted(lidar + others)):
         # The network's delay varies by up to 0.1 ms, but packets of a sensor stay in order.
         before_ns = max(before_ns, ready_ns + place.delay_ns + ident * 37 % 11 * 10_000)
@@ -254,7 +261,8 @@ def _datagrams(place: Place) -> list[_Datagram]:
 def _others(place: Place) -> list[tuple[int, int, bytes]]:
     """Receive time, port and payload of packets without points."""
     if place is VELODYNE:
-        end_us, step_us = (END_NS - START_NS) // 1000 - 5_000, 1e-3 * POSITION_STEP_NS
+        end_us = (END_NS - START_NS) // 1000 - 5_000
+        step_us = 1e-3 * POSITION_STEP_NS
         times_us = np.arange(2_000, end_us, step_us, dtype=np.float64)
         sent = velodyne.position_packets(VELODYNE_SPEC, times_us)
         rows: Payloads = [

@@ -36,7 +36,9 @@ from tests.builders.hesai_models import (
     HesaiModel,
 )
 
-SINGLE, DUAL, TRIPLE = 0x37, 0x39, 0x3D
+SINGLE = 0x37
+DUAL = 0x39
+TRIPLE = 0x3D
 _RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x3D: 3}
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
@@ -103,7 +105,8 @@ def packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
 
 def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n,) packet time and offset of the block, by section 5."""
-    row, groups = spec.row, spec.groups
+    row = spec.row
+    groups = spec.groups
     packet, group = np.divmod(np.arange(columns), groups)
     if row.counts_back:
         # (last block - b) // returns; the blocks of a group give the same.
@@ -178,7 +181,8 @@ def encode_packets(
     ranges: (n, channels, returns) in the spec's unit, 0 no return; levels: the same shape, 0..255.
     What a silent beam is given is left out.
     """
-    row, columns = spec.row, len(ranges)
+    row = spec.row
+    columns = len(ranges)
     packets = columns // spec.groups
     if packets * spec.groups != columns or ranges.shape[1:] != (row.channels, spec.returns):
         raise ValueError(f"{ranges.shape}: no whole packets of {spec.groups} columns")
@@ -213,7 +217,8 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
     row = spec.row
     head = bytearray.fromhex(row.head)
     if len(head) == 12:
-        head[8:10], head[11] = bytes([spec.returns > 1, row.unit_mm]), row.flags
+        head[8:10] = bytes([spec.returns > 1, row.unit_mm])
+        head[11] = row.flags
     elif head:
         head[4:6] = bytes([spec.returns > 1, row.unit_mm])
     parts = [bytes(head), body]
@@ -232,8 +237,10 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
 
 
 def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
-    place, tail = spec.row.tail, bytearray(spec.row.tail.size)
-    tail[place.mode], tail[place.factory] = spec.mode, 0x42
+    place = spec.row.tail
+    tail = bytearray(spec.row.tail.size)
+    tail[place.mode] = spec.mode
+    tail[place.factory] = 0x42
     # JT128 counts in 0.1 rpm.
     struct.pack_into("<h", tail, place.speed, spec.rpm * spec.row.speed_units_per_rpm)
     if place.date:
@@ -244,7 +251,8 @@ def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
     if place.operation:
         tail[place.operation] = OPERATIONS[spec.operation]
     if spec.model in STATES:
-        first, states = number * spec.groups, _states(spec)
+        first = number * spec.groups
+        states = _states(spec)
         fields = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
         state = sum(one << (14 - 2 * block) for block, one in enumerate(fields))
         struct.pack_into("<H", tail, place.state, state)

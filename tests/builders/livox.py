@@ -15,7 +15,11 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array
 
-CARTESIAN32, CARTESIAN16, SPHERICAL, DUAL, IMU = 1, 2, 3, 0x11, 0
+CARTESIAN32 = 1
+CARTESIAN16 = 2
+SPHERICAL = 3
+DUAL = 0x11
+IMU = 0
 # Three coordinates, reflectivity, tag.
 _RETURN = {CARTESIAN32: "<3iBB", CARTESIAN16: "<3hBB", SPHERICAL: "<I2HBB", DUAL: "<3iBB"}
 # x, y, z in mm; x, y, z in cm; depth in mm, theta and phi in 0.01 degrees.

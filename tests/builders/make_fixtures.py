@@ -29,11 +29,15 @@ from tests.builders.two_lidars import (
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "two_lidars"
-HOST_IP, OTHER_IP = "10.5.5.1", "10.5.5.20"
-NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
+HOST_IP = "10.5.5.1"
+OTHER_IP = "10.5.5.20"
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
 SECOND_NS = int(datetime(2026, 5, 4, 8, 0, 0, tzinfo=timezone.utc).timestamp()) * NS_PER_S
 # The recording is from 20 ms to 870 ms after the full second.
-START_NS, END_NS = SECOND_NS + 20 * NS_PER_MS, SECOND_NS + 870 * NS_PER_MS
+START_NS = SECOND_NS + 20 * NS_PER_MS
+END_NS = SECOND_NS + 870 * NS_PER_MS
 TURNS = 10
 MTU = 1500
 # A full frame takes 120 us at 100 Mbit/s.

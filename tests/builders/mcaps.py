@@ -18,7 +18,9 @@ from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.make_fixtures import FOLDER
 
-NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
+NONE = CompressionType.NONE
+LZ4 = CompressionType.LZ4
+ZSTD = CompressionType.ZSTD
 OUSTER = "ouster_sensor_msgs/PacketMsg"
 OUSTER_ROS1 = "ouster_ros/PacketMsg"
 DEFINITIONS = {
@@ -104,7 +106,8 @@ def fixture_packets() -> tuple[Packet, ...]:
     for batch in open_recording(FOLDER / "two_lidars.pcap", streams).packets():
         for at in range(len(batch)):
             stream = streams.streams[int(batch.stream[at])]
-            begin, size = int(batch.start[at]), int(batch.size[at])
+            begin = int(batch.start[at])
+            size = int(batch.size[at])
             if stream.source_ip in NAMES:
                 topic = f"/{NAMES[stream.source_ip]}/{TAILS[stream.port]}"
                 payload = batch.data[begin : begin + size].tobytes()

@@ -173,13 +173,15 @@ def encode_packets(
     of the profile's table, RANGE in mm; what is left out is 0. A packet takes the frame id of its
     first column.
     """
-    layout, count = spec.layout, len(stamps_ns)
+    layout = spec.layout
+    count = len(stamps_ns)
     packets = count // layout.columns
     if packets * layout.columns != count:
         raise ValueError(f"{count} columns are no whole packets of {layout.columns}")
     measured = np.ones(count, np.bool_) if valid is None else valid
     head = np.zeros(count, LEGACY_COLUMN if layout.legacy else COLUMN)
-    head["stamp_ns"], head["measurement_id"] = stamps_ns, mids
+    head["stamp_ns"] = stamps_ns
+    head["measurement_id"] = mids
     records = np.zeros((count, layout.record_size), np.uint8)
     if layout.legacy:
         head["frame_id"] = frame_ids
@@ -225,14 +227,17 @@ def imu_packet(
     if spec.imu_profile != ACCEL32:
         old = np.zeros(1, LEGACY_IMU)
         old["gyroscope_ns"] = stamps_ns
-        old["system_ns"], old["acceleration_ns"] = old["gyroscope_ns"] + 2, old["gyroscope_ns"] - 1
+        old["system_ns"] = old["gyroscope_ns"] + 2
+        old["acceleration_ns"] = old["gyroscope_ns"] - 1
         old["acceleration_g"] = acceleration / STANDARD_GRAVITY
         old["angular_velocity_deg"] = angular_velocity / RAD_PER_DEG
         return old.tobytes()
     samples = np.zeros(len(stamps_ns), SAMPLE)
-    samples["stamp_ns"], samples["measurement_id"] = stamps_ns, np.arange(len(stamps_ns))
+    samples["stamp_ns"] = stamps_ns
+    samples["measurement_id"] = np.arange(len(stamps_ns))
     samples["status"] = 1 if valid is None else valid
-    samples["acceleration"], samples["angular_velocity"] = acceleration, angular_velocity
+    samples["acceleration"] = acceleration
+    samples["angular_velocity"] = angular_velocity
     payload = np.zeros((1, imu_size(len(samples))), np.uint8)
     payload[0, SAMPLES_START : SAMPLES_START + samples.nbytes] = samples.view(np.uint8)
     _write_headers(spec, payload, IMU_PACKET, np.zeros(1, np.int64))

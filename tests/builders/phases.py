@@ -19,10 +19,12 @@ import numpy as np
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
-NS_PER_S, NS_PER_MS = 10**9, 10**6
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
 # A whole number of periods of 10 Hz and of 20 Hz; the rotors pass zero some time after it.
 EPOCH_NS = 1_800_000_000 * NS_PER_S
-BEAMS, COLUMNS = 4, 512
+BEAMS = 4
+COLUMNS = 512
 REVOLUTION_NS = 100 * NS_PER_MS
 
 
@@ -56,7 +58,8 @@ class Rotor:
         revolutions = int((seconds * NS_PER_S - self.zero_ms * NS_PER_MS) // self.revolution_ns)
         column = np.arange(revolutions * COLUMNS)
         stamp_ns = begin_ns + column * self.revolution_ns // COLUMNS
-        mids, frames = column % COLUMNS, column // COLUMNS
+        mids = column % COLUMNS
+        frames = column // COLUMNS
         payloads = encode_packets(self.spec, stamp_ns, mids, frames, {})
         size = self.spec.columns_per_packet
         silent_ns = [EPOCH_NS + round(at * NS_PER_S) for at in self.silent_s]
@@ -77,7 +80,8 @@ class Case:
     seconds: float = 10.0
 
 
-LEFT, RIGHT = 1001, 1002
+LEFT = 1001
+RIGHT = 1002
 CASES: dict[str, Case] = {
     "10 Hz, in phase": Case(Rotor(LEFT), Rotor(RIGHT)),
     "10 Hz, 37 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 57)),

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from mlbatch.arrays import U8Array
 from tests.builders.bags import Body, Recorded
 
-CLOUD, CUSTOM, CUSTOM2 = (
-    "sensor_msgs/PointCloud2",
-    "livox_ros_driver/CustomMsg",
-    "livox_ros_driver2/CustomMsg",
-)
+CLOUD = "sensor_msgs/PointCloud2"
+CUSTOM = "livox_ros_driver/CustomMsg"
+CUSTOM2 = "livox_ros_driver2/CustomMsg"
 # Number and code of `struct` of the types of a PointField.
 TYPES = {
     "int8": (1, "b"),

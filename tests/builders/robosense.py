@@ -2,8 +2,8 @@
 
 Source: docs/sources/robosense.md sections 1 to 7. A rotor of constant speed fires a round of all
 channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + the
-rotation of the rotor meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a
-decoder.
+rotation of the rotor meanwhile. Rounds inside the field of view are columns. Nothing here is shared
+with a decoder.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ class Angles:
 
 def fan(spec: RobosenseSpec) -> Angles:
     """An uneven fan of whole counts of the DIFOP; RS-16 has no azimuths of its own."""
-    row, unit = spec.row, spec.row.angles.unit_deg
+    row = spec.row
+    unit = spec.row.angles.unit_deg
     even = np.linspace(*row.span_deg, row.channels)
     counts = np.rint(even / unit) + np.arange(row.channels) * 5 % 7
     pattern = (np.arange(row.channels) * 3 % 8 - 3.5) * 1.04 if row.angles.azimuth_at else 0.0
@@ -147,7 +148,8 @@ def directions(spec: RobosenseSpec, angles: Angles, columns: I64Array) -> F64Arr
 
 def origins(spec: RobosenseSpec, columns: I64Array) -> F64Array:
     """(n, channels, 3) places of the lens at each firing, metres, sensor frame."""
-    azimuth, (radius, height) = np.radians(azimuths_deg(spec, columns)), spec.row.lens_m
+    azimuth = np.radians(azimuths_deg(spec, columns))
+    radius, height = spec.row.lens_m
     parts = (radius * np.cos(azimuth), -radius * np.sin(azimuth), np.full_like(azimuth, height))
     return np.stack(parts, axis=-1)
 
@@ -188,7 +190,8 @@ def difop(
     parts: Mapping[int, bytes] | None = None,
 ) -> bytes:
     """A device packet; sync: mode and state (gPTP, locked by PTP); parts: bytes to put in last."""
-    row, layout = spec.row, spec.row.angles
+    row = spec.row
+    layout = spec.row.angles
     view = (round(degrees * 100) % 36001 for degrees in spec.view_deg)
     fields = {
         0: DIFOP_MAGIC,
@@ -258,10 +261,12 @@ def _block_azimuths(spec: RobosenseSpec, blocks: int) -> I64Array:
 
 def _sent(spec: RobosenseSpec, payloads: U8Array) -> list[tuple[int, bytes]]:
     """Add the headers; a packet arrives after the round of its last block."""
-    row, sent = spec.row, []
+    row = spec.row
+    sent = []
     step = spec.columns_per_packet
     for number, payload in enumerate(payloads):
-        first, after = int(number * step), int(np.ceil((number + 1) * step))
+        first = int(number * step)
+        after = int(np.ceil((number + 1) * step))
         first_round, last_round = rounds(spec, np.array([first, after - 1])).tolist()
         fields = {
             **row.marks,

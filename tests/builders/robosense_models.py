@@ -10,8 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
-STRONGEST, LAST, NEAREST, DUAL = "strongest", "last", "nearest", "dual"
+FIRST = bytes.fromhex("55aa050a5aa550a0")
+SECOND = bytes.fromhex("55aa055a")
+STRONGEST = "strongest"
+LAST = "last"
+NEAREST = "nearest"
+DUAL = "dual"
 
 
 @dataclass(frozen=True, slots=True)

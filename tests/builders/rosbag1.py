@@ -11,7 +11,9 @@ from rosbags.rosbag1 import Writer
 from tests.builders.bags import Recorded, definition
 
 # Field names and values of headers are free; rosbags never makes these.
-MESSAGE, CONNECTION, CHUNK = 2, 7, 5
+MESSAGE = 2
+CONNECTION = 7
+CHUNK = 5
 
 
 def write_rosbag1(
@@ -66,7 +68,8 @@ def open_chunk(bag: bytes) -> bytes:
 
 def last_chunk(bag: bytes) -> int:
     """Where the record of the last chunk begins."""
-    at, found = len(b"#ROSBAG V2.0\n"), 0
+    at = len(b"#ROSBAG V2.0\n")
+    found = 0
     while at < len(bag):
         head = struct.unpack_from("<I", bag, at)[0]
         fields = bag[at + 4 : at + 4 + head]

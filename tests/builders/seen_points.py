@@ -12,7 +12,11 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.seen import Seen
 
 # docs/sources/outputs.md section 3.
-STRONGEST_FIRST, STRONGEST_LAST, WEAK_FIRST, WEAK_LAST, ONLY = 3, 4, 5, 6, 7
+STRONGEST_FIRST = 3
+STRONGEST_LAST = 4
+WEAK_FIRST = 5
+WEAK_LAST = 6
+ONLY = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +49,8 @@ class Expected:
     """Makes the points of scans of these sensors, in the order of `lidar_id`."""
 
     def __init__(self, seen: Sequence[Seen], *, keep_repeated: bool = False) -> None:
-        self._sensors, ring_base = [], 0
+        self._sensors = []
+        ring_base = 0
         for sight in seen:
             self._sensors.append(_sorted(sight, ring_base, keep_repeated))
             ring_base += sight.channels

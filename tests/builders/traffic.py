@@ -14,12 +14,15 @@ from tests.builders.run import FIXTURE
 
 Records = list[tuple[int, bytes]]
 
-_IPV4, _UDP = b"\x08\x00", 17
+_IPV4 = b"\x08\x00"
+_UDP = 17
 
 
 def read_pcap(path: Path) -> Records:
     """(host_ns, frame) of all records of a little-endian pcap in us, as the fixture is."""
-    data, at, records = path.read_bytes(), 24, []
+    data = path.read_bytes()
+    at = 24
+    records = []
     while at < len(data):
         seconds, us, captured, _ = struct.unpack_from("<4I", data, at)
         records.append((seconds * 10**9 + us * 1000, data[at + 16 : at + 16 + captured]))

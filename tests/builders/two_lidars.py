@@ -16,7 +16,9 @@ import numpy.typing as npt
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from tests.builders.scene import Scene
 
-COLUMNS_PER_TURN, COLUMNS_PER_PACKET, BEAMS = 512, 16, 32
+COLUMNS_PER_TURN = 512
+COLUMNS_PER_PACKET = 16
+BEAMS = 32
 PACKETS_PER_TURN = COLUMNS_PER_TURN // COLUMNS_PER_PACKET
 MM_PER_M = 1000.0
 
@@ -134,7 +136,7 @@ def body_from_sensor(lidar: FixtureLidar) -> F64Array:
 
 
 def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
-    """Origins and unit directions (columns x beams, 3) of a revolution, m, body frame (section 6)."""
+    """Origins, unit directions (columns x beams, 3) of a revolution, m, body frame; section 6."""
     theta = 2 * math.pi * (1 - np.arange(COLUMNS_PER_TURN)[:, None] / COLUMNS_PER_TURN)
     turned = theta - np.radians(azimuth_deg(lidar))
     altitude = np.radians(altitude_deg(lidar))
@@ -148,9 +150,11 @@ def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
     )
     # Lidar to sensor frame: half a revolution about z, and the lift.
     half_revolution = np.array([-1.0, -1.0, 1.0])
-    offset_m, lift_m = lidar.offset_mm / MM_PER_M, lidar.lift_mm / MM_PER_M
+    offset_m = lidar.offset_mm / MM_PER_M
+    lift_m = lidar.lift_mm / MM_PER_M
     origin = np.zeros_like(direction)
-    origin[..., 0], origin[..., 1] = offset_m * np.cos(theta), offset_m * np.sin(theta)
+    origin[..., 0] = offset_m * np.cos(theta)
+    origin[..., 1] = offset_m * np.sin(theta)
     pose = body_from_sensor(lidar)
     sensor_origin = origin * half_revolution + (0.0, 0.0, lift_m)
     return (
@@ -162,7 +166,8 @@ def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
 def turn_pixels(lidar: FixtureLidar, scene: Scene) -> npt.NDArray[np.void]:
     """Pixels (columns, beams) of any revolution, as nothing moves; range 0 where nothing is hit."""
     origins, directions = rays(lidar)
-    distance_m, surface = scene.cast(origins, directions), scene.surface_hit(origins, directions)
+    distance_m = scene.cast(origins, directions)
+    surface = scene.surface_hit(origins, directions)
     hit = surface >= 0
     brightness = np.array([surface.reflectivity for surface in scene.surfaces] + [0])[surface]
     # The sensor counts the range from the rotor's axis, along the beam.
@@ -194,7 +199,9 @@ def packets(lidar: FixtureLidar, pixels: npt.NDArray[np.void], stamp_ns: I64Arra
     )
     mid = np.arange(len(stamp_ns)) % COLUMNS_PER_TURN
     columns = np.zeros(len(stamp_ns), column)
-    columns["stamp_ns"], columns["mid"], columns["status"] = stamp_ns, mid, 1
+    columns["stamp_ns"] = stamp_ns
+    columns["mid"] = mid
+    columns["status"] = 1
     columns["pixel"] = pixels[mid]
     out = np.zeros(len(stamp_ns) // COLUMNS_PER_PACKET, packet)
     out["column"] = columns.reshape(-1, COLUMNS_PER_PACKET)

@@ -18,7 +18,8 @@ from mlbatch.arrays import F64Array, I64Array, U8Array
 from tests.builders.velodyne_tables import MODELS, Table
 
 HOUR_US = 3_600_000_000
-NMEA_AT, NMEA_SIZE = 206, 128
+NMEA_AT = 206
+NMEA_SIZE = 128
 _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _READING = np.dtype([("distance", "<u2"), ("level", "u1")])
 _BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("reading", _READING, 32)])
@@ -107,7 +108,8 @@ class Rays:
 
 def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
     """Packets with these counts of distance and levels, each (columns, lasers, returns)."""
-    table, rows_per_packet = spec.table, spec.rows_per_packet
+    table = spec.table
+    rows_per_packet = spec.rows_per_packet
     rows = len(distance) // table.columns_per_row
     count = rows // rows_per_packet
     if len(distance) != count * spec.columns_per_packet:
@@ -169,7 +171,8 @@ def firing_times_ns(spec: VelodyneSpec, columns: I64Array) -> I64Array:
 
 def directions(spec: VelodyneSpec, columns: I64Array) -> F64Array:
     """(n, lasers, 3) unit vectors at each laser's own firing, sensor frame."""
-    alpha, elevation = _alpha_rad(spec, columns), np.deg2rad(spec.table.elevation_deg)
+    alpha = _alpha_rad(spec, columns)
+    elevation = np.deg2rad(spec.table.elevation_deg)
     flat = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), alpha.shape)
     return np.stack((flat * np.cos(alpha), -flat * np.sin(alpha), up), axis=-1)
@@ -177,7 +180,8 @@ def directions(spec: VelodyneSpec, columns: I64Array) -> F64Array:
 
 def origins(spec: VelodyneSpec, columns: I64Array) -> F64Array:
     """(n, lasers, 3) where the rays begin, m, sensor frame; section 10 with cx = cy = 0."""
-    alpha, aside_m = _alpha_rad(spec, columns), np.array(spec.table.horizontal_m)
+    alpha = _alpha_rad(spec, columns)
+    aside_m = np.array(spec.table.horizontal_m)
     up = np.broadcast_to(np.array(spec.table.vertical_m), alpha.shape)
     return np.stack((aside_m * np.sin(alpha), aside_m * np.cos(alpha), up), axis=-1)
 

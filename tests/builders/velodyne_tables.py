@@ -10,7 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-EE, DD, CC, BB = 0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF
+EE = 0xEEFF
+DD = 0xDDFF
+CC = 0xCCFF
+BB = 0xBBFF
 
 
 @dataclass(frozen=True)

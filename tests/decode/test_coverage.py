@@ -37,14 +37,16 @@ def columns(seed: int, count: int, most: int) -> WindowColumns:
 @pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
 @pytest.mark.parametrize("seed", range(4))
 def test_column_statistics_equal_those_of_numpy(seed: int, count: int) -> None:
-    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
+    compiled = CompiledColumnStatistics(POSITIONS)
+    plain = ColumnStatistics(POSITIONS)
     for again in range(3):
         due = columns(seed * 10 + again, count, 500)
         assert compiled.measure(due) == plain.measure(due)
 
 
 def test_numpy_measures_positions_beyond_the_revolution() -> None:
-    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
+    compiled = CompiledColumnStatistics(POSITIONS)
+    plain = ColumnStatistics(POSITIONS)
     due = columns(1, 5000, 2000)
     assert (due.encoder[due.sensor == 2] >= 512).any()
     assert compiled.measure(due) == plain.measure(due)

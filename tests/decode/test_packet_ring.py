@@ -91,7 +91,8 @@ def test_a_ring_that_is_emptied_does_not_grow() -> None:
 
 
 def test_places_never_come_twice() -> None:
-    ring, seen = PacketRing(36, Records(0, 12, 12)), set[int]()
+    ring = PacketRing(36, Records(0, 12, 12))
+    seen = set[int]()
     for count in (3, 64, 1, 70, 5, 64):
         data = np.zeros(count * 36, np.uint8)
         _, place = ring.store(data, np.arange(count, dtype=np.int64) * 36, None)

@@ -31,7 +31,8 @@ class Sensor:
 
 
 def _sensor(number: int, seen: Seen) -> Sensor:
-    lidar, sent = seen.lidar, seen.sent
+    lidar = seen.lidar
+    sent = seen.sent
     ring = PacketRing(lidar.packet_size, lidar.records)
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
     _, first = ring.store(sent.payloads.reshape(-1).copy(), start, None)

@@ -118,7 +118,10 @@ def _matrix(*rows: tuple[float, ...]) -> F64Array:
     return np.array(rows, dtype=np.float64)
 
 
-X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+X = (1, 0, 0, 0)
+Y = (0, 1, 0, 0)
+Z = (0, 0, 1, 0)
+W = (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize(

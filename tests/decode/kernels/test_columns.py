@@ -35,7 +35,8 @@ from tests.golden import test_every_model as models
 
 pytestmark = needs_numba
 
-START_NS, END_NS = 1_800_000_000_000_000_000, 1_800_000_000_100_000_000
+START_NS = 1_800_000_000_000_000_000
+END_NS = 1_800_000_000_100_000_000
 # Tilted, level, and where the vehicle is: sensors that are decoded together differ in these.
 POSES = (
     from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0)),
@@ -43,7 +44,8 @@ POSES = (
     np.eye(4),
 )
 NAMES = tuple(name for name in PROFILES if name != "OFF")
-GUARD_ROWS, GUARD = 64, 0xA5
+GUARD_ROWS = 64
+GUARD = 0xA5
 # Of kinds that kernels decode, and of two that only numpy does.
 OTHERS = (
     (models.velodyne_sent, ("VLP-16", "dual")),
@@ -114,7 +116,8 @@ class Guarded(ScanBuffer):
             array = getattr(self, name)
             row = array.itemsize * int(np.prod(array.shape[1:]))
             whole = np.full((len(array) + 2 * GUARD_ROWS) * row, GUARD, np.uint8)
-            begin, end = GUARD_ROWS * row, (GUARD_ROWS + len(array)) * row
+            begin = GUARD_ROWS * row
+            end = (GUARD_ROWS + len(array)) * row
             self._guards += [whole[:begin], whole[end:]]
             setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
 
@@ -158,7 +161,9 @@ def check(lidars: list[Lidar], case: Case) -> None:
     rng = np.random.default_rng(case.seed)
     rings = [filled(lidar, rng) for lidar in lidars]
     boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
-    infos, sources, base = [], [], 0
+    infos = []
+    sources = []
+    base = 0
     for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
         pose = POSES[(case.seed + number) % len(POSES)]
         low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
@@ -226,7 +231,8 @@ def test_nothing_is_written_beyond_the_arrays(
 
 
 def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    lidar, rng = ouster("RNG15_RFL8_NIR8", 16), np.random.default_rng(0)
+    lidar = ouster("RNG15_RFL8_NIR8", 16)
+    rng = np.random.default_rng(0)
     ring, places = filled(lidar, rng)
     before = weakref.ref(ring.pieces)
 
@@ -247,7 +253,8 @@ def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> No
     run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
     sources = [Source(lidar, ring, POSES[0], 0)]
     decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine="numba")
-    stamp_ns, nothing = np.full(len(places), START_NS), np.zeros(len(places), np.int64)
+    stamp_ns = np.full(len(places), START_NS)
+    nothing = np.zeros(len(places), np.int64)
     due = WindowColumns(stamp_ns, nothing, places, nothing)
     assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
 
