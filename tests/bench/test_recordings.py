@@ -151,7 +151,7 @@ def test_a_conversion_accepts_every_packet(folder: Path, tmp_path: Path, name: s
     place = folder / name
     report = tmp_path / "report.json"
     done = command(
-        *("convert", place / CAPTURE, "--rig", place / RIG, "--dry-run", "--report", report)
+        "convert", place / CAPTURE, "--rig", place / RIG, "--dry-run", "--report", report
     )
     assert (done.code, done.err) == (0, "")
     report_document = json.loads(report.read_text(encoding="utf-8"))

@@ -165,9 +165,29 @@ def damaged_text(rng: random.Random, text: str) -> str:
 Json: TypeAlias = bool | int | float | str | list["Json"] | dict[str, "Json"] | None
 # Each is a document of its own: a replaced value may be changed again.
 VALUES = (
-    *("null", "true", "-1", "0", "1", "3", "17", "65536", "2147483648", "1180591620717411303424"),
-    *("0.5", "1e308", "NaN", "Infinity", '""', '"x"', '"512x10"', '"LEGACY"'),
-    *("[]", "[0]", "[1, 2, 3, 4]", "{}", '{"a": 1}'),
+    "null",
+    "true",
+    "-1",
+    "0",
+    "1",
+    "3",
+    "17",
+    "65536",
+    "2147483648",
+    "1180591620717411303424",
+    "0.5",
+    "1e308",
+    "NaN",
+    "Infinity",
+    '""',
+    '"x"',
+    '"512x10"',
+    '"LEGACY"',
+    "[]",
+    "[0]",
+    "[1, 2, 3, 4]",
+    "{}",
+    '{"a": 1}',
 )
 
 

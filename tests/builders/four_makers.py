@@ -76,24 +76,42 @@ class Place:
 
 # In the order of the rig. The mounts keep the machine out of most of the view.
 OUSTER = Place(
-    *("left", "OS-1-32-U1", "192.168.1.87", 7502),
-    *((0.3, 0.95, 2.45), (0.4, 22.0, 80.0)),
-    *(210_000, "left.json"),
+    name="left",
+    model="OS-1-32-U1",
+    ip="192.168.1.87",
+    port=7502,
+    translation_m=(0.3, 0.95, 2.45),
+    rpy_deg=(0.4, 22.0, 80.0),
+    delay_ns=210_000,
+    metadata="left.json",
 )
 VELODYNE = Place(
-    *("roof", "VLP-16", "192.168.1.201", 2368),
-    *((-0.1, 0.05, 2.6), (0.3, 4.0, -1.5)),
-    130_000,
+    name="roof",
+    model="VLP-16",
+    ip="192.168.1.201",
+    port=2368,
+    translation_m=(-0.1, 0.05, 2.6),
+    rpy_deg=(0.3, 4.0, -1.5),
+    delay_ns=130_000,
 )
 HESAI = Place(
-    *("right", "PandarXT-16", "192.168.1.202", 2368),
-    *((0.28, -0.9, 2.4), (-20.5, 1.2, -150.0)),
-    *(260_000, "right.csv"),
+    name="right",
+    model="PandarXT-16",
+    ip="192.168.1.202",
+    port=2368,
+    translation_m=(0.28, -0.9, 2.4),
+    rpy_deg=(-20.5, 1.2, -150.0),
+    delay_ns=260_000,
+    metadata="right.csv",
 )
 ROBOSENSE = Place(
-    *("rear", "Helios 16", "192.168.1.200", 6699),
-    *((-1.5, 0.1, 2.2), (0.0, -6.0, 178.0)),
-    90_000,
+    name="rear",
+    model="Helios 16",
+    ip="192.168.1.200",
+    port=6699,
+    translation_m=(-1.5, 0.1, 2.2),
+    rpy_deg=(0.0, -6.0, 178.0),
+    delay_ns=90_000,
 )
 PLACES = (OUSTER, VELODYNE, HESAI, ROBOSENSE)
 POSITION_PORT = 8308

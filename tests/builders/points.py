@@ -149,9 +149,20 @@ def read_packets(packets: U8Array) -> list[Column]:
         rest = data[HEAD_BYTES + 18 * slots :]
         found.append(
             Column(
-                *(magic, version, kind, slots, stamp_ns, number, count),
-                *(planes[0], planes[1], planes[2], planes[3], ring),
-                *(rest[:slots], rest[slots : 2 * slots]),
+                magic,
+                version,
+                kind,
+                slots,
+                stamp_ns,
+                number,
+                count,
+                planes[0],
+                planes[1],
+                planes[2],
+                planes[3],
+                ring,
+                rest[:slots],
+                rest[slots : 2 * slots],
             )
         )
     return found

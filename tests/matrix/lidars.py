@@ -178,17 +178,38 @@ class Vendor:
 
 VENDORS: Mapping[str, Vendor] = {
     "ouster": Vendor(
-        *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
-        *(0, 2**16 - 1),
+        send=ouster,
+        ip="10.0.0.1",
+        port=7502,
+        topic="/front/ouster/lidar_packets",
+        metadata="front.json",
+        begin_ns=0,
+        wrap=2**16 - 1,
     ),
-    "velodyne": Vendor(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
+    "velodyne": Vendor(
+        send=velodyne_vlp16,
+        ip="10.0.0.2",
+        port=2368,
+        topic="/velodyne_packets",
+        metadata="",
+        begin_ns=3_100_000,
+    ),
     "hesai": Vendor(
-        *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
-        *(5_700_000, 2**32 - 100),
+        send=hesai_xt16,
+        ip="10.0.0.3",
+        port=2368,
+        topic="/pandar_packets",
+        metadata="unit.csv",
+        begin_ns=5_700_000,
+        wrap=2**32 - 100,
     ),
     "robosense": Vendor(
-        *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
-        7_300_000,
+        send=robosense_helios16,
+        ip="10.0.0.4",
+        port=6699,
+        topic="/rslidar_packets",
+        metadata="angles.csv",
+        begin_ns=7_300_000,
     ),
 }
 

@@ -91,9 +91,7 @@ class Cell:
         target = self.folder / output
         fault = self.kind.fault.format(v=self.victim)
         faults = ["--fault", fault] if fault and faulty else []
-        return command(
-            *("convert", recording, "-o", target, "--rig", rig, "--quiet"), *faults, *words
-        )
+        return command("convert", recording, "-o", target, "--rig", rig, "--quiet", *faults, *words)
 
 
 # -- checks of every output -----------------------------------------------------------------------

@@ -97,7 +97,10 @@ def test_missing_keys_are_taken_from_the_recording(tmp_path: Path) -> None:
     assert (rig.body_frame, rig.rate, rig.exclude_boxes_m.shape) == ("base_link", None, (0, 6))
     assert (sensor.model, sensor.stream, sensor.metadata, sensor.extrinsics) == (None,) * 4
     assert (sensor.clock, sensor.offset_ns, sensor.min_range_m, sensor.max_range_m) == (
-        *(None, 0, None, None),
+        None,
+        0,
+        None,
+        None,
     )
     assert (sensor.optional, sensor.decode) == (False, {})
 
