@@ -166,7 +166,7 @@ def _largest(key: I64Array, starts: I64Array) -> I64Array:
 GROUP_NS = NS_PER_S // 4
 GROUP_PACKETS = 64
 MAX_GROUPS = 512
-# Points on each side among which a damaged stamp stands out, by at least this much.
+# Points on each side among which a damaged stamp is an outlier, by at least this much.
 _REACH = 16
 _OUTLIER_NS = NS_PER_MS
 _OUTLIER_SCALES = 10

@@ -61,9 +61,9 @@ class Limits:
 
 @dataclass(slots=True)
 class Sensor:
-    """A lidar of this run: how it is read, where it sits, its clock, its packets and counters.
+    """A lidar of this run: its decoder, pose, clock, packets and counters.
 
-    index: `lidar_id` in outputs; detected: what discovery knows of it; ring_base: first ring
+    index: `lidar_id` in outputs; detected: result of discovery; ring_base: first ring
     number of its channels; columns_per_s: nominal rate, None if unknown; ring: raw packets until
     their window closes.
     """

@@ -243,7 +243,8 @@ def _timing(timing: Timing) -> Section:
 
 
 def _sensor(sensor: SensorReport) -> Section:
-    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    packets = sensor.ledger.packets
+    columns = sensor.ledger.columns
     return {
         "name": sensor.name,
         "model": sensor.model,
@@ -279,7 +280,8 @@ def _sensor(sensor: SensorReport) -> Section:
 
 
 def _summary_row(sensor: SensorReport) -> tuple[str, ...]:
-    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    packets = sensor.ledger.packets
+    columns = sensor.ledger.columns
     counts = (
         packets.read,
         packets.lost,

@@ -85,8 +85,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 16.csv; give the sensor's with "
-        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to "
-        "360 deg, got zero; read the correction file from the lidar again)",
+        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to "
+        "360 deg, found zero; read the correction file from the lidar again)",
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",
@@ -131,10 +131,9 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "ROBOSENSE angles of another model": (
         "helios_bare/drive.pcap --metadata files/rs32.csv",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles of "
-        "its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata (without a "
-        "match: rs32.csv)",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: expected the angles "
+        "of its channels, found no DIFOP packets; record its device port (7788) as well, or give "
+        "a csv of `elevation,azimuth` lines with --metadata (without a match: rs32.csv)",
     ),
     "serial number of another ROBOSENSE": (
         "helios/drive.pcap --rig serial.yaml",
@@ -172,9 +171,9 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "HDL-64E with another file": (
         "hdl64/drive.pcap --metadata files/vlp16.yml",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; give "
-        "the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (without a match: "
-        "vlp16.yml)",
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: expected its calibration, found none; "
+        "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (without a "
+        "match: vlp16.yml)",
     ),
     "strict with the file of another Velodyne": (
         "vlp32c/drive.pcap --metadata files/vlp16.yml --strict",
@@ -273,13 +272,14 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "decoder option with another value": (
         "vlp16/drive.pcap --decode firing_azimuth=maybe",
         2,
-        "--decode firing_azimuth: wanted on or off, got 'maybe'; write --decode firing_azimuth=on",
+        "--decode firing_azimuth: expected on or off, found 'maybe'; write --decode "
+        "firing_azimuth=on",
     ),
     "unknown decoder option": (
         "vlp16/drive.pcap --decode nonsense=1",
         2,
-        "--decode: wanted one of crc, firing_azimuth, optical_centre, packet_stamp, "
-        "vertical_offset, got 'nonsense'; write --decode crc=check",
+        "--decode: expected one of crc, firing_azimuth, optical_centre, packet_stamp, "
+        "vertical_offset, found 'nonsense'; write --decode crc=check",
     ),
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",
@@ -375,8 +375,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with a change of the return mode": (
         "changed/drive.pcap --strict",
         1,
-        "sensor velodyne_1: 400 packet(s) rejected as bad_header while --strict was given; "
-        "leave it out to count them and go on",
+        "sensor velodyne_1: expected no rejected packet because of --strict, found 400 rejected "
+        "as bad_header; leave --strict out to count them instead",
     ),
     "strict with packets of two sizes": (
         "p40/drive.pcap --strict",

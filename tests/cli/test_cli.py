@@ -184,8 +184,8 @@ def test_an_interrupted_run_leaves_nothing_under_the_final_name(tmp_path: Path) 
     assert process.returncode == 130
     assert out.splitlines()[0] == "a scan"
     assert err == (
-        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
-        "on\n"
+        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
+        "--resume continues\n"
     )
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["out.partial", "out.partial.state"]

@@ -118,4 +118,4 @@ def test_aligned_clocks_give_the_scans_of_synchronised_ones(
 def test_mistakes(shell: Shell) -> None:
     outcome = shell(f"convert {RECORDING} --dry-run --align-clocks --align-to second")
     assert outcome.code == 2
-    assert "--align-to: wanted host or first, got 'second'" in outcome.err
+    assert "--align-to: expected host or first, found 'second'" in outcome.err

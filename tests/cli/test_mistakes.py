@@ -1,4 +1,4 @@
-"""What users do wrong: one line says what, where, wanted, got and what to do; no traceback."""
+"""Mistakes of users: one line with what, where, expected, found and the remedy; no traceback."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
     assert outcome.out == ""
     lines = [line for line in outcome.err.splitlines() if "warning" not in line]
     assert len(lines) == 1
-    wanted = ".*".join(map(re.escape, message.split("{*}")))
-    assert re.fullmatch(f"mlbatch: error: {wanted}", lines[0]), lines[0]
+    pattern = ".*".join(map(re.escape, message.split("{*}")))
+    assert re.fullmatch(f"mlbatch: error: {pattern}", lines[0]), lines[0]
     assert outcome.code == code
     assert _files(place) == before
 

@@ -262,7 +262,7 @@ def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, 
     shutil.copy(CAPTURE, recording)
     outcome = shell(f"convert {recording} --identity-extrinsics -o drive.mcap")
     assert outcome.code == 1
-    assert f"wanted an output that leaves {recording} as it is" in outcome.err
+    assert f"expected an output that does not overwrite {recording}, found one" in outcome.err
     assert recording.read_bytes() == CAPTURE.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == [recording.name]
 
@@ -279,11 +279,11 @@ def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, 
 def test_a_report_takes_the_place_of_no_output(shell: Shell, output: str, report: str) -> None:
     outcome = shell(f"convert {FIX} -o {output} --report {report}")
     assert outcome.code == 1
-    assert f"{report}: wanted a report besides the files of the output" in outcome.err
+    assert f"{report}: expected a report that is no file of the output, found one" in outcome.err
     assert not Path(output).exists()
 
 
 def test_a_bag_is_not_read_where_it_is_replaced(shell: Shell) -> None:
     assert shell(f"convert {FIX} -o bag --format rosbag2").code == 0
     outcome = shell("convert bag/bag_0.mcap -o bag --format rosbag2 --overwrite")
-    assert (outcome.code, "leaves bag/bag_0.mcap as it is" in outcome.err) == (1, True)
+    assert (outcome.code, "does not overwrite bag/bag_0.mcap" in outcome.err) == (1, True)

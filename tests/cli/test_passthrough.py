@@ -76,8 +76,8 @@ def test_windows_that_are_left_out_hold_no_message_back(
     assert outcome.code == 0, outcome.err
     report = json.loads((tmp_path / "out.mcap.report.json").read_text())
     assert report["scans"]["dropped_incomplete"] > 3
-    wanted = [(one.log_ns, one.data) for one in messages if one.topic == "/note"]
-    assert _notes(tmp_path / "out.mcap") == wanted
+    expected = [(one.log_ns, one.data) for one in messages if one.topic == "/note"]
+    assert _notes(tmp_path / "out.mcap") == expected
     assert report["messages"] == [
         {"topic": "/note", "read": NOTES, "written": NOTES, "dropped": {}}
     ]
@@ -107,7 +107,7 @@ def test_messages_alone_are_no_output(shell: Shell, tmp_path: Path, resumed: str
         f"{resumed}"
     )
     assert outcome.code == 1
-    assert "no scan: wanted a whole window" in outcome.err
+    assert "no scan: expected a whole window" in outcome.err
     assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
 
 

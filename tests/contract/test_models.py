@@ -136,7 +136,7 @@ def test_a_plugin_offers_all_that_is_asked_of_it(plugin: Plugin) -> None:
     assert plugin.VENDOR
     assert plugin.MODELS
     for model in plugin.MODELS:
-        assert model.verified in WORDS, f"{model.name}: wanted one of {WORDS}"
+        assert model.verified in WORDS, f"{model.name}: expected one of {WORDS}"
         assert model.channels > 0
         assert model.returns
         assert model.clock

@@ -151,7 +151,7 @@ def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
     assert (outcome.code, outcome.out) == (1, "")
     assert outcome.err == (
-        "mlbatch: error: rig.yaml: wanted a new rig file, got an existing one; choose another "
+        "mlbatch: error: rig.yaml: expected a new rig file, found an existing one; choose another "
         "name\n"
     )
     assert Path("rig.yaml").read_text() == "mine\n"

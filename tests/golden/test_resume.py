@@ -82,7 +82,7 @@ def test_a_file_that_may_not_grow_is_continued(
     assert refused.returncode == 1
     assert re.search(
         r"partial: expected to write it, found 'File too large'; raise the limit of file sizes or "
-        r"choose another disk; then --resume goes on after the \d+ scans that are safe\n$",
+        r"choose another disk; then --resume continues after the \d+ scans that are safe\n$",
         refused.stderr,
     )
     resumed = _run("-m", "mlbatch", *words, "--resume", cwd=place)

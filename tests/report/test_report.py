@@ -105,7 +105,7 @@ def test_messages_that_nobody_accounts_for_are_found() -> None:
     passed = ForwardedMessages("/imu", 10, 6, {"no_place": 4})
     assert imbalances(replace(run(), messages=(passed,))) == []
     assert imbalances(replace(run(), messages=(passed, replace(passed, written=5)))) == [
-        "messages of /imu: wanted 10 accounted for, got 5 + 4"
+        "messages of /imu: expected 10 accounted for, found 5 + 4"
     ]
 
 
@@ -115,7 +115,7 @@ def test_datagrams_that_reach_no_sensor_are_found(repeated: int) -> None:
     counted = replace(run(), capture=CaptureCounts(121 - repeated, 121 - repeated))
     assert imbalances(replace(counted, repeated=repeated)) == []
     assert imbalances(replace(counted, repeated=repeated + 1)) == [
-        "datagrams: wanted 122 accounted for, got 110 + 9 + 2"
+        "datagrams: expected 122 accounted for, found 110 + 9 + 2"
     ]
 
 
@@ -125,7 +125,7 @@ def test_unknown_reasons_are_found() -> None:
     counts.packets.read += 1
     assert counts.check() == ["packets: unknown reason 'mood'"]
     capture = CaptureCounts(10, 8, {"not_udp": 1})
-    assert check_capture(capture) == ["frames: wanted 10 accounted for, got 8 + 1"]
+    assert check_capture(capture) == ["frames: expected 10 accounted for, found 8 + 1"]
 
 
 def test_table_of_scans_by_hand() -> None:
