@@ -1,4 +1,4 @@
-"""Mistakes with bags and the line that answers each; their files: `test_cli_bag_mistakes.py`."""
+"""Mistakes with bags and the error line of each; their files: `cli/test_bag_mistakes.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mistakes of users and the line that answers each; their files: `test_cli_mistakes.py`."""
+"""Mistakes of users and the error line of each; their files: `cli/test_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ NO_LIDAR = (
 )
 DATA_PORT = "; check that the recording contains the sensor's data port"
 
-# (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} stands
-# for words of the parser, which differ between its versions, and for lists that grow.
+# (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} matches
+# words of the parser, which differ between its versions, and lists that grow.
 MISTAKES: dict[str, tuple[str, int, str]] = {
     "nothing at all": ("-o out", 2, "Missing argument {*}; see `mlbatch --help`"),
     "misspelt option": (
@@ -339,7 +339,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/two_lidars.pcap --metadata fix/rig.yaml",
         1,
         "fix/rig.yaml: expected the metadata or calibration of a lidar, found another kind of "
-        "file; give the file that the sensor's driver or recorder saved",
+        "file; give the file that the sensor's driver or recording software saved",
     ),
     "metadata of another lidar": (
         "bare/drive.pcap --metadata pair/222.json",
@@ -404,7 +404,7 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         f"{ONE_UNIT}.pcap --metadata {DIGEST}",
         1,
         f"{DIGEST}: expected the metadata or calibration of a lidar, found another kind of file; "
-        "give the file that the sensor's driver or recorder saved",
+        "give the file that the sensor's driver or recording software saved",
     ),
     "TCP only": (
         "R/other/sick-tcp_pcapng/test.pcapng",
@@ -438,7 +438,7 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         "-1718728642.002 s for ouster_122247000785; use --align-clocks or --clock host, or give "
         "clock.offset_s or clock.epoch in the rig",
     ),
-    "one turn is never a whole window": (
+    "one revolution is never a whole window": (
         f"{ONE_UNIT}.pcap",
         1,
         f"{ONE_UNIT}.pcap: no scan: expected a whole window of 100 ms with all sensors, found "

@@ -177,7 +177,7 @@ Values = tuple[str | int | bool | tuple[int, ...], ...]
 
 
 def print_of(scan: Scan) -> Values:
-    """All of a scan but the arrival of the packet that closed it; arrays as digests."""
+    """All of a scan but the receive time of the packet that closed it; arrays as digests."""
     values: list[str | int | bool | tuple[int, ...]] = []
     for part in fields(scan):
         value = getattr(scan, part.name)

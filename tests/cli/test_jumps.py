@@ -26,7 +26,7 @@ TURN_NS = 100 * NS_PER_MS
 
 
 def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
-    """The same lidar, whose clock steps after every piece while the recorder's runs on."""
+    """The same lidar, whose clock steps after every piece; the capture host's does not."""
     pieces, begin_ns, ahead_ns = [], unit.begin_ns, unit.host_ns
     for number, step_ns in enumerate((0, *steps_ns)):
         begin_ns, ahead_ns = begin_ns + step_ns, ahead_ns - step_ns
@@ -74,7 +74,7 @@ def test_a_jump_is_an_error_that_names_its_times(
 
 
 def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
-    """Five seconds of silence, at the sensor and at the recorder."""
+    """Five seconds of silence, at the sensor and at the capture host."""
     first = Unit(turns=6)
     later = replace(first, begin_ns=first.begin_ns + 5 * NS_PER_S, first_frame=55)
     write_session(tmp_path, first, later)

@@ -25,14 +25,14 @@ NOTES = TURNS * TURN_NS // EVERY_NS
 
 
 def _lidar(name: str, unit: Unit, lost: Collection[int]) -> list[Recorded]:
-    """A lidar that lost a third of each of these turns, within one window."""
+    """A lidar that lost a third of each of these revolutions, within one window."""
     about, *packets = unit_messages(replace(unit, turns=TURNS), name)
     lossy = [at // 32 in lost and 10 <= at % 32 < 20 for at in range(len(packets))]
     return [about, *(one for one, is_lost in zip(packets, lossy, strict=True) if not is_lost)]
 
 
 def _messages(*lost: int, also: Collection[int] = ()) -> list[Recorded]:
-    """Two lidars that lost parts of turns, and notes beside them."""
+    """Two lidars that lost parts of revolutions, and messages of /note."""
     messages = _lidar("top", Unit(), lost) + _lidar("low", twin(Unit(), 222), also)
     messages += [
         Recorded("/note", "std_msgs/String", messages[0].log_ns + number * EVERY_NS, _text(number))

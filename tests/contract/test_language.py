@@ -32,8 +32,8 @@ IDIOM = {
     r"wanted|wants": "expected",
 }
 WORDS = re.compile("|".join(rf"\b(?:{pattern})\b" for pattern in IDIOM), re.IGNORECASE)
-# Names of others: a function of typer, a field of a vendor's format.
-FOREIGN = re.compile(r"typer\.echo|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']")
+# Fixed names: a function of typer, fields of JSON documents, a field of a vendor's format.
+FOREIGN = re.compile(r"typer\.echo|\"(?:maker|wanted)\"|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']")
 # Pages that the repository does not have, and the old place of the sources.
 OUTSIDE = re.compile(
     r"\b(?:STYLE|CONTRACT|ARCHITECTURE|REDESIGN)\.md|\bfacts/\w+\.md|\.\./shared/\w+\.md"

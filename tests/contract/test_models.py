@@ -1,4 +1,4 @@
-"""Every supported model: what its maker's module offers, an encoder, a case, the laws of `Lidar`.
+"""Every supported model: what its vendor's module offers, an encoder, a case, the laws of `Lidar`.
 
 What is missing for a new one is named here; docs/add-a-sensor.md says where it goes.
 """
@@ -42,7 +42,7 @@ SOURCE = "192.168.1.201"
 START_NS = 1_700_000_000_000_000_000
 # Rows of encoders that go by another name than the model, or are a second kind of its packets.
 VARIANTS = {"Pandar64-7": "Pandar64", **ROBOSENSE_NAMES}
-# Sizes of packets that any maker knows, and of some that nobody does.
+# Sizes of packets that a vendor's module knows, and some unknown ones.
 SIZES = (*range(0, 64), 80, 512, 554, 568, 812, 820, 861, 1072, 1080, 1095, 1127, 1198, 1200, 1206)
 SIZES += (1210, 1212, 1248, 1262, 1266, 1268, 1270, 1362, 1380, 1392, 3392, 6464, 8448, 12608)
 
@@ -68,11 +68,11 @@ def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
     payloads = sent.seen.payloads
     packets = rows([payload for _, payload in payloads])
     host_ns = np.array([at for at, _ in payloads])
-    beside = tuple(
+    neighbours = tuple(
         NeighbourStream(Stream(SOURCE, 7788), len(payload), rows([payload]), np.array([at]))
         for at, payload in sent.neighbours
     )
-    evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, beside)
+    evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, neighbours)
     given = parse_calibration(Path(sent.file), sent.content) if sent.file else None
     known = built_in() if given is None else [given]
     found = [calibration for one in known if (calibration := _named(one, sent))]

@@ -62,7 +62,7 @@ def _module(path: Path) -> Module:
 
 
 def imports(module: Module, names: frozenset[str]) -> Iterator[Import]:
-    """Imports from the package; `names`: all its modules, to tell them from what they define."""
+    """Imports from the package; `names`: all its modules, unlike what they define."""
     guarded, called = _inside(module.tree, _is_guard), _inside(module.tree, _is_function)
     for node in ast.walk(module.tree):
         for target in _targets(node, module, names):

@@ -41,7 +41,7 @@ def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
     recordings = [open_recording(path, table) for path in captures]
     host_ns = np.concatenate([batch.host_ns for batch in first_seconds(recordings)])
     assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
-    # 32 packets a turn of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
+    # 32 packets a revolution of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
     sampler, _ = probe(recordings, table)
     assert [samples.packets for samples in sampler.kinds.values()] == [60 * 32, 50 * 32 + 1]
 

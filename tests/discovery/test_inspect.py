@@ -207,7 +207,7 @@ REAL = {
         53750: ("ouster_992108000265", 17, "uptime"),
         7503: ("ouster_992108000265", 10, ""),
     },
-    # 540.8 s ahead of the recorder: neither UTC nor TAI.
+    # 540.8 s ahead of the capture host: neither UTC nor TAI.
     "os2-128_duplicate-ip-id/duplicate_id.pcap": {34636: ("ouster_992219000042", 1, "unknown")},
     "os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap": {7513: ("", 8, ""), 7514: ("", 1, "")},
     "empty-pcap/empty_pcap.pcap": {},

@@ -2,7 +2,7 @@
 
     python -m tests.golden.expected
 
-Only after a change of the output that is wanted; commit it alone, with the reason.
+Only after an intended change of the output; commit it alone, with the reason.
 """
 
 from __future__ import annotations

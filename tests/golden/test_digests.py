@@ -518,7 +518,7 @@ def _lines(texts: Mapping[str, Sequence[str]]) -> set[str]:
 
 def _join(texts: dict[str, set[str]], found: Digests, command_name: str = "") -> None:
     for key, lines in found.texts.items():
-        # Outputs are called out or out.*, a report inside of one is as that beside.
+        # Outputs are called out or out.*, a report inside of one is as that next to it.
         if key.startswith("verify "):
             key = "verify " + key.split(" ", 2)[2]
         elif "report" in key:

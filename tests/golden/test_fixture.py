@@ -141,7 +141,7 @@ def test_ranges_agree_with_positions(folder: Path) -> None:
     for lidar_id, lidar in enumerate(LIDARS):
         own = cloud.of_sensor(lidar_id)
         centre = body_from_sensor(lidar) @ (0.0, 0.0, lidar.lift_mm / 1000, 1.0)
-        # A beam starts beside the rotor's axis by its offset, but the range counts from the axis:
+        # A beam starts at its offset from the rotor's axis, but the range counts from the axis:
         # the straight distance differs by less than the offset in any direction.
         straight_m: F64Array = np.linalg.norm(own.xyz - centre[:3], axis=1)
         assert np.abs(straight_m - own.range_m).max() <= lidar.offset_mm / 1000

@@ -73,7 +73,7 @@ def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
     result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     assert [sensor.clock.source for sensor in result.report.sensors] == ["sensor", "host"]
-    # The last column of a packet counts as its arrival: 1 ms and a column's 0.195 ms after it was.
+    # The last column of a packet gets its receive time: 1 ms and a column's 0.195 ms later.
     grid_ns = np.arange(1536) * 195_312.5 + 1_195_312.5 + one.begin_ns % NS_PER_S
     for scan in result.scans:
         start_ns = scan.start_ns % NS_PER_S
@@ -94,7 +94,7 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     assert [note.code for note in run.notes[1:]] == ["clocks"]
 
 
-# -- what a run tells while and after it runs -----------------------------------------------------
+# -- progress and report ---------------------------------------------------------------------------
 
 
 def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
@@ -102,11 +102,13 @@ def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
         write_session(tmp_path / name, replace(Unit(), begin_ns=EPOCH_NS + at * NS_PER_S))
         for name, at in (("1", 1), ("2", 2))
     )
-    told: list[tuple[int, int]] = []
-    convert(Job(captures, keep_partial=True), None, lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    convert(
+        Job(captures, keep_partial=True), None, lambda done, total: reported.append((done, total))
+    )
     size = sum(capture.stat().st_size for capture in captures)
-    assert told == sorted(told)
-    assert told[-1] == (size, size)
+    assert reported == sorted(reported)
+    assert reported[-1] == (size, size)
 
 
 def test_the_stages_take_no_longer_than_the_run() -> None:
@@ -115,7 +117,7 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
     assert timing is not None
     parts = timing.read_s + timing.decode_s + timing.merge_s + timing.write_s
     assert 0 < parts <= timing.wall_s
-    # From the first frame's arrival to the last (SOURCE.md: 20 to 870 ms).
+    # From the first receive time to the last (SOURCE.md: 20 to 870 ms).
     assert timing.recorded_s == pytest.approx(0.85, abs=0.01)
 
 

@@ -1,4 +1,4 @@
-"""What `--resume` says and refuses, and what other ends of a run leave."""
+"""`--resume`: messages, refused jobs, files left by runs that end early."""
 
 from __future__ import annotations
 

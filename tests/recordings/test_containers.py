@@ -9,8 +9,8 @@ import pytest
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.run import in_memory, prints
-from tests.golden.maker_messages import CONTAINERS, unit_of
-from tests.golden.test_maker_containers import job
+from tests.golden.test_vendor_containers import job
+from tests.golden.vendor_messages import CONTAINERS, unit_of
 from tests.recordings import RECORDINGS
 
 BAGS = {
