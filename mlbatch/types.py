@@ -160,7 +160,7 @@ class Columns:
 
     stamp_ns: I64Array  # (n,) common clock
     ring_index: I64Array  # (n,) row of the sensor's `PacketRing`
-    encoder: I64Array  # (n,) rotor position: index into the sensor's angle table, or rotor word
+    encoder: I64Array  # (n,) index into the angle table of the beams, or rotor word
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

@@ -55,7 +55,7 @@ BY_HOST = replace(FIXTURE, selection=replace(FIXTURE.selection, host_clock=True)
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What a command said, and its exit code."""
+    """Output of a command, and its exit code."""
 
     code: int
     out: str
@@ -220,7 +220,7 @@ def buffers_of(size: int) -> Iterator[None]:
         yield
 
 
-# -- what lies in a folder of npz files -----------------------------------------------------------
+# -- content of a folder of npz files -------------------------------------------------------------
 
 
 def scan_files(folder: Path) -> list[Path]:

@@ -35,7 +35,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Unit:
-    """A lidar in a session; begin_ns: its first stamp; host_ns: capture host's clock minus its own."""
+    """A lidar in a session; begin_ns: its first stamp; host_ns: host clock minus sensor clock."""
 
     spec: OusterSpec = SMALL
     ip: str = "10.0.0.1"

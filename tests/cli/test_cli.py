@@ -47,7 +47,7 @@ def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
         "dropped",
         "points",
     ]
-    # 7 windows of 512 columns; head and tail hold the other 752 of 4336 (SOURCE.md).
+    # 7 windows of 512 columns; head and tail have the other 752 of 4336 (SOURCE.md).
     assert left.split() == ["left", "OS-0-32-U1", "271", "0", "0", "3584", "752", "90790"]
     assert right.split() == ["right", "OS-1-32-U1", "271", "0", "0", "3584", "752", "105196"]
     assert scans == (
@@ -108,7 +108,7 @@ def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:
     table, listed = shell("sensors"), json.loads(shell("sensors --json").out)
     lines = table.out.splitlines()
     assert lines[0].split() == list(listed[0])
-    # Columns of the table are two blanks or more apart; names hold one at most.
+    # Columns of the table are two blanks or more apart; names have one at most.
     cells = [re.split(r" {2,}", line)[0] for line in lines[1:]]
     assert cells == [row["model"] for row in listed]
     assert {"OS0-32", "VLP-16", "PandarXT-32", "Helios 16", "Livox SDK2"} <= set(cells)

@@ -106,8 +106,8 @@ def test_aligned_clocks_give_the_scans_of_synchronised_ones(
         _stamps(tmp_path / "mapped", sensor) - _stamps(tmp_path / "true", sensor)
         for sensor in (0, 1)
     ]
-    # By the capture host's clock, later than the columns by the packet's transport (1 ms) and what
-    # its last column (0.2 ms), which both share; by the first sensor's, where they were.
+    # On the capture host's clock, later than the columns by the packet's transport (1 ms) and its
+    # length (0.2 ms), the same for both; on the first sensor's clock, unchanged.
     expected = 1_200_000 if to == "host" else 0
     for one in away:
         assert np.abs(one - expected).max() < 500_000

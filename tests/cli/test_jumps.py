@@ -145,7 +145,7 @@ def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path
 
 
 def test_passed_messages_go_to_one_part(shell: Shell, tmp_path: Path) -> None:
-    """The metadata, which stand at the start, are known in both."""
+    """The metadata are recorded at the start, and used for both."""
     one, two = _pieces(Unit(), FORWARD)
     messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
     first_ns, last_ns = messages[0].log_ns, messages[-1].log_ns

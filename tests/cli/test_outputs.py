@@ -91,7 +91,7 @@ def _ledger_balances(report: Report) -> None:
 
 
 def test_an_end_stops_the_reading(dry: Callable[[str], Report], tmp_path: Path) -> None:
-    """Of 90 s in two files the end lies in the first, whose buffer holds some 30 s."""
+    """Of 90 s in two files the end is in the first, whose buffer has some 30 s."""
     first = Unit(turns=450)
     second = replace(first, begin_ns=first.begin_ns + 45 * NS_PER_S, first_frame=455)
     one, two = write_session(tmp_path / "1", first), write_session(tmp_path / "2", second)
@@ -151,9 +151,9 @@ def test_partial_windows_and_slices_have_their_own_names(shell: Shell) -> None:
         HEAD_POINTS,
     )
     shell(f"convert {FIX} -o sliced --keep-partial --slices 4")
-    # The first stamps lie 22 ms after the second: all slices of the head hold columns.
+    # The first stamps are 22 ms after the second: all slices of the head have columns.
     whole = [f"{name}-{j}.npz" for name in [*windows[:7], "head"] for j in range(4)]
-    # The last stamps lie 69 ms into window 7.
+    # The last stamps are 69 ms into window 7.
     assert names("sliced") == sorted([*whole, *(f"000007-{j}.npz" for j in range(3))])
     last = arrays("sliced/head-3.npz")
     assert (int(last["index"]), int(last["slice"]), int(last["slices"])) == (-1, 3, 4)

@@ -1,4 +1,4 @@
-"""What the command line says of sessions with lidars that have no decoder."""
+"""Messages of the command line about lidars that have no decoder."""
 
 from __future__ import annotations
 

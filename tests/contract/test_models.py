@@ -240,7 +240,7 @@ def test_a_packet_says_the_same_in_any_company(name: str) -> None:
 
 
 def _check_table(lidar: Lidar) -> None:
-    """What a lidar says of its columns before any packet."""
+    """Properties of a lidar's columns, before any packet."""
     model = next(m for m in models() if _is_named(lidar, m))
     assert (lidar.vendor, lidar.channels) == (model.vendor, model.channels)
     assert lidar.firing_ns.ndim == 2

@@ -34,7 +34,7 @@ class Module:
 
 @dataclass(frozen=True, slots=True)
 class Import:
-    """An import of a module of the package, wherever in a file it stands."""
+    """An import of a module of the package, anywhere in a file."""
 
     target: str
     line: int

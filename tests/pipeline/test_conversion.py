@@ -45,7 +45,7 @@ def _rig(folder: Path, *clocks: str) -> Path:
 
 
 def test_an_offset_of_the_rig_brings_clocks_together(tmp_path: Path) -> None:
-    """One lidar on UTC, one on TAI, 37 s ahead: the rig says so, and the run is on UTC."""
+    """One lidar on UTC, one on TAI, 37 s ahead: the rig gives it, and the run is on UTC."""
     one = Unit()
     tai = replace(twin(one, 222), begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S)
     tai = replace(tai, host_ns=tai.host_ns + NS_PER_MS)

@@ -328,7 +328,7 @@ def test_a_full_disk_names_the_remedy(shell: Shell, monkeypatch: pytest.MonkeyPa
 def test_an_unreadable_disk_names_the_remedy(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The reader's buffer holds 8 MB: the recording is longer, and breaks at its end."""
+    """The reader's buffer has 8 MB: the recording is longer, and breaks at its end."""
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=60))
     whole = _whole(shell, str(capture))

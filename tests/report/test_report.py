@@ -111,7 +111,7 @@ def test_messages_that_nobody_accounts_for_are_found() -> None:
 
 @pytest.mark.parametrize("repeated", [0, 4, -3])
 def test_datagrams_that_reach_no_sensor_are_found(repeated: int) -> None:
-    """110 lidar packets, 9 of an IMU and 2 of nobody."""
+    """110 lidar packets, 9 of an IMU and 2 of no sensor."""
     counted = replace(run(), capture=CaptureCounts(121 - repeated, 121 - repeated))
     assert imbalances(replace(counted, repeated=repeated)) == []
     assert imbalances(replace(counted, repeated=repeated + 1)) == [
@@ -245,7 +245,7 @@ def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
 
 
 def test_names_that_are_no_text_come_back() -> None:
-    """A file called by two bytes that UTF-8 does not know."""
+    """A file name of two bytes that are not UTF-8."""
     name = os.fsdecode(b"/data/\xff\xfe.pcap")
     text = report_text(replace(run(), inputs=(InputReport(name, 1000, "pcap"),)))
     assert json.loads(text.encode("utf-8"))["inputs"][0]["path"] == name
