@@ -64,7 +64,9 @@ class Told:
 
 def command(*words: str | Path) -> Told:
     """Run `mlbatch` with these words in this process."""
-    out, err, before = io.StringIO(), io.StringIO(), sys.argv
+    out = io.StringIO()
+    err = io.StringIO()
+    before = sys.argv
     sys.argv = ["mlbatch", *map(str, words)]
     code: object = 0
     try:

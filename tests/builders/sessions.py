@@ -24,7 +24,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 FIXTURE = REPOSITORY / "fixtures" / "two_lidars"
 RECORDINGS = REPOSITORY / ".." / "shared" / "recordings"
 NO_RECORDINGS = "the folder of real recordings is not here"
-NS_PER_S, NS_PER_MS = 10**9, 10**6
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
 EPOCH_NS = 1_800_000_000 * NS_PER_S
 PACKETS_PER_TURN = 32
 SMALL = OusterSpec(beams=16, columns_per_frame=512, serial=111)

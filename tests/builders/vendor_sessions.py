@@ -18,7 +18,8 @@ from tests.builders.sessions import Records, Unit
 # 800 s past the full hour.
 BEGIN_NS = 1_700_000_000 * 10**9
 BEGIN_US = 800_000_000.0
-RAW_RANGE, LEVEL = 2000, 50
+RAW_RANGE = 2000
+LEVEL = 50
 Payloads = list[tuple[int, bytes]]
 
 

@@ -105,7 +105,8 @@ def test_the_version_and_the_help_go_to_stdout(shell: Shell) -> None:
 
 
 def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:
-    table, listed = shell("sensors"), json.loads(shell("sensors --json").out)
+    table = shell("sensors")
+    listed = json.loads(shell("sensors --json").out)
     lines = table.out.splitlines()
     assert lines[0].split() == list(listed[0])
     # Columns of the table are two blanks or more apart; names have one at most.

@@ -84,7 +84,9 @@ def _ledger_balances(report: Report) -> None:
     own = sum(s["packets"]["read"] + s["imu_packets"] for s in report["sensors"])
     assert capture["datagrams"] == own + unassigned
     for sensor in report["sensors"]:
-        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        packets = sensor["packets"]
+        columns = sensor["columns"]
+        points = sensor["points"]
         assert packets["read"] == packets["accepted"] + sum(packets["rejected"].values())
         assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
         assert points["slots"] == sum(points.values()) - points["slots"]
@@ -131,8 +133,10 @@ def test_range_limits(shell: Shell) -> None:
 def test_boxes_add_to_those_of_the_rig(shell: Shell) -> None:
     shell(f"convert {FIX} -o all")
     shell(f"convert {FIX} -o cut --exclude-box=0,-8,-1,20,8,9 --exclude-box=-20,0,-1,0,8,9")
-    whole, cut = arrays("all/000000.npz")["xyz"], arrays("cut/000000.npz")["xyz"]
-    x, y = whole[:, 0], whole[:, 1]
+    whole = arrays("all/000000.npz")["xyz"]
+    cut = arrays("cut/000000.npz")["xyz"]
+    x = whole[:, 0]
+    y = whole[:, 1]
     np.testing.assert_array_equal(cut, whole[(x < 0) & (y < 0)])
     first, second = (report_of(f"{name}/report.json") for name in ("all", "cut"))
     # 763 returns of `left` a window hit the machine, none of `right` (SOURCE.md).
@@ -169,7 +173,8 @@ def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
     ]
     whole = arrays("merged/000004.npz")
     for number, sensor in enumerate(("left", "right")):
-        own, part = whole["lidar_id"] == number, arrays(f"split/{sensor}/000004.npz")
+        own = whole["lidar_id"] == number
+        part = arrays(f"split/{sensor}/000004.npz")
         np.testing.assert_array_equal(part["xyz"], whole["xyz"][own])
         np.testing.assert_array_equal(part["ring"], whole["ring"][own] - 32 * number)
         assert (int(part["index"]), bool(part["complete"])) == (4, True)

@@ -20,7 +20,9 @@ from tests.builders.sessions import NS_PER_MS, Shell, Unit, twin
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 
 # Longer than what rates are measured over.
-TURNS, TURN_NS, EVERY_NS = 24, 100 * NS_PER_MS, 20 * NS_PER_MS
+TURNS = 24
+TURN_NS = 100 * NS_PER_MS
+EVERY_NS = 20 * NS_PER_MS
 NOTES = TURNS * TURN_NS // EVERY_NS
 
 

@@ -43,9 +43,13 @@ XT16 = HesaiSpec("PandarXT-16")
 P40 = HesaiSpec("Pandar40P")
 HELIOS = RobosenseSpec("Helios 16")
 # Packets that suffice to be recognised, and those of more than a few windows.
-FEW, MANY = 20, 400
-PORT, RS_PORT, DIFOP_PORT = 2368, 6699, 7788
-IP, OTHER_IP = "10.0.0.8", "10.0.0.9"
+FEW = 20
+MANY = 400
+PORT = 2368
+RS_PORT = 6699
+DIFOP_PORT = 7788
+IP = "10.0.0.8"
+OTHER_IP = "10.0.0.9"
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +129,8 @@ def _write_hesai(folder: Path) -> None:
 
 
 def _write_robosense(folder: Path) -> None:
-    many, device = robosense_payloads(HELIOS, MANY), difop_payloads(HELIOS)
+    many = robosense_payloads(HELIOS, MANY)
+    device = difop_payloads(HELIOS)
     write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
     write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
     write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))

@@ -91,7 +91,8 @@ def _named(calibration: Calibration, sent: Sent) -> Calibration | None:
 
 
 def _ouster(model: SensorModel) -> Stand:
-    beams, product = model.channels, model.name.replace("OS", "OS-", 1)
+    beams = model.channels
+    product = model.name.replace("OS", "OS-", 1)
     spec = ouster.OusterSpec(beams=beams, columns_per_frame=512, product=product)
     ranges = np.full((512, beams, 1), 4000)
     packets = rows(ouster.encode_frame(spec, START_NS, 5, ranges)[:8])
@@ -187,7 +188,8 @@ def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) 
     try:
         found = plugin.read_calibration(Path("some.file"), content)
     except MlbatchError as err:
-        found, refusal = None, str(err)
+        found = None
+        refusal = str(err)
     assert found is None
     assert refusal.startswith("some.file: ")
 
@@ -195,7 +197,8 @@ def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) 
 @pytest.mark.parametrize("name", cases())
 def test_a_lidar_keeps_the_laws(name: str) -> None:
     stand = cases()[name]()
-    lidar, packets = stand.lidar, stand.packets
+    lidar = stand.lidar
+    packets = stand.packets
     _check_table(lidar)
     shape = (len(packets), lidar.columns_per_packet)
     headers = lidar.column_headers(packets, stand.host_ns)
@@ -218,7 +221,9 @@ def test_a_lidar_keeps_the_laws(name: str) -> None:
 @pytest.mark.parametrize("name", cases())
 def test_a_packet_says_the_same_in_any_company(name: str) -> None:
     stand = cases()[name]()
-    lidar, packets, host_ns = stand.lidar, stand.packets, stand.host_ns
+    lidar = stand.lidar
+    packets = stand.packets
+    host_ns = stand.host_ns
     order = np.random.default_rng(2).permutation(len(packets))
     whole, shuffled = (
         lidar.column_headers(packets, host_ns),
@@ -253,7 +258,8 @@ def _check_table(lidar: Lidar) -> None:
     assert len(lidar.return_types) == lidar.returns
     assert lidar.typed_by in ("order", "level", "")
     assert lidar.beams.direction.shape == (3, lidar.channels, 3)
-    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    at = lidar.records
+    column = np.arange(lidar.columns_per_packet)
     begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
     assert begins.min() >= 0
     assert begins.max() + at.size <= lidar.packet_size
@@ -265,7 +271,8 @@ def _is_named(lidar: Lidar, model: SensorModel) -> bool:
 
 def _records(lidar: Lidar, packets: U8Array) -> U8Array:
     """The bytes of all columns, one by one."""
-    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    at = lidar.records
+    column = np.arange(lidar.columns_per_packet)
     begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
     found = packets[:, begins[:, None] + np.arange(at.size)]
     return np.ascontiguousarray(found.reshape(-1, at.size))

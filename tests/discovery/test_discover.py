@@ -101,7 +101,8 @@ def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: P
 
 
 def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) -> None:
-    first, second = tmp_path / "1", tmp_path / "2"
+    first = tmp_path / "1"
+    second = tmp_path / "2"
     for folder, serial in ((first, 1), (second, 2)):
         folder.mkdir()
         write_metadata(folder / "any name.JSON", replace(SMALL, serial=serial))

@@ -28,7 +28,8 @@ from tests.builders.sessions import (
 CAPTURE = FIXTURE / "two_lidars.pcap"
 OUSTER = RECORDINGS / "ouster"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
-LEFT, RIGHT = "ouster_122647000123", "ouster_122648000456"
+LEFT = "ouster_122647000123"
+RIGHT = "ouster_122648000456"
 
 
 def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:

@@ -39,7 +39,8 @@ from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
 
 PACKETS = 12
-SOURCE, HOST = "192.168.1.201", "192.168.1.10"
+SOURCE = "192.168.1.201"
+HOST = "192.168.1.10"
 # Beams that point up see walls as well.
 EYE = Eye(hall(), pose((3.1, 1.3, 1.5), (9.0, 31.0, -41.0)))
 FLOAT32_M = 1e-5
@@ -99,10 +100,13 @@ def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sen
     elevation = np.round(np.linspace(highest, lowest, channels), 3).tolist()
     azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
     beams: Beams = Angles(elevation, azimuth)
-    file, content = "unit.csv", angles_csv(elevation, azimuth)
+    file = "unit.csv"
+    content = angles_csv(elevation, azimuth)
     if model == "AT128":
         mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
-        beams, file, content = mirrors, "unit.dat", mirrors.dat()
+        beams = mirrors
+        file = "unit.dat"
+        content = mirrors.dat()
     sight = hesai_sees(spec, beams, EYE, PACKETS)
     types: tuple[int, ...] = {"33": (0,), "37": (1,), "38": (2,)}.get(mode, ())
     if model == "JT16":  # Nothing in its packets identifies it.
@@ -221,7 +225,8 @@ def test_all_comes_back(make: Callable[..., Sent], words: tuple[str, ...], tmp_p
 
 def check_readings(sent: Sent, scans: Sequence[Scan], order: I64Array) -> None:
     """Every slot of every column."""
-    sight, shape = sent.seen, sent.seen.counts.shape
+    sight = sent.seen
+    shape = sent.seen.counts.shape
     slack_ns = MEASURED_NS.get(sent.model, 0)
     stamps = np.concatenate([scan.column_stamp_ns for scan in scans])
     assert np.abs(stamps - sight.stamp_ns[order]).max() <= slack_ns

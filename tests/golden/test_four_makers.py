@@ -26,7 +26,8 @@ from tests.builders.scene import hall
 from tests.builders.seen import ASIDE_PER_M, Seen
 from tests.builders.seen_points import Expected, Points, pair_types, repeated
 
-PCAP, RIG = FOLDER / "four_makers.pcap", FOLDER / "rig.yaml"
+PCAP = FOLDER / "four_makers.pcap"
+RIG = FOLDER / "rig.yaml"
 SENSORS = [seen()[place.name] for place in PLACES]
 NAMES = [place.name for place in PLACES]
 ROOF = PLACES.index(VELODYNE)
@@ -82,7 +83,8 @@ def columns_of(window: Window) -> tuple[I64Array, I64Array]:
 
 
 def check_windows(converted: Run) -> None:
-    files, windows = scan_files(converted.folder), converted.outcome.windows
+    files = scan_files(converted.folder)
+    windows = converted.outcome.windows
     assert len(files) == len(windows)
     for path, window in zip(files, windows, strict=True):
         scan, (sensor, column) = load(path), columns_of(window)
@@ -99,7 +101,8 @@ def check_points(converted: Run, *, keep_repeated: bool = False, are_turned: boo
     """What each point is, when it was measured, where it lies, and the order of points."""
     expected = Expected(SENSORS, keep_repeated=keep_repeated)
     for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
-        cloud, expected_points = Cloud.of(path), expected.points(*columns_of(window))
+        cloud = Cloud.of(path)
+        expected_points = expected.points(*columns_of(window))
         check_cloud(cloud, expected_points)
         # On the very ray, but for the azimuth.
         away_m: F64Array = np.linalg.norm(cloud.xyz - expected_points.xyz_m, axis=1)
@@ -123,7 +126,8 @@ def check_places(cloud: Cloud) -> None:
     assert np.isfinite(cloud.intensity).all()
     for number, (place, sight) in enumerate(zip(PLACES, SENSORS, strict=True)):
         own = cloud.of_sensor(number)
-        xyz_m, range_m = own.xyz.astype(np.float64), own.range_m.astype(np.float64)
+        xyz_m = own.xyz.astype(np.float64)
+        range_m = own.range_m.astype(np.float64)
         allowed_m = sight.unit_m / 2 + OFF_PER_M * range_m + FLOAT32_AT_20_M
         assert (hall().distance_to_surfaces(xyz_m) - allowed_m).max() < 0, place.name
         straight_m: F64Array = np.linalg.norm(xyz_m - place.body_from_sensor[:3, 3], axis=1)
@@ -271,7 +275,9 @@ def test_ledgers_balance(whole: Run) -> None:
         report["capture"]["skipped"].values()
     )
     for sensor, sight in zip(report["sensors"], SENSORS, strict=True):
-        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        packets = sensor["packets"]
+        columns = sensor["columns"]
+        points = sensor["points"]
         assert packets["read"] == packets["accepted"] == len(sight.payloads)
         assert (packets["rejected"], packets["lost"], packets["reordered"]) == ({}, 0, 0)
         assert columns["decoded"] == columns["written"] == len(sight.stamp_ns)
@@ -289,5 +295,6 @@ def test_streams_are_recognised_without_a_rig() -> None:
 def test_fixture_is_made_again_to_the_byte(tmp_path: Path) -> None:
     main(tmp_path)
     for path in sorted(tmp_path.iterdir()):
-        made, kept = path.read_bytes(), (FOLDER / path.name).read_bytes()
+        made = path.read_bytes()
+        kept = (FOLDER / path.name).read_bytes()
         assert hashlib.sha256(made).hexdigest() == hashlib.sha256(kept).hexdigest(), path.name

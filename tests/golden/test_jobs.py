@@ -105,7 +105,8 @@ class Nth:
     """Fails at one of its calls."""
 
     def __init__(self, number: int, error: BaseException) -> None:
-        self._left, self._error = number, error
+        self._left = number
+        self._error = error
 
     def call(self) -> None:
         """Count a call."""
@@ -131,7 +132,9 @@ def test_an_error_of_any_stage_ends_the_run(
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
     error, message = STAGES[stage]
     nth = Nth(number, error)
-    scan, compress, write_all = Decoder.scan, Chunk.compress, output_file.write_all
+    scan = Decoder.scan
+    compress = Chunk.compress
+    write_all = output_file.write_all
 
     def failing_scan(*given: object) -> object:
         nth.call()

@@ -29,7 +29,8 @@ from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes
 
 # Ten revolutions a second; a dark sector is recognised after a dozen.
-LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000
+LENGTH_NS = 200_000_000
+DARK_NS = 1_350_000_000
 FIRST = 100
 DARK_DEG = {"": None, "dark": (100.0, 250.5), "dark through zero": (330.3, 29.7)}
 

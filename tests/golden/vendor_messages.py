@@ -19,7 +19,8 @@ from tests.builders.sessions_of_bags import Mcap, split_at, write_mcap
 NS_PER_MS = 1_000_000
 HOST = "192.168.1.10"
 # A driver publishes the packets of a revolution a little after its end.
-TURN_NS, LATER_NS = 100 * NS_PER_MS, 3 * NS_PER_MS
+TURN_NS = 100 * NS_PER_MS
+LATER_NS = 3 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,8 @@ def shell(
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
     """Have the writing of a scan fail, once."""
-    encode, calls = npz.NpzEncoder.encode, 0
+    encode = npz.NpzEncoder.encode
+    calls = 0
 
     def failing(encoder: npz.NpzEncoder, found: Scan) -> list[Bytes]:
         nonlocal calls

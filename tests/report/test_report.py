@@ -33,17 +33,24 @@ from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 def ledger() -> SensorLedger:
     """A ledger that balances, every counter different."""
     counts = SensorLedger()
-    counts.packets.read, counts.packets.accepted = 110, 100
+    counts.packets.read = 110
+    counts.packets.accepted = 100
     counts.packets.reject("duplicate", 7)
     counts.packets.reject("bad_size", 2)
     counts.packets.reject("bad_size")
-    counts.packets.lost, counts.packets.reordered = 4, 5
-    counts.columns.decoded, counts.columns.written = 1600, 1500
+    counts.packets.lost = 4
+    counts.packets.reordered = 5
+    counts.columns.decoded = 1600
+    counts.columns.written = 1500
     counts.columns.drop("late", 100)
     counts.columns.drop("tail", 0)
     points = counts.points
-    points.slots, points.no_return, points.range = 6000, 1000, 300
-    points.box, points.repeated, points.written = 200, 0, 4500
+    points.slots = 6000
+    points.no_return = 1000
+    points.range = 300
+    points.box = 200
+    points.repeated = 0
+    points.written = 4500
     counts.imu_packets = 9
     return counts
 
@@ -139,7 +146,8 @@ def test_table_of_scans_by_hand() -> None:
         "coverage_left,coverage_right,overlap_left,overlap_right,missing_left,missing_right,"
         "ready_host_ns"
     )
-    start, end = START_NS, START_NS + PERIOD_NS
+    start = START_NS
+    end = START_NS + PERIOD_NS
     last = start + 75_000_000  # four columns, 25 ms apart
     times = [start, end, start, last]
     # Nothing is known of rotors here, nor of what the sensors should have sent.
