@@ -149,16 +149,13 @@ _JITTER = 1 / 360
 
 @dataclass(slots=True)
 class _Packets:
-    """Packets of one sensor, (n,) each; bins: (n, C) uint16, angle bins of all columns.
+    """Packets of one sensor, (n,) each."""
 
-    stamp_ns: of the first column; first, last: angles of the first and last column, revolutions.
-    """
-
-    stamp_ns: I64Array
+    stamp_ns: I64Array  # of the first column
     host_ns: I64Array
-    first: F64Array
-    last: F64Array
-    bins: U16Array
+    first: F64Array  # angle of the first column, revolutions
+    last: F64Array  # angle of the last column, revolutions
+    bins: U16Array  # (n, C) angle bins of all columns
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

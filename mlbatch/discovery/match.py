@@ -41,10 +41,10 @@ class Matched:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A calibration that matches packets; number: its index."""
+    """A calibration that matches packets."""
 
     score: int
-    number: int
+    number: int  # index of the calibration
     lidar: Lidar
 
 
@@ -224,11 +224,11 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedSensor:
-    """A sensor of the rig, and calibrations it may have; options: of the command line."""
+    """A sensor of the rig, and calibrations it may have."""
 
     rig: RigSensor
     calibrations: Sequence[Calibration]
-    options: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, str] = field(default_factory=dict)  # of the command line
 
     @property
     def name(self) -> str:

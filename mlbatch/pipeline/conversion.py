@@ -35,11 +35,11 @@ Item = TypeVar("Item")
 
 @dataclass(slots=True)
 class Stages:
-    """Seconds spent in each stage; merge_s: all that makes windows, without reading."""
+    """Seconds spent in each stage."""
 
     read_s: float = 0.0
     decode_s: float = 0.0
-    merge_s: float = 0.0
+    merge_s: float = 0.0  # ingest and batching, with reading
     write_s: float = 0.0
     _started_s: tuple[float, float] = field(
         default_factory=lambda: (time.perf_counter(), time.process_time())

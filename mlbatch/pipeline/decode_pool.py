@@ -22,15 +22,12 @@ NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
 
 @dataclass(slots=True)
 class DecodeTask:
-    """Columns of one scan, to be decoded.
-
-    only: with `--split` the index of their sensor; outcomes: as in `Decoder.scan`.
-    """
+    """Columns of one scan, to be decoded."""
 
     columns: WindowColumns
     label: ScanHeader
-    only: int | None
-    outcomes: Outcomes | None
+    only: int | None  # with `--split` the index of their sensor
+    outcomes: Outcomes | None  # as in `Decoder.scan`
     is_decoded: bool = False
 
     @property

@@ -30,16 +30,13 @@ POINT_OUTCOMES = ("no_return", "range", "box", "repeated", "written")
 
 @dataclass(slots=True)
 class PacketCounts:
-    """Lidar packets of a sensor: read = accepted + sum(rejected).
-
-    lost: gaps in the sequence; reordered: packets received after a later one.
-    """
+    """Lidar packets of a sensor: read = accepted + sum(rejected)."""
 
     read: int = 0
     accepted: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
-    lost: int = 0
-    reordered: int = 0
+    lost: int = 0  # gaps in the sequence
+    reordered: int = 0  # packets received after a later one
 
     def reject(self, reason: str, count: int = 1) -> None:
         """Count rejected packets."""

@@ -34,7 +34,7 @@ IDIOM = {
 WORDS = re.compile("|".join(rf"\b(?:{pattern})\b" for pattern in IDIOM), re.IGNORECASE)
 # Fixed names: functions of typer and of files, fields of JSON documents and of a vendor's format.
 FOREIGN = re.compile(
-    r"typer\.echo|\.tell\(\)|`tell`|[`\"](?:maker|wanted)[`\"]"
+    r"typer\.echo|\btell\(|`tell`|[`\"](?:maker|wanted)[`\"]"
     r"|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']"
 )
 # Pages that the repository does not have, and the old place of the sources.
