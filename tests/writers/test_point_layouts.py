@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.decode.scan_buffer import Buffer
+from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import Scan
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
 from tests.builders.scans import dense_scan, organized_scan
@@ -21,7 +21,7 @@ SPARE = 7
 def side_by_side(scan: Scan) -> Scan:
     """The same scan in the arrays of a decoder, which are longer than what is in them."""
     rows, *slots = scan.time_ns.shape
-    buffer = Buffer(rows + SPARE, *slots or (None,))
+    buffer = ScanBuffer(rows + SPARE, *slots or (None,))
     buffer.point[:rows, ..., :3] = scan.xyz
     buffer.point[:rows, ..., 3] = scan.intensity
     for name in ("time_ns", "ring", "return_type", "lidar_id"):
