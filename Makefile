@@ -2,6 +2,7 @@
 #
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
 #   make test    formatting, lint, types, all tests, branch coverage
+#   make test-quick   the tests of daily work, within a minute
 #   make lint    the first three of them
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
@@ -14,12 +15,12 @@ RIG := fixtures/two_lidars
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench fuzz clean
+.PHONY: help demo test test-quick lint bench fuzz clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
 
-demo: $(VENV)/core.stamp
+demo: $(VENV)/dev.stamp
 	@mkdir -p demo
 	$(CONVERT) -o demo/two_lidars.mcap
 	$(CONVERT) -o demo/scans
@@ -28,6 +29,9 @@ demo: $(VENV)/core.stamp
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered
+
+test-quick: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -n 2 -m 'not slow and not long'
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
@@ -48,11 +52,11 @@ fuzz: $(VENV)/dev.stamp
 clean:
 	rm -rf $(VENV) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
 
-# A stamp is as old as its environment: it is made again when pyproject.toml changes.
+# The environment is updated when pyproject.toml changes.
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
-		echo "make: wanted Python 3.10 or later, got $$($(PYTHON) --version 2>&1);" \
-			"give another one: make PYTHON=python3.12"; exit 1; }
+		echo "make: expected Python 3.10 or later, found $$($(PYTHON) --version 2>&1);" \
+			"choose another: make PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "make: $(PYTHON) cannot make a virtual environment;" \
 			"on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }

@@ -38,7 +38,7 @@ def with_table(page: str) -> str:
 
 def _shared(model: SensorModel) -> tuple[str, ...]:
     returns = ", ".join(map(str, model.returns))
-    return model.maker, returns, model.clock, model.calibration, model.verified
+    return model.vendor, returns, model.clock, model.calibration, model.verified
 
 
 def _name(model: SensorModel) -> str:

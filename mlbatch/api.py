@@ -1,4 +1,4 @@
-"""The Python face: the scans that `mlbatch convert` writes, one after the other in memory."""
+"""Python interface: the scans that `mlbatch convert` writes, one after another in memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.decode.kernels import ENGINES
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
@@ -53,11 +53,11 @@ def scans(
         ("engine", engine, ENGINES),
     ):
         if value not in known:
-            raise UsageError(f"{name}: wanted {' or '.join(known)}, got {value!r}; choose one")
+            raise UsageError(f"{name}: expected {' or '.join(known)}, found {value!r}; choose one")
     check_ranges_m("min_range", min_range, "max_range", max_range)
     job = Job(
         recordings=tuple(Path(path) for path in recordings),
-        wishes=Wishes(
+        selection=SensorSelection(
             rig=None if rig is None else Path(rig),
             metadata=tuple(Path(path) for path in metadata),
             only=tuple(only),
@@ -66,7 +66,7 @@ def scans(
             host_clock=clock == "host",
             decode=dict(decode or {}),
         ),
-        # The text of a float is what its writer meant: 29.97, and not the nearest binary number.
+        # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
         slices=check_slices("slices", slices),
         layout=layout,
@@ -83,7 +83,7 @@ def scans(
 
 
 def _owned(scan: Scan) -> Scan:
-    """The scan with arrays that the next one does not overwrite."""
+    """A scan with arrays of its own."""
     return replace(
         scan,
         xyz=np.array(scan.xyz, order="C"),

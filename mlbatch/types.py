@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
@@ -110,33 +109,60 @@ class CaptureCounts:
     skipped: dict[str, int] = field(default_factory=dict)
 
     def skip(self, reason: str, count: int = 1) -> None:
-        """Count `count` frames that gave no datagram; reasons are CONTRACT's closed list."""
+        """Count `count` frames that gave no datagram; reasons: `ledger.CAPTURE_REASONS`."""
         if count:
             self.skipped[reason] = self.skipped.get(reason, 0) + count
 
 
-class Recording(Protocol):
-    """An opened recording, whatever its container.
+@dataclass(slots=True)
+class Recording:
+    """An opened recording; each container derives its own `packets`.
 
-    topics: of a bag, all of them; keep: names of topics whose messages the batches shall hold (set
-    before `packets` is called); notes: what is wrong with the file, a line each.
+    container: name of the format; size_bytes: of the files on disk; topics: all topics of a bag;
+    keep: names of topics whose messages the batches include (set before `packets` is called);
+    counts: frames of the current pass; notes: what is wrong with the recording, one line each;
+    position_bytes: how much of `size_bytes` the current pass has read.
     """
 
-    topics: tuple[Topic, ...]
-    keep: frozenset[str]
-    notes: list[str]
     path: Path
     container: str
-    counts: CaptureCounts
     size_bytes: int
-    position_bytes: int
+    topics: tuple[Topic, ...] = field(default=(), kw_only=True)
+    keep: frozenset[str] = field(default=frozenset(), kw_only=True)
+    counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)
+    notes: list[str] = field(default_factory=list, kw_only=True)
+    position_bytes: int = field(default=0, kw_only=True)
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
-        """Yield all packets from the start, in file order; may be called again (counts restart).
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield all packets from the start, in file order; each call is a new pass.
 
-        until_ns: stop once this much time (ns) has passed since the first packet's arrival.
+        A pass resets counts, notes and position. Closing the generator closes the file.
         """
-        ...
+        raise NotImplementedError
+
+    def use_engine(self, engine: str) -> None:
+        """Read by `numpy` or `numba`; ignored by containers that have one implementation."""
+
+
+class WrappedRecording(Recording):
+    """A recording that changes the packets of another one; all else is that of the inner one.
+
+    Only `keep` is its own. Attributes that are not set here are looked up in `inner`.
+    """
+
+    __slots__ = ("inner",)
+
+    def __init__(self, inner: Recording) -> None:
+        self.inner = inner
+        self.keep = frozenset()
+
+    def __getattr__(self, name: str) -> object:
+        """Called for slots without a value."""
+        return getattr(self.inner, name)
+
+    def use_engine(self, engine: str) -> None:
+        """Pass the engine on."""
+        self.inner.use_engine(engine)
 
 
 @dataclass(slots=True)

@@ -1,8 +1,18 @@
-"""The strategy of Faitli et al. (2025), section 2.1, over many packets at once.
+"""The strategy of Faitli et al. (2025), section 2.1, on batches of packets instead of columns.
 
-The paper takes the smallest waiting stamp, converts, advances. Here a whole batch of packets is
-judged by running maxima, columns wait as small records, and a stable sort of the stamps of a window
-stands for the merge. `reference.py` is the same law in plain loops; tests compare the two.
+The paper takes the smallest waiting stamp of all sensors, converts that column, advances. Here the
+columns of a batch wait as small records, and a stable sort by stamp merges those of closed windows.
+`reference.py` implements the same rules in plain loops; tests compare both.
+
+Terms of event-time stream processing:
+- t0: the first stamp of a sensor. Eq. (1) gives t_init, the start of the first window, from the
+  largest t0 of the sensors.
+- watermark: the smallest newest stamp of all sensors minus the allowed lateness. A window closes,
+  and is published, once the watermark reaches its end.
+- allowed lateness (SLACK_NS): how far stamps may be out of order, by packets that the network
+  reordered.
+- idle-source timeout (`Policy.max_wait_ns`, `--max-wait`): a sensor whose newest stamp is further
+  behind the newest of all sensors is stalled, and the watermark ignores it.
 """
 
 from __future__ import annotations
@@ -14,19 +24,59 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Arrival, Delivery, Intake, JumpGuard
+from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Arrival, Intake, JumpGuard
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.errors import ClockJump
 from mlbatch.types import Columns
 from mlbatch.units import NS_PER_MS
 
-# A window closes this long after its end in stamps, so that packets swapped by the network count.
+# Allowed lateness.
 SLACK_NS = 10 * NS_PER_MS
+_NONE = np.empty(0, np.int64)
+
+
+@dataclass(slots=True)
+class Track:
+    """State of one sensor.
+
+    first_ns: t0; newest_ns: largest stamp delivered; offset_ns: first stamp minus its receive time;
+    gaps: (begin, end) of steps longer than the idle-source timeout; waiting: columns of windows
+    that are open; decoded: columns of accepted packets; dropped: columns by reason.
+    """
+
+    intake: Intake
+    first_ns: int = NEVER
+    newest_ns: int = NEVER
+    offset_ns: int | None = None
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+    waiting: list[Columns] = field(default_factory=list)
+    # Lower bound of the ring indices of all waiting columns.
+    oldest_place: int = FOREVER
+    decoded: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def drop(self, reason: str, count: int) -> None:
+        """Count columns that are written to no window."""
+        if count:
+            self.dropped[reason] = self.dropped.get(reason, 0) + count
+
+
+@dataclass(slots=True)
+class Progress:
+    """State before the first delivery of a batch, and after each of its E deliveries.
+
+    newest: (S, E + 1) int64, newest stamp of each sensor; watermark: (E + 1,) int64; host_ns: (E,)
+    int64, receive time of each delivery.
+    """
+
+    newest: I64Array
+    watermark: I64Array
+    host_ns: I64Array
 
 
 class Batcher:
-    """Takes packets in arrival order, gives windows; one named object owns all state."""
+    """Takes packets in order of receive time, yields windows; owns the state of all sensors."""
 
     def __init__(
         self,
@@ -35,22 +85,25 @@ class Batcher:
         policy: Policy,
         guards: Sequence[JumpGuard] = (),
     ) -> None:
-        """guards: one for each sensor whose clock must not jump; all or none."""
+        """Arguments of a run.
+
+        intakes: one a sensor; guards: one a sensor, or none where clocks are not checked.
+        """
         self._grid = grid
         self._policy = policy
         self._schedule = Schedule(grid, policy)
         self._tracks = [Track(intake) for intake in intakes]
         self._watermark = NEVER
-        # All that was waiting before this stamp was published.
+        # All columns before this stamp are published.
         self._until = NEVER
         self._guards = tuple(guards)
 
-    # -- what came in -------------------------------------------------------------------------
+    # -- main loop ----------------------------------------------------------------------------
 
     def push(self, arrivals: Sequence[Arrival | None], host_ns: I64Array) -> Iterator[Window]:
         """Deliver a batch; yield every window that it closes.
 
-        arrivals: one for each sensor; host_ns: (P,) arrival times of the whole batch, by position.
+        arrivals: one a sensor; host_ns: (P,) receive times of the whole batch, by position.
         """
         accepted = self._accept(arrivals)
         ranks, position = ranked(accepted)
@@ -58,16 +111,16 @@ class Batcher:
             return
         self._check_clocks(accepted, ranks)
         progress = self._advance(accepted, ranks, host_ns[position])
-        for number, delivery in enumerate(accepted):
-            if delivery is not None:
-                self._wait(number, delivery.packets, progress.watermark[:-1][ranks[number]])
+        for number, one in enumerate(accepted):
+            if one is not None:
+                self._enqueue(number, one.packets, progress.watermark[:-1][ranks[number]])
         for track, newest_ns in zip(self._tracks, progress.newest[:, -1].tolist(), strict=True):
             track.newest_ns = newest_ns
         self._watermark = int(progress.watermark[-1])
         yield from self._publish(progress)
 
     def finish(self, host_ns: int) -> Iterator[Window]:
-        """End of input: close what is open; host_ns: arrival of the last packet."""
+        """End of input: close all open windows; host_ns: receive time of the last packet."""
         for track in self._tracks:
             track.intake.finish()
         firsts = [track.first_ns for track in self._tracks if track.first_ns > NEVER]
@@ -85,11 +138,11 @@ class Batcher:
             last_of_all=max(track.newest_ns for track in self._tracks),
         )
 
-    # -- what became of it --------------------------------------------------------------------
+    # -- state for reports and for the packet ring ----------------------------------------------
 
     @property
     def t_init_ns(self) -> int | None:
-        """Eq. (1): start of the first window; None as long as it is not known."""
+        """Start of the first window by eq. (1); None until it is known."""
         return self._schedule.t_init_ns
 
     @property
@@ -99,12 +152,12 @@ class Batcher:
 
     @property
     def rejected(self) -> list[dict[str, int]]:
-        """Packets of each sensor that were turned away, by reason."""
+        """Rejected packets of each sensor, by reason."""
         return [track.intake.rejected for track in self._tracks]
 
     @property
     def dropped(self) -> list[dict[str, int]]:
-        """Columns of each sensor that reach no window, by reason."""
+        """Columns of each sensor that are written to no window, by reason."""
         return [track.dropped for track in self._tracks]
 
     @property
@@ -114,27 +167,27 @@ class Batcher:
 
     @property
     def firsts(self) -> list[tuple[int, int] | None]:
-        """First stamp of each sensor and the arrival of its packet; None if it gave none."""
+        """First stamp of each sensor and the receive time of its packet; None without a stamp."""
         return [
             None if track.offset_ns is None else (track.first_ns, track.first_ns - track.offset_ns)
             for track in self._tracks
         ]
 
     def loss(self, sensor: int) -> tuple[int, int]:
-        """Packets of a sensor that were lost, and that came out of order."""
+        """Lost and reordered packets of a sensor."""
         loss = self._tracks[sensor].intake.loss
         return loss.lost, loss.reordered
 
     @property
     def spans_ns(self) -> list[tuple[int, int] | None]:
-        """First and newest stamp of each sensor; None if it gave none."""
+        """First and newest stamp of each sensor; None without a stamp."""
         return [
             None if track.first_ns == NEVER else (track.first_ns, track.newest_ns)
             for track in self._tracks
         ]
 
     def oldest_place(self, sensor: int) -> int | None:
-        """First ring place whose pixels are still needed; None: nothing waits."""
+        """First ring index whose pixels are still needed; None if no column waits."""
         track = self._tracks[sensor]
         held = track.intake.held_place
         oldest = track.oldest_place if held is None else min(track.oldest_place, held)
@@ -142,34 +195,35 @@ class Batcher:
 
     @property
     def limits_ns(self) -> tuple[int | None, int | None]:
-        """`--start` and `--end` on the common clock; None: none, or not known yet."""
+        """`--start` and `--end` on the common clock; None: not given, or not known yet."""
         return self._schedule.limits_ns
 
     @property
     def past_end(self) -> bool:
-        """Whether `--end` was passed, so that nothing that comes can be written any more."""
+        """True once `--end` is passed, so that no later packet can be written."""
         return self._schedule.is_past_end(self._watermark)
 
-    # -- steps --------------------------------------------------------------------------------
+    # -- step 1: accept packets ---------------------------------------------------------------
 
-    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Delivery | None]:
-        """What the sensors' doors let in; ClockJump where clocks jump.
+    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Accepted | None]:
+        """Packets that the intakes accept; ClockJump where clocks jump.
 
-        Clocks that jump together are cut at the first packet of any of them, also of one whose
-        next packet is not here yet: else it would depend on the batch where a recording is cut.
+        If several clocks jump together, the recording is cut at the first packet after any of the
+        jumps, including a packet that is held for confirmation. Otherwise the cut would depend on
+        how packets are grouped into batches.
         """
-        accepted: list[Delivery | None] = []
+        accepted: list[Accepted | None] = []
         jumps: list[ClockJump] = []
         for number, (track, arrival) in enumerate(zip(self._tracks, arrivals, strict=True)):
-            delivery = None
+            one = None
             try:
                 if arrival is not None:
-                    delivery = track.intake.accept(arrival)
+                    one = track.intake.accept(arrival)
                     for guard in self._guards[number : number + 1]:
-                        guard.check(delivery)
+                        guard.check(one)
             except ClockJump as jump:
                 jumps.append(jump)
-            accepted.append(delivery)
+            accepted.append(one)
         if jumps:
             first = min(jumps, key=lambda jump: jump.host_ns)
             held_ns = [track.intake.held_host_ns for track in self._tracks]
@@ -177,13 +231,13 @@ class Batcher:
             raise ClockJump(str(first), min([first.host_ns, *near_ns]))
         return accepted
 
-    def _check_clocks(self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array]) -> None:
-        """As soon as two sensors have a packet, their stamps must be comparable."""
+    def _check_clocks(self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array]) -> None:
+        """Record first stamps; ClockError if those of two sensors are not comparable."""
         firsts = []
-        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
-            if delivery is None or track.first_ns > NEVER:
+        for number, (track, one) in enumerate(zip(self._tracks, accepted, strict=True)):
+            if one is None or track.first_ns > NEVER:
                 continue
-            arrival = delivery.packets
+            arrival = one.packets
             measured = np.flatnonzero(arrival.heads.valid.any(axis=1))
             if len(measured):
                 row = int(measured[0])
@@ -196,19 +250,21 @@ class Batcher:
                 [(track.intake.name, track.offset_ns) for track in self._tracks], number
             )
 
+    # -- step 2: newest stamps, eq. (1), watermark ----------------------------------------------
+
     def _advance(
-        self, accepted: Sequence[Delivery | None], ranks: Sequence[I64Array], host_ns: I64Array
+        self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array], host_ns: I64Array
     ) -> Progress:
-        """Newest stamps and the watermark before and after each delivery; evaluates eq. (1)."""
+        """Newest stamps and watermark before and after each delivery; evaluates eq. (1)."""
         newest = np.full((len(self._tracks), len(host_ns) + 1), NEVER)
-        for number, (track, delivery) in enumerate(zip(self._tracks, accepted, strict=True)):
+        for number, (track, one) in enumerate(zip(self._tracks, accepted, strict=True)):
             newest[number, 0] = track.newest_ns
-            if delivery is not None:
-                newest[number, 1:][ranks[number]] = delivery.newest_ns
+            if one is not None:
+                newest[number, 1:][ranks[number]] = one.newest_ns
         np.maximum.accumulate(newest, axis=1, out=newest)
         stalled = self._stalled(newest)
-        waited = newest if stalled is None else np.where(stalled, FOREVER, newest)
-        watermark: I64Array = waited.min(axis=0) - SLACK_NS
+        live = newest if stalled is None else np.where(stalled, FOREVER, newest)
+        watermark: I64Array = live.min(axis=0) - SLACK_NS
         began = 1
         if self.t_init_ns is None:
             began += self._begin(newest[:, 1:], None if stalled is None else stalled[:, 1:])
@@ -217,11 +273,11 @@ class Batcher:
         return Progress(newest, watermark, host_ns)
 
     def _stalled(self, newest: I64Array) -> BoolArray | None:
-        """Which sensors are not waited for, (S, E + 1); None: all are."""
+        """Mask (S, E + 1) of sensors past the idle-source timeout; None if there are none."""
         wait_ns = self._policy.max_wait_ns
         if wait_ns is None:
             return None
-        # What was never further apart than from the first of these to the last is not told apart.
+        # The largest distance possible in this batch; the usual case ends here.
         before_ns = min(track.newest_ns for track in self._tracks)
         if before_ns > NEVER and int(newest[:, -1].max()) - before_ns <= wait_ns:
             return None
@@ -234,7 +290,10 @@ class Batcher:
         return behind
 
     def _begin(self, newest: I64Array, stalled: BoolArray | None) -> int:
-        """Evaluate eq. (1) at the first delivery that allows it; its number, or past the end."""
+        """Evaluate eq. (1) at the first delivery where every sensor has a stamp or is stalled.
+
+        Returns the number of that delivery, or the number of all deliveries if there is none.
+        """
         present = newest > NEVER
         away = np.zeros_like(present) if stalled is None else stalled
         ready: BoolArray = np.logical_and((present | away).all(axis=0), present.any(axis=0))
@@ -247,9 +306,15 @@ class Batcher:
         )
         return at
 
-    def _wait(self, number: int, arrival: Arrival, published: I64Array) -> None:
-        """Queue the valid columns of a sensor, except late ones; published: watermarks before."""
-        track, heads = self._tracks[number], arrival.heads
+    # -- step 3: enqueue columns --------------------------------------------------------------
+
+    def _enqueue(self, number: int, arrival: Arrival, published: I64Array) -> None:
+        """Queue the valid columns of a sensor that are not late.
+
+        published: (P,) watermark before each packet.
+        """
+        track = self._tracks[number]
+        heads = arrival.heads
         valid = heads.valid.reshape(-1)
         count = int(np.count_nonzero(valid))
         track.decoded += len(valid)
@@ -261,34 +326,38 @@ class Batcher:
         columns = Columns(heads.stamp_ns.reshape(-1), place.reshape(-1), heads.encoder.reshape(-1))
         published = published.repeat(per_packet)
         if count < len(valid):
-            columns, published = columns.take(valid), published[valid]
-        if not self._goes_on(track, columns.stamp_ns, int(published[-1])):
+            columns = columns.take(valid)
+            published = published[valid]
+        if not self._is_in_time(track, columns.stamp_ns, int(published[-1])):
             columns = self._without_late(track, columns, published)
         if len(columns):
             track.waiting.append(columns)
             track.oldest_place = min(track.oldest_place, int(columns.place.min()))
 
-    def _goes_on(self, track: Track, stamp: I64Array, published: int) -> bool:
-        """Whether, as in nearly all small batches, no column can be late, and none ends a gap."""
-        newest, wait_ns = max(track.newest_ns, int(stamp.max())), self._policy.max_wait_ns
-        is_near = wait_ns is None or newest - track.newest_ns <= wait_ns
-        return is_near and int(stamp.min()) >= max(newest - SLACK_NS, published)
+    def _is_in_time(self, track: Track, stamp: I64Array, published: int) -> bool:
+        """True if no column can be late and none ends a gap: nearly all small batches."""
+        newest = max(track.newest_ns, int(stamp.max()))
+        wait_ns = self._policy.max_wait_ns
+        has_gap = wait_ns is not None and newest - track.newest_ns > wait_ns
+        return not has_gap and int(stamp.min()) >= max(newest - SLACK_NS, published)
 
     def _without_late(self, track: Track, columns: Columns, published: I64Array) -> Columns:
-        """The columns that are not late; published: (n,) watermark before each of them."""
+        """The columns that are not late; published: (n,) watermark before each column."""
         running = np.empty(len(columns) + 1, np.int64)
-        running[0], running[1:] = track.newest_ns, columns.stamp_ns
+        running[0] = track.newest_ns
+        running[1:] = columns.stamp_ns
         np.maximum.accumulate(running, out=running)
-        self._note_gaps(track, running)
+        self._record_gaps(track, running)
         late = self._late(columns.stamp_ns, np.maximum(running[:-1] - SLACK_NS, published))
         if not late.any():
             return columns
         track.drop("late", int(np.count_nonzero(late)))
         return columns.take(~late)
 
-    def _note_gaps(self, track: Track, running: I64Array) -> None:
+    def _record_gaps(self, track: Track, running: I64Array) -> None:
+        """Record steps of a running maximum of stamps that exceed the idle-source timeout."""
         wait_ns = self._policy.max_wait_ns
-        # Stamps that never step back span at least their widest step.
+        # No step is wider than all of them together.
         if wait_ns is None or int(running[-1]) - int(running[0]) <= wait_ns:
             return
         steps = running[1:] - running[:-1]
@@ -296,16 +365,17 @@ class Batcher:
         track.gaps += [(int(running[at]), int(running[at + 1])) for at in wide]
 
     def _late(self, stamp: I64Array, limit: I64Array) -> BoolArray:
-        """Which columns come after the end of their window was passed: (n,) bool."""
+        """Mask (n,) of columns whose window ends at or before the limit of the column."""
         late = np.less(stamp, limit)
         for at in np.flatnonzero(late).tolist():
             end = self._grid.bound(self._grid.index_of(int(stamp[at])) + 1)
             late[at] = end <= int(limit[at])
         return late
 
-    # -- windows ------------------------------------------------------------------------------
+    # -- step 4: publish windows --------------------------------------------------------------
 
     def _publish(self, progress: Progress, last_of_all: int | None = None) -> Iterator[Window]:
+        """Yield the windows that the watermark has passed; last_of_all: as in Schedule.enter."""
         if self.t_init_ns is None:
             return
         until = FOREVER
@@ -316,12 +386,13 @@ class Batcher:
         if until <= self._until:
             return
         self._until = until
-        stamp, sensor, place, encoder = self._take_until(until)
+        columns, sensor = self._take_until(until)
         done = 0
-        while done < len(stamp):
-            window = self._grid.index_of(int(stamp[done]))
-            start, end = self._grid.bound(window), self._grid.bound(window + 1)
-            upto = int(np.searchsorted(stamp, end))
+        while done < len(columns):
+            window = self._grid.index_of(int(columns.stamp_ns[done]))
+            start = self._grid.bound(window)
+            end = self._grid.bound(window + 1)
+            upto = int(np.searchsorted(columns.stamp_ns, end))
             closed_by = int(np.searchsorted(progress.watermark, end))
             part = slice(done, upto)
             done = upto
@@ -336,34 +407,32 @@ class Batcher:
                 end_ns=end,
                 complete=self._complete(progress, closed_by, start, end),
                 ready_host_ns=int(progress.host_ns[closed_by - 1]),
-                stamp_ns=stamp[part],
+                stamp_ns=columns.stamp_ns[part],
                 sensor=sensor[part],
-                place=place[part],
-                encoder=encoder[part],
+                place=columns.place[part],
+                encoder=columns.encoder[part],
             )
         for track in self._tracks:
             track.gaps = [gap for gap in track.gaps if gap[1] > until]
 
-    def _take_until(self, until: int) -> tuple[I64Array, I64Array, I64Array, I64Array]:
-        """Take waiting columns before `until`, merged: by stamp, then sensor, then arrival."""
+    def _take_until(self, until: int) -> tuple[Columns, I64Array]:
+        """Take waiting columns before `until`, by stamp, sensor, order of delivery; their sensors.
+
+        The stable sort is the merge of the paper: smallest stamp first.
+        """
         taken = []
         for track in self._tracks:
-            due, left = parted(chained(track.waiting), until)
+            due, left = split_at(joined(track.waiting), until)
             taken.append(due)
             track.waiting = [left] if len(left) else []
             track.oldest_place = int(left.place.min(initial=FOREVER))
-        merged = chained(taken)
+        merged = joined(taken)
         sensor = np.arange(len(taken)).repeat([len(columns) for columns in taken])
         order = merged.stamp_ns.argsort(kind="stable")
-        return (
-            merged.stamp_ns[order],
-            sensor[order],
-            merged.place[order],
-            merged.encoder[order],
-        )
+        return merged.take(order), sensor[order]
 
     def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:
-        """Every sensor began at or before the start and came past the end, and none stalled."""
+        """True if every sensor began by the start, reached the end, and no stall overlaps."""
         return bool((progress.newest[:, at] >= end).all()) and not any(
             track.first_ns > start
             or any(before < end and after > start for before, after in track.gaps)
@@ -375,47 +444,9 @@ class Batcher:
             self._tracks[number].drop(reason, int(count))
 
 
-# What the batching knows of each sensor, and of all of them over the deliveries of a batch.
-
-_NONE = np.empty(0, np.int64)
-
-
-@dataclass(slots=True)
-class Track:
-    """What is known of one sensor so far, and its columns that wait."""
-
-    intake: Intake
-    first_ns: int = NEVER
-    newest_ns: int = NEVER
-    offset_ns: int | None = None
-    gaps: list[tuple[int, int]] = field(default_factory=list)
-    waiting: list[Columns] = field(default_factory=list)
-    # No column that waits has a smaller place.
-    oldest_place: int = FOREVER
-    decoded: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-
-    def drop(self, reason: str, count: int) -> None:
-        """Count columns that reach no window."""
-        if count:
-            self.dropped[reason] = self.dropped.get(reason, 0) + count
-
-
-@dataclass(slots=True)
-class Progress:
-    """State before the first delivery of a batch and after each of its E deliveries.
-
-    newest: (S, E + 1) int64; watermark: (E + 1,); host_ns: (E,), arrival of each delivery.
-    """
-
-    newest: I64Array
-    watermark: I64Array
-    host_ns: I64Array
-
-
-def ranked(accepted: Sequence[Delivery | None]) -> tuple[list[I64Array], I64Array]:
-    """Of each sensor, the number of each of its packets among all; positions of these, in order."""
-    events = [_NONE if delivery is None else delivery.packets.position for delivery in accepted]
+def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Array]:
+    """Order of delivery: per sensor the rank of each packet; and the positions of all, by rank."""
+    events = [_NONE if one is None else one.packets.position for one in accepted]
     delivering = [number for number, event in enumerate(events) if len(event)]
     if len(delivering) == 1:
         ranks: list[I64Array] = [np.arange(len(event)) for event in events]
@@ -428,7 +459,7 @@ def ranked(accepted: Sequence[Delivery | None]) -> tuple[list[I64Array], I64Arra
     return np.split(rank, cuts), position[order]
 
 
-def parted(columns: Columns, until: int) -> tuple[Columns, Columns]:
+def split_at(columns: Columns, until: int) -> tuple[Columns, Columns]:
     """Columns with stamps before `until`, and the others; each in their order."""
     stamp = columns.stamp_ns
     if bool((stamp[1:] >= stamp[:-1]).all()):
@@ -438,13 +469,12 @@ def parted(columns: Columns, until: int) -> tuple[Columns, Columns]:
     return columns.take(due), columns.take(~due)
 
 
-def chained(parts: Sequence[Columns]) -> Columns:
-    """Columns one after the other."""
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Columns of all parts, in order."""
     if len(parts) == 1:
         return parts[0]
     if not parts:
-        nothing = np.empty(0, np.int64)
-        return Columns(nothing, nothing, nothing)
+        return Columns(_NONE, _NONE, _NONE)
     return Columns(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.place for part in parts]),

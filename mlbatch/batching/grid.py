@@ -1,7 +1,7 @@
-"""The absolute grid of windows (CONTRACT.md section 1): all scan boundaries come from here.
+"""The absolute grid of windows; every bound of a window or slice is computed here.
 
-Bounds are Python integers, rounded up once from the exact rational: no drift, also at 15 Hz, and
-no overflow (products of int64 stamps and rates would).
+Bounds are Python integers, rounded up once from the exact rational. They do not drift (15 Hz has no
+whole period in ns) and do not overflow (a product of an int64 stamp and a rate would).
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from mlbatch.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Windows of 1 / rate seconds since time 0, each cut into `slices` equal slices.
+    """Windows of 1 / rate seconds since time 0, each divided into `slices` equal slices.
 
-    Slices are numbered through: slice j of window k is q = k * slices + j, and covers
-    [bound(q), bound(q + 1)), half open. With one slice q is the window itself.
+    Slice j of window k has the number q = k * slices + j and covers [bound(q), bound(q + 1)). With
+    one slice a window, q is the number of the window.
     """
 
     rate: Fraction
     slices: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse a grid without windows."""
+        """Check the values; UsageError where there would be no windows."""
         if self.rate <= 0:
-            raise UsageError(f"rate: wanted a positive number of Hz, got {self.rate}")
+            raise UsageError(f"rate: expected a positive number of Hz, found {self.rate}")
         if self.slices < 1:
-            raise UsageError(f"slices: wanted 1 or more a window, got {self.slices}")
+            raise UsageError(f"slices: expected 1 or more a window, found {self.slices}")
 
     def bound(self, q: int) -> int:
         """First nanosecond of slice `q`: ceil(q * 1e9 / (rate * slices))."""
@@ -37,19 +37,19 @@ class Grid:
 
     def index_of(self, stamp_ns: int) -> int:
         """The slice q with bound(q) <= stamp_ns < bound(q + 1)."""
-        # An integer is at or past ceil(x) exactly when it is at or past x: the floor is the answer.
+        # For an integer n, n >= ceil(x) is the same as n >= x, so the floor is exact.
         scaled = int(stamp_ns) * self.rate.numerator * self.slices
         return scaled // (NS_PER_S * self.rate.denominator)
 
     def floor_bound(self, stamp_ns: int) -> int:
-        """First nanosecond of the slice that holds `stamp_ns`."""
+        """First nanosecond of the slice that contains `stamp_ns`."""
         return self.bound(self.index_of(stamp_ns))
 
     def first_window(self, t0max_ns: int) -> int:
-        """Eq. (1): k0, the first window that begins after `t0max_ns`.
+        """Eq. (1): k0, the number of the first window that begins after `t0max_ns`.
 
-        k0 counts whole windows, so its first slice is k0 * slices. A `t0max_ns` that lies on the
-        grid waits one more period, as printed in the paper.
+        k0 counts windows; its first slice is k0 * slices. If `t0max_ns` is itself a bound, k0 is
+        the window one period later ("larger than" in the paper).
         """
         scaled = int(t0max_ns) * self.rate.numerator
         return scaled // (NS_PER_S * self.rate.denominator) + 1

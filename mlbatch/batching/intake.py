@@ -1,6 +1,7 @@
-"""What of a sensor's packets is let in: no duplicates, no wild stamps, clock resets named.
+"""Per-sensor intake: rejects duplicates and implausible stamps, detects clocks that jump.
 
-CONTRACT.md section 1, `bad_stamp`; section 4, `duplicate`.
+`Intake` filters packets (`duplicate`, `bad_stamp`) and reports clock resets. `JumpGuard` checks the
+accepted ones for forward jumps of the clock. Both raise ClockJump.
 """
 
 from __future__ import annotations
@@ -16,25 +17,27 @@ from mlbatch.errors import ClockJump
 from mlbatch.types import Heads
 from mlbatch.units import NS_PER_S
 
+# A packet whose stamps differ more than this from the newest one needs confirmation.
 STEP_NS = NS_PER_S
 STAMP_LIMIT_NS = 2**31 * NS_PER_S
-# A packet is a duplicate of one that came at most this many packets of the sensor before: captures
-# of bridged ports repeat within milliseconds, while a 16-bit frame id comes back after hours.
+# Duplicates are searched among this many packets of the sensor: captures of bridged ports repeat
+# packets within milliseconds, while a 16-bit frame id repeats after hours.
 DUPLICATE_REACH = 1024
+# Stamps of no packet: before and after all others.
 NEVER = -(2**62)
 FOREVER = 2**62
-# Keys are kept in so many pieces at most.
-_MOST_PIECES = 32
+# Arrays in which recent keys are kept before they are joined.
+_MAX_PIECES = 32
 _NONE = np.empty(0, np.int64)
 
 
 @dataclass(slots=True)
 class Arrival:
-    """Packets of one sensor in one batch, in order of arrival.
+    """Packets of one sensor in one batch, in order of receive time.
 
-    position: (P,) int64, place in the batch; host_ns: (P,) int64; key: (P,) int64, equal for
-    duplicates, negative for packets without identity; heads: their columns, sensor clock; place:
-    (P,) int64, where the packet's first column lies in the ring.
+    position: (P,) int64, index in the batch; host_ns: (P,) int64, receive time; key: (P,) int64,
+    equal for duplicates, negative for packets without identity; heads: their columns, sensor clock;
+    place: (P,) int64, ring index of the packet's first column.
     """
 
     position: I64Array
@@ -56,10 +59,10 @@ class Arrival:
 
 
 @dataclass(slots=True)
-class Delivery:
+class Accepted:
     """Accepted packets of one sensor on the common clock, in order of delivery.
 
-    newest_ns: (A,) int64, largest valid stamp of each, NEVER where none is valid.
+    newest_ns: (A,) int64, largest valid stamp of each packet, NEVER where none is valid.
     """
 
     packets: Arrival
@@ -68,7 +71,8 @@ class Delivery:
 
 def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
     """Smallest and largest valid stamp of each packet; FOREVER and NEVER where none is valid."""
-    stamp, valid = heads.stamp_ns, heads.valid
+    stamp = heads.stamp_ns
+    valid = heads.valid
     if valid.size and valid.all():
         return stamp.min(axis=1), stamp.max(axis=1)
     low = np.where(valid, stamp, FOREVER).min(axis=1, initial=FOREVER)
@@ -77,7 +81,7 @@ def extremes(heads: Heads) -> tuple[I64Array, I64Array]:
 
 
 class Intake:
-    """The door of one sensor; `rejected` counts what stays outside."""
+    """Filter of the packets of one sensor; `rejected` counts rejected packets by reason."""
 
     def __init__(
         self,
@@ -88,20 +92,25 @@ class Intake:
         modulus: int = 0,
         packet_ns: float = 0.0,
     ) -> None:
-        """modulus, packet_ns: as in PacketLoss."""
+        """Arguments of one sensor.
+
+        host_clock: replace stamps by receive times; offset_ns: added to stamps; modulus,
+        packet_ns: as in PacketLoss.
+        """
         self.name = name
         self.loss = PacketLoss(modulus, packet_ns)
         self.rejected: dict[str, int] = {}
         self._host_clock = host_clock
         self._offset_ns = offset_ns
         self._newest = NEVER
+        # A packet that steps, until the next packet confirms or refutes the step.
         self._held: Arrival | None = None
-        # Keys of the newest packets, DUPLICATE_REACH or more where there were so many.
+        # Keys of the newest packets: DUPLICATE_REACH of them or more, once there are so many.
         self._recent: list[I64Array] = []
         self._largest_key = -1
 
-    def accept(self, arrival: Arrival) -> Delivery:
-        """Let in the packets of a batch, as far as they are good."""
+    def accept(self, arrival: Arrival) -> Accepted:
+        """Accept the good packets of a batch; ClockJump where the clock was reset."""
         fresh = self._distinct(arrival.key)
         if fresh is not None:
             arrival = arrival.take(fresh)
@@ -109,19 +118,70 @@ class Intake:
         if self._offset_ns:
             heads.stamp_ns = heads.stamp_ns + self._offset_ns
         low, high = extremes(heads)
-        if self._held is None and len(high) and self._is_calm(int(low.min()), int(high.max())):
+        if self._held is None and len(high) and self._has_no_step(int(low.min()), int(high.max())):
             self._newest = max(self._newest, int(high.max()))
         else:
-            arrival, low, high = self._sift(arrival, low, high)
+            arrival, low, high = self._check_stamps(arrival, low, high)
         self.loss.add(arrival.key, arrival.heads, arrival.host_ns)
         if self._host_clock and len(high):
-            stamp, known = arrival.heads.stamp_ns, high > NEVER
+            stamp = arrival.heads.stamp_ns
+            measured = high > NEVER
             arrival.heads.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
-            high = np.where(known, arrival.host_ns, NEVER)
-        return Delivery(arrival, high)
+            high = np.where(measured, arrival.host_ns, NEVER)
+        return Accepted(arrival, high)
 
-    def _is_calm(self, lowest: int, highest: int) -> bool:
-        """Whether stamps between these limits are sane, and no packet of them can be a step."""
+    def finish(self) -> None:
+        """End of input: reject the packet that is still held, since nothing can confirm it."""
+        if self._held is not None:
+            self._reject("bad_stamp", 1)
+            self._held = None
+
+    @property
+    def held_host_ns(self) -> int | None:
+        """Receive time of the packet that is held, if any."""
+        return None if self._held is None else int(self._held.host_ns[0])
+
+    @property
+    def held_place(self) -> int | None:
+        """Ring index of the packet that is held, if any; its pixels must not be overwritten."""
+        return None if self._held is None else int(self._held.place[0])
+
+    def _reject(self, reason: str, count: int) -> None:
+        if count:
+            self.rejected[reason] = self.rejected.get(reason, 0) + count
+
+    # -- duplicates ---------------------------------------------------------------------------
+
+    def _distinct(self, key: I64Array) -> BoolArray | None:
+        """Mask of packets that repeat none of the last DUPLICATE_REACH; None: all are new."""
+        rises = len(key) > 0 and int(key[0]) > self._largest_key
+        if rises and (len(key) == 1 or bool((key[1:] > key[:-1]).all())):
+            # The usual case: every key is larger than all before it.
+            self._remember(key)
+            self._largest_key = int(key[-1])
+            return None
+        recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
+        if len(key) == 1:
+            # One key without an order: a linear search is cheaper than a sort.
+            fresh = np.array([key[0] < 0 or not (recent == key).any()])
+        else:
+            fresh = _first_of_kind(recent, key)
+        self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
+        self._recent = [recent]
+        self._remember(key)
+        repeated = len(key) - int(np.count_nonzero(fresh))
+        self._reject("duplicate", repeated)
+        return fresh if repeated else None
+
+    def _remember(self, key: I64Array) -> None:
+        self._recent.append(key)
+        if len(self._recent) > _MAX_PIECES:
+            self._recent = [np.concatenate(self._recent)[-DUPLICATE_REACH:]]
+
+    # -- stamps -------------------------------------------------------------------------------
+
+    def _has_no_step(self, lowest: int, highest: int) -> bool:
+        """True if no stamp between these limits can be out of range or part of a step."""
         return (
             lowest >= 0
             and highest < STAMP_LIMIT_NS
@@ -129,75 +189,48 @@ class Intake:
             and (self._newest == NEVER or highest - self._newest <= STEP_NS)
         )
 
-    def _sift(
+    def _check_stamps(
         self, arrival: Arrival, low: I64Array, high: I64Array
     ) -> tuple[Arrival, I64Array, I64Array]:
-        """The packets whose stamps are sane and whose steps are confirmed; their extremes."""
-        # Where nothing was measured, low lies far above and high far below: such packets pass.
+        """Packets with stamps in range and without unconfirmed steps; their extremes."""
+        # A packet without a valid column has low = FOREVER and high = NEVER, and is accepted.
         sane = (low >= 0) & (high < STAMP_LIMIT_NS) & (high - low <= STEP_NS)
         if not sane.all():
             self._reject("bad_stamp", len(sane) - int(np.count_nonzero(sane)))
-            arrival, low, high = arrival.take(sane), low[sane], high[sane]
+            arrival = arrival.take(sane)
+            low = low[sane]
+            high = high[sane]
         if self._held is not None or self._steps(low, high).any():
-            arrival = self._judge(arrival)
+            arrival = self._confirm_steps(arrival)
             return arrival, *extremes(arrival.heads)
         self._newest = max(self._newest, int(high.max(initial=NEVER)))
         return arrival, low, high
 
-    def finish(self) -> None:
-        """End of input: a packet that is still held was never confirmed."""
-        if self._held is not None:
-            self._reject("bad_stamp", 1)
-            self._held = None
-
-    def _reject(self, reason: str, count: int) -> None:
-        if count:
-            self.rejected[reason] = self.rejected.get(reason, 0) + count
-
-    def _distinct(self, key: I64Array) -> BoolArray | None:
-        """Which packets are not a repetition of one of the last DUPLICATE_REACH; None: all."""
-        rises = len(key) > 0 and int(key[0]) > self._largest_key
-        if rises and (len(key) == 1 or bool((key[1:] > key[:-1]).all())):
-            # As nearly always: every number is larger than all before it.
-            self._remember(key)
-            self._largest_key = int(key[-1])
-            return None
-        recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
-        if len(key) == 1:
-            # Numbers without an order that come one by one: a look at all is cheaper than a sort.
-            fresh = np.array([key[0] < 0 or not (recent == key).any()])
-        else:
-            fresh = _first_of_kind(recent, key)
-        self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
-        self._recent = [recent]
-        self._remember(key)
-        again = len(key) - int(np.count_nonzero(fresh))
-        self._reject("duplicate", again)
-        return fresh if again else None
-
-    def _remember(self, key: I64Array) -> None:
-        self._recent.append(key)
-        if len(self._recent) > _MOST_PIECES:
-            self._recent = [np.concatenate(self._recent)[-DUPLICATE_REACH:]]
-
     def _steps(self, low: I64Array, high: I64Array) -> BoolArray:
-        """Which packets step more than 1 s from the newest stamp before them, if none were held."""
+        """Mask of packets more than STEP_NS from the newest stamp before them, if none is held."""
         newest = np.empty_like(high)
-        newest[:1], newest[1:] = self._newest, high[:-1]
+        newest[:1] = self._newest
+        newest[1:] = high[:-1]
         np.maximum.accumulate(newest, out=newest)
-        # The first packet of all has nothing to step from.
-        known, measured = newest > NEVER, high > NEVER
-        return known & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
+        # The first packet of all has no stamp before it.
+        has_newest = newest > NEVER
+        measured = high > NEVER
+        return has_newest & measured & ((high > newest + STEP_NS) | (low < newest - STEP_NS))
 
-    def _judge(self, arrival: Arrival) -> Arrival:
-        """Hold packets that step until the next one: packet by packet, since it is rare."""
+    def _confirm_steps(self, arrival: Arrival) -> Arrival:
+        """Hold each packet that steps until the next one; packet by packet, since steps are rare.
+
+        The next packet confirms the step if all of it is within STEP_NS of the held packet.
+        """
         rows = arrival if self._held is None else _joined(self._held, arrival)
         low, high = extremes(rows.heads)
         position = rows.position.copy()
         held = None if self._held is None else 0
-        newest, accepted = self._newest, []
+        newest = self._newest
+        accepted = []
         for row in range(0 if held is None else 1, len(high)):
-            lowest, highest = int(low[row]), int(high[row])
+            lowest = int(low[row])
+            highest = int(high[row])
             if highest > NEVER:
                 steps = newest > NEVER and (highest > newest + STEP_NS or lowest < newest - STEP_NS)
                 if held is not None:
@@ -207,11 +240,13 @@ class Intake:
                         if first < newest:
                             if not self._host_clock:
                                 raise self._reset(newest, first, int(rows.host_ns[held]))
-                            newest = NEVER  # Stamps only tell ages within a packet.
+                            # With --clock host, stamps are only used for ages within a packet.
+                            newest = NEVER
                         accepted.append(held)
-                        # It is let in together with the packet that confirms it.
+                        # It is delivered together with the packet that confirms it.
                         position[held] = position[row]
-                        newest, held = max(newest, int(high[held])), None
+                        newest = max(newest, int(high[held]))
+                        held = None
                         steps = False
                     else:
                         self._reject("bad_stamp", 1)
@@ -222,7 +257,7 @@ class Intake:
                 newest = max(newest, highest)
             accepted.append(row)
         self._newest = newest
-        self._held = None if held is None else _copied(rows, held)
+        self._held = None if held is None else rows.take(np.array([held]))
         rows.position = position
         return rows.take(np.array(accepted, np.int64))
 
@@ -233,25 +268,18 @@ class Intake:
 
     def _reset(self, newest: int, back: int, host_ns: int) -> ClockJump:
         return ClockJump(
-            f"sensor {self.name}: clock reset within the recording: stamps went back from "
-            f"{newest / NS_PER_S:.6f} s to {back / NS_PER_S:.6f} s; wanted one running clock; "
-            "use --on-jump split, or --clock host",
+            f"sensor {self.name}: clock reset within the recording: expected stamps of one "
+            f"continuous clock, found a step back from {newest / NS_PER_S:.6f} s to "
+            f"{back / NS_PER_S:.6f} s; use --on-jump split, or --clock host",
             host_ns,
         )
 
-    @property
-    def held_host_ns(self) -> int | None:
-        """Arrival of the packet that is held, if any."""
-        return None if self._held is None else int(self._held.host_ns[0])
-
-    @property
-    def held_place(self) -> int | None:
-        """Ring place of the packet that is held, if any; its pixels must not be overwritten."""
-        return None if self._held is None else int(self._held.place[0])
-
 
 def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:
-    """Which keys (n,) repeat none of the DUPLICATE_REACH before them; recent: those before all."""
+    """Mask of keys (n,) that repeat none of the DUPLICATE_REACH keys before them.
+
+    recent: keys of earlier batches, oldest first.
+    """
     keys = np.concatenate([recent, key])
     order = keys.argsort(kind="stable")
     ordered = keys[order]
@@ -262,16 +290,11 @@ def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:
     return fresh[len(recent) :]
 
 
-def _copied(rows: Arrival, row: int) -> Arrival:
-    return rows.take(np.array([row]))
-
-
 def _joined(first: Arrival, second: Arrival) -> Arrival:
-    one, two = first.heads, second.heads
     heads = Heads(
-        np.concatenate([one.stamp_ns, two.stamp_ns]),
-        np.concatenate([one.encoder, two.encoder]),
-        np.concatenate([one.valid, two.valid]),
+        np.concatenate([first.heads.stamp_ns, second.heads.stamp_ns]),
+        np.concatenate([first.heads.encoder, second.heads.encoder]),
+        np.concatenate([first.heads.valid, second.heads.valid]),
     )
     return Arrival(
         np.concatenate([first.position, second.position]),
@@ -282,71 +305,75 @@ def _joined(first: Arrival, second: Arrival) -> Arrival:
     )
 
 
-# Clocks that jump forward: a gap in the stamps that the recorder's clock did not see.
-#
-# A sensor that was silent goes on where its clock is by then, and as much time has passed at the
-# recorder. Where stamps step by more than a second and arrivals do not, the clock was set: by
-# PTP or GPS that locked, or by a restart. Backward steps are told by `intake.py`.
-
-
 class Watch(Protocol):
-    """What wants to know the stamps and arrivals of all accepted packets."""
+    """Observer of the stamps and receive times of accepted packets (`clocks.watch.ClockWatch`)."""
 
     def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
-        """Take in packets (P,), in order of delivery."""
+        """Add packets (P,), in order of delivery."""
         ...
 
 
 class JumpGuard:
-    """Looks at the accepted packets of one sensor; `check` raises ClockJump.
+    """Detects forward jumps of a sensor's clock: steps in the stamps but not in receive times.
 
-    watch: told of all packets; None where arrivals are not known well enough. has_clock: False
-    where stamps are arrivals, which tell nothing of a clock.
+    After a silence both have advanced by the same time, which is a gap and no jump. If stamps
+    advance by more than STEP_NS longer than receive times, the clock was set: PTP or GPS lock, or a
+    restart. Backward jumps are detected by `Intake`.
     """
 
     def __init__(self, name: str, watch: Watch | None = None, *, has_clock: bool = True) -> None:
+        """Arguments of one sensor.
+
+        watch: observer of all packets, None where receive times are too inexact; has_clock: False
+        where stamps are receive times, which show nothing of a sensor's clock.
+        """
         self.name = name
         self._watch = watch
         self._has_clock = has_clock
         self._newest_ns = NEVER
         self._host_ns = 0
 
-    def check(self, delivery: Delivery) -> None:
-        """Look at the next packets, in order of delivery."""
+    def check(self, accepted: Accepted) -> None:
+        """Check the next packets, in order of delivery; ClockJump at the first jump."""
         if not self._has_clock:
             return
-        stamp_ns, host_ns = delivery.newest_ns, delivery.packets.host_ns
+        stamp_ns = accepted.newest_ns
+        host_ns = accepted.packets.host_ns
         if len(stamp_ns) and int(stamp_ns.min()) <= NEVER:
             measured = stamp_ns > NEVER
-            stamp_ns, host_ns = stamp_ns[measured], host_ns[measured]
+            stamp_ns = stamp_ns[measured]
+            host_ns = host_ns[measured]
         if not len(stamp_ns):
             return
         if self._newest_ns == NEVER:
-            self._newest_ns, self._host_ns = int(stamp_ns[0]), int(host_ns[0])
+            self._newest_ns = int(stamp_ns[0])
+            self._host_ns = int(host_ns[0])
         newest_ns = max(self._newest_ns, int(stamp_ns.max()))
         if newest_ns - self._newest_ns > STEP_NS:
             self._refuse_jump(stamp_ns, host_ns)
-        self._newest_ns, self._host_ns = newest_ns, int(host_ns[-1])
+        self._newest_ns = newest_ns
+        self._host_ns = int(host_ns[-1])
         if self._watch is not None:
             self._watch.add(stamp_ns, host_ns)
 
     def _refuse_jump(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
-        """Look for a step of more than a second in the stamps that arrivals do not show."""
         newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], stamp_ns]))
         hosts = np.concatenate([[self._host_ns], host_ns])
-        steps, passed = newest[1:] - newest[:-1], hosts[1:] - hosts[:-1]
-        # Recorders without times of their own say nothing.
+        steps = newest[1:] - newest[:-1]
+        passed = hosts[1:] - hosts[:-1]
+        # No time passed between packets that share the receive time of a message.
         jumps = (steps > STEP_NS) & (passed > 0) & (steps - passed > STEP_NS)
         if jumps.any():
             raise self._jump(newest, hosts, int(np.argmax(jumps)))
 
     def _jump(self, newest: I64Array, hosts: I64Array, at: int) -> ClockJump:
-        before, after = int(newest[at]), int(newest[at + 1])
+        before = int(newest[at])
+        after = int(newest[at + 1])
         passed = int(hosts[at + 1] - hosts[at])
         return ClockJump(
-            f"sensor {self.name}: clock jump within the recording: stamps went forward from "
-            f"{before / NS_PER_S:.6f} s to {after / NS_PER_S:.6f} s while only "
-            f"{passed / NS_PER_S:.6f} s passed at the recorder; wanted one running clock; use "
-            "--on-jump split, or --clock host",
+            f"sensor {self.name}: clock jump within the recording: expected stamps of one "
+            f"continuous clock, found a step forward from {before / NS_PER_S:.6f} s to "
+            f"{after / NS_PER_S:.6f} s within {passed / NS_PER_S:.6f} s at the capture host; "
+            "use --on-jump split, or --clock host",
             int(hosts[at + 1]),
         )

@@ -1,4 +1,9 @@
-"""Packets lost and reordered on the way: by the sensor's own count, else by the pace of stamps."""
+"""Lost and reordered packets: by sequence numbers, otherwise by gaps in the stamps.
+
+`SequenceLoss` serves sensors whose packets have a sequence number. `GapLoss` serves the others: it
+compares the step between two packets with the packet period, without the time in which the sensor
+sends nothing because its rotor passes a dark sector.
+"""
 
 from __future__ import annotations
 
@@ -11,42 +16,44 @@ from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.types import Heads
 from mlbatch.units import NS_PER_S
 
-# A longer step is believed only if the next packet goes on from there: one flipped bit in a frame
-# number must not count as a million lost packets.
-BELIEVED_STEP = 1024
-
 
 class PacketLoss:
-    """What one sensor's packets tell of others that did not come, or came late.
+    """Lost and reordered packets of one sensor.
 
-    By their numbers where they bear a count, else by the pace of their stamps; a sensor of which
-    neither is known loses nothing that we know of.
+    Zero for a sensor that has neither sequence numbers nor a known packet period.
     """
 
     def __init__(self, modulus: int, packet_ns: float = 0.0) -> None:
-        """modulus: where the count wraps, 0 none; packet_ns: time of a packet, 0 unknown."""
-        self._numbers = Loss(modulus)
-        self._pace = PaceLoss(packet_ns) if packet_ns and not modulus else None
+        """modulus: of sequence numbers, 0: none; packet_ns: nominal packet period, 0: unknown."""
+        self._numbers = SequenceLoss(modulus)
+        self._gaps = GapLoss(packet_ns) if packet_ns and not modulus else None
 
     @property
     def lost(self) -> int:
-        """Packets missing between those that came."""
-        return self._numbers.lost if self._pace is None else self._pace.lost
+        """Packets missing between those received."""
+        return self._numbers.lost if self._gaps is None else self._gaps.lost
 
     @property
     def reordered(self) -> int:
-        """Packets that came after a later one."""
-        return self._numbers.reordered if self._pace is None else self._pace.reordered
+        """Packets received after a later one."""
+        return self._numbers.reordered if self._gaps is None else self._gaps.reordered
 
     def add(self, sequence: I64Array, heads: Heads, host_ns: I64Array) -> None:
-        """Count accepted packets (P,), in order of arrival, by the sensor's own clock."""
-        if self._pace is None:
+        """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
+        if self._gaps is None:
             self._numbers.add(sequence)
         elif len(host_ns):
-            self._pace.add(heads, host_ns)
+            self._gaps.add(heads, host_ns)
 
 
-class Loss:
+# -- by sequence numbers --------------------------------------------------------------------------
+
+# A longer step needs the next packet as confirmation: one flipped bit in a frame number must not
+# count as a million lost packets.
+BELIEVED_STEP = 1024
+
+
+class SequenceLoss:
     """Counts gaps and backward steps in sequence numbers that wrap at `modulus` (0: none)."""
 
     def __init__(self, modulus: int) -> None:
@@ -54,15 +61,16 @@ class Loss:
         self.reordered = 0
         self._modulus = modulus
         self._newest: int | None = None
+        # A number after a long step, until the next one confirms it.
         self._doubtful: int | None = None
-        # One packet alone proves nothing: the first of all may be the damaged one.
+        # False until a second number confirms the first, which may be the damaged one.
         self._is_sure = False
 
     def add(self, sequence: I64Array) -> None:
-        """Count accepted packets (n,), in order of arrival; negative: outside the count."""
+        """Add accepted packets (n,) in order of receive time; negative numbers are ignored."""
         if not self._modulus or not len(sequence):
             return
-        if self._is_sure and self._doubtful is None and self._goes_on(sequence):
+        if self._is_sure and self._doubtful is None and self._is_consecutive(sequence):
             self._newest = int(sequence[-1])
             return
         for number in sequence[sequence >= 0].tolist():
@@ -71,8 +79,8 @@ class Loss:
             else:
                 self._step(number)
 
-    def _goes_on(self, sequence: I64Array) -> bool:
-        """Whether every number is one more than that before, as nearly always."""
+    def _is_consecutive(self, sequence: I64Array) -> bool:
+        """True if every number is its predecessor plus one, the usual case."""
         if self._newest is None or int(sequence[0]) != (self._newest + 1) % self._modulus:
             return False
         return len(sequence) == 1 or bool(
@@ -85,12 +93,15 @@ class Loss:
             if self._doubtful is None or abs(self._signed(number - self._doubtful)) > BELIEVED_STEP:
                 self._doubtful = number
                 return
-            # A restart counts anew; a long gap is a gap.
+            # A long gap forward is loss; a step back is a restart, which counts from anew.
             if step > 0 and self._is_sure:
                 self.lost += step - 2
-            self._newest, self._doubtful, self._is_sure = number, None, True
+            self._newest = number
+            self._doubtful = None
+            self._is_sure = True
             return
-        self._doubtful, self._is_sure = None, True
+        self._doubtful = None
+        self._is_sure = True
         if step > 0:
             self.lost += step - 1
             self._newest = number
@@ -103,53 +114,51 @@ class Loss:
         return (step + half) % self._modulus - half
 
 
-# Packets lost on the way, of sensors whose packets bear no count: told by the pace of stamps.
-#
-# Packets follow each other at a steady pace, so a step of k paces is one of k - 1 lost packets
-# (issue 5: "azimuth continuity and the known packet period"). A sensor that leaves out a part of
-# its turn is silent through the same angles every turn: these take their time, and no packet.
-# They are known by where columns never lie, though the rotor passed.
+# -- by gaps in the stamps ------------------------------------------------------------------------
 
-# `intake.py` lets no packet in that lies further behind its sensor's newest stamp than 1 s: what is
-# older than this is in its final order. A longer step back is a clock that was reset.
-_SETTLED_NS = 3 * NS_PER_S // 2
-# Packets that are judged together: a dozen turns of the sensors that send the most.
+# `Intake` accepts no packet further behind the newest stamp of its sensor than 1 s, so the order of
+# packets older than this is final. A longer step back is a clock reset.
+_FINAL_NS = 3 * NS_PER_S // 2
+# Packets that are evaluated together: a dozen revolutions of the sensors that send the most.
 _CHUNK = 16384
-# Longer silences must have passed at the recorder too, up to this (as in `jumps.py`).
+# A gap longer than this must have passed at the capture host too, up to this tolerance; it is the
+# step that `Intake` accepts.
 _STEP_NS = NS_PER_S
-# Places on a turn at which columns were seen: half of what packets count, 0.01 degrees.
-_PLACE_BITS = 16
-_PLACES = 1 << _PLACE_BITS
+# Bins of a revolution for the angles of columns: about 0.0055 degrees, half of the finest encoder.
+_BIN_BITS = 16
+_BINS = 1 << _BIN_BITS
 _TURNS_PER_TICK = 2.0**-32
-# Columns leave holes between them; a dark sector is wider than so many of their steps.
-_HOLE_STEPS = 2.5
-# So many turns without one column of a sector are no chance, if not half of all packets are lost.
-_PASSES = 12
-# Angles are rounded: a column may seem to lie as much behind an edge, in turns.
-_GRID_OFF = 1 / _PLACES
-# The rotor of a sensor goes on while packets are lost: turns that it may be off by.
-_ROTOR_OFF = 0.1
-# Steps from which the pace is taken, and how far they may lie from each other.
-_FEWEST_STEPS, _LOW, _NEAR, _SHARE = 16, 0.05, 0.1, 0.08
-_BACK_TURNS = 1 / 360
-# Share of columns that lie where those before them do, if each return is one: half of them do.
-_TWICE = 0.25
-# Packets over which the speed of the rotor is taken.
-_SPEED_OVER = 64
+# A dark sector is wider than so many steps between columns.
+_MIN_WIDTH = 2.5
+# A sector without columns is dark if the rotor passed it so often during gaps: random loss would
+# have spared it at least once.
+_MIN_PASSES = 12
+# Largest error of a predicted rotor angle, in revolutions, after a gap.
+_ROTOR_ERROR = 0.1
+# The period is estimated from at least so many steps, from those within 10 % of the 5 % quantile,
+# if these are 8 % of all or more.
+_MIN_STEPS = 16
+_QUANTILE = 0.05
+_TOLERANCE = 0.1
+_MIN_SHARE = 0.08
+# Share of columns at the angle of the one before, if each return is a column: half of them are.
+_MIN_DUAL_SHARE = 0.25
+# A backward move of the rotor within a packet that is jitter, in revolutions.
+_JITTER = 1 / 360
 
 
 @dataclass(slots=True)
 class _Packets:
-    """Packets of one sensor, (n,) each; places: (n, C) uint16, rows of the angles of its columns.
+    """Packets of one sensor, (n,) each; bins: (n, C) uint16, angle bins of all columns.
 
-    stamp_ns: of the first column; first, last: angles of the first and last column, in turns.
+    stamp_ns: of the first column; first, last: angles of the first and last column, revolutions.
     """
 
     stamp_ns: I64Array
     host_ns: I64Array
     first: F64Array
     last: F64Array
-    places: U16Array
+    bins: U16Array
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -160,51 +169,53 @@ class _Packets:
             self.host_ns[index],
             self.first[index],
             self.last[index],
-            self.places[index],
+            self.bins[index],
         )
 
     def mirrored(self) -> _Packets:
-        """Those of a rotor that turns the other way."""
-        first, last = -self.first % 1.0, -self.last % 1.0
-        return _Packets(self.stamp_ns, self.host_ns, first, last, ~self.places)
+        """The same packets of a rotor that turns the other way."""
+        return _Packets(
+            self.stamp_ns, self.host_ns, -self.first % 1.0, -self.last % 1.0, ~self.bins
+        )
 
 
-class PaceLoss:
-    """Counts packets that are missing between those that came, and those that came out of order.
+class GapLoss:
+    """Counts lost and reordered packets by their stamps.
 
-    The answer is the same however packets are cut into batches: they are judged in the order of
-    their stamps, in chunks that depend on nothing else.
+    The result does not depend on how packets are grouped: they are evaluated in the order of their
+    stamps, in chunks of fixed size.
     """
 
     def __init__(self, packet_ns: float) -> None:
-        """packet_ns: nominal time of a packet, used where packets are too few to tell their own."""
+        """packet_ns: nominal packet period, used where packets are too few to estimate it."""
         self.reordered = 0
         self._packet_ns = packet_ns
-        self._judged = 0
+        # Lost packets of the chunks that are evaluated.
+        self._lost = 0
         self._parts: list[_Packets] = []
         self._waiting = 0
         self._newest_ns: int | None = None
-        self._crowd = 3 * _CHUNK
+        self._limit = 3 * _CHUNK
 
     @property
     def lost(self) -> int:
-        """Packets missing so far; those that wait are judged as if no other came."""
+        """Packets missing so far, as if the input ended here."""
         if not self._parts:
-            return self._judged
-        self._settle()
-        return self._judged + _missing(self._parts[0], self._packet_ns)
+            return self._lost
+        self._evaluate()
+        return self._lost + _missing(self._parts[0], self._packet_ns)
 
     def add(self, heads: Heads, host_ns: I64Array) -> None:
-        """Take in accepted packets (P,), in order of arrival, by the sensor's own clock."""
+        """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
         measured = np.flatnonzero(heads.valid.any(axis=1))
         ticks = rotor_ticks(heads.encoder)
         packets = _Packets(
-            # A copy: else the stamps of all columns would be kept.
+            # A copy, so that the stamps of all columns are not kept in memory.
             heads.stamp_ns[:, 0].copy(),
             host_ns,
             ticks[:, 0].astype(np.float64) * _TURNS_PER_TICK,
             ticks[:, -1].astype(np.float64) * _TURNS_PER_TICK,
-            (ticks >> (32 - _PLACE_BITS)).astype(np.uint16),
+            (ticks >> (32 - _BIN_BITS)).astype(np.uint16),
         )
         if len(measured) < len(packets):
             packets = packets.take(measured)
@@ -212,58 +223,58 @@ class PaceLoss:
             packets = self._until_reset(packets)
 
     def _until_reset(self, packets: _Packets) -> _Packets:
-        """Take in packets up to where the clock was reset; gives the others."""
+        """Add packets up to a clock reset; return those after it."""
         stamp_ns = packets.stamp_ns
         begin = int(stamp_ns[0]) if self._newest_ns is None else self._newest_ns
         newest = np.maximum.accumulate(np.concatenate([[begin], stamp_ns]))
         back = newest[:-1] - stamp_ns
         count = len(packets)
-        if int(back.max()) > _SETTLED_NS:
-            count = int(np.argmax(back > _SETTLED_NS))
+        if int(back.max()) > _FINAL_NS:
+            count = int(np.argmax(back > _FINAL_NS))
         self.reordered += int(np.count_nonzero(back[:count] > 0))
         self._newest_ns = int(newest[count])
-        if count == len(packets):
-            self._wait(packets)
-            return packets.take(slice(count, None))
-        self._wait(packets.take(slice(count)))
-        # What was missed meanwhile, nobody knows.
-        self._judged, self._parts, self._waiting = self.lost, [], 0
-        self._newest_ns = None
+        self._enqueue(packets.take(slice(count)))
+        if count < len(packets):
+            # Loss across a reset cannot be known: begin anew.
+            self._lost = self.lost
+            self._parts = []
+            self._waiting = 0
+            self._newest_ns = None
         return packets.take(slice(count, None))
 
-    def _wait(self, packets: _Packets) -> None:
+    def _enqueue(self, packets: _Packets) -> None:
         if not len(packets):
             return
         self._parts.append(packets)
         self._waiting += len(packets)
-        if self._waiting >= self._crowd:
-            self._settle()
-            self._crowd = max(3 * _CHUNK, 2 * self._waiting)
+        if self._waiting >= self._limit:
+            self._evaluate()
+            self._limit = max(3 * _CHUNK, 2 * self._waiting)
 
-    def _settle(self) -> None:
-        """Judge the oldest of the packets that are in their final order, chunk by chunk.
+    def _evaluate(self) -> None:
+        """Evaluate the oldest packets whose order is final, chunk by chunk.
 
-        As many are left as are judged at once, so that the last chunk of all is no short one.
+        A full chunk always remains, so that the last chunk of all is not a short one.
         """
         rows = _in_order(self._parts)
-        final_ns = rows.stamp_ns[-1] - _SETTLED_NS
-        settled = int(np.searchsorted(rows.stamp_ns, final_ns))
-        while settled >= 2 * _CHUNK:
-            # The last packet is the next chunk's first: the step between them counts once.
-            self._judged += _missing(rows.take(slice(_CHUNK + 1)), self._packet_ns)
+        final = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - _FINAL_NS))
+        while final >= 2 * _CHUNK:
+            # The last packet of a chunk is the first of the next, to count the step between them.
+            self._lost += _missing(rows.take(slice(_CHUNK + 1)), self._packet_ns)
             rows = rows.take(slice(_CHUNK, None))
-            settled -= _CHUNK
-        self._parts, self._waiting = [rows], len(rows)
+            final -= _CHUNK
+        self._parts = [rows]
+        self._waiting = len(rows)
 
 
 def _in_order(parts: list[_Packets]) -> _Packets:
-    """All packets in the order of their stamps; of equal stamps the first that came."""
+    """All packets by stamp; those of equal stamps by receive time."""
     rows = _Packets(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.host_ns for part in parts]),
         np.concatenate([part.first for part in parts]),
         np.concatenate([part.last for part in parts]),
-        np.concatenate([part.places for part in parts]),
+        np.concatenate([part.bins for part in parts]),
     )
     if bool((rows.stamp_ns[1:] >= rows.stamp_ns[:-1]).all()):
         return rows
@@ -271,145 +282,115 @@ def _in_order(parts: list[_Packets]) -> _Packets:
 
 
 def _missing(packets: _Packets, packet_ns: float) -> int:
-    """How many packets are missing between these, which are in the order of their stamps."""
-    # Packets that share a stamp (a return each) are missed together.
+    """Number of packets missing between these, which are sorted by stamp."""
+    # Packets of equal stamps (one a return) count as one.
     packets = packets.take(np.diff(packets.stamp_ns, prepend=packets.stamp_ns[:1] - 1) > 0)
     step_ns = np.diff(packets.stamp_ns).astype(np.float64)
-    pace_ns = _pace_ns(step_ns, packet_ns)
-    gap = np.flatnonzero(step_ns > 1.5 * pace_ns)
+    period_ns = _period_ns(step_ns, packet_ns)
+    is_gap = step_ns > 1.5 * period_ns
+    gap = np.flatnonzero(is_gap)
     if not len(gap):
         return 0
-    speed = _speed(packets, step_ns, pace_ns)[gap]
-    if median(speed) < 0:
-        packets, speed = packets.mirrored(), -speed
-    step_ns, begin, end = step_ns[gap], packets.first[gap], packets.first[gap + 1]
-    turned = end - begin + np.rint(speed * step_ns - (end - begin))
+    speed = _speed(packets, step_ns, is_gap)
+    if speed < 0:
+        packets = packets.mirrored()
+        speed = -speed
+    gap_ns = step_ns[gap]
+    begin = packets.first[gap]
+    turned = packets.first[gap + 1] - begin
+    turned += np.rint(speed * gap_ns - turned)
     passed_ns = packets.host_ns[gap + 1] - packets.host_ns[gap]
+    # A clock that was set also steps: then the rotor, or the capture host, did not move as long.
     is_silence = np.where(
-        step_ns > _STEP_NS,
-        passed_ns >= step_ns - _STEP_NS,
-        np.abs(speed * step_ns - turned) < _ROTOR_OFF,
+        gap_ns > _STEP_NS,
+        passed_ns >= gap_ns - _STEP_NS,
+        np.abs(speed * gap_ns - turned) < _ROTOR_ERROR,
     )
-    due = step_ns / pace_ns
-    columns = packets.places.shape[1]
-    column_turns = np.maximum(speed * (pace_ns / columns), 0.0)
-    dark = _dark_sectors(packets, begin, turned, median(column_turns))
-    across = np.flatnonzero(dark.passes(begin, turned).any(axis=1) & (column_turns > 0))
-    if len(across):
-        together = _together(packets.places)
-        pitch = together * column_turns[across]
-        seen = together * dark.angles(begin[across], turned[across], pitch)
-        if together > 1:
-            # Packets may begin with the second column of an angle.
-            second = (packets.places[:, 0] != packets.places[:, 1]).astype(np.float64)
-            seen += second[gap[across] + 1] - second[gap[across]]
-        due[across] = seen / columns
-    missing = np.rint(due) - 1
+    columns = packets.bins.shape[1]
+    dark = _dark_sectors(packets, begin, turned, speed * period_ns / columns)
+    dark_turned = dark.passes(begin, turned) @ dark.width
+    share = np.divide(dark_turned, turned, out=np.zeros(len(gap)), where=turned > 0)
+    sent = gap_ns * (1 - share) / period_ns
+    sent[dark_turned > 0] -= _edge_excess(packets.bins)
+    missing = np.rint(sent) - 1
     return int(missing[is_silence & (missing > 0)].sum())
 
 
-def _together(places: U16Array) -> int:
-    """Columns at one angle: 2 where each return is a column of its own, else 1."""
-    if places.shape[1] == 1:
-        return 1
-    return 2 if float(np.mean(places[:, 1:] == places[:, :-1])) > _TWICE else 1
+def _edge_excess(bins: U16Array) -> float:
+    """Packets by which the estimate across a dark sector may exceed what rounding corrects.
+
+    One angle at an edge of the sector; and, if two returns are columns of one angle, the column
+    with which a packet begins. Positive for packets of up to 3 columns only.
+    """
+    columns = int(bins.shape[1])
+    is_dual = columns > 1 and float(np.mean(bins[:, 1:] == bins[:, :-1])) > _MIN_DUAL_SHARE
+    return max((3 if is_dual else 1) / columns - 0.5, 0.0)
 
 
-def _pace_ns(step_ns: F64Array, packet_ns: float) -> float:
-    """Time of a packet, by the steps between them that are usual; else the nominal one.
+def _period_ns(step_ns: F64Array, packet_ns: float) -> float:
+    """The packet period: mean of the usual steps, else the nominal one.
 
-    By two steps at once: where three columns of two returns make a packet, steps of one and two
-    rounds take turns.
+    Over two steps at a time, since three columns of two returns in a packet make steps of one and
+    two rounds alternate.
     """
     pair_ns = (step_ns[1:] + step_ns[:-1]) / 2
-    if len(pair_ns) < _FEWEST_STEPS:
+    if len(pair_ns) < _MIN_STEPS:
         return packet_ns
-    low_ns = float(np.quantile(pair_ns, _LOW))
-    near = pair_ns[np.abs(pair_ns - low_ns) <= _NEAR * low_ns]
-    # Where most packets are lost, what is left does not tell.
-    return float(near.mean()) if len(near) >= _SHARE * len(pair_ns) else packet_ns
+    low_ns = float(np.quantile(pair_ns, _QUANTILE))
+    near = pair_ns[np.abs(pair_ns - low_ns) <= _TOLERANCE * low_ns]
+    # If most packets are lost, the remaining steps show no period.
+    return float(near.mean()) if len(near) >= _MIN_SHARE * len(pair_ns) else packet_ns
 
 
-def _speed(packets: _Packets, step_ns: F64Array, pace_ns: float) -> F64Array:
-    """Turns a ns of the rotor around each step, by the steps near it between which none is lost."""
+def _speed(packets: _Packets, step_ns: F64Array, is_gap: BoolArray) -> float:
+    """Speed of the rotor, revolutions per ns, over the steps that are no gaps."""
     turned = np.diff(packets.first)
     turned -= np.rint(turned)
-    clean = step_ns < 1.5 * pace_ns
-    at = np.arange(len(step_ns) + 1)
-    low = np.maximum(at[:-1] - _SPEED_OVER // 2, 0)
-    high = np.minimum(at[:-1] + _SPEED_OVER // 2, len(step_ns))
-    turns = np.concatenate([[0.0], np.cumsum(np.where(clean, turned, 0.0))])
-    time_ns = np.concatenate([[0.0], np.cumsum(np.where(clean, step_ns, 0.0))])
-    took_ns = time_ns[high] - time_ns[low]
-    usual = turns[-1] / time_ns[-1] if time_ns[-1] else 0.0
-    return np.where(took_ns > 0, (turns[high] - turns[low]) / np.maximum(took_ns, 1.0), usual)
+    time_ns = float(step_ns[~is_gap].sum())
+    return float(turned[~is_gap].sum()) / time_ns if time_ns else 0.0
 
 
 @dataclass(slots=True)
 class _Sectors:
-    """Sectors of a turn, (k,) each: from where to where the rotor passes them, in turns."""
+    """Sectors of a revolution, (k,) each, in revolutions, in the direction of the rotor."""
 
     begin: F64Array
     width: F64Array
 
-    def take(self, index: BoolArray) -> _Sectors:
-        return _Sectors(self.begin[index], self.width[index])
-
     def passes(self, begin: F64Array, turned: F64Array) -> F64Array:
-        """(g, k) how often rotors pass them that turn from `begin` on by `turned`."""
+        """(g, k) how often a rotor passes each sector that turns by `turned` from `begin`."""
         ahead = begin[:, None] - (self.begin + self.width / 2)
         count: F64Array = np.floor(ahead + turned[:, None]) - np.floor(ahead)
         return count
-
-    def angles(self, begin: F64Array, turned: F64Array, pitch: F64Array) -> F64Array:
-        """(g,) angles that a sensor measures at while it turns so, from `begin` on.
-
-        They lie on a grid: at both edges the last one in the light is known.
-        """
-        lit = turned - self.passes(begin, turned) @ self.width
-        before = self.begin - begin[:, None]
-        after = (begin + turned)[:, None] - self.begin - self.width
-        at_edges = 1 + _beyond_grid(before, pitch) + _beyond_grid(after, pitch)
-        return np.asarray(lit / pitch + at_edges, np.float64)
-
-
-def _beyond_grid(turns: F64Array, pitch: F64Array) -> F64Array:
-    """(g,) down to a whole number of pitches, from the least of the ways (g, k) along a turn.
-
-    Where rounding may hide an angle, half of it.
-    """
-    high = ((turns + _GRID_OFF) % 1.0).min(axis=1)
-    low = np.maximum(high - 2 * _GRID_OFF, 0.0)
-    whole = (np.floor(high / pitch) + np.floor(low / pitch)) / 2
-    return np.asarray(whole - (high - _GRID_OFF) / pitch, np.float64)
 
 
 def _dark_sectors(
     packets: _Packets, begin: F64Array, turned: F64Array, column_turns: float
 ) -> _Sectors:
-    """Where no column ever lies, though the rotor passed: in steps (g,) from `begin` by `turned`.
+    """Sectors in which the sensor measures nothing; begin, turned: (g,) gaps.
 
-    That is known where it passed often, or within a packet, where nothing can be lost.
+    These are sectors without a column that the rotor passed during many gaps, or within a packet,
+    where nothing can be lost.
     """
-    holes = _holes(packets.places, column_turns)
-    is_dark = np.count_nonzero(holes.passes(begin, turned), axis=0) >= _PASSES
+    bare = _bare_sectors(packets.bins, column_turns)
+    is_dark = np.count_nonzero(bare.passes(begin, turned), axis=0) >= _MIN_PASSES
     if not is_dark.all():
         span = (packets.last - packets.first) % 1.0
-        # A rotor that jitters or rests may seem to step back.
-        span[span > 1 - _BACK_TURNS] = 0.0
+        span[span > 1 - _JITTER] = 0.0
         wide = np.flatnonzero(span > 1.5 * median(span))
-        is_dark |= holes.passes(packets.first[wide], span[wide]).any(axis=0)
-    return holes.take(is_dark)
+        is_dark |= bare.passes(packets.first[wide], span[wide]).any(axis=0)
+    return _Sectors(bare.begin[is_dark], bare.width[is_dark])
 
 
-def _holes(places: U16Array, column_turns: float) -> _Sectors:
-    """Sectors in which no column lies."""
-    bare = np.bincount(places.ravel(), minlength=_PLACES) == 0
-    # Turned so that none passes the end.
+def _bare_sectors(bins: U16Array, column_turns: float) -> _Sectors:
+    """Sectors without a column; column_turns: step between columns, revolutions."""
+    bare = np.bincount(bins.ravel(), minlength=_BINS) == 0
+    # Rotated so that no sector contains the end.
     first = int(np.argmin(bare))
     edge = np.diff(np.roll(bare, -first).astype(np.int8), append=np.int8(0))
-    begin, end = np.flatnonzero(edge == 1) + 1, np.flatnonzero(edge == -1) + 1
-    # On average half of the place at each edge is dark as well.
-    width = (end - begin + 1) / _PLACES
-    wide = width > _HOLE_STEPS * column_turns
-    return _Sectors(((begin + first - 0.5) / _PLACES % 1.0)[wide], width[wide])
+    begin = np.flatnonzero(edge == 1) + 1
+    end = np.flatnonzero(edge == -1) + 1
+    # On average half of the bin at each edge is dark as well.
+    width = (end - begin + 1) / _BINS
+    wide = width > _MIN_WIDTH * column_turns
+    return _Sectors(((begin + first - 0.5) / _BINS % 1.0)[wide], width[wide])

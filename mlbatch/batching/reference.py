@@ -1,31 +1,47 @@
 """The paper in plain loops: the oracle of the fast batcher, never optimised.
 
-Source: Faitli et al. (2025), section 2.1, as CONTRACT.md section 1 makes it exact. It takes packets
-in arrival order, one after the other, column by column, and shares no helper with the fast code.
-Where the contract leaves room, these rules decide (N: newest stamp delivered by a sensor, t0: its
-first, G: the largest N; slack: 10 ms):
+Source: Faitli et al. (2025), section 2.1. It takes packets in order of receive time, one after the
+other, column by column, and shares no code with the fast batcher. Where the paper leaves a choice,
+these rules apply (N: newest stamp delivered by a sensor; t0: its first stamp; G: the largest N;
+slack: the allowed lateness, 10 ms; max-wait: the idle-source timeout):
 
-1. Intake: see `reference_intake.py`. A held packet is delivered when one confirms it.
-2. Invalid columns are dropped `invalid` and are never stamps, but count as decoded.
-3. Clocks are compared when a sensor's first valid column is delivered, with every sensor that had
-   one: with the first alone it would matter which came first. Not with the host clock.
-4. Sensor s is stalled after a delivery if G - N[s], or before its first column G minus the smallest
-   t0, exceeds max-wait.
+1. Intake, per sensor, in its own order of packets:
+   - A key that occurred in at most 1024 packets of the sensor before (accepted or not) makes a
+     `duplicate`; keys below 0 identify nothing.
+   - A packet without a valid column is accepted; it neither confirms nor rejects a held packet.
+   - A valid stamp outside [0, 2^31 s), or valid stamps that span more than 1 s: `bad_stamp`.
+   - A packet with a valid stamp more than 1 s from the newest accepted one is a step, and is held
+     until the next packet Q of the sensor that passes the rules above. If Q is no step, the held
+     packet is rejected and Q accepted. If all of Q is within 1 s of the first valid stamp of the
+     held packet, the step is confirmed: forward it is a gap, and both are accepted, in order;
+     backward it is a clock reset, a `ClockError`. Otherwise the held packet is rejected and Q is
+     held. End of input rejects a held packet.
+   - With the host clock, the same rules apply to the stamps of the sensor, except that a reset is
+     accepted. Then the stamps of an accepted packet become its receive time minus their age
+     relative to its largest valid stamp.
+   A held packet is delivered together with the packet that confirms it.
+2. Invalid columns are dropped as `invalid`; they have no stamp, but count as decoded.
+3. Clocks are compared when the first valid column of a sensor is delivered, with every sensor that
+   already has one (comparing with the first sensor only would depend on the order). Not with the
+   host clock.
+4. Sensor s is stalled after a delivery if G - N[s] exceeds max-wait; before its first column, if G
+   minus the smallest t0 does.
 5. Eq. (1) is evaluated after the first delivery at which every sensor has a column or is stalled,
    over those that have one and are not stalled; else at the end, over all that have one.
 6. Slices are windows q = k * slices + j with bounds ceil(q * 1e9 / (rate * slices)).
-7. After each delivery the watermark is the smallest N of the sensors not stalled, minus the slack,
-   if that is larger than before; windows that end at or before it are published. A column is `late`
-   if its window ends at or before its sensor's newest stamp before it minus the slack, or the end
-   of what was published before its packet.
-8. `complete` is judged at publication: t0 <= start and N >= end for every sensor, and no stall
+7. After each delivery the watermark is the smallest N of the sensors that are not stalled, minus
+   the slack, if that is larger than before; windows that end at or before it are published. A
+   column is `late` if its window ends at or before the newest stamp of its sensor before it minus
+   the slack, or at or before the end of what was published before its packet.
+8. `complete` is decided at publication: t0 <= start and N >= end for every sensor, and no stall
    overlaps. A stall is a step of a sensor's running maximum from a to b > a + max-wait; it overlaps
    if a < end and b > start.
-9. End of input publishes everything else, at the arrival of the feed's last packet.
-10. A column has one reason, the first of: invalid, late, before_start (k < k0 - 1), outside_time
-   (start of the whole window outside [start, end)), head (k = k0 - 1), tail (the slice of the final
-   G). Keep-partial writes head and tail. `empty` counts slices without a column from k0 to the last
-   that holds one, inside [start, end). In a window columns lie by (stamp, sensor, arrival).
+9. End of input publishes everything else, at the receive time of the last packet.
+10. A column is dropped for one reason, the first of: invalid, late, before_start (k < k0 - 1),
+   outside_time (start of the whole window outside [start, end)), head (k = k0 - 1), tail (the slice
+   of the final G). Keep-partial writes head and tail. `empty` counts slices without a column from
+   k0 to the last with a column, inside [start, end). In a window, columns are ordered by stamp,
+   sensor, order of delivery.
 """
 
 from __future__ import annotations
@@ -37,15 +53,31 @@ from fractions import Fraction
 
 from mlbatch.errors import ClockError
 
-__all__ = ["FeedPacket", "Outcome", "Settings", "Window", "reference_scans"]
+__all__ = ["FeedPacket", "Intake", "Outcome", "Settings", "Window", "reference_scans"]
 
 SECOND_NS = 10**9
 SLACK_NS = 10**7
+DUPLICATE_REACH = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class FeedPacket:
+    """A packet in order of receive time: key < 0: no identity; stamps on the sensor's clock, ns."""
+
+    sensor: int
+    host_ns: int
+    key: int
+    stamps: tuple[int, ...]
+    valid: tuple[bool, ...]
+
+    def valid_stamps(self) -> list[int]:
+        """Stamps of the valid columns, in their order."""
+        return [stamp for stamp, valid in zip(self.stamps, self.valid, strict=True) if valid]
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the user chose; max_wait_ns None waits for ever; rate in Hz."""
+    """Options of a run; rate in Hz; max_wait_ns None: no idle-source timeout."""
 
     rate: Fraction
     sensors: int
@@ -72,7 +104,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """All that came of a feed; lists over the sensors count packets (rejected) or columns."""
+    """Result of a run; lists over the sensors count packets (rejected) or columns."""
 
     t_init_ns: int | None
     windows: list[Window]
@@ -84,9 +116,86 @@ class Outcome:
     incomplete: int
 
 
+class Intake:
+    """Filter of the packets of one sensor: rule 1."""
+
+    def __init__(self, sensor: int, host_clock: bool) -> None:
+        self.sensor = sensor
+        self.host_clock = host_clock
+        self.rejected: dict[str, int] = {}
+        self.packets = 0
+        self.last_seen: dict[int, int] = {}
+        self.newest: int | None = None
+        self.held: FeedPacket | None = None
+
+    def take(self, packet: FeedPacket) -> list[FeedPacket]:
+        """Packets that are accepted with this one, in order, stamps on the common clock."""
+        if self._is_duplicate(packet.key):
+            self._reject("duplicate")
+            return []
+        stamps = packet.valid_stamps()
+        if not stamps:
+            return [packet]
+        impossible = min(stamps) < 0 or max(stamps) >= 2**31 * SECOND_NS
+        if impossible or max(stamps) - min(stamps) > SECOND_NS:
+            self._reject("bad_stamp")
+            return []
+        return [self._accept(one) for one in self._confirm(packet, stamps)]
+
+    def finish(self) -> None:
+        """End of input: reject a held packet."""
+        if self.held is not None:
+            self._reject("bad_stamp")
+            self.held = None
+
+    def _is_duplicate(self, key: int) -> bool:
+        self.packets += 1
+        if key < 0:
+            return False
+        before = self.last_seen.get(key)
+        self.last_seen[key] = self.packets
+        return before is not None and self.packets - before <= DUPLICATE_REACH
+
+    def _confirm(self, packet: FeedPacket, stamps: list[int]) -> list[FeedPacket]:
+        held = self.held
+        newest = self.newest
+        self.held = None
+        if newest is None or all(abs(stamp - newest) <= SECOND_NS for stamp in stamps):
+            if held is not None:
+                self._reject("bad_stamp")
+            return [packet]
+        if held is None:
+            self.held = packet
+            return []
+        first = held.valid_stamps()[0]
+        if any(abs(stamp - first) > SECOND_NS for stamp in stamps):
+            self._reject("bad_stamp")
+            self.held = packet
+            return []
+        if first < newest and self.host_clock:
+            self.newest = None
+        elif first < newest:
+            raise ClockError(
+                f"sensor {self.sensor}: expected stamps of one continuous clock, found a reset "
+                f"from {newest} ns back to {first} ns; cut the recording there or use --clock host"
+            )
+        return [held, packet]
+
+    def _accept(self, packet: FeedPacket) -> FeedPacket:
+        largest = max(packet.valid_stamps())
+        self.newest = largest if self.newest is None else max(self.newest, largest)
+        if not self.host_clock:
+            return packet
+        stamps = tuple(packet.host_ns - (largest - stamp) for stamp in packet.stamps)
+        return replace(packet, stamps=stamps)
+
+    def _reject(self, reason: str) -> None:
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+
+
 @dataclass(slots=True)
 class Sensor:
-    """What is known of one sensor after the deliveries so far."""
+    """State of one sensor after the deliveries so far."""
 
     packets: int = 0
     first: int | None = None
@@ -100,8 +209,8 @@ class Sensor:
         """Count one column that is not written."""
         self.dropped[reason] = self.dropped.get(reason, 0) + 1
 
-    def note(self, stamp: int, max_wait_ns: int | None) -> None:
-        """Move N, and remember a step of N that is a stall."""
+    def observe(self, stamp: int, max_wait_ns: int | None) -> None:
+        """Update N, and record a step of N that is a stall."""
         before = stamp if self.newest is None else self.newest
         if max_wait_ns is not None and stamp - before > max_wait_ns:
             self.stalls.append((before, stamp))
@@ -109,7 +218,7 @@ class Sensor:
 
 
 class Session:
-    """The main loop of the paper and what it remembers between packets."""
+    """The main loop of the paper and its state between packets."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -133,9 +242,10 @@ class Session:
         return math.floor(stamp * self.slices_per_ns)
 
     def deliver(self, packet: FeedPacket, host_ns: int) -> None:
-        """One accepted packet, at host time `host_ns`: load its columns, publish what it closes."""
+        """Load the columns of an accepted packet, publish the windows that it closes."""
         sensor = self.sensors[packet.sensor]
-        number, sensor.packets = sensor.packets, sensor.packets + 1
+        number = sensor.packets
+        sensor.packets += 1
         for column, stamp in enumerate(packet.stamps):
             sensor.decoded += 1
             if not packet.valid[column]:
@@ -155,14 +265,15 @@ class Session:
         for other, known in self.offsets.items():
             if not self.settings.host_clock and abs(offset - known) > SECOND_NS:
                 raise ClockError(
-                    f"sensors {other} and {number}: wanted comparable clocks, got stamp minus "
-                    f"host {known} ns and {offset} ns; use --clock host or clock.offset_s"
+                    f"sensors {other} and {number}: expected comparable clocks, found stamp minus "
+                    f"receive time {known} ns and {offset} ns; use --clock host or clock.offset_s"
                 )
         self.offsets[number] = offset
 
     def load(self, number: int, stamp: int, packet: int, column: int) -> None:
         """Put a column into its window, unless it is late: rule 7."""
-        sensor, q = self.sensors[number], self.slice_of(stamp)
+        sensor = self.sensors[number]
+        q = self.slice_of(stamp)
         end = self.bound(q + 1)
         passed = [] if self.published_end is None else [self.published_end]
         passed += [] if sensor.newest is None else [sensor.newest - SLACK_NS]
@@ -170,7 +281,7 @@ class Session:
             sensor.drop("late")
         else:
             self.waiting.setdefault(q, []).append((stamp, number, packet, column))
-        sensor.note(stamp, self.settings.max_wait_ns)
+        sensor.observe(stamp, self.settings.max_wait_ns)
 
     def stalled(self, sensor: Sensor) -> bool:
         """Rule 4."""
@@ -189,12 +300,12 @@ class Session:
             self.begin([one for one, s in zip(self.sensors, stalled, strict=True) if not s])
 
     def begin(self, live: list[Sensor]) -> None:
-        """The first window that begins after every first stamp."""
+        """Eq. (1): k0 is the first window that begins after every first stamp."""
         t0max = max(sensor.first for sensor in live if sensor.first is not None)
         self.k0 = math.floor(t0max * self.settings.rate / SECOND_NS) + 1
 
     def publish(self, host_ns: int) -> None:
-        """Raise the watermark and close the windows it has passed: rule 7."""
+        """Advance the watermark, close the windows that it passes: rule 7."""
         live = [sensor for sensor in self.sensors if not self.stalled(sensor)]
         mark = min(sensor.newest for sensor in live if sensor.newest is not None) - SLACK_NS
         self.watermark = mark if self.watermark is None else max(self.watermark, mark)
@@ -214,7 +325,7 @@ class Session:
             self.close(min(self.waiting), host_ns, tail)
 
     def close(self, q: int, host_ns: int, tail: int | None) -> None:
-        """Write slice q, or drop its columns under one reason."""
+        """Write slice q, or drop its columns for one reason."""
         columns = sorted(self.waiting.pop(q))
         self.filled.add(q)
         reason = self.unwanted(q, tail)
@@ -225,15 +336,17 @@ class Session:
                 self.sensors[number].written += 1
         if reason or self.k0 is None:
             return
-        start, end = self.bound(q), self.bound(q + 1)
+        start = self.bound(q)
+        end = self.bound(q + 1)
         k, part = divmod(q, self.settings.slices)
         order = [(number, packet, column) for _, number, packet, column in columns]
         complete = self.complete(start, end)
         self.windows.append(Window(k - self.k0, part, start, end, complete, host_ns, order))
 
     def unwanted(self, q: int, tail: int | None) -> str:
-        """Why slice q is not written, or nothing: rule 10."""
-        k, k0 = q // self.settings.slices, self.k0
+        """Reason not to write slice q, or an empty text: rule 10."""
+        k = q // self.settings.slices
+        k0 = self.k0
         if k0 is None or k < k0 - 1:
             return "before_start"
         if not self.inside(k):
@@ -245,8 +358,9 @@ class Session:
         return "tail" if q == tail else ""
 
     def inside(self, k: int) -> bool:
-        """Whether window k begins in [start, end)."""
-        low, high = self.settings.start_ns, self.settings.end_ns
+        """True if window k begins in [start, end)."""
+        low = self.settings.start_ns
+        high = self.settings.end_ns
         begin = self.bound(k * self.settings.slices)
         return (low is None or begin >= low) and (high is None or begin < high)
 
@@ -262,11 +376,14 @@ class Session:
         return True
 
     def empty(self) -> int:
-        """Slices of rule 10 without a column, by subtraction: gaps may last for hours."""
+        """Slices without a column (rule 10), by subtraction: gaps may last for hours."""
         if self.k0 is None or not self.filled:
             return 0
-        low, high, slices = self.settings.start_ns, self.settings.end_ns, self.settings.slices
-        first, last = self.k0 * slices, max(self.filled)
+        low = self.settings.start_ns
+        high = self.settings.end_ns
+        slices = self.settings.slices
+        first = self.k0 * slices
+        last = max(self.filled)
         # ceil(k * T) >= low is k * T > low - 1, and ceil(k * T) < high is k * T <= high - 1.
         if low is not None:
             first = max(first, (self.slice_of(low - 1) // slices + 1) * slices)
@@ -276,132 +393,21 @@ class Session:
 
 
 def reference_scans(feed: Iterable[FeedPacket], settings: Settings) -> Outcome:
-    """Take the packets of a feed one by one, as the paper does."""
-    session, host_ns = Session(settings), 0
+    """Batch the packets of a feed, one by one; ClockError for clocks that cannot be used."""
+    session = Session(settings)
+    host_ns = 0
     for packet in feed:
         host_ns = packet.host_ns
         for accepted in session.intakes[packet.sensor].take(packet):
             session.deliver(accepted, host_ns)
     session.finish(host_ns)
     return Outcome(
-        None if session.k0 is None else session.bound(session.k0 * settings.slices),
-        session.windows,
-        [intake.rejected for intake in session.intakes],
-        [sensor.dropped for sensor in session.sensors],
-        [sensor.decoded for sensor in session.sensors],
-        [sensor.written for sensor in session.sensors],
-        session.empty(),
-        sum(not window.complete for window in session.windows),
+        t_init_ns=None if session.k0 is None else session.bound(session.k0 * settings.slices),
+        windows=session.windows,
+        rejected=[intake.rejected for intake in session.intakes],
+        dropped=[sensor.dropped for sensor in session.sensors],
+        decoded=[sensor.decoded for sensor in session.sensors],
+        written=[sensor.written for sensor in session.sensors],
+        empty=session.empty(),
+        incomplete=sum(not window.complete for window in session.windows),
     )
-
-
-# Which packets the oracle lets in: rule 1 of `reference.py`, packet by packet.
-#
-# Source: CONTRACT.md section 1, `bad_stamp`, and section 4, `duplicate`, made exact. Each sensor
-# is judged in its own order:
-#
-# - A key that the sensor sent at most 1024 of its packets ago (let in or not) is a `duplicate`;
-# keys below 0 identify nothing. - A packet without a valid column is accepted; it neither
-# confirms nor rejects anything. - A valid stamp outside [0, 2^31 s), or valid stamps that span
-# more than 1 s: `bad_stamp` at once. - A packet with a valid stamp more than 1 s from the newest
-# accepted one steps, and is held. The sensor's next packet Q that gets this far judges it. Q
-# does not step from the newest: the held one is rejected, Q accepted. All of Q lies within 1 s
-# of the held one's first valid stamp: confirmed; forward it is a gap, both are accepted in
-# order; backward it is a reset, a `ClockError`. Else the held one is rejected and Q is held. End
-# of input rejects what is held. - With the host clock the same is judged on the sensor's stamps,
-# but that a reset is accepted; then the stamps of an accepted packet become its host time minus
-# their age against its largest valid stamp.
-
-SECOND_NS = 10**9
-DUPLICATE_REACH = 1024
-
-
-@dataclass(frozen=True, slots=True)
-class FeedPacket:
-    """One packet as it arrives: key < 0 has no identity; stamps on the sensor's clock, ns."""
-
-    sensor: int
-    host_ns: int
-    key: int
-    stamps: tuple[int, ...]
-    valid: tuple[bool, ...]
-
-    def valid_stamps(self) -> list[int]:
-        """Stamps of the columns that were measured, in their order."""
-        return [stamp for stamp, valid in zip(self.stamps, self.valid, strict=True) if valid]
-
-
-class Intake:
-    """The door of one sensor: rule 1."""
-
-    def __init__(self, sensor: int, host_clock: bool) -> None:
-        self.sensor = sensor
-        self.host_clock = host_clock
-        self.rejected: dict[str, int] = {}
-        self.packets = 0
-        self.last_seen: dict[int, int] = {}
-        self.newest: int | None = None
-        self.held: FeedPacket | None = None
-
-    def take(self, packet: FeedPacket) -> list[FeedPacket]:
-        """Packets that are let in when this one arrives, in order, stamps on the common clock."""
-        if self._is_duplicate(packet.key):
-            self._reject("duplicate")
-            return []
-        stamps = packet.valid_stamps()
-        if not stamps:
-            return [packet]
-        impossible = min(stamps) < 0 or max(stamps) >= 2**31 * SECOND_NS
-        if impossible or max(stamps) - min(stamps) > SECOND_NS:
-            self._reject("bad_stamp")
-            return []
-        return [self._let_in(one) for one in self._judge(packet, stamps)]
-
-    def finish(self) -> None:
-        """End of input: nothing can confirm a held packet any more."""
-        if self.held is not None:
-            self._reject("bad_stamp")
-            self.held = None
-
-    def _is_duplicate(self, key: int) -> bool:
-        self.packets += 1
-        if key < 0:
-            return False
-        before = self.last_seen.get(key)
-        self.last_seen[key] = self.packets
-        return before is not None and self.packets - before <= DUPLICATE_REACH
-
-    def _judge(self, packet: FeedPacket, stamps: list[int]) -> list[FeedPacket]:
-        held, self.held = self.held, None
-        newest = self.newest
-        if newest is None or all(abs(stamp - newest) <= SECOND_NS for stamp in stamps):
-            if held is not None:
-                self._reject("bad_stamp")
-            return [packet]
-        if held is None:
-            self.held = packet
-            return []
-        first = held.valid_stamps()[0]
-        if any(abs(stamp - first) > SECOND_NS for stamp in stamps):
-            self._reject("bad_stamp")
-            self.held = packet
-            return []
-        if first < newest and self.host_clock:
-            self.newest = None
-        elif first < newest:
-            raise ClockError(
-                f"sensor {self.sensor}: wanted a clock that runs on, got a reset from "
-                f"{newest} ns back to {first} ns; cut the recording there or use --clock host"
-            )
-        return [held, packet]
-
-    def _let_in(self, packet: FeedPacket) -> FeedPacket:
-        largest = max(packet.valid_stamps())
-        self.newest = largest if self.newest is None else max(self.newest, largest)
-        if not self.host_clock:
-            return packet
-        stamps = tuple(packet.host_ns - (largest - stamp) for stamp in packet.stamps)
-        return replace(packet, stamps=stamps)
-
-    def _reject(self, reason: str) -> None:
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1

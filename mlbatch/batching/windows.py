@@ -1,4 +1,9 @@
-"""Windows of the common clock: which are wanted, how they are numbered, which stayed empty."""
+"""Windows of a run: numbering from t_init, `--start` and `--end`, which are written, which empty.
+
+A window is a tumbling event-time window of stream processing: half open, on an absolute grid. The
+start of the first one, t_init, follows from eq. (1): with t0max the largest first stamp t0 of the
+sensors, t_init is the first bound after t0max.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ from mlbatch.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """An end of `--start`/`--end`: a time, or (from_t_init) a time after t_init; int ns."""
+    """Value of `--start` or `--end`: a time, or (from_t_init) a time after t_init; int ns."""
 
     ns: int
     from_t_init: bool = False
@@ -23,7 +28,11 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """Options of the batching; max_wait_ns None waits for ever (the paper to the letter)."""
+    """Options of batching.
+
+    max_wait_ns: idle-source timeout, None: none (the paper to the letter); keep_partial: write the
+    window before t_init and the one of the last stamp; start, end: limits of window starts.
+    """
 
     max_wait_ns: int | None = NS_PER_S
     keep_partial: bool = False
@@ -33,9 +42,11 @@ class Policy:
 
 @dataclass(slots=True)
 class Window:
-    """Columns of one window (or slice) of all sensors, by (stamp, sensor, arrival).
+    """Columns of all sensors in one window or slice, sorted by stamp, sensor, order of delivery.
 
-    stamp_ns, sensor, place, encoder: (n,) int64; `index` is -1 for the head.
+    index: number of the window from t_init, -1 for the one before (the head); start_ns, end_ns:
+    half open; complete: every sensor covers the window in time; ready_host_ns: receive time of the
+    packet that closed it. stamp_ns, sensor, place, encoder: (n,) int64, as in `Columns`.
     """
 
     index: int
@@ -51,14 +62,16 @@ class Window:
 
 
 class Schedule:
-    """The windows of a run, once eq. (1) is known; all windows are given as slices of the grid."""
+    """Which windows of the grid a run writes. Arguments named `window` are slice numbers q."""
 
     def __init__(self, grid: Grid, policy: Policy) -> None:
         self.t_init_ns: int | None = None
         self._grid = grid
         self._policy = policy
+        # k0 of eq. (1).
         self._first = 0
-        self._seen = 0
+        # Windows with columns from k0 on, within the limits.
+        self._filled = 0
         self._last: int | None = None
 
     def begin(self, t0max_ns: int) -> None:
@@ -67,19 +80,19 @@ class Schedule:
         self.t_init_ns = self._grid.bound(self._first * self._grid.slices)
 
     def index_of(self, window: int) -> int:
-        """Index in the output of the whole window that a slice belongs to; -1 is the head."""
+        """Output index of the whole window that a slice belongs to; -1 is the head."""
         return window // self._grid.slices - self._first
 
     def enter(self, window: int, last_of_all: int | None) -> str:
-        """Note that a window holds columns; gives why they are dropped, or an empty text.
+        """Record a window that has columns; return the reason to drop them, or an empty text.
 
-        last_of_all: the newest stamp of all sensors at the end of input, None before.
+        last_of_all: newest stamp of all sensors at the end of input, None before the end.
         """
         index = self.index_of(window)
         inside = self._is_inside(index)
         if index >= 0:
             self._last = window
-            self._seen += inside
+            self._filled += inside
         if index < -1:
             return "before_start"
         if not inside:
@@ -92,16 +105,16 @@ class Schedule:
         return "tail" if is_tail else ""
 
     def is_past_end(self, watermark_ns: int) -> bool:
-        """Whether all windows that begin before `--end` are closed."""
+        """True once all windows that begin before `--end` are closed."""
         if self.t_init_ns is None or self._policy.end is None:
             return False
-        # A window that begins before the end may reach past it by less than a period.
+        # A window that begins before the limit may end after it.
         end = max(self._policy.end.at(self.t_init_ns), 0)
         return watermark_ns >= self._grid.bound(self._at_or_after(end) * self._grid.slices)
 
     @property
     def limits_ns(self) -> tuple[int | None, int | None]:
-        """`--start` and `--end` on the common clock; None: none, or not known yet."""
+        """`--start` and `--end` on the common clock; None: not given, or not known yet."""
         return self._limit_ns(self._policy.start), self._limit_ns(self._policy.end)
 
     def _limit_ns(self, limit: Limit | None) -> int | None:
@@ -111,29 +124,31 @@ class Schedule:
 
     @property
     def empty(self) -> int:
-        """Windows without a column from the first to the last that holds one, by subtraction."""
+        """Windows without a column from k0 to the last one with columns, by subtraction."""
         if self._last is None or self.t_init_ns is None:
             return 0
-        slices, policy = self._grid.slices, self._policy
-        low, stop = self._first, self._last + 1
-        if policy.start is not None:
-            low = max(low, self._at_or_after(policy.start.at(self.t_init_ns)))
-        if policy.end is not None:
-            stop = min(stop, self._at_or_after(policy.end.at(self.t_init_ns)) * slices)
-        return max(0, stop - low * slices - self._seen)
+        slices = self._grid.slices
+        first = self._first
+        stop = self._last + 1
+        if self._policy.start is not None:
+            first = max(first, self._at_or_after(self._policy.start.at(self.t_init_ns)))
+        if self._policy.end is not None:
+            stop = min(stop, self._at_or_after(self._policy.end.at(self.t_init_ns)) * slices)
+        return max(0, stop - first * slices - self._filled)
 
     def _is_inside(self, index: int) -> bool:
-        """Whether the start of window `index` lies in [--start, --end)."""
+        """True if window `index` begins in [--start, --end)."""
         if self.t_init_ns is None:
             return False
-        start = self._grid.bound((index + self._first) * self._grid.slices)
-        low, high = self._policy.start, self._policy.end
-        return (low is None or start >= low.at(self.t_init_ns)) and (
-            high is None or start < high.at(self.t_init_ns)
+        begin = self._grid.bound((index + self._first) * self._grid.slices)
+        start = self._policy.start
+        end = self._policy.end
+        return (start is None or begin >= start.at(self.t_init_ns)) and (
+            end is None or begin < end.at(self.t_init_ns)
         )
 
     def _at_or_after(self, time_ns: int) -> int:
-        """First whole window whose start is at or after `time_ns`."""
+        """Number of the first whole window that begins at or after `time_ns`."""
         slices = self._grid.slices
         window = self._grid.index_of(max(time_ns, 0)) // slices
         return window if self._grid.bound(window * slices) >= time_ns else window + 1

@@ -1,7 +1,5 @@
-"""How fast mlbatch is on this machine: standard recordings, whole processes, floors and peers.
+"""Benchmark of mlbatch on this machine: standard recordings, whole processes, floors and peers.
 
-Nothing here imports numpy at the top of a module that the measuring process loads: Linux counts a
-parent's pages at the fork into the peak of its child (measure.py).
+Modules that the measuring process loads do not import numpy: Linux counts a parent's pages at the
+fork in the peak memory of its child (measure.py).
 """
-
-from __future__ import annotations

@@ -1,101 +1,245 @@
-"""The standard cases: which recordings are converted to what, and what runs beside them."""
+"""The standard recordings and the benchmark cases, as data.
+
+The measuring process loads this module, so it imports no numpy; recordings.py encodes the packets.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
-from mlbatch.bench.ratios import COPY, DRY_RUN, LIBRARY, START, WRITE
-from mlbatch.bench.recordings import RECORDINGS, Recording
+from mlbatch.bench.results import COPY, DRY_RUN, LIBRARY, START, WRITE
+from mlbatch.units import NS_PER_MS
 
-AUTO, NUMPY, NUMBA = "auto", "numpy", "numba"
+# -- recordings -----------------------------------------------------------------------------------
+
+CAPTURE: Final = "capture.pcap"
+RIG: Final = "rig.yaml"
+# File in a recording's folder: digest of the modules that made the recording.
+DIGEST: Final = "made-by.sha256"
+_ENCODER_MODULES: Final = ("cases.py", "recordings.py")
+
+# Sensor kinds: an Ouster profile, or a model of another vendor.
+LOW: Final = "RNG15_RFL8_NIR8"
+FULL: Final = "RNG19_RFL8_SIG16_NIR16"
+VLP16: Final = "VLP-16"
+PANDAR64: Final = "Pandar64"
+
+# Ethernet, IPv4 and UDP headers, and the header of a pcap record.
+_HEADERS_BYTES: Final = 14 + 20 + 8 + 16
+
+
+@dataclass(frozen=True, slots=True)
+class SensorKind:
+    """Packet rate and size of a sensor kind."""
+
+    packets_per_s: int
+    packet_bytes: int
+    slots_per_s: int
+    # Suffix of the metadata or calibration file it needs; empty: none.
+    suffix: str
+
+
+KINDS: Final[Mapping[str, SensorKind]] = {
+    LOW: SensorKind(640, 8448, 10_240 * 128, ".json"),
+    FULL: SensorKind(640, 24832, 10_240 * 128, ".json"),
+    VLP16: SensorKind(754, 1206, 18_084 * 16, ""),
+    PANDAR64: SensorKind(3000, 1198, 18_000 * 64, ".csv"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSensor:
+    """A sensor of a standard recording; kind: a key of KINDS; phase_ns: delay of its rotor."""
+
+    name: str
+    kind: str
+    source_ip: str
+    port: int
+    phase_ns: int
+    translation_m: tuple[float, float, float]
+    yaw_deg: float
+    serial: int = 0
+
+    @property
+    def file(self) -> str:
+        """Name of its metadata or calibration file; empty: none."""
+        suffix = KINDS[self.kind].suffix
+        return f"{self.name}{suffix}" if suffix else ""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRecording:
+    """A standard recording; fragments: packets are sent in IPv4 fragments of 1500 bytes."""
+
+    name: str
+    sensors: tuple[BenchSensor, ...]
+    fragments: bool = False
+
+    @property
+    def bytes_per_s(self) -> int:
+        """Approximate size of its capture per second."""
+        kinds = [KINDS[sensor.kind] for sensor in self.sensors]
+        return sum(kind.packets_per_s * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
+
+    @property
+    def slots_per_s(self) -> int:
+        """Slots per second of all sensors: the upper limit of its points."""
+        return sum(KINDS[sensor.kind].slots_per_s for sensor in self.sensors)
+
+
+def _dual(profile: str) -> tuple[BenchSensor, ...]:
+    """Two OS-1-128."""
+    return (
+        BenchSensor(
+            name="a",
+            kind=profile,
+            source_ip="192.168.7.11",
+            port=7502,
+            phase_ns=0,
+            translation_m=(0.0, 0.6, 1.8),
+            yaw_deg=0.0,
+            serial=122201000998,
+        ),
+        BenchSensor(
+            name="b",
+            kind=profile,
+            source_ip="192.168.7.12",
+            port=7504,
+            phase_ns=37_100_000,
+            translation_m=(0.0, -0.6, 1.8),
+            yaw_deg=90.0,
+            serial=122201000999,
+        ),
+    )
+
+
+_ROOF: Final = BenchSensor("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
+_LEFT: Final = BenchSensor(
+    "left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0
+)
+_RIGHT: Final = BenchSensor(
+    "right", VLP16, "192.168.7.23", 2368, 61 * NS_PER_MS, (0.0, -0.8, 1.6), -60.0
+)
+_REAR: Final = BenchSensor("rear", PANDAR64, "192.168.7.31", 2370, 0, (-1.0, 0.0, 1.8), 180.0)
+
+RECORDINGS: Final[Mapping[str, BenchRecording]] = {
+    recording.name: recording
+    for recording in (
+        BenchRecording("dual-4", _dual(LOW)),
+        BenchRecording("dual-4-fragments", _dual(LOW), fragments=True),
+        BenchRecording("dual-12", _dual(FULL)),
+        BenchRecording("dual-12-fragments", _dual(FULL), fragments=True),
+        BenchRecording("three-vlp16", (_ROOF, _LEFT, _RIGHT)),
+        BenchRecording("pandar64", (_REAR,)),
+        BenchRecording("mixed", (_dual(LOW)[0], _ROOF, _REAR)),
+    )
+}
+
+
+@lru_cache(maxsize=1)
+def digest() -> str:
+    """SHA-256 of the modules that determine the bytes of recordings."""
+    folder = Path(__file__).parent
+    sources = [(folder / name).read_bytes() for name in _ENCODER_MODULES]
+    return hashlib.sha256(b"".join(sources)).hexdigest()
+
+
+def is_current(folder: Path) -> bool:
+    """Whether a folder contains a complete recording made by the modules of this version."""
+    made_by = folder / DIGEST
+    if not (folder / CAPTURE).is_file() or not made_by.is_file():
+        return False
+    return made_by.read_text(encoding="utf-8") == digest()
+
+
+# -- cases ----------------------------------------------------------------------------------------
+
+AUTO: Final = "auto"
+NUMPY: Final = "numpy"
+NUMBA: Final = "numba"
 
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """A conversion as it is measured.
-
-    output: suffix of a file, or a format of a folder; empty: a dry run. base: another program of
-    the case, which this one extends.
-    """
+    """A conversion to measure."""
 
     name: str
     recording: str
     engine: str = AUTO
+    # Suffix of a file, or format of a folder; empty: a dry run.
     output: str = ""
     options: tuple[str, ...] = ()
+    # Another program of the case to compare with; empty: none.
     base: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Programs that run in turn: conversions, floors, and peers of the first recording.
-
-    variants: conversions of their own kind, instead of those that follow from the output.
-    """
+    """Programs that run alternately: conversions, floors, and peers on the first recording."""
 
     name: str
     recordings: tuple[str, ...]
     output: str = ""
     floors: tuple[str, ...] = (START, COPY)
+    # Replace the conversions that follow from `recordings` and `output`.
     variants: tuple[Conversion, ...] = ()
 
     @property
-    def first(self) -> Recording:
-        """The recording that its peers get."""
+    def first(self) -> BenchRecording:
+        """The recording that peers read."""
         return RECORDINGS[self.recordings[0]]
 
     def conversions(self, engines: Sequence[str]) -> list[Conversion]:
-        """What is converted: each recording by each engine, or to the output."""
+        """Dry runs of each recording by each engine, or a dry run and an output."""
         if self.variants:
             return list(self.variants)
         if self.output:
             (recording,) = self.recordings
             dry = Conversion(DRY_RUN, recording)
             return [dry, Conversion(self.output, recording, output=self.output, base=DRY_RUN)]
+        plain, *fragments = self.recordings
         return [
-            Conversion(
-                engine if number == 0 else f"{engine}, fragments",
-                recording,
-                engine,
-                base="" if number == 0 else engine,
-            )
-            for number, recording in enumerate(self.recordings)
-            for engine in engines
+            *(Conversion(engine, plain, engine) for engine in engines),
+            *(
+                Conversion(f"{engine}, fragments", recording, engine, base=engine)
+                for recording in fragments
+                for engine in engines
+            ),
         ]
-
-
-_DUAL: Final = "dual-4"
 
 
 def _by_jobs(*options: str) -> tuple[Conversion, ...]:
     """The same output by one and by two jobs."""
-    one = Conversion("jobs 1", _DUAL, output="mcap", options=(*options, "--jobs", "1"))
-    two = (*options, "--jobs", "2")
-    return one, replace(one, name="jobs 2", options=two, base=one.name)
+    one = Conversion("jobs 1", "dual-4", output="mcap", options=(*options, "--jobs", "1"))
+    two = replace(one, name="jobs 2", options=(*options, "--jobs", "2"), base=one.name)
+    return one, two
 
 
 CASES: Final = (
-    Case("dual-4", (_DUAL, "dual-4-fragments")),
+    Case("dual-4", ("dual-4", "dual-4-fragments")),
     Case("dual-12", ("dual-12", "dual-12-fragments")),
     Case("three-vlp16", ("three-vlp16",)),
     Case("pandar64", ("pandar64",)),
     Case("mixed", ("mixed",)),
-    Case("dual-4-mcap", (_DUAL,), "mcap", (COPY, WRITE, LIBRARY)),
-    Case("dual-4-npz", (_DUAL,), "npz", (COPY, WRITE)),
-    Case("dual-4-ply", (_DUAL,), "ply", (COPY, WRITE)),
+    Case("dual-4-mcap", ("dual-4",), "mcap", (COPY, WRITE, LIBRARY)),
+    Case("dual-4-npz", ("dual-4",), "npz", (COPY, WRITE)),
+    Case("dual-4-ply", ("dual-4",), "ply", (COPY, WRITE)),
     Case("mixed-mcap", ("mixed",), "mcap", (COPY, WRITE)),
-    Case("dual-4-jobs", (_DUAL,), "mcap", (), _by_jobs()),
-    Case("dual-4-zstd", (_DUAL,), "mcap", (), _by_jobs("--compression", "zstd")),
+    Case("dual-4-jobs", ("dual-4",), "mcap", (), _by_jobs()),
+    Case("dual-4-zstd", ("dual-4",), "mcap", (), _by_jobs("--compression", "zstd")),
 )
-# What a point takes in the largest output, in bytes, and what floors and peers write beside it.
-MOST_POINT_BYTES: Final = 48
+# Upper limit of an output, per point.
+_MAX_POINT_BYTES: Final = 48
 
 
 def disk_bytes(cases: Sequence[Case], seconds: float) -> int:
-    """Most that the recordings and one output at a time take."""
+    """Upper limit of disk space: all recordings, and one output at a time."""
     names = {name for case in cases for name in case.recordings}
-    recorded = sum(RECORDINGS[name].bytes_a_second for name in names)
-    written = [case.first.slots_a_second * MOST_POINT_BYTES for case in cases if case.output]
+    recorded = sum(RECORDINGS[name].bytes_per_s for name in names)
+    written = [case.first.slots_per_s * _MAX_POINT_BYTES for case in cases if case.output]
     return round(seconds * (recorded + max(written, default=0)))

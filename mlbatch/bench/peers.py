@@ -1,16 +1,16 @@
-"""Other programs that do a part of the same work, in an environment of their own."""
+"""Other programs that do a part of the same work, in environments of their own."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from mlbatch.bench.cases import CAPTURE, FULL, LOW, VLP16, BenchRecording
 from mlbatch.bench.measure import BenchError, measure
-from mlbatch.bench.recordings import CAPTURE, FULL, LOW, VLP16, Recording
-from mlbatch.bench.results import Counted, Run
+from mlbatch.bench.results import Run, Workload
 
 _VERSIONS: Final = """
 import importlib.metadata as metadata, json, sys
@@ -26,69 +26,78 @@ open(sys.argv[1], "w").write(json.dumps(found))
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A peer: its distribution, the script that runs it and in which way.
-
-    kinds: sensors that it knows; output: what it writes, as in a case.
-    """
+    """A program to compare with."""
 
     name: str
     distribution: str
-    script: str
-    way: str
+    # Name in programs.py.
+    program: str
+    # Sensor kinds that it can decode.
     kinds: frozenset[str]
+    # Output format, as in a case; empty: none.
     output: str = ""
 
-    def fits(self, recording: Recording, output: str) -> bool:
-        """Whether it can be measured on this."""
-        return output == self.output and {s.kind for s in recording.sensors} <= self.kinds
+    def fits(self, recording: BenchRecording, output: str) -> bool:
+        """Whether it can process this recording to this output."""
+        kinds = {sensor.kind for sensor in recording.sensors}
+        return output == self.output and kinds <= self.kinds
 
 
 _OUSTER: Final = frozenset({LOW, FULL})
+_VELODYNE: Final = frozenset({VLP16})
 PEERS: Final = (
-    Peer("ouster-sdk", "ouster-sdk", "peer_ouster.py", "all", _OUSTER),
-    Peer("ouster-sdk lean", "ouster-sdk", "peer_ouster.py", "lean", _OUSTER),
-    Peer("ouster-cli", "ouster-sdk", "peer_ouster.py", "ply", _OUSTER, "ply"),
-    Peer("velodyne-decoder", "velodyne-decoder", "peer_velodyne.py", "all", frozenset({VLP16})),
+    Peer("ouster-sdk", "ouster-sdk", "ouster-sdk", _OUSTER),
+    Peer("ouster-sdk lean", "ouster-sdk", "ouster-sdk-lean", _OUSTER),
+    Peer("ouster-cli", "ouster-sdk", "ouster-cli", _OUSTER, "ply"),
+    Peer("velodyne-decoder", "velodyne-decoder", "velodyne-decoder", _VELODYNE),
 )
 
 
 def installed(python: str, scratch: Path) -> dict[str, str]:
-    """Versions of the peers in an environment; raises BenchError where it has no interpreter."""
+    """Versions of the peers that an interpreter has; BenchError if it is no interpreter."""
     result = scratch / "versions.json"
     names = sorted({peer.distribution for peer in PEERS})
     measure("--peer-python", [python, "-c", _VERSIONS, str(result), *names], scratch)
     try:
-        found: dict[str, str] = json.loads(result.read_text(encoding="utf-8"))
+        versions: dict[str, str] = json.loads(result.read_text(encoding="utf-8"))
     except (OSError, ValueError) as err:
         raise BenchError(
-            f"--peer-python {python}: wanted a Python interpreter, got another program; "
+            f"--peer-python {python}: expected a Python interpreter, found another program; "
             "give the python of an environment"
         ) from err
-    return found
+    return versions
 
 
 def run_peer(
-    peer: Peer, python: str, recording: Recording, folder: Path, recorded_s: float, scratch: Path
+    peer: Peer,
+    python: str,
+    recording: BenchRecording,
+    folder: Path,
+    recorded_s: float,
+    scratch: Path,
 ) -> Run:
-    """Measure a peer once on a recording in a folder."""
-    script = Path(__file__).with_name(peer.script).read_text(encoding="utf-8")
+    """Measure a peer once on the recording in `folder`."""
     result = scratch / "peer.json"
     capture = folder / CAPTURE
-    # As text, since a script's own folder would come first among places to import from.
-    command = [python, "-c", script, peer.way, str(capture), str(result)]
-    usage = measure(peer.name, [*command, *_sensors(recording, folder)], scratch)
-    told = json.loads(result.read_text(encoding="utf-8"))
-    counted = Counted(
-        *(told["slots"], told["points"], told["scans"], recorded_s),
-        *(capture.stat().st_size, told.get("written_bytes", 0)),
+    # As text: Python puts the folder of a script first in its search path.
+    script = Path(__file__).with_name("programs.py").read_text(encoding="utf-8")
+    command = [python, "-c", script, peer.program, str(result), str(capture)]
+    usage = measure(peer.name, [*command, *_sensor_arguments(recording, folder)], scratch)
+    found = json.loads(result.read_text(encoding="utf-8"))
+    workload = Workload(
+        slots=found["slots"],
+        points=found["points"],
+        scans=found["scans"],
+        recorded_s=recorded_s,
+        read_bytes=capture.stat().st_size,
+        written_bytes=found.get("written_bytes", 0),
     )
-    return Run(usage.cpu_s, usage.wall_s, usage.rss_mb, told["own_cpu_s"], counted)
+    return Run(usage.cpu_s, usage.wall_s, usage.rss_mb, found["own_cpu_s"], workload)
 
 
-def _sensors(recording: Recording, folder: Path) -> Sequence[str]:
-    """Metadata file and mounting of each sensor."""
-    return [
-        ",".join([str(folder / sensor.file), *map(str, sensor.translation_m), str(sensor.yaw_deg)])
-        for sensor in recording.sensors
-        if sensor.file
-    ]
+def _sensor_arguments(recording: BenchRecording, folder: Path) -> Iterator[str]:
+    """Metadata file and pose of each sensor, as `PATH,X,Y,Z,YAW_DEG`."""
+    for sensor in recording.sensors:
+        if sensor.file:
+            pose = (*sensor.translation_m, sensor.yaw_deg)
+            yield ",".join([str(folder / sensor.file), *map(str, pose)])

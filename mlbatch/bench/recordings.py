@@ -1,163 +1,418 @@
-"""The standard recordings: which lidars, how they are mounted, and the files beside a capture.
+"""Makes a standard recording: packets of lidars, as a pcap capture with rig and metadata files.
 
     python -m mlbatch.bench.recordings dual-4 12 FOLDER
 
-makes one of them in a process of its own, so that the measuring process stays small.
+It runs in a process of its own, so that the measuring process does not import numpy. The packets
+of one revolution are encoded once; later packets repeat its pixels with their own timestamps,
+angles and counters. Ranges are waves with noise and no-return regions: about a fifth of the shots,
+as outdoors.
+
+Source of packets: docs/sources/ouster.md sections 1 to 3, docs/sources/velodyne.md sections 1 and
+2, docs/sources/hesai.md sections 2, 3 and 6. Source of frames: RFC 791 (IPv4), RFC 768 (UDP; no
+checksum: 0), draft-ietf-opsawg-pcap.
 """
 
 from __future__ import annotations
 
-import hashlib
+import ipaddress
 import json
+import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
-from mlbatch.units import NS_PER_MS
+import numpy as np
+import numpy.typing as npt
 
-CAPTURE, RIG = "capture.pcap", "rig.yaml"
-# Beside a capture: of what makes it, so that one that another version made is made anew.
-DIGEST: Final = "made-by.sha256"
-_MAKERS: Final = ("recordings.py", "captures.py", "lidars.py")
-LOW, FULL = "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"
-VLP16, PANDAR64 = "VLP-16", "Pandar64"
-INIT_ID: Final = 7_109_750
-# Ethernet, IPv4 and UDP headers, and that of a pcap record.
-_HEADERS_BYTES: Final = 14 + 20 + 8 + 16
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """What a lidar sends in a second, and the suffix of the file it needs (empty: none)."""
-
-    packets: int
-    packet_bytes: int
-    slots: int
-    suffix: str
-
-
-# An Ouster profile, or a model of another maker.
-KINDS: Final[Mapping[str, Kind]] = {
-    LOW: Kind(640, 8448, 10_240 * 128, ".json"),
-    FULL: Kind(640, 24832, 10_240 * 128, ".json"),
-    VLP16: Kind(754, 1206, 18_084 * 16, ""),
-    PANDAR64: Kind(3000, 1198, 18_000 * 64, ".csv"),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Mounted:
-    """A sensor of a rig; kind: a key of KINDS."""
-
-    name: str
-    kind: str
-    source_ip: str
-    port: int
-    phase_ns: int
-    translation_m: tuple[float, float, float]
-    yaw_deg: float
-    serial: int = 0
-
-    @property
-    def file(self) -> str:
-        """What lies beside the recording for it; empty: nothing."""
-        suffix = KINDS[self.kind].suffix
-        return f"{self.name}{suffix}" if suffix else ""
-
-
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """A standard recording."""
-
-    name: str
-    what: str
-    sensors: tuple[Mounted, ...]
-    fragments: bool = False
-
-    @property
-    def bytes_a_second(self) -> int:
-        """About what its capture takes."""
-        kinds = [KINDS[sensor.kind] for sensor in self.sensors]
-        return sum(kind.packets * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
-
-    @property
-    def slots_a_second(self) -> int:
-        """Most points that can come out of it."""
-        return sum(KINDS[sensor.kind].slots for sensor in self.sensors)
-
-
-def _dual(profile: str) -> tuple[Mounted, ...]:
-    behind_ns = 37_100_000
-    return (
-        Mounted("a", profile, "192.168.7.11", 7502, 0, (0.0, 0.6, 1.8), 0.0, 122201000998),
-        Mounted(
-            "b", profile, "192.168.7.12", 7504, behind_ns, (0.0, -0.6, 1.8), 90.0, 122201000999
-        ),
-    )
-
-
-_ROOF: Final = Mounted("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
-_REAR: Final = Mounted("rear", PANDAR64, "192.168.7.31", 2370, 0, (-1.0, 0.0, 1.8), 180.0)
-_TRIPLE: Final = (
-    _ROOF,
-    Mounted("left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0),
-    Mounted("right", VLP16, "192.168.7.23", 2368, 61 * NS_PER_MS, (0.0, -0.8, 1.6), -60.0),
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.bench.cases import (
+    CAPTURE,
+    DIGEST,
+    FULL,
+    KINDS,
+    LOW,
+    PANDAR64,
+    RECORDINGS,
+    RIG,
+    VLP16,
+    BenchRecording,
+    BenchSensor,
+    digest,
 )
-RECORDINGS: Final[Mapping[str, Recording]] = {
-    recording.name: recording
-    for recording in (
-        Recording("dual-4", "two OS-1-128, 4 bytes a pixel", _dual(LOW)),
-        Recording("dual-4-fragments", "the same in 1500-byte fragments", _dual(LOW), True),
-        Recording("dual-12", "two OS-1-128, 12 bytes a pixel", _dual(FULL)),
-        Recording("dual-12-fragments", "the same in 1500-byte fragments", _dual(FULL), True),
-        Recording("three-vlp16", "three VLP-16, one return", _TRIPLE),
-        Recording("pandar64", "a HESAI Pandar64, one return", (_REAR,)),
-        Recording("mixed", "an OS-1-128, a VLP-16, a Pandar64", (_dual(LOW)[0], _ROOF, _REAR)),
-    )
+from mlbatch.types import Stream
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+# -- packets --------------------------------------------------------------------------------------
+
+# Time of the first shot.
+EPOCH_NS: Final = 1_700_000_000 * NS_PER_S
+REVOLUTION_NS: Final = 100 * NS_PER_MS
+# From the last shot of a packet to its capture.
+_TRAVEL_NS: Final = 300 * NS_PER_US
+_CDEG_PER_REVOLUTION: Final = 36_000
+
+
+@dataclass(frozen=True, slots=True)
+class PacketEncoder:
+    """Encodes the packets of one lidar."""
+
+    # (packets, bytes): the packets of one revolution.
+    revolution: U8Array
+    packet_ns: int
+    # Writes timestamps, angles and counters into payloads (n, bytes), from the numbers (n,) of the
+    # packets and the times (n,) of their first shots, ns.
+    update: Callable[[U8Array, I64Array, I64Array], None]
+
+    @classmethod
+    def from_packets(
+        cls,
+        packets: npt.NDArray[np.void],
+        packet_ns: int,
+        update: Callable[[U8Array, I64Array, I64Array], None],
+    ) -> PacketEncoder:
+        """From the packets (n,) of one revolution as records."""
+        return cls(packets.view(np.uint8).reshape(len(packets), -1), packet_ns, update)
+
+    def packets(self, numbers: I64Array, phase_ns: int) -> tuple[I64Array, U8Array]:
+        """Receive times (n,), ns, and payloads (n, bytes) of the packets with these numbers."""
+        begin_ns = EPOCH_NS + phase_ns + numbers * self.packet_ns
+        payloads = self.revolution[numbers % len(self.revolution)]
+        self.update(payloads, numbers, begin_ns)
+        return begin_ns + self.packet_ns + _TRAVEL_NS, payloads
+
+
+def scene(columns: int, channels: int) -> tuple[I64Array, I64Array]:
+    """Ranges in mm, 0 for none, and reflectivities 0 to 255: (columns, channels) each."""
+    random = np.random.default_rng(columns * channels)
+    column = np.arange(columns)[:, None] * (2 * np.pi / columns)
+    channel = np.arange(channels) * (8 / channels)
+    wave = np.sin(3 * column + channel) + 0.3 * np.sin(11 * column - channel)
+    range_mm = np.rint(14_000 + 9_000 * wave + random.normal(0, 15, wave.shape)).astype(np.int64)
+    # No-return regions, and single shots without a return.
+    sky = np.cos(5 * column + 2 * channel) > 0.85
+    range_mm[sky | (random.random(wave.shape) < 0.03)] = 0
+    reflectivity = np.rint(90 + 60 * wave + random.normal(0, 10, wave.shape)).astype(np.int64)
+    return range_mm, np.where(range_mm > 0, reflectivity.clip(1, 255), 0)
+
+
+_OUSTER_BEAMS: Final = 128
+_OUSTER_COLUMNS: Final = 1024
+_OUSTER_COLUMNS_PER_PACKET: Final = 16
+_OUSTER_INIT_ID: Final = 7_109_750
+_OUSTER_SIGNAL_PEAK: Final = 2000
+_OUSTER_PIXEL: Final[Mapping[str, np.dtype[np.void]]] = {
+    LOW: np.dtype([("range_8mm", "<u2"), ("reflectivity", "u1"), ("near_ir", "u1")]),
+    FULL: np.dtype(
+        [
+            ("range_mm", "<u4"),
+            ("reflectivity", "u1"),
+            ("unused", "u1"),
+            ("signal", "<u2"),
+            ("near_ir", "<u2"),
+            ("window", "<u2"),
+        ]
+    ),
 }
 
 
-@lru_cache(maxsize=1)
-def digest() -> str:
-    """Of the sources that make recordings."""
-    folder = Path(__file__).parent
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in _MAKERS)).hexdigest()
+def ouster(profile: str, serial: int) -> PacketEncoder:
+    """An OS-1-128 at 1024x10."""
+    range_mm, reflectivity = scene(_OUSTER_COLUMNS, _OUSTER_BEAMS)
+    signal = _OUSTER_SIGNAL_PEAK * reflectivity // (1 + range_mm // 100)
+    values = {
+        "range_8mm": range_mm // 8,
+        "range_mm": range_mm,
+        "reflectivity": reflectivity,
+        "signal": np.where(range_mm > 0, signal, 0),
+        "near_ir": 40 + reflectivity // 4,
+    }
+    pixel = np.zeros(range_mm.shape, _OUSTER_PIXEL[profile])
+    for name in set(values) & set(pixel.dtype.names or ()):
+        pixel[name] = values[name]
+    column = np.dtype(
+        [
+            ("stamp_ns", "<u8"),
+            ("measurement_id", "<u2"),
+            ("status", "<u2"),
+            ("pixel", _OUSTER_PIXEL[profile], _OUSTER_BEAMS),
+        ]
+    )
+    packet = np.dtype(
+        [
+            ("type", "<u2"),
+            ("frame_id", "<u2"),
+            ("init_id", "u1", 3),
+            ("serial", "u1", 5),
+            ("state", "u1", 20),
+            ("column", column, _OUSTER_COLUMNS_PER_PACKET),
+            ("footer", "u1", 32),
+        ]
+    )
+    rows = (-1, _OUSTER_COLUMNS_PER_PACKET)
+    packets = np.zeros(_OUSTER_COLUMNS // _OUSTER_COLUMNS_PER_PACKET, packet)
+    packets["type"] = 1
+    packets["init_id"] = np.frombuffer(_OUSTER_INIT_ID.to_bytes(3, "little"), np.uint8)
+    packets["serial"] = np.frombuffer(serial.to_bytes(5, "little"), np.uint8)
+    packets["column"]["status"] = 1
+    packets["column"]["measurement_id"] = np.arange(_OUSTER_COLUMNS).reshape(rows)
+    packets["column"]["pixel"] = pixel.reshape(*rows, _OUSTER_BEAMS)
+
+    def update(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        sent = payloads.view(packet)[:, 0]
+        sent["frame_id"] = numbers // len(packets) % 2**16
+        step_ns = np.arange(_OUSTER_COLUMNS_PER_PACKET) * REVOLUTION_NS // _OUSTER_COLUMNS
+        sent["column"]["stamp_ns"] = begin_ns[:, None] + step_ns
+
+    packet_ns = REVOLUTION_NS * _OUSTER_COLUMNS_PER_PACKET // _OUSTER_COLUMNS
+    return PacketEncoder.from_packets(packets, packet_ns, update)
 
 
-def is_made(folder: Path) -> bool:
-    """Whether a recording stands in a folder as it would be made now."""
-    made = folder / DIGEST
-    is_whole = (folder / CAPTURE).is_file() and made.is_file()
-    return is_whole and made.read_text(encoding="utf-8") == digest()
+# A reading of Velodyne and of HESAI; the range is in steps of the vendor.
+_READING: Final = np.dtype([("range", "<u2"), ("reflectivity", "u1")])
+
+_VLP16_CHANNELS: Final = 16
+_VLP16_SEQUENCES_PER_BLOCK: Final = 2
+_VLP16_BLOCKS: Final = 12
+# Two firing sequences of 55.296 us.
+_VLP16_BLOCK_NS: Final = 110_592
+_VLP16_STEP_MM: Final = 2
+_US_PER_HOUR: Final = 3_600_000_000
 
 
-def make(recording: Recording, seconds: float, folder: Path) -> None:
-    """Write capture, rig and what the sensors need into an existing folder."""
-    from mlbatch.bench.captures import ETHERNET_MTU, JUMBO_MTU, Source, write_capture
-    from mlbatch.bench.lidars import MAKERS
-    from mlbatch.types import Stream
+def vlp16(serial: int = 0) -> PacketEncoder:
+    """A VLP-16 at 600 rpm with one return; its packets have no serial number."""
+    block = np.dtype(
+        [
+            ("flag", "<u2"),
+            ("azimuth_cdeg", "<u2"),
+            ("reading", _READING, (_VLP16_SEQUENCES_PER_BLOCK, _VLP16_CHANNELS)),
+        ]
+    )
+    packet = np.dtype(
+        [
+            ("block", block, _VLP16_BLOCKS),
+            ("past_hour_us", "<u4"),
+            ("mode", "u1"),
+            ("product", "u1"),
+        ]
+    )
+    packet_ns = _VLP16_BLOCK_NS * _VLP16_BLOCKS
+    packets = np.zeros(REVOLUTION_NS // packet_ns, packet)
+    packets["mode"] = 0x37
+    packets["product"] = 0x22
+    packets["block"]["flag"] = 0xEEFF
+    _fill_readings(packets["block"]["reading"], _VLP16_CHANNELS, _VLP16_STEP_MM)
 
+    def update(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        sent = payloads.view(packet)[:, 0]
+        sent["past_hour_us"] = begin_ns // NS_PER_US % _US_PER_HOUR
+        shot_ns = begin_ns[:, None] + np.arange(_VLP16_BLOCKS) * _VLP16_BLOCK_NS
+        sent["block"]["azimuth_cdeg"] = _azimuth_cdeg(shot_ns)
+
+    return PacketEncoder.from_packets(packets, packet_ns, update)
+
+
+_PANDAR64_CHANNELS: Final = 64
+_PANDAR64_BLOCKS: Final = 6
+_PANDAR64_BLOCK_NS: Final = 55_560
+_PANDAR64_STEP_MM: Final = 4
+
+
+def pandar64(serial: int = 0) -> PacketEncoder:
+    """A Pandar64 at 600 rpm with one return; its packets have no serial number."""
+    block = np.dtype([("azimuth_cdeg", "<u2"), ("reading", _READING, _PANDAR64_CHANNELS)])
+    packet = np.dtype(
+        [
+            ("head", "u1", 8),
+            ("block", block, _PANDAR64_BLOCKS),
+            ("reserved", "u1", 8),
+            ("speed_rpm", "<u2"),
+            ("micros", "<u4"),
+            ("mode", "u1"),
+            ("factory", "u1"),
+            ("date", "u1", 6),
+            ("sequence", "<u4"),
+        ]
+    )
+    packet_ns = _PANDAR64_BLOCK_NS * _PANDAR64_BLOCKS
+    packets = np.zeros(REVOLUTION_NS // packet_ns, packet)
+    packets["head"] = [0xEE, 0xFF, _PANDAR64_CHANNELS, _PANDAR64_BLOCKS, 0, 4, 0, 0]
+    packets["speed_rpm"] = 600
+    packets["mode"] = 0x37
+    packets["factory"] = 0x42
+    _fill_readings(packets["block"]["reading"], _PANDAR64_CHANNELS, _PANDAR64_STEP_MM)
+
+    def update(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        sent = payloads.view(packet)[:, 0]
+        sent["micros"] = begin_ns // NS_PER_US % (NS_PER_S // NS_PER_US)
+        sent["sequence"] = numbers
+        shot_ns = begin_ns[:, None] + np.arange(_PANDAR64_BLOCKS) * _PANDAR64_BLOCK_NS
+        sent["block"]["azimuth_cdeg"] = _azimuth_cdeg(shot_ns)
+        seconds, index = np.unique(begin_ns // NS_PER_S, return_inverse=True)
+        sent["date"] = np.array([_date(epoch_s) for epoch_s in seconds.tolist()], np.uint8)[index]
+
+    return PacketEncoder.from_packets(packets, packet_ns, update)
+
+
+def _fill_readings(readings: npt.NDArray[np.void], channels: int, step_mm: int) -> None:
+    """Write the scene into the readings (..., channels) of one revolution."""
+    range_mm, reflectivity = scene(readings.size // channels, channels)
+    readings["range"] = (range_mm // step_mm).reshape(readings.shape)
+    readings["reflectivity"] = reflectivity.reshape(readings.shape)
+
+
+def _azimuth_cdeg(shot_ns: I64Array) -> I64Array:
+    """Rotor angle at these times, 1/100 deg."""
+    return shot_ns % REVOLUTION_NS * _CDEG_PER_REVOLUTION // REVOLUTION_NS
+
+
+def _date(epoch_s: int) -> list[int]:
+    """Year since 1900, month, day, hour, minute, second (UTC)."""
+    date = time.gmtime(epoch_s)
+    return [
+        date.tm_year - 1900,
+        date.tm_mon,
+        date.tm_mday,
+        date.tm_hour,
+        date.tm_min,
+        date.tm_sec,
+    ]
+
+
+# By sensor kind; the argument is the serial number.
+ENCODERS: Final[Mapping[str, Callable[[int], PacketEncoder]]] = {
+    LOW: partial(ouster, LOW),
+    FULL: partial(ouster, FULL),
+    VLP16: vlp16,
+    PANDAR64: pandar64,
+}
+
+# -- captures -------------------------------------------------------------------------------------
+
+ETHERNET_MTU: Final = 1500
+JUMBO_MTU: Final = 65535
+_FILE_HEADER: Final = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+_RECORD_HEADER: Final = np.dtype([("s", "<u4"), ("us", "<u4"), ("kept", "<u4"), ("length", "<u4")])
+_ETHERNET: Final = np.frombuffer(bytes(12) + b"\x08\x00", np.uint8)
+_IP: Final = struct.Struct(">BBHHHBBH4s4s")
+_IP_ID_AT: Final = 4
+_IP_CHECKSUM_AT: Final = 10
+_UDP: Final = struct.Struct(">HHHH")
+_RECEIVER: Final = ipaddress.IPv4Address("192.168.7.2").packed
+_MORE_FRAGMENTS: Final = 0x2000
+# Time of a full frame on 1 Gbit/s Ethernet, between fragments of a packet.
+_FRAGMENT_STEP_NS: Final = 12 * NS_PER_US
+# Packets are made for this much time at once, which bounds memory.
+CHUNK_NS: Final = 500 * NS_PER_MS
+
+# Receive time, ns, and bytes of a pcap record.
+CaptureRecord: TypeAlias = tuple[int, U8Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A lidar on the network; phase_ns: delay of its rotor."""
+
+    encoder: PacketEncoder
+    stream: Stream
+    phase_ns: int
+
+
+def write_capture(path: Path, sources: Sequence[Source], seconds: float, mtu: int) -> None:
+    """Write a pcap with the packets of all sources in the order of their receive times."""
+    end_ns = EPOCH_NS + round(seconds * NS_PER_S)
+    waiting: list[CaptureRecord] = []
+    sent = [0] * len(sources)
+    with path.open("wb") as file:
+        file.write(_FILE_HEADER)
+        for chunk_end_ns in (*range(EPOCH_NS + CHUNK_NS, end_ns, CHUNK_NS), end_ns):
+            for number, source in enumerate(sources):
+                sending_ns = chunk_end_ns - EPOCH_NS - source.phase_ns
+                count = sending_ns // source.encoder.packet_ns
+                packet_numbers = np.arange(sent[number], max(sent[number], count))
+                sent[number] += len(packet_numbers)
+                waiting += capture_records(source, packet_numbers, mtu)
+            waiting.sort(key=itemgetter(0))
+            # Records received later can be preceded by packets of the next chunk.
+            ready = sum(receive_ns < chunk_end_ns for receive_ns, _ in waiting)
+            file.writelines(record.data for _, record in waiting[:ready])
+            del waiting[:ready]
+        file.writelines(record.data for _, record in waiting)
+
+
+def capture_records(source: Source, numbers: I64Array, mtu: int) -> Iterator[CaptureRecord]:
+    """The records of the packets with these numbers, in fragments where they exceed the MTU."""
+    if not len(numbers):
+        return
+    receive_ns, payloads = source.encoder.packets(numbers, source.phase_ns)
+    port = source.stream.port
+    size = payloads.shape[1] + _UDP.size
+    udp = np.frombuffer(_UDP.pack(port, port, size, 0), np.uint8)
+    datagrams = np.concatenate([np.broadcast_to(udp, (len(numbers), _UDP.size)), payloads], 1)
+    step = (mtu - _IP.size) // 8 * 8
+    for fragment, offset in enumerate(range(0, size, step)):
+        part = datagrams[:, offset : offset + step]
+        flags = offset // 8 | (_MORE_FRAGMENTS if offset + step < size else 0)
+        ip = _ip_headers(source.stream.source_ip, numbers & 0xFFFF, flags, part.shape[1])
+        at_ns = receive_ns + fragment * _FRAGMENT_STEP_NS
+        yield from zip(at_ns.tolist(), _pcap_records(at_ns, ip, part), strict=True)
+
+
+def _pcap_records(at_ns: I64Array, ip: U8Array, part: U8Array) -> U8Array:
+    """Pcap records (n, bytes) of IP headers (n, 20) and their data (n, bytes)."""
+    seconds, rest_ns = np.divmod(at_ns, NS_PER_S)
+    length = len(_ETHERNET) + _IP.size + part.shape[1]
+    header = np.zeros(len(part), _RECORD_HEADER)
+    header["s"] = seconds
+    header["us"] = rest_ns // NS_PER_US
+    header["kept"] = length
+    header["length"] = length
+    ethernet = np.broadcast_to(_ETHERNET, (len(part), len(_ETHERNET)))
+    return np.concatenate([header.view(np.uint8).reshape(len(part), -1), ethernet, ip, part], 1)
+
+
+def _ip_headers(source_ip: str, ids: I64Array, flags: int, size: int) -> U8Array:
+    """IPv4 headers (n, 20) with their checksums; size: bytes of data."""
+    sender = ipaddress.IPv4Address(source_ip).packed
+    header = _IP.pack(0x45, 0, _IP.size + size, 0, flags, 64, 17, 0, sender, _RECEIVER)
+    total = sum(struct.unpack(">10H", header)) + ids
+    folded = (total & 0xFFFF) + (total >> 16)
+    checksum = ~((folded & 0xFFFF) + (folded >> 16)) & 0xFFFF
+    headers = np.tile(np.frombuffer(header, np.uint8), (len(ids), 1))
+    for at, words in ((_IP_ID_AT, ids), (_IP_CHECKSUM_AT, checksum)):
+        headers[:, at] = words >> 8
+        headers[:, at + 1] = words & 0xFF
+    return headers
+
+
+# -- recordings -----------------------------------------------------------------------------------
+
+
+def make(recording: BenchRecording, seconds: float, folder: Path) -> None:
+    """Write capture, rig and the files that its sensors need into an existing folder."""
     sources = []
     for sensor in recording.sensors:
         if sensor.file:
             text = _FILES[KINDS[sensor.kind].suffix](sensor)
             (folder / sensor.file).write_text(text, encoding="utf-8")
-        lidar = MAKERS[sensor.kind](sensor.serial)
-        stream = Stream(sensor.source_ip, sensor.port)
-        sources.append(Source(lidar, stream, sensor.phase_ns))
+        encoder = ENCODERS[sensor.kind](sensor.serial)
+        sources.append(Source(encoder, Stream(sensor.source_ip, sensor.port), sensor.phase_ns))
     (folder / RIG).write_text(_rig(recording.sensors), encoding="utf-8")
     mtu = ETHERNET_MTU if recording.fragments else JUMBO_MTU
-    # A capture that is there is whole.
-    partial = folder / f"{CAPTURE}.partial"
-    write_capture(partial, sources, seconds, mtu)
-    partial.replace(folder / CAPTURE)
+    # Renamed when complete: a capture that exists is complete.
+    partial_path = folder / f"{CAPTURE}.partial"
+    write_capture(partial_path, sources, seconds, mtu)
+    partial_path.replace(folder / CAPTURE)
     (folder / DIGEST).write_text(digest(), encoding="utf-8")
 
 
-def _rig(sensors: Sequence[Mounted]) -> str:
+def _rig(sensors: Sequence[BenchSensor]) -> str:
+    """The rig file."""
     lines = ["body_frame: base_link", "rate_hz: 10", "sensors:"]
     for sensor in sensors:
         x, y, z = sensor.translation_m
@@ -166,41 +421,44 @@ def _rig(sensors: Sequence[Mounted]) -> str:
             f"    stream: {{source_ip: {sensor.source_ip}, port: {sensor.port}}}",
             f"    extrinsics: {{translation_m: [{x}, {y}, {z}],"
             f" rotation_rpy_deg: [0, 0, {sensor.yaw_deg}]}}",
-            *([f"    metadata: {sensor.file}"] if sensor.file else []),
         ]
+        if sensor.file:
+            lines.append(f"    metadata: {sensor.file}")
     return "\n".join(lines) + "\n"
 
 
-def _even(first_deg: float, last_deg: float, count: int) -> list[float]:
-    step = (last_deg - first_deg) / (count - 1)
-    return [round(first_deg + step * beam, 3) for beam in range(count)]
+def _evenly_spaced(first_deg: float, last_deg: float, count: int) -> list[float]:
+    step_deg = (last_deg - first_deg) / (count - 1)
+    return [round(first_deg + step_deg * beam, 3) for beam in range(count)]
 
 
-def _angles(sensor: Mounted) -> str:
-    """The angle file of a Pandar64 (facts/hesai.md section 6)."""
-    lines = [f"{number},{deg},0\n" for number, deg in enumerate(_even(15, -25, 64), 1)]
+def _pandar64_angles(sensor: BenchSensor) -> str:
+    """The angle file of a Pandar64."""
+    elevations_deg = _evenly_spaced(15, -25, _PANDAR64_CHANNELS)
+    lines = [f"{number},{deg},0\n" for number, deg in enumerate(elevations_deg, 1)]
     return "".join(["Laser id,Elevation,Azimuth\n", *lines])
 
 
-def _metadata(sensor: Mounted) -> str:
-    """What an OS-1-128 tells of itself (facts/ouster.md section 1)."""
-    beams = 128
-    turned = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1]
+def _ouster_metadata(sensor: BenchSensor) -> str:
+    """The metadata of an OS-1-128."""
+    beams = _OUSTER_BEAMS
     document = {
         "beam_intrinsics": {
-            "beam_altitude_angles": _even(21, -21, beams),
+            "beam_altitude_angles": _evenly_spaced(21, -21, beams),
             "beam_azimuth_angles": [(4.2, 1.4, -1.4, -4.2)[beam % 4] for beam in range(beams)],
             "beam_to_lidar_transform": [1, 0, 0, 15.806, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
             "lidar_origin_to_beam_origin_mm": 15.806,
         },
-        "lidar_intrinsics": {"lidar_to_sensor_transform": turned},
+        "lidar_intrinsics": {
+            "lidar_to_sensor_transform": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1]
+        },
         "imu_intrinsics": {
             "imu_to_sensor_transform": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
         },
         "sensor_info": {
             "prod_line": f"OS-1-{beams}",
             "prod_sn": str(sensor.serial),
-            "initialization_id": INIT_ID,
+            "initialization_id": _OUSTER_INIT_ID,
             "build_rev": "v2.5.2",
             "image_rev": "ousteros-image-prod-aries-v2.5.2",
             "status": "RUNNING",
@@ -208,9 +466,9 @@ def _metadata(sensor: Mounted) -> str:
         "calibration_status": {"reflectivity": {"valid": True, "timestamp": ""}},
         "lidar_data_format": {
             "pixels_per_column": beams,
-            "columns_per_packet": 16,
-            "columns_per_frame": 1024,
-            "column_window": [0, 1023],
+            "columns_per_packet": _OUSTER_COLUMNS_PER_PACKET,
+            "columns_per_frame": _OUSTER_COLUMNS,
+            "column_window": [0, _OUSTER_COLUMNS - 1],
             "pixel_shift_by_row": [(24, 16, 8, 0)[beam % 4] for beam in range(beams)],
             "udp_profile_lidar": sensor.kind,
             "udp_profile_imu": "LEGACY",
@@ -222,13 +480,17 @@ def _metadata(sensor: Mounted) -> str:
             "udp_port_lidar": sensor.port,
             "udp_port_imu": sensor.port + 1,
             "udp_profile_lidar": sensor.kind,
-            "columns_per_packet": 16,
+            "columns_per_packet": _OUSTER_COLUMNS_PER_PACKET,
         },
     }
     return json.dumps(document, indent=1)
 
 
-_FILES: Final[Mapping[str, Callable[[Mounted], str]]] = {".json": _metadata, ".csv": _angles}
+# By suffix of the file.
+_FILES: Final[Mapping[str, Callable[[BenchSensor], str]]] = {
+    ".json": _ouster_metadata,
+    ".csv": _pandar64_angles,
+}
 
 
 if __name__ == "__main__":

@@ -10,18 +10,18 @@ from typing import NoReturn
 
 from mlbatch.errors import Interrupted, MlbatchError, UsageError
 
-# numpy's linear algebra, which nothing here uses, would start a thread on every core.
+# Otherwise numpy's linear algebra, which is not used, starts a thread on every core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# What a command loads, some ten thousand objects, stays to its end. The collector of cycles would
-# look through them again and again while they come, and once more when the process ends.
+# Allocations between collections of cycles. A command loads some ten thousand objects that live to
+# its end: the collector would traverse them repeatedly, and once more at exit.
 _BETWEEN_COLLECTIONS = 100_000
 
 EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
 
 def main() -> None:
-    """Run the command line; exit codes are those of CONTRACT.md section 2."""
+    """Run the command line; exit codes: docs/commands.md."""
     gc.set_threshold(_BETWEEN_COLLECTIONS)
     atexit.register(gc.freeze)
     from mlbatch.cli.app import command_line
@@ -40,7 +40,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _fail("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # Whoever read our output closed it: nothing to say, and nowhere to say it.
+        # The reader of our output closed it: there is nowhere to print to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_ERROR)
     except MemoryError:
@@ -59,10 +59,10 @@ def main() -> None:
 
 
 def _usage(err: Exception) -> str:
-    """What the parser of the command line refused; empty for other errors."""
+    """Message of a usage error of typer; "" for other errors."""
     import typer
 
-    # typer names a leaf of its usage errors only; their root lies in another place each version.
+    # typer exports only a leaf of its usage errors; the module of their root changes with versions.
     if not isinstance(err, typer.BadParameter.__mro__[1]):
         return ""
     return str(getattr(err, "format_message", err.__str__)()).rstrip(".")

@@ -1,4 +1,4 @@
-"""All commands; what they need is imported when they run, so that `--help` is quick."""
+"""The commands; each imports what it needs when it runs, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import typer
 
 import mlbatch
 
-# Modules of this package, and the functions in them, in the order of the first page.
+# Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "bench")
 
 
 def command_line(first: str = "") -> typer.Typer:
     """The parser of a command line; first: its first word.
 
-    Where that is a command, the others are left out: each takes its time to be described.
+    If that is a command, the others are left out, since describing each takes time.
     """
     app = typer.Typer(
         name="mlbatch",

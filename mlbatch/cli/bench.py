@@ -1,4 +1,4 @@
-"""`mlbatch bench`: how fast it is here, beside floors and peers."""
+"""`mlbatch bench`: measure mlbatch on this machine, with floors and peers."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from mlbatch.bench.runner import Settings
 
 ENGINES = ("all", "numpy", "numba", "auto")
-# The kernels' compiler, which the extra of this name brings.
-COMPILER, EXTRA = "numba", "mlbatch[fast]"
-MOST_SECONDS, MOST_RUNS = 3600.0, 1000
+# Distribution of the engine numba, and the extra that installs it.
+COMPILER = "numba"
+EXTRA = "mlbatch[fast]"
+MAX_SECONDS = 3600.0
+MAX_RUNS = 1000
 
 
 def bench(
@@ -40,18 +42,17 @@ def bench(
         typer.Option(help="Folder to keep and reuse the recordings in. [default: temporary]"),
     ] = None,
     against: Annotated[
-        Path | None, typer.Option(help="Earlier result (JSON), to tell what changed.")
+        Path | None, typer.Option(help="Earlier result (JSON) to compare with.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
-    """Measure conversions of standard recordings: CPU, time, memory, beside floors and peers."""
+    """Measure conversions of standard recordings: CPU, time and memory, with floors and peers."""
     from mlbatch.bench.measure import BenchError
-    from mlbatch.bench.results import document
+    from mlbatch.bench.results import document, lines
     from mlbatch.bench.runner import bench as measure
-    from mlbatch.bench.table import lines
 
     result = measure(
-        _settings(seconds, repeat, case or [], engine, peer_python or [], keep, against)
+        settings_from(seconds, repeat, case or [], engine, peer_python or [], keep, against)
     )
     if as_json:
         typer.echo(json.dumps(document(result), indent=1))
@@ -64,7 +65,7 @@ def bench(
         )
 
 
-def _settings(
+def settings_from(
     seconds: float,
     repeat: int,
     case: list[str],
@@ -73,48 +74,47 @@ def _settings(
     keep: Path | None,
     against: Path | None,
 ) -> Settings:
-    """The options as values, or a UsageError."""
+    """Check the options; raises UsageError."""
     from mlbatch.bench.cases import CASES
-    from mlbatch.bench.runner import Settings
+    from mlbatch.bench.runner import Settings, no_progress
 
-    if not 1 <= seconds <= MOST_SECONDS:
-        raise UsageError(f"--seconds: wanted 1 to {MOST_SECONDS:g}, got {seconds:g}; write 12")
-    if not 1 <= repeat <= MOST_RUNS:
-        raise UsageError(f"--repeat: wanted 1 to {MOST_RUNS}, got {repeat}; write 5")
-    # Not by the helpers of other commands: they load numpy, which would count as memory of all
-    # processes that are measured (measure.py).
+    if not 1 <= seconds <= MAX_SECONDS:
+        raise UsageError(f"--seconds: expected 1 to {MAX_SECONDS:g}, found {seconds:g}; write 12")
+    if not 1 <= repeat <= MAX_RUNS:
+        raise UsageError(f"--repeat: expected 1 to {MAX_RUNS}, found {repeat}; write 5")
+    # Checked here: the helpers of other commands import numpy, which would count in the peak
+    # memory of measured processes (measure.py).
     if engine not in ENGINES:
-        raise UsageError(f"--engine: wanted one of {', '.join(ENGINES)}, got {engine!r}")
+        raise UsageError(f"--engine: expected one of {', '.join(ENGINES)}, found {engine!r}")
     cases = {known.name: known for known in CASES}
     for name in case:
         if name not in cases:
-            raise UsageError(f"--case: wanted one of {', '.join(cases)}, got {name!r}")
-    engines, notes = _engines(engine)
+            raise UsageError(f"--case: expected one of {', '.join(cases)}, found {name!r}")
+    engines, notes = engines_to_measure(engine)
     return Settings(
-        *(tuple(cases[name] for name in dict.fromkeys(case or cases)), engines, seconds, repeat),
-        # Not resolved: the python of an environment is a link, and its place says which one.
+        cases=tuple(cases[name] for name in dict.fromkeys(case or cases)),
+        engines=engines,
+        seconds=seconds,
+        repeat=repeat,
+        # Not resolved: the python of an environment is a link; its path names the environment.
         peer_pythons=tuple(str(path.absolute()) for path in peer_python),
         keep=keep,
         against=against,
         notes=notes,
-        tell=_tell if sys.stderr.isatty() else _silent,
+        progress=_show if sys.stderr.isatty() else no_progress,
     )
 
 
-def _engines(wanted: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Engines to measure, and what is to be said about others."""
-    from mlbatch.bench.machine import version
+def engines_to_measure(engine: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Engines to measure, and notes on the others."""
+    from mlbatch.bench.measure import version
 
-    if wanted != "all":
-        return (wanted,), ()
+    if engine != "all":
+        return (engine,), ()
     if version(COMPILER):
         return ("numpy", "numba"), ()
     return ("numpy",), (f"engine numba was not measured: pip install {EXTRA}",)
 
 
-def _tell(text: str) -> None:
+def _show(text: str) -> None:
     typer.echo(f"mlbatch: {text}", err=True)
-
-
-def _silent(text: str) -> None:
-    """Progress is for terminals."""

@@ -1,4 +1,4 @@
-"""`mlbatch compare`: turns joined to sets against windows, on the same recording."""
+"""`mlbatch compare`: frame-level fusion against windows, on the same recording."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ def compare(
     ],
     rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
     rate: Annotated[
-        str | None, typer.Option(help="Windows a second, Hz: 10, 29.97. [default: rig's, 10]")
+        str | None, typer.Option(help="Windows per second, Hz: 10, 29.97. [default: rig's, 10]")
     ] = None,
     metadata: Annotated[
         list[Path] | None,
         typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
     ] = None,
     clock: Annotated[
-        str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
+        str, typer.Option(help="sensor: timestamps of the packets; host: their receive times.")
     ] = "sensor",
     tolerance: Annotated[
-        str, typer.Option(help="Nearest turns: they begin within so many s of each other.")
+        str, typer.Option(help="Approximate time: sweeps begin within this many s of each other.")
     ] = "0.05",
     timeout: Annotated[
-        str, typer.Option(help="Collected turns: a set is closed after so many s.")
+        str, typer.Option(help="Timeout collate: a set is closed after this many s.")
     ] = "0.1",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
-    """Measure joined turns of several lidars against windows: time spans, columns, stale data."""
+    """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
     from mlbatch.cli import options
-    from mlbatch.cli.options import columns
+    from mlbatch.cli.tables import table_lines
     from mlbatch.compare.compare import Settings, compare
-    from mlbatch.discovery.discover import Wishes
+    from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
     options.choice("--clock", clock, ("sensor", "host"))
@@ -48,8 +48,8 @@ def compare(
         _duration_ns("--tolerance", tolerance),
         _duration_ns("--timeout", timeout),
     )
-    wishes = Wishes(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(tuple(recordings), wishes, rate=None if rate is None else options.rate(rate))
+    selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
+    job = Job(tuple(recordings), selection, rate=None if rate is None else options.rate(rate))
     found = compare(job, settings)
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
@@ -57,16 +57,16 @@ def compare(
         typer.echo(json.dumps(found.as_json(), indent=1))
         return
     typer.echo(found.title())
-    for line in columns(found.rows()):
+    for line in table_lines(found.rows()):
         typer.echo(line)
 
 
 def _duration_ns(option: str, text: str) -> int:
-    """A time in s, above 0."""
+    """A duration in s, above 0."""
     try:
         seconds = float(text)
     except ValueError:
         seconds = math.nan
     if not 0 < seconds < math.inf:
-        raise UsageError(f"{option}: wanted seconds above 0, got {text!r}; write 0.05")
+        raise UsageError(f"{option}: expected seconds above 0, found {text!r}; write 0.05")
     return round(seconds * NS_PER_S)

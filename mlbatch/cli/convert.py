@@ -14,13 +14,12 @@ def convert(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", help="A .mcap or .bag file, or a folder for one file a scan."
-        ),
+        typer.Option("-o", "--output", help="A .mcap or .bag file, or a folder (one file a scan)."),
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
     rate: Annotated[
-        str | None, typer.Option(help="Scans a second, Hz: 10, 29.97, 10/3. [default: rig's, 10]")
+        str | None,
+        typer.Option(help="Scan rate, Hz: 10, 29.97, 10/3. [default: rig's, or 10]"),
     ] = None,
     format_: Annotated[
         str | None,
@@ -38,7 +37,7 @@ def convert(
         str,
         typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 3)."),
     ] = "none",
-    slices: Annotated[int, typer.Option(help="Partial scans a window.")] = 1,
+    slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
     split: Annotated[
         bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
     ] = False,
@@ -52,7 +51,8 @@ def convert(
         ),
     ] = 0.0,
     max_wait: Annotated[
-        str, typer.Option(help="Wait for a silent sensor so long, s of stamps, or inf.")
+        str,
+        typer.Option(help="Idle-source timeout: wait for a silent sensor, s, or inf."),
     ] = "1.0",
     start: Annotated[
         str | None,
@@ -60,18 +60,18 @@ def convert(
     ] = None,
     end: Annotated[str | None, typer.Option(help="Windows start before: as --start.")] = None,
     clock: Annotated[
-        str, typer.Option(help="sensor: stamps in the packets; host: their arrival.")
+        str, typer.Option(help="sensor: timestamps in the packets; host: receive times.")
     ] = "sensor",
     align_clocks: Annotated[
         bool,
-        typer.Option("--align-clocks", help="Map the sensors' clocks; reads the recording twice."),
+        typer.Option("--align-clocks", help="Map all clocks onto one; reads the recording twice."),
     ] = False,
     align_to: Annotated[
-        str, typer.Option(help="host: the recorder's clock; first: that of the first sensor.")
+        str, typer.Option(help="host: clock of the capture host; first: of the first sensor.")
     ] = "host",
     on_jump: Annotated[
         str,
-        typer.Option(help="Where a clock jumps: error, or split into outputs named .segN."),
+        typer.Option(help="At a clock step: error, or split into outputs named .segN."),
     ] = "error",
     min_range: Annotated[float, typer.Option(help="Drop nearer points, m.")] = 0.0,
     max_range: Annotated[
@@ -86,7 +86,7 @@ def convert(
     ] = False,
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
     ] = None,
     identity_extrinsics: Annotated[
         bool, typer.Option("--identity-extrinsics", help="Sensors without extrinsics: at 0, 0, 0.")
@@ -107,21 +107,21 @@ def convert(
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="Replay a fault, as drop:left:5% or stall:left:5s-8s; repeatable."),
+        typer.Option(help="Inject a fault, as drop:left:5% or stall:left:5s-8s; repeatable."),
     ] = None,
-    fault_seed: Annotated[int, typer.Option(help="Which packets random faults befall.")] = 0,
+    fault_seed: Annotated[int, typer.Option(help="Seed of random faults.")] = 0,
     dry_run: Annotated[
         bool,
         typer.Option(
             "--dry-run",
-            help="Do all but write; print the report (with --on-jump split a line for each part).",
+            help="Do not write; print the report (with --on-jump split a line a segment).",
         ),
     ] = False,
-    report: Annotated[Path | None, typer.Option(help="Where the report goes (JSON).")] = None,
-    jobs: Annotated[int, typer.Option(help="Scans made at the same time, each in a thread.")] = 1,
+    report: Annotated[Path | None, typer.Option(help="Path of the report (JSON).")] = None,
+    jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
-        typer.Option(help="What decodes: auto, numpy, or numba, which needs mlbatch[fast]."),
+        typer.Option(help="Decoder: auto, numpy, or numba (needs mlbatch[fast])."),
     ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
@@ -134,14 +134,14 @@ def convert(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary, no progress.")] = False,
     verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Also say what was found and chosen.")
+        bool, typer.Option("-v", "--verbose", help="Also print what was found and chosen.")
     ] = False,
 ) -> None:
     """Turn raw lidar packets into merged scans at an exact rate."""
     from mlbatch.cli import options
-    from mlbatch.cli.run import Wanted, run
+    from mlbatch.cli.run import Target, run
     from mlbatch.decode.kernels import ENGINES
-    from mlbatch.discovery.discover import Wishes
+    from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
     options.choices(
@@ -157,7 +157,7 @@ def convert(
     first, last, are_dates = options.time_limits(start, end)
     job = Job(
         recordings=tuple(recordings),
-        wishes=Wishes(
+        selection=SensorSelection(
             rig=rig,
             metadata=tuple(metadata or ()),
             only=tuple(only or ()),
@@ -189,11 +189,19 @@ def convert(
         jobs=options.jobs(jobs),
         engine=engine,
     )
-    splits = on_jump == "split"
     run(
         job,
-        Wanted(
-            *(output, format_, point_layout, compression, dry_run, report, splits),
-            *(overwrite, options.resume(resume, dry_run=dry_run), quiet, verbose),
+        Target(
+            output=output,
+            format=format_,
+            point_layout=point_layout,
+            compression=compression,
+            dry_run=dry_run,
+            report=report,
+            split_jumps=on_jump == "split",
+            overwrite=overwrite,
+            resume=options.resume(resume, dry_run=dry_run),
+            quiet=quiet,
+            verbose=verbose,
         ),
     )

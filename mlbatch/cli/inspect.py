@@ -1,4 +1,4 @@
-"""`mlbatch inspect`: what a recording holds, at a glance."""
+"""`mlbatch inspect`: content of a recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def inspect(
     ],
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
     ] = None,
     whole: Annotated[
         bool, typer.Option("--whole", help="Loss and clocks of the whole recording, not of 10 s.")
@@ -28,23 +28,23 @@ def inspect(
     ] = None,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
-    from mlbatch.cli.options import columns
-    from mlbatch.discovery.inspect import survey
+    from mlbatch.cli.tables import table_lines
+    from mlbatch.discovery.inspect import inspect as inspect_recordings
 
-    found = survey(tuple(recordings), tuple(metadata or ()), whole=whole)
+    found = inspect_recordings(tuple(recordings), tuple(metadata or ()), whole=whole)
     if write_rig is not None:
         from mlbatch.errors import ExportError
         from mlbatch.writers import write_text
 
         if write_rig.exists():
             raise ExportError(
-                f"{write_rig}: wanted a new rig file, got an existing one; choose another name"
+                f"{write_rig}: expected a new rig file, found an existing one; choose another name"
             )
         write_text(write_rig, found.rig_text(write_rig.parent))
     if as_json:
         typer.echo(json.dumps(found.as_json(), indent=1))
         return
-    for line in columns(found.rows()):
+    for line in table_lines(found.rows()):
         typer.echo(line)
     if found.clocks is not None:
         typer.echo("\n" + "\n".join(found.clock_lines()))

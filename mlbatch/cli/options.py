@@ -1,4 +1,4 @@
-"""Option values from text, with errors that say what was wanted."""
+"""Option values from text."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.batching.windows import Limit
-from mlbatch.errors import UsageError, one_line
+from mlbatch.errors import UsageError
 from mlbatch.pipeline.job import MOST_S, check_ranges_m, check_slices, wait_ns
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S, parse_rate
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import Fault
+    from mlbatch.faults import Fault
 
-# Every job holds a few scans in memory.
+# Every job needs memory for a few scans.
 MAX_JOBS = 64
 
 
@@ -43,24 +43,24 @@ def ranges_m(low: float, high: float) -> None:
 
 
 def in_order(first: Limit | None, last: Limit | None) -> None:
-    """`--start` before `--end`, where both count from the same time."""
+    """Raise UsageError unless `--start` is before `--end`, if both count from the same time."""
     if first is None or last is None or first.from_t_init != last.from_t_init:
         return
     if last.ns <= first.ns:
         raise UsageError(
-            f"--end: wanted a time after --start ({first.ns / NS_PER_S:g} s), got "
+            f"--end: expected a time after --start ({first.ns / NS_PER_S:g} s), found "
             f"{last.ns / NS_PER_S:g} s; swap them"
         )
 
 
 def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
-    """A `--start`/`--end`: epoch seconds, ISO time, or +S; and whether it was a date."""
+    """A `--start` or `--end` (epoch seconds, ISO time, +S), and True if it is a date."""
     if text is None:
         return None, False
     relative = text.startswith("+")
     try:
         seconds = Decimal(text)
-        # Compared, not computed: even the absolute value of 1e999999999 overflows.
+        # No arithmetic before the range is checked: abs(1e999999999) overflows.
         if seconds.is_finite() and -MOST_S <= seconds <= MOST_S:
             return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
     except InvalidOperation:
@@ -69,7 +69,7 @@ def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
         return Limit(_iso_ns(text)), True
     except ValueError:
         raise UsageError(
-            f"{option}: wanted epoch seconds, an ISO time or +SECONDS, got {text!r}; "
+            f"{option}: expected epoch seconds, an ISO time or +SECONDS, found {text!r}; "
             "write 1700000000.5, 2026-05-01T12:00:00 or +12.5"
         ) from None
 
@@ -103,7 +103,7 @@ def box_m(text: str) -> tuple[float, ...]:
     ordered = len(values) == 6 and all(a < b for a, b in zip(values[:3], values[3:], strict=True))
     if not ordered:
         raise UsageError(
-            f"--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+            f"--exclude-box: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
             f"got {text!r}; write --exclude-box=-1,-1,0,1,1,2"
         )
     return values
@@ -116,12 +116,12 @@ def decode_options(texts: Sequence[str]) -> dict[str, str]:
         key, sign, value = text.partition("=")
         if key not in DECODE_OPTIONS:
             raise UsageError(
-                f"--decode: wanted one of {', '.join(DECODE_OPTIONS)}, got {key!r}; "
+                f"--decode: expected one of {', '.join(DECODE_OPTIONS)}, found {key!r}; "
                 "write --decode crc=check"
             )
         if not sign or value not in DECODE_OPTIONS[key]:
             raise UsageError(
-                f"--decode {key}: wanted {' or '.join(DECODE_OPTIONS[key])}, got {value!r}; "
+                f"--decode {key}: expected {' or '.join(DECODE_OPTIONS[key])}, found {value!r}; "
                 f"write --decode {key}={DECODE_OPTIONS[key][0]}"
             )
         options[key] = value
@@ -129,16 +129,18 @@ def decode_options(texts: Sequence[str]) -> dict[str, str]:
 
 
 def choice(option: str, text: str, allowed: Sequence[str]) -> str:
-    """One of a few words."""
+    """An option with a closed list of words."""
     if text in allowed:
         return text
-    raise UsageError(f"{option}: wanted {' or '.join(allowed)}, got {text!r}; choose one of them")
+    raise UsageError(
+        f"{option}: expected {' or '.join(allowed)}, found {text!r}; choose one of them"
+    )
 
 
 def percent(option: str, value: float) -> float:
-    """A share in percent."""
+    """A percentage."""
     if not 0 <= value <= 100:
-        raise UsageError(f"{option}: wanted a share from 0 to 100 %, got {value:g}; correct it")
+        raise UsageError(f"{option}: expected a share from 0 to 100 %, found {value:g}; correct it")
     return value
 
 
@@ -147,7 +149,7 @@ def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
     if not texts:
         return ()
     # Not loaded for runs without faults.
-    from mlbatch.faults.replay import parse_fault
+    from mlbatch.faults import parse_fault
 
     return tuple(parse_fault(text) for text in texts)
 
@@ -155,7 +157,9 @@ def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
 def seed(number: int) -> int:
     """`--fault-seed`, a whole number from 0."""
     if number < 0:
-        raise UsageError(f"--fault-seed: wanted a whole number from 0, got {number}; correct it")
+        raise UsageError(
+            f"--fault-seed: expected a whole number from 0, found {number}; correct it"
+        )
     return number
 
 
@@ -163,48 +167,35 @@ def jobs(number: int) -> int:
     """`--jobs`, scans that are made at the same time."""
     if not 1 <= number <= MAX_JOBS:
         raise UsageError(
-            f"--jobs: wanted 1 to {MAX_JOBS}, got {number}; give the number of free cores"
+            f"--jobs: expected 1 to {MAX_JOBS}, found {number}; give the number of free cores"
         )
     return number
 
 
 def output(path: Path | None, *, dry_run: bool) -> None:
-    """`-o`, which only a dry run goes without."""
+    """`-o`, required unless it is a dry run."""
     if path is None and not dry_run:
-        raise UsageError("-o: wanted an output, got none; give -o scans.mcap, or --dry-run")
+        raise UsageError("-o: expected an output, found none; give -o scans.mcap, or --dry-run")
 
 
 def choices(**options: tuple[str, Sequence[str]]) -> None:
-    """Options that are one of a few words: what was given, and the words."""
+    """Check options with a closed list of words: name=(text, words)."""
     for name, (text, allowed) in options.items():
         choice(f"--{name.replace('_', '-')}", text, allowed)
 
 
 def time_limits(start: str | None, end: str | None) -> tuple[Limit | None, Limit | None, bool]:
-    """`--start` and `--end` in this order, and whether one of them is a date."""
+    """`--start` and `--end`, and True if one of them is a date."""
     first, first_is_date = time_limit("--start", start)
     last, last_is_date = time_limit("--end", end)
     in_order(first, last)
     return first, last, first_is_date or last_is_date
 
 
-def resume(wanted: bool, *, dry_run: bool) -> bool:
-    """Whether to go on; a dry run leaves nothing to go on with."""
-    if wanted and dry_run:
+def resume(resume: bool, *, dry_run: bool) -> bool:
+    """`--resume`, which a dry run cannot have: it leaves no output."""
+    if resume and dry_run:
         raise UsageError(
-            "--resume: wanted an output to go on with, got --dry-run; give one of both"
+            "--resume: expected an output to continue, found --dry-run; give one of them"
         )
-    return wanted
-
-
-# Plain text tables; cells may quote recordings, and hold nothing that a terminal obeys.
-
-
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows as lines, cells padded to the width of their column."""
-    rows = [[one_line(cell) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    return resume

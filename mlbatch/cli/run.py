@@ -1,24 +1,36 @@
-"""Running a conversion from the command line: progress, summary, report."""
+"""Running a conversion: segments, progress, messages, summary, report.
+
+Apart from `convert.py`, whose options are described without loading any of this.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import FrameType
 
 import typer
 
-from mlbatch.cli import interrupted
-from mlbatch.errors import ClockJump, Interrupted, MlbatchError, NoScanError, one_line
-from mlbatch.pipeline import preflight
+from mlbatch.errors import (
+    ClockJump,
+    ExportError,
+    Interrupted,
+    NoScanError,
+    RecordingError,
+    one_line,
+)
+from mlbatch.pipeline import preflight, resume
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
-from mlbatch.pipeline.segments import Part
-from mlbatch.report.report import ReportInputs, report_text, summary_lines
+from mlbatch.pipeline.segments import TimeSegment
+from mlbatch.report.report import RunReport, report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -33,9 +45,9 @@ from mlbatch.writers import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """Where the result goes and how much is said about it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """Where the result goes, and how much is printed."""
 
     output: Path | None
     format: str | None
@@ -43,165 +55,261 @@ class Wanted:
     compression: str
     dry_run: bool
     report: Path | None
-    splits_jumps: bool
+    split_jumps: bool
     overwrite: bool
     resume: bool
     quiet: bool
     verbose: bool
 
+    @property
+    def written(self) -> Path | None:
+        """The output, None in a dry run."""
+        return None if self.dry_run else self.output
 
-def run(job: Job, wanted: Wanted) -> None:
-    """Convert, write the report, print the summary; with `--on-jump split` part by part."""
-    with interrupted.by_termination():
-        if wanted.splits_jumps:
-            _run_parts(job, wanted)
+
+def run(job: Job, target: Target) -> None:
+    """Convert, write the report, print the summary; with `--on-jump split` each segment."""
+    with _terminated_as_interrupt():
+        if target.split_jumps:
+            _run_segments(job, target)
         else:
-            _convert(job, wanted)
+            _run_one(job, target)
 
 
-def _run_parts(job: Job, wanted: Wanted) -> None:
-    """Convert each stretch between clock jumps; a jump is found where a part runs into it."""
+def _say(text: str) -> None:
+    """Print a line to stderr."""
+    typer.echo(one_line(f"mlbatch: {text}"), err=True)
+
+
+# -- one output -------------------------------------------------------------------------------
+
+
+def _run_one(job: Job, target: Target) -> None:
+    # A dry run without an output decodes what a .mcap of this point layout would contain.
+    name = choose_format(target.output or Path("scans.mcap"), target.format)
+    options = WriterOptions(
+        target.point_layout, target.overwrite, job.split, compression=target.compression
+    )
+    check_compression(name, options)
+    job = replace(job, extras=extras(name, options))
+    report_path = target.report
+    open_output: OpenWriter | None = None
+    resume_log = None
+    if target.written is not None:
+        output = target.written
+        preflight.check_output(job, output, name)
+        if target.resume and _is_complete(output, overwrite=target.overwrite):
+            return
+        resume_log = _resume_log(job, output, name, options, resumes=target.resume)
+        options = replace(options, kept_bytes=resume_log.kept_bytes)
+        if options.kept_bytes is None:
+            check_target(name, output, options, job.layout)
+            if warning := preflight.check_disk(job, output):
+                _say(f"warning: {warning}")
+        open_output = _opener(name, output, options)
+        report_path = report_path or report_paths(output, name).report
+    preflight.check_report(job, report_path, target.written, name)
+    with _progress(target.quiet) as progress:
+        conversion, inputs = _converted(
+            job, open_output, progress, resume_log, _report_writer(target, report_path)
+        )
+    for note in conversion.notes:
+        _say(f"warning: {note.code}: {note.message}")
+    if open_output is None and report_path is not None:
+        write_text(report_path, report_text(inputs))
+    elif target.dry_run and report_path is None:
+        # One line a segment: several JSON documents in a row are no document.
+        typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
+        return
+    if target.quiet:
+        return
+    if target.verbose:
+        _print_sensors(conversion)
+    for line in summary_lines(inputs):
+        if not line.startswith("warning "):
+            typer.echo(one_line(line))
+    if target.written is not None:
+        typer.echo(f"wrote {target.written}, report {report_path}")
+
+
+def _converted(
+    job: Job,
+    open_output: OpenWriter | None,
+    progress: Progress | None,
+    resume_log: ResumeLog | None,
+    last: Last,
+) -> tuple[Conversion, RunReport]:
+    """Run a job; errors that leave a resumable output say so."""
+    try:
+        return convert(job, open_output, progress, resume_log, last)
+    except (ExportError, RecordingError) as err:
+        # A subclass has another cause than the disk.
+        is_disk = isinstance(err.__cause__, OSError) and type(err) in (ExportError, RecordingError)
+        if resume_log is None or not resume_log.recorded or not is_disk:
+            raise
+        advice = f"then --resume continues after the {resume_log.recorded} scans that are safe"
+        raise type(err)(f"{err}; {advice}") from err
+    except KeyboardInterrupt as err:
+        if resume_log is None or not resume_log.recorded:
+            raise
+        raise Interrupted(
+            "interrupted; finished scans are kept in .partial, from where --resume continues"
+        ) from err
+
+
+def _report_writer(target: Target, report_path: Path | None) -> Last:
+    """Writes the report before the output has its name, so that no output is without one."""
+
+    def write(inputs: RunReport, partial: Path) -> None:
+        if report_path is None or target.output is None:
+            return
+        is_inside = report_path.parent.absolute() == target.output.absolute()
+        write_text(partial / report_path.name if is_inside else report_path, report_text(inputs))
+
+    return write
+
+
+def _opener(name: str, output: Path, options: WriterOptions) -> OpenWriter:
+    def start(info: RunInfo) -> ScanWriter:
+        return open_writer(name, output, info, options)
+
+    return start
+
+
+def _print_sensors(conversion: Conversion) -> None:
+    """Print what was found and chosen (`--verbose`)."""
+    for sensor in conversion.sensors:
+        lidar = sensor.lidar
+        # Calibrations and frames may be named by topics, with any character.
+        typer.echo(
+            one_line(
+                f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
+                f"extrinsics from {sensor.detected.pose.describe()}"
+            )
+        )
+    typer.echo(f"decoded by {conversion.session.engine}")
+
+
+# -- segments between clock steps -------------------------------------------------------------
+
+
+def _run_segments(job: Job, target: Target) -> None:
+    """Convert each segment between clock steps; a step is found when a segment reaches it."""
     if job.faults:
-        # Times of faults count from the start of the session, in all parts of it.
+        # Times of faults count from the start of the session, in all segments.
         job = replace(job, fault_begin_ns=Conversion(job).session.begin_ns)
-    number, part, scans = 1, Part(), 0
+    number = 1
+    outputs = 0
+    segment = TimeSegment()
     while True:
-        # Without a jump there is one part, which needs no number.
-        alone = part == Part()
-        now, named = replace(job, part=part), wanted if alone else _numbered(wanted, number)
+        # Without a clock step there is one segment, and its output has no number.
+        is_whole = segment == TimeSegment()
+        one = replace(job, segment=segment)
+        own_target = target if is_whole else _numbered(target, number)
         try:
-            interrupted.refuse_jump(now, resume=wanted.resume)
-            _convert(now, named)
-            scans += 1
+            if target.resume:
+                # The end of the segment is needed first: complete segments are not made again.
+                _refuse_jump(one)
+            _run_one(one, own_target)
+            outputs += 1
         except ClockJump as jump:
-            if jump.host_ns <= (part.begin_ns or 0):
+            if jump.host_ns <= (segment.begin_ns or 0):
                 raise
-            typer.echo(f"mlbatch: part {number} ends where {jump}", err=True)
-            part = Part(part.begin_ns, jump.host_ns)
-            if alone or not wanted.resume:
-                interrupted.discard(None if wanted.dry_run else named.output)
+            _say(f"segment {number} ends where {jump}")
+            segment = TimeSegment(segment.begin_ns, jump.host_ns)
+            if own_target.written is not None and (is_whole or not target.resume):
+                # Outputs of segments have other names.
+                resume.abandon(own_target.written)
             continue
         except NoScanError as err:
-            if alone:
+            if is_whole:
                 raise
-            typer.echo(f"mlbatch: warning: part {number}: {err}", err=True)
-        if part.end_ns is None:
+            _say(f"warning: segment {number}: {err}")
+        if segment.end_ns is None:
             break
-        number, part = number + 1, Part(part.end_ns)
-    if not scans:
-        raise NoScanError(f"none of {number} parts between clock jumps holds a whole window")
+        number += 1
+        segment = TimeSegment(segment.end_ns)
+    if not outputs:
+        raise NoScanError(
+            f"expected a whole window between two clock steps, found none in {number} segments; "
+            "write partial ones with --keep-partial"
+        )
 
 
-def _numbered(wanted: Wanted, number: int) -> Wanted:
-    """The same with names of a part: scans.seg2.mcap, scans.seg2."""
+def _refuse_jump(job: Job) -> None:
+    jump = resume.find_jump(job)
+    if jump is not None:
+        raise jump
+
+
+def _numbered(target: Target, number: int) -> Target:
+    """The target of a segment: scans.seg2.mcap, scans.seg2."""
     return replace(
-        wanted,
-        output=_of_part(wanted.output, number, ".mcap", ".bag"),
-        report=_of_part(wanted.report, number, ".json"),
+        target,
+        output=_with_number(target.output, number, ".mcap", ".bag"),
+        report=_with_number(target.report, number, ".json"),
     )
 
 
-def _of_part(path: Path | None, number: int, *suffixes: str) -> Path | None:
+def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
     if path is None:
         return None
     suffix = path.suffix if path.suffix.lower() in suffixes else ""
     return path.with_name(f"{path.name.removesuffix(suffix)}.seg{number}{suffix}")
 
 
-def _convert(job: Job, wanted: Wanted) -> None:
-    opener, report_path, course = None, wanted.report, None
-    # A dry run without an output decodes what a .mcap of this point layout would hold.
-    name = choose_format(wanted.output or Path("scans.mcap"), wanted.format)
-    options = WriterOptions(
-        wanted.point_layout, wanted.overwrite, job.split, compression=wanted.compression
-    )
-    check_compression(name, options)
-    job = replace(job, extras=extras(name, options))
-    if wanted.output is not None and not wanted.dry_run:
-        preflight.place(job, wanted.output, name)
-        if wanted.resume and interrupted.is_complete(wanted.output, overwrite=wanted.overwrite):
-            return
-        course = interrupted.course(job, wanted.output, name, options, resume=wanted.resume)
-        options = replace(options, kept_bytes=course.kept_bytes)
-        if options.kept_bytes is None:
-            check_target(name, wanted.output, options, job.layout)
-            preflight.disk(job, wanted.output)
-        opener = _opener(name, wanted.output, options)
-        report_path = report_path or report_paths(wanted.output, name).report
-    preflight.report(job, report_path, None if wanted.dry_run else wanted.output, name)
-    with _progress(wanted.quiet) as progress:
-        conversion, inputs = _converted(job, opener, progress, course, _last(wanted, report_path))
-    for note in conversion.notes:
-        typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
-    if opener is None and report_path is not None:
-        write_text(report_path, report_text(inputs))
-    elif wanted.dry_run and report_path is None:
-        # Of several parts each is a line, since documents one after the other are none.
-        typer.echo(report_text(inputs, in_a_line=wanted.splits_jumps), nl=False)
+# -- interrupted runs -------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupt() -> Iterator[None]:
+    """Treat SIGTERM as an interrupt from the keyboard."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
         return
-    if not wanted.quiet:
-        if wanted.verbose:
-            _tell(conversion)
-        for line in summary_lines(inputs):
-            if not line.startswith("warning "):
-                typer.echo(one_line(line))
-        if wanted.output is not None and not wanted.dry_run:
-            typer.echo(f"wrote {wanted.output}, report {report_path}")
 
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
 
-def _converted(
-    job: Job,
-    opener: OpenWriter | None,
-    progress: Progress | None,
-    course: ResumeLog | None,
-    last: Last,
-) -> tuple[Conversion, ReportInputs]:
+    before = signal.signal(signal.SIGTERM, interrupt)
     try:
-        return convert(job, opener, progress, course, last)
-    except MlbatchError as err:
-        told = interrupted.with_advice(err, course)
-        if told is err:
-            raise
-        raise told from err
-    except KeyboardInterrupt as err:
-        # Of a run that writes nothing, or nothing so far, there is no more to say.
-        if course is None or not course.recorded:
-            raise
-        raise Interrupted(
-            "interrupted; what was written stays under .partial, where --resume goes on"
-        ) from err
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
-def _last(wanted: Wanted, report_path: Path | None) -> Last:
-    """The report comes before the output has its name, so that no output is without."""
-
-    def write(inputs: ReportInputs, partial: Path) -> None:
-        if report_path is None or wanted.output is None:
-            return
-        inside = report_path.parent.absolute() == wanted.output.absolute()
-        write_text(partial / report_path.name if inside else report_path, report_text(inputs))
-
-    return write
-
-
-def _opener(name: str, target: Path, options: WriterOptions) -> OpenWriter:
-    def start(info: RunInfo) -> ScanWriter:
-        return open_writer(name, target, info, options)
-
-    return start
+def _is_complete(output: Path, *, overwrite: bool) -> bool:
+    """True if an earlier run completed the output, so that there is nothing to resume."""
+    earlier = resume.find(output)
+    # With --overwrite an older output is replaced, but not the one of the interrupted run.
+    if not earlier.is_complete or (overwrite and not earlier.was_published):
+        return False
+    resume.forget(output)
+    _say(f"{output}: is complete; there is nothing to resume")
+    return True
 
 
-def _tell(conversion: Conversion) -> None:
-    for sensor in conversion.sensors:
-        lidar = sensor.lidar
-        # Topics name calibrations and frames, and may be named anything.
-        typer.echo(
-            one_line(
-                f"{sensor.name}: {lidar.model} {lidar.mode}, calibration {lidar.calibration}, "
-                f"extrinsics from {sensor.detected.origin}"
-            )
+def _resume_log(
+    job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
+) -> ResumeLog:
+    """Progress of an output: that of the interrupted run, or from the start."""
+    state = resume.find(output).state
+    if state is not None and not resumes:
+        _say(
+            f"warning: interrupted: {output}.partial with {len(state.rows)} finished scans is "
+            "discarded; --resume would continue after them"
         )
-    typer.echo(f"decoded by {conversion.session.engine}")
+    log = ResumeLog(output, job, name, options, state if resumes else None)
+    if log.kept_bytes is None:
+        resume.forget(output)
+        if resumes:
+            _say(f"{output}: nothing to resume; started over")
+    else:
+        _say(f"{output}: resumed after {log.done} scans")
+    return log
+
+
+# -- progress ---------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -210,22 +318,14 @@ def _progress(quiet: bool) -> Iterator[Progress | None]:
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-    from rich.progress import (
-        Progress as Bar,
-    )
 
-    with Bar(
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
+    with progress.Progress(
+        progress.BarColumn(),
+        progress.DownloadColumn(),
+        progress.TransferSpeedColumn(),
+        progress.TimeRemainingColumn(),
         console=Console(stderr=True),
         transient=True,
     ) as bar:

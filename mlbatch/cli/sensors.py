@@ -19,7 +19,7 @@ def sensors(
     rows: list[dict[str, object]] = [
         {
             "model": model.name,
-            "maker": model.maker,
+            "maker": model.vendor,
             "channels": model.channels,
             "returns": list(model.returns),
             "clock": model.clock,
@@ -31,10 +31,10 @@ def sensors(
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
         return
-    from mlbatch.cli.options import columns
+    from mlbatch.cli.tables import table_lines
 
     cells = [[_cell(row[key]) for key in HEAD] for row in rows]
-    for line in columns([list(HEAD), *cells]):
+    for line in table_lines([list(HEAD), *cells]):
         typer.echo(line)
 
 

@@ -1,4 +1,4 @@
-"""`mlbatch verify`: a proof of an output from the output alone."""
+"""`mlbatch verify`: checks of an output from the output alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mlbatch.errors import one_line
 if TYPE_CHECKING:
     from mlbatch.verify import Verdict
 
-# Violations that are shown to people; the rest is counted. JSON has more of them.
+# Violations in text output; the others are counted. JSON has up to 1000.
 SHOWN = 20
 
 
@@ -22,29 +22,31 @@ def verify(
         Path, typer.Argument(help="Output of convert: folder of npz or PLY, .mcap, .bag, rosbag2.")
     ],
     report: Annotated[
-        Path | None, typer.Option(help="Report of the run (JSON). [default: in or beside OUTPUT]")
+        Path | None,
+        typer.Option(help="Report of the run (JSON). [default: in OUTPUT or next to it]"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
-    """Prove grid, order, times, counts and ledgers of an output, from nothing but the output."""
+    """Check grid, order, times, counts and ledgers of an output, from the output alone."""
     from mlbatch.verify import VerifyError
-    from mlbatch.verify import verify as prove
+    from mlbatch.verify import verify as check
 
-    verdict = prove(output, report)
+    verdict = check(output, report)
     if as_json:
         typer.echo(json.dumps(_values(verdict), indent=1))
     else:
         for line in _lines(verdict):
             typer.echo(one_line(line))
     if not verdict.ok:
-        broken = sum(check.violations > 0 for check in verdict.checks)
+        violated = sum(one.violations > 0 for one in verdict.checks)
         raise VerifyError(
-            f"{output}: wanted none, got {verdict.count} violation(s) of {broken} check(s); "
+            f"{output}: expected no violation, found {verdict.count} of {violated} check(s); "
             "see above, and convert again"
         )
 
 
 def _values(verdict: Verdict) -> dict[str, object]:
+    """The verdict as JSON; the names of its fields are fixed."""
     return {
         "schema": "mlbatch.verdict/1",
         "output": verdict.path,
@@ -57,21 +59,21 @@ def _values(verdict: Verdict) -> dict[str, object]:
             {
                 "name": check.name,
                 "outcome": check.outcome,
-                "judged": check.judged,
+                "judged": check.checked,
                 "violations": check.violations,
                 "limit": check.limit,
             }
             for check in verdict.checks
         ],
         "violations": [
-            {"check": one.check, "where": one.where, "wanted": one.wanted, "got": one.got}
+            {"check": one.check, "where": one.where, "wanted": one.expected, "got": one.found}
             for one in verdict.violations
         ],
     }
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    from mlbatch.cli.options import columns
+    from mlbatch.cli.tables import table_lines
 
     size = f"{verdict.scans} scans, {verdict.points} points"
     if verdict.columns is not None:
@@ -79,14 +81,14 @@ def _lines(verdict: Verdict) -> list[str]:
     rows = [
         (
             check.name,
-            str(check.judged or ""),
+            str(check.checked or ""),
             _outcome(check.violations, check.outcome),
             check.limit,
         )
         for check in verdict.checks
     ]
     lines = [f"{verdict.path}: {verdict.format}, {size}"]
-    lines += columns([("check", "judged", "outcome", "what stays open"), *rows])
+    lines += table_lines([("check", "checked", "outcome", "not checkable"), *rows])
     shown = verdict.violations[:SHOWN]
     lines += map(str, shown)
     if verdict.count > len(shown):

@@ -1,8 +1,8 @@
-"""`--align-clocks`: a sensor's clock mapped onto the recorder's, or onto the first sensor's.
+"""`--align-clocks`: maps of sensors' clocks onto the capture host's, or onto the first sensor's.
 
-The map follows the upper envelope of stamp minus arrival, straight between knots. Steps of the
-recorder's clock are left out, since the stamps went on: aligned stamps run by the recorder's clock
-as it was at the start. Steps of the sensor's clock are taken out of its stamps.
+A map follows the envelope of stamp minus receive time. Steps of the capture host's clock are left
+out, since the stamps did not step: aligned stamps are on the host's clock as it was at the start.
+Steps of a sensor's clock are removed from its stamps.
 """
 
 from __future__ import annotations
@@ -13,23 +13,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.clocks.compare import with_host_steps
+from mlbatch.clocks.compare import mark_host_steps
 from mlbatch.clocks.timescale import DELAY, HOST
-from mlbatch.clocks.watch import LIMIT_NS, ClockFinding, ClockWatch, Stretch, steady, stretch_of
+from mlbatch.clocks.watch import (
+    LIMIT_NS,
+    ClockEstimate,
+    ClockWatch,
+    Segment,
+    segment_of,
+    without_host_steps,
+)
 from mlbatch.errors import ClockError
 from mlbatch.units import NS_PER_MS
 
-TO_HOST, TO_FIRST = "host", "first"
-# Whatever steps on the recorder's side: the stamps went on.
-_TAKEN_OUT = (HOST, DELAY)
+TO_HOST = "host"
+TO_FIRST = "first"
+# Jumps that are not of the sensor's clock: its stamps did not step.
+_NOT_OF_SENSOR = (HOST, DELAY)
 _FAR = 2**62
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A stretch of a map: offsets to add at stamps (k,), ns; beyond them the rate goes on.
+    """Map of one segment: offsets to add at stamps (k,), ns, straight between them.
 
-    least_ns, most_ns: no aligned stamp lies outside, so that stretches keep their order.
+    rate: slope beyond the stamps; least_ns, most_ns: limits of aligned stamps, so that segments
+    keep their order.
     """
 
     stamp_ns: I64Array
@@ -39,7 +48,7 @@ class _Piece:
     most_ns: int
 
     def apply(self, stamp_ns: I64Array) -> I64Array:
-        """Aligned stamps: exact, since only differences, never epochs, become floats."""
+        """Aligned stamps; exact, since only differences become floats."""
         at = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         inner = np.clip(at, 0, len(self.stamp_ns) - 1)
         since = (stamp_ns - self.stamp_ns[inner]).astype(np.float64)
@@ -57,134 +66,134 @@ class _Piece:
 
 @dataclass(frozen=True, slots=True)
 class ClockMap:
-    """Maps a sensor's stamps onto another clock; larger stamps never become smaller ones.
+    """Map of a sensor's stamps onto another clock; it keeps their order.
 
-    knots: of all stretches; residual_p50_ns, residual_max_ns: how far the fastest packets lie from
-    the map; to: `host` or `first`.
+    to: `host` or `first`; knots: of all segments; residual_p50_ns, residual_max_ns: distance of the
+    fastest packets from the map.
     """
 
     to: str
     knots: int
     residual_p50_ns: int
     residual_max_ns: int
-    stretches: tuple[Stretch, ...]
+    segments: tuple[Segment, ...]
     _pieces: tuple[_Piece, ...]
 
     def apply(self, stamp_ns: I64Array, host_ns: I64Array | None = None) -> I64Array:
-        """Aligned stamps, int64 ns, of any shape; what is no time at all stays as it is.
+        """Aligned stamps, int64 ns, of any shape; stamps outside [0, 2^31) s are unchanged.
 
-        host_ns: arrivals, of a shape that fits; they tell stamps apart that a clock gave twice
-        because it was set back.
+        host_ns: receive times, of a shape that fits, to separate equal stamps of a clock that was
+        set back.
         """
         sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS)
         if not sane.all():
-            # Damaged stamps could come round to good ones by overflow.
+            # Damaged stamps could overflow to good ones.
             good_ns = np.where(sane, stamp_ns, 0)
             return np.where(sane, self.apply(good_ns, host_ns), stamp_ns)
         if len(self._pieces) == 1:
             return self._pieces[0].apply(stamp_ns)
-        which = stretch_of(self.stretches, stamp_ns, host_ns)
+        which = segment_of(self.segments, stamp_ns, host_ns)
         aligned = np.empty_like(stamp_ns)
         for number, piece in enumerate(self._pieces):
             mine = which == number
             aligned[mine] = piece.apply(stamp_ns[mine])
         return aligned
 
-    def in_words(self) -> str:
-        """One line for the report."""
-        target = "the recorder's clock" if self.to == TO_HOST else "the first sensor's clock"
+    def describe(self) -> str:
+        """The map as one line."""
+        target = "the capture host's clock" if self.to == TO_HOST else "the first sensor's clock"
         return (
-            f"aligned to {target}: {self.knots} knot(s), fastest packets within "
-            f"{self.residual_p50_ns / NS_PER_MS:.3f} ms (half of them), "
-            f"{self.residual_max_ns / NS_PER_MS:.3f} ms (all)"
+            f"aligned to {target}: {self.knots} knot(s), residual of the fastest packets "
+            f"{self.residual_p50_ns / NS_PER_MS:.3f} ms (median), "
+            f"{self.residual_max_ns / NS_PER_MS:.3f} ms (maximum)"
         )
 
 
 def fit(watches: Sequence[ClockWatch], to: str = TO_HOST) -> tuple[ClockMap | None, ...]:
     """A map for each sensor; None for one without packets.
 
-    to: `host` or `first`; ClockError if the first sensor's clock cannot be a target.
+    to: `host` or `first`; ClockError if the first sensor's clock cannot be the target.
     """
-    found = [(str(at), watch.finding()) for at, watch in enumerate(watches)]
-    seen = with_host_steps([(name, one) for name, one in found if one is not None])
-    findings = dict(seen)
-    target = _target(findings.get("0")) if to == TO_FIRST else ()
+    all_estimates = [(str(at), watch.estimate()) for at, watch in enumerate(watches)]
+    known = [(name, one) for name, one in all_estimates if one is not None]
+    estimates = dict(mark_host_steps(known))
+    target = _target(estimates.get("0")) if to == TO_FIRST else ()
     maps: list[ClockMap | None] = []
-    for name, _ in found:
-        finding = findings.get(name)
-        if finding is None:
+    for name, _ in all_estimates:
+        estimate = estimates.get(name)
+        if estimate is None:
             maps.append(None)
         elif to == TO_FIRST and name == "0":
-            maps.append(_itself(finding))
+            maps.append(_identity(estimate))
         else:
-            maps.append(_map(finding, to, target))
+            maps.append(_map(estimate, to, target))
     return tuple(maps)
 
 
-def _target(finding: ClockFinding | None) -> tuple[Stretch, ...]:
-    """The first sensor's clock, by a recorder's clock that never stepped."""
-    if finding is None:
+def _target(estimate: ClockEstimate | None) -> tuple[Segment, ...]:
+    """The first sensor's clock, by a capture host's clock that never stepped."""
+    if estimate is None:
         raise ClockError(
-            "--align-clocks first: wanted packets of the first sensor, got none; "
+            "--align-clocks first: expected packets of the first sensor, found none; "
             "use --align-clocks host"
         )
-    if finding.sensor_jumps or finding.unsteady:
+    if estimate.sensor_jumps or estimate.unsteady:
         raise ClockError(
-            "--align-clocks first: wanted a first sensor whose clock runs without a jump, got "
-            f"{len(finding.sensor_jumps)} jump(s); use --align-clocks host"
+            "--align-clocks first: expected a first sensor whose clock does not jump, found "
+            f"{len(estimate.sensor_jumps)} jump(s); use --align-clocks host"
         )
-    return steady(finding, _TAKEN_OUT)
+    return without_host_steps(estimate, _NOT_OF_SENSOR)
 
 
-def _itself(finding: ClockFinding) -> ClockMap:
-    """The map of the target: nothing changes."""
-    nothing = np.zeros(1, np.int64)
-    return ClockMap(
-        TO_FIRST, 0, 0, 0, finding.stretches[:1], (_Piece(nothing, nothing, 0.0, -_FAR, _FAR),)
-    )
+def _identity(estimate: ClockEstimate) -> ClockMap:
+    """The map of the target itself."""
+    zero = np.zeros(1, np.int64)
+    piece = _Piece(zero, zero, rate=0.0, least_ns=-_FAR, most_ns=_FAR)
+    return ClockMap(TO_FIRST, 0, 0, 0, estimate.segments[:1], (piece,))
 
 
-def _map(finding: ClockFinding, to: str, target: Sequence[Stretch]) -> ClockMap:
+def _map(estimate: ClockEstimate, to: str, target: Sequence[Segment]) -> ClockMap:
     pieces: list[_Piece] = []
     least_ns = -_FAR
-    for one in steady(finding, _TAKEN_OUT):
+    for one in without_host_steps(estimate, _NOT_OF_SENSOR):
         piece = _piece(one, target, least_ns)
         least_ns = int(piece.apply(np.array([one.last_stamp_ns], np.int64))[0])
         pieces.append(replace(piece, most_ns=least_ns))
     pieces[-1] = replace(pieces[-1], most_ns=_FAR)
-    residual_ns = np.concatenate([one.line.residual_ns for one in finding.stretches])
+    residual_ns = np.concatenate([one.envelope.residual_ns for one in estimate.segments])
     return ClockMap(
-        to,
-        sum(len(piece.stamp_ns) for piece in pieces),
-        round(float(np.quantile(residual_ns, 0.5, method="inverted_cdf"))),
-        round(float(residual_ns.max())),
-        finding.stretches,
-        tuple(pieces),
+        to=to,
+        knots=sum(len(piece.stamp_ns) for piece in pieces),
+        residual_p50_ns=round(float(np.quantile(residual_ns, 0.5, method="inverted_cdf"))),
+        residual_max_ns=round(float(residual_ns.max())),
+        segments=estimate.segments,
+        _pieces=tuple(pieces),
     )
 
 
-def _piece(one: Stretch, target: Sequence[Stretch], least_ns: int) -> _Piece:
-    """The map of one stretch; target: empty for the recorder's clock."""
-    at_ns = one.line.host_ns
-    rate = 0.0
+def _piece(one: Segment, target: Sequence[Segment], least_ns: int) -> _Piece:
+    """The map of one segment; target: empty for the capture host's clock."""
+    at_ns = one.envelope.host_ns
+    target_rate = 0.0
     if target:
-        at_ns = np.union1d(at_ns, np.concatenate([stretch.line.host_ns for stretch in target]))
+        theirs_ns = np.concatenate([segment.envelope.host_ns for segment in target])
+        at_ns = np.union1d(at_ns, theirs_ns)
         near = (at_ns >= one.first_host_ns) & (at_ns <= one.last_host_ns)
-        at_ns = at_ns[near | np.isin(at_ns, one.line.host_ns)]
-        rate = target[-1].line.rate
-    ours_ns = one.line.at(at_ns)
-    stamp_ns = at_ns + ours_ns
+        at_ns = at_ns[near | np.isin(at_ns, one.envelope.host_ns)]
+        target_rate = target[-1].envelope.rate
+    own_ns = one.envelope.at(at_ns)
+    stamp_ns = at_ns + own_ns
     newest = np.maximum.accumulate(np.append(-_FAR, stamp_ns))[:-1]
     kept = stamp_ns > newest
-    offset_ns = (_offsets(target, at_ns) - ours_ns)[kept]
-    rate = (rate - one.line.rate) / (1 + one.line.rate)
+    offset_ns = (_offsets(target, at_ns) - own_ns)[kept]
+    rate = (target_rate - one.envelope.rate) / (1 + one.envelope.rate)
     return _Piece(stamp_ns[kept], offset_ns, rate, least_ns, _FAR)
 
 
-def _offsets(target: Sequence[Stretch], at_ns: I64Array) -> I64Array:
-    """How far the target's clock is ahead of the recorder's."""
+def _offsets(target: Sequence[Segment], at_ns: I64Array) -> I64Array:
+    """How far the target's clock is ahead of the capture host's, at receive times."""
     offset_ns = np.zeros(len(at_ns), np.int64)
-    for number, stretch in enumerate(target):
-        mine = at_ns >= stretch.first_host_ns if number else np.ones(len(at_ns), bool)
-        offset_ns[mine] = stretch.line.at(at_ns[mine])
+    for number, segment in enumerate(target):
+        mine = at_ns >= segment.first_host_ns if number else np.ones(len(at_ns), bool)
+        offset_ns[mine] = segment.envelope.at(at_ns[mine])
     return offset_ns

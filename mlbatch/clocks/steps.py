@@ -1,7 +1,8 @@
-"""Where a clock steps: between packets, and too small to be seen from one packet to the next.
+"""Steps of a clock: where the offset of stamps to receive times changes at once.
 
-A step between two packets is a break of the track. A smaller one shows as a level of the envelope
-that ends at once and does not come back; its packets are then found in the bins.
+A step above 1 s between two packets ends a table of bins (`watch`). A smaller one, down to 1 ms,
+shows as a level of the envelope that changes at once and does not return; its packets are then
+located in the bins. Smaller steps are not reported: the envelope follows them as drift.
 """
 
 from __future__ import annotations
@@ -15,34 +16,40 @@ from mlbatch.arrays import F64Array, I64Array, median
 from mlbatch.clocks.envelope import (
     BACK,
     FALL,
-    MOST_GROUPS,
+    MAX_GROUPS,
     RISE,
-    Line,
-    Part,
-    Track,
-    envelope,
-    groups,
+    BinRange,
+    BinTable,
+    Envelope,
+    fit_envelope,
+    group_tops,
+    offset_rise,
 )
 from mlbatch.clocks.timescale import HOST, SENSOR
 from mlbatch.units import NS_PER_MS
 
-# Smaller steps are followed as changes of the rate.
 SMALLEST_NS = NS_PER_MS
+# A step must exceed the usual difference of neighbouring groups so many times.
 _SCALES = 8
-# Groups on each side that must agree; a fall may also be a late packet, so it needs all of them.
-_SIDE, _LEAST_RISE, _LEAST_FALL = 3, 2, 3
-# A step happens between neighbouring rows, a fast change of rate takes longer: so many rows on each
-# side must have less than this share of it still to come, or already gone.
-_ROWS, _SHARE = 3, 0.25
-_PAUSE_NS, _PAUSE_PERIODS = 20 * NS_PER_MS, 16
+# Groups on each side that must agree. A fall may also be delayed packets, so it needs all of them.
+_SIDE = 3
+_MIN_RISE = 2
+_MIN_FALL = 3
+# A step is between neighbouring rows, a fast change of rate takes longer. Before a step the highest
+# of so many rows may have moved by at most this share of its size, after it by at least the rest.
+_ROWS = 3
+_SHARE = 0.25
+# Longest time between two packets from which the clock that stepped can be determined.
+_PAUSE_NS = 20 * NS_PER_MS
+_PAUSE_PERIODS = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A step between two parts: stamp and arrival of the packets before and after it, ns.
+    """A step between two ranges: stamp and receive time of the packets before and after it, ns.
 
-    size_ns: change of stamp minus arrival; side: `sensor` where the stamps step, `host` where the
-    arrivals do, "" where a pause leaves that open.
+    size_ns: change of the offset; side: `sensor` if the stamps step, `host` if the receive times
+    do, "" if a pause hides it.
     """
 
     before: tuple[int, int]
@@ -52,82 +59,96 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """A clock from its first packet to its last: parts, their envelopes, the steps between them."""
+class ClockTrack:
+    """A clock from its first packet to its last: ranges, their envelopes, steps between them."""
 
-    parts: tuple[Part, ...]
-    lines: tuple[Line, ...]
+    parts: tuple[BinRange, ...]
+    envelopes: tuple[Envelope, ...]
     steps: tuple[Step, ...]
 
 
-def course_of(tracks: Sequence[Track]) -> Course:
-    """What a clock did: steps that come to nothing are pauses of the recorder, and left out."""
-    parts, lines, steps = list[Part](), list[Line](), list[Step]()
-    for part in (part for track in tracks for part in _split(track)):
-        line = envelope(part)
+def track_of(tables: Sequence[BinTable]) -> ClockTrack:
+    """The track of a clock, from the tables between its large steps.
+
+    Ranges whose envelopes differ by less than SMALLEST_NS are joined: there, the capture host
+    paused.
+    """
+    parts: list[BinRange] = []
+    envelopes: list[Envelope] = []
+    steps: list[Step] = []
+    for part in (part for table in tables for part in _split(table)):
+        envelope = fit_envelope(part)
         if parts:
-            step = _step(parts[-1], lines[-1], part, line)
+            step = _step(parts[-1], envelopes[-1], part, envelope)
             if abs(step.size_ns) <= SMALLEST_NS:
                 parts[-1] = _joined(parts[-1], part)
-                lines[-1] = envelope(parts[-1])
+                envelopes[-1] = fit_envelope(parts[-1])
                 continue
             steps.append(step)
         parts.append(part)
-        lines.append(line)
-    return Course(tuple(parts), tuple(lines), tuple(steps))
+        envelopes.append(envelope)
+    return ClockTrack(tuple(parts), tuple(envelopes), tuple(steps))
 
 
-def _joined(one: Part, two: Part) -> Part:
-    """Two parts as one."""
-    if one.track is two.track:
-        return Part(one.track, one.begin, two.end, one.first, two.last)
+def _joined(one: BinRange, two: BinRange) -> BinRange:
+    """Two successive ranges as one."""
+    if one.table is two.table:
+        return BinRange(one.table, one.begin, two.end, one.first, two.last)
     rows = np.concatenate(
-        [one.track.rows[one.begin : one.end], two.track.rows[two.begin : two.end]]
+        [one.table.rows[one.begin : one.end], two.table.rows[two.begin : two.end]]
     )
     packets = one.packets + two.packets
-    track = Track(rows, max(-(-packets // len(rows)), 1), packets, two.last)
-    return Part(track, 0, len(rows), one.first, two.last)
+    table = BinTable(rows, max(-(-packets // len(rows)), 1), packets, two.last)
+    return BinRange(table, 0, len(rows), one.first, two.last)
 
 
-def _split(track: Track) -> list[Part]:
-    """A track, cut at the steps of its envelope."""
-    whole = Part(track, 0, len(track.rows), track.first, track.last)
+# -- small steps ----------------------------------------------------------------------------------
+
+
+def _split(table: BinTable) -> list[BinRange]:
+    """A table, cut at the steps of its envelope."""
+    whole = BinRange(table, 0, len(table.rows), table.first, table.last)
     host_ns, offset_ns, row = whole.points()
-    tops = groups(host_ns, offset_ns, whole, MOST_GROUPS)
+    tops = group_tops(host_ns, offset_ns, whole, MAX_GROUPS)
     rate = _usual_rate(host_ns[tops], offset_ns[tops])
     level = _level(host_ns[tops], offset_ns[tops] - offset_ns[0], host_ns[0], rate)
-    if len(level) < 2 * _LEAST_RISE:
+    if len(level) < 2 * _MIN_RISE:
         return [whole]
     usual_ns = median(np.abs(np.diff(level)))
-    size = _gaps(level)
-    tops_of_rows = track.rows[:, 0] - track.rows[:, 1] - offset_ns[0]
-    levels = _level(track.rows[:, 1], tops_of_rows, host_ns[0], rate)
-    parts: list[Part] = []
-    begin, first = 0, whole.first
+    size = _level_changes(level)
+    row_offset_ns = table.rows[:, 0] - table.rows[:, 1] - offset_ns[0]
+    row_level = _level(table.rows[:, 1], row_offset_ns, host_ns[0], rate)
+    parts: list[BinRange] = []
+    begin = 0
+    first = whole.first
     for at in np.flatnonzero(np.abs(size) > max(SMALLEST_NS, _SCALES * usual_ns)).tolist():
         near = slice(row[tops[max(at - 2, 0)]], row[tops[min(at + 1, len(tops) - 1)]] + 1)
-        cut = _cut(track, near, levels, float(level[at - 1]), float(size[at]))
-        if cut is not None and cut.end > begin and cut.start < len(track.rows):
-            parts.append(Part(track, begin, cut.end, first, cut.before))
-            begin, first = cut.start, cut.after
-    return [*parts, Part(track, begin, len(track.rows), first, whole.last)]
+        found = _locate(table, near, row_level, float(level[at - 1]), float(size[at]))
+        if found is not None and found.end > begin and found.start < len(table.rows):
+            parts.append(BinRange(table, begin, found.end, first, found.before))
+            begin = found.start
+            first = found.after
+    return [*parts, BinRange(table, begin, len(table.rows), first, whole.last)]
 
 
 def _usual_rate(host_ns: I64Array, offset_ns: I64Array) -> float:
-    """The usual rate from each point to the next; steps do not count."""
+    """Median rate from each point to the next; steps do not change it."""
     run = np.diff(host_ns)
     rates = np.diff(offset_ns)[run > 0] / run[run > 0]
     return median(rates) if len(rates) else 0.0
 
 
 def _level(host_ns: I64Array, offset_ns: I64Array, begin_ns: int, rate: float) -> F64Array:
-    """Offsets (small numbers) without what a steady rate since `begin_ns` explains."""
+    """Offsets (small numbers) less a steady drift since `begin_ns`."""
     level: F64Array = offset_ns - rate * (host_ns - begin_ns)
     return level
 
 
-def _gaps(level: F64Array) -> F64Array:
-    """(n,) how far the levels from each on lie above (negative: below) all before it; else 0."""
+def _level_changes(level: F64Array) -> F64Array:
+    """(n,) distance by which the levels from each on are above (below: negative) those before it.
+
+    0 where the _SIDE levels before and the _SIDE levels from there on overlap.
+    """
     count = len(level)
     size = np.zeros(count)
     high = np.concatenate([np.full(_SIDE, -np.inf), level, np.full(_SIDE, -np.inf)])
@@ -138,16 +159,19 @@ def _gaps(level: F64Array) -> F64Array:
     up = lowest[at + _SIDE] - highest[at]
     down = lowest[at] - highest[at + _SIDE]
     side = np.minimum(at, count - at)
-    rises = (side >= _LEAST_RISE) & (up > 0)
-    falls = (side >= _LEAST_FALL) & (down > 0)
+    rises = (side >= _MIN_RISE) & (up > 0)
+    falls = (side >= _MIN_FALL) & (down > 0)
     size[rises] = up[rises]
     size[falls] = -down[falls]
     return size
 
 
 @dataclass(frozen=True, slots=True)
-class _Cut:
-    """End of the rows before a step, start of those after it, the packets around it."""
+class StepLocation:
+    """A step in the rows of a table, and the packets before and after it (stamp, receive time).
+
+    end: of the rows before the step; start: of the rows after it.
+    """
 
     end: int
     start: int
@@ -155,57 +179,69 @@ class _Cut:
     after: tuple[int, int]
 
 
-def _cut(track: Track, near: slice, level: F64Array, old: float, size: float) -> _Cut | None:
-    """Where a step lies in the rows `near`; level: of all rows; old: before it; None: no step."""
+def _locate(
+    table: BinTable, near: slice, level: F64Array, old: float, size: float
+) -> StepLocation | None:
+    """Location of a step of a size in the rows `near`; None if there is no step.
+
+    level: of all rows; old: before the step.
+    """
     over = np.flatnonzero(level[near] > old + size / 2)
     if not len(over):
         return None
-    # Delays only lower points: the first row up there holds a rise, and the last one is at or
-    # right before a fall.
+    # Delays only lower points: the first row above contains a rise, and the last row above is
+    # before a fall or contains it.
     at = near.start + int(over[0] if size > 0 else over[-1])
     begin = at if size > 0 else at + 1
-    sides = (level[max(begin - _ROWS, 0) : begin], level[begin : begin + _ROWS])
-    if not all(len(side) for side in sides):
+    before_level = level[max(begin - _ROWS, 0) : begin]
+    after_level = level[begin : begin + _ROWS]
+    if not len(before_level) or not len(after_level):
         return None
-    low, high = (float(side.max() - old) / size for side in sides)
-    if low > _SHARE or high < 1 - _SHARE:
+    risen = float(before_level.max() - old) / size
+    reached = float(after_level.max() - old) / size
+    if risen > _SHARE or reached < 1 - _SHARE:
         return None
-    pairs = track.rows[[at], RISE] if size > 0 else _falls(track.rows[at : at + 2])
-    heights = (pairs[:, 2] - pairs[:, 0]) - (pairs[:, 3] - pairs[:, 1])
-    best = int(np.argmin(np.abs(heights - size)))
-    before, after = pairs[best, :2].tolist(), pairs[best, 2:].tolist()
-    # Of a fall, the first half of the pairs is of the last row before it, or in that row.
+    pairs = table.rows[[at], RISE] if size > 0 else _falls(table.rows[at : at + 2])
+    best = int(np.argmin(np.abs(offset_rise(pairs) - size)))
+    before = pairs[best, :2].tolist()
+    after = pairs[best, 2:].tolist()
+    # The first half of the pairs of a fall is of the last row above, the other of the next row.
     end = at if size > 0 or best < len(pairs) // 2 else at + 1
-    # A row of one packet lies on one side; one of many may hold packets of both.
-    return _Cut(end, end + (track.per_bin > 1), tuple(before), tuple(after))
+    # A row of one packet is on one side of the step; one of several may contain both sides.
+    return StepLocation(end, end + (table.per_bin > 1), tuple(before), tuple(after))
 
 
 def _falls(rows: I64Array) -> I64Array:
-    """Pairs of packets around falls, of one row after the other."""
+    """Pairs of packets around the falls of rows, row by row."""
     return np.stack([rows[:, FALL], rows[:, BACK]], axis=1).reshape(-1, 4)
 
 
-def _step(one: Part, line: Line, two: Part, next_line: Line) -> Step:
-    """The step between two parts."""
-    before, after = one.last, two.first
-    stamps_ns, hosts_ns = after[0] - before[0], after[1] - before[1]
-    size_ns = _size(line, next_line, after[1], after[1])
+# -- size and side of a step ----------------------------------------------------------------------
+
+
+def _step(one: BinRange, envelope: Envelope, two: BinRange, next_envelope: Envelope) -> Step:
+    """The step between two ranges."""
+    before = one.last
+    after = two.first
+    stamps_ns = after[0] - before[0]
+    hosts_ns = after[1] - before[1]
+    size_ns = _height(envelope, next_envelope, after[1], after[1])
     period_ns = one.span_ns // max(one.packets - 1, 1)
     if min(stamps_ns, hosts_ns) > _PAUSE_NS + _PAUSE_PERIODS * period_ns:
         return Step(before, after, size_ns, "")
     if abs(stamps_ns - hosts_ns - size_ns) > abs(size_ns) / 2:
-        # A burst at the same time: arrivals tell nothing.
+        # A burst at the same time: receive times show nothing.
         by_sensor = abs(stamps_ns - period_ns - size_ns) < abs(stamps_ns - period_ns)
     else:
         by_sensor = abs(stamps_ns - period_ns) >= abs(hosts_ns - period_ns)
     if not by_sensor:
-        # The time over which the recorder's clock stepped never was: nothing drifted in it.
-        size_ns = _size(line, next_line, before[1], after[1])
+        # The time that the capture host's clock skipped did not pass: there was no drift in it.
+        size_ns = _height(envelope, next_envelope, before[1], after[1])
     return Step(before, after, size_ns, SENSOR if by_sensor else HOST)
 
 
-def _size(line: Line, next_line: Line, before_ns: int, after_ns: int) -> int:
-    """How far an envelope lies above another, each at its own time of arrival, ns."""
-    low = line.at(np.array([before_ns], np.int64))
-    high = next_line.at(np.array([after_ns], np.int64))
+def _height(envelope: Envelope, next_envelope: Envelope, before_ns: int, after_ns: int) -> int:
+    """Difference of two envelopes, each at its own receive time, ns."""
+    low = envelope.at(np.array([before_ns], np.int64))
+    high = next_envelope.at(np.array([after_ns], np.int64))
     return int(high[0]) - int(low[0])

@@ -1,6 +1,8 @@
-"""What a sensor's stamps count: decided by their value and by the recorder's clock.
+"""What the stamps of a sensor count: UTC, TAI, GPS time, time since power-on; leap seconds.
 
-facts/ouster.md section 7: the mode a sensor was set to does not prove what it does; its values do.
+The timescale follows from the values of the stamps and the receive times of their packets, never
+from a mode field: a sensor in PTP mode counts from power-on until PTP locks
+(docs/sources/ouster.md section 7, velodyne.md section 7, hesai.md section 4).
 """
 
 from __future__ import annotations
@@ -10,40 +12,38 @@ from datetime import datetime, timezone
 
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
-# Stamps below 1e9 s (2001) cannot be today's time: the sensor counts from power-on.
-EPOCH_NS = 10**9 * NS_PER_S
-# How far the recorder's clock may be off for a timescale to be told.
-NEAR_NS = 2 * NS_PER_S
+UTC = "utc"
+TAI = "tai"
+GPS = "gps"
+TOP_OF_HOUR = "top_of_hour"
+UPTIME = "uptime"
+WRONG_YEAR = "wrong_year"
+UNKNOWN = "unknown"
+# Domains of clocks that follow civil time.
+EPOCHS = (UTC, TAI, GPS)
+DESCRIPTION = {
+    UTC: "UTC",
+    TAI: "TAI",
+    GPS: "GPS time",
+    TOP_OF_HOUR: "past an hour, not synchronised",
+    UPTIME: "since power-on",
+    WRONG_YEAR: "a wrong date",
+    UNKNOWN: "unknown",
+}
 
+# -- leap seconds ---------------------------------------------------------------------------------
 
-def timescale(stamp_ns: int, host_ns: int) -> str:
-    """`utc`, `tai`, `uptime` or `unknown`, for a stamp and the arrival of its packet (UTC)."""
-    if stamp_ns < EPOCH_NS:
-        return "uptime"
-    for name, offset_ns in (("utc", 0), ("tai", tai_utc_s(host_ns) * NS_PER_S)):
-        if abs(stamp_ns - host_ns - offset_ns) < NEAR_NS:
-            return name
-    return "unknown"
-
-
-def common_timescale(names: list[str]) -> str:
-    """The timescale of a scan made of several sensors: theirs if they agree, else unknown."""
-    return names[0] if len(set(names)) == 1 else "unknown"
-
-
-# Leap seconds: how far TAI and GPS time are ahead of UTC.
-#
 # Source: leap-seconds.list of the IERS (hpiers.obspm.fr/iers/bul/bulc/ntp/leap-seconds.list, in
-# the form of RFC 8633 section 3.7), updated 2026-07-06; Bulletin C says every half year whether
-# a leap second follows. GPS time: IS-GPS-200, section 3.3.4: equal to UTC on 1980-01-06, no leap
-# seconds.
+# the form of RFC 8633 section 3.7), updated 2026-07-06; Bulletin C announces every half year
+# whether a leap second follows. GPS time: IS-GPS-200, section 3.3.4: equal to UTC on 1980-01-06,
+# no leap seconds.
 
-# Until then no leap second can have been added that the table lacks.
+# The table is complete until this day.
 VALID_UNTIL = "2027-06-28"
 TAI_GPS_S = 19
 # 1980-01-06 in seconds since 1970.
 GPS_EPOCH_S = 315_964_800
-# From this day (UTC) on, TAI - UTC is so many seconds.
+# TAI - UTC in seconds from this day (UTC) on.
 LEAPS: tuple[tuple[str, int], ...] = (
     ("1972-01-01", 10),
     ("1972-07-01", 11),
@@ -89,57 +89,47 @@ def gps_utc_s(utc_ns: int) -> int:
     return tai_utc_s(utc_ns) - TAI_GPS_S
 
 
-# Names for what clocks count and for the differences between them.
-#
-# facts/ouster.md section 7, facts/velodyne.md section 7, facts/hesai.md section 4: the mode a
-# sensor was set to does not prove what its clock does; the values do.
+# -- timescale of a stamp -------------------------------------------------------------------------
 
-UTC, TAI, GPS = "utc", "tai", "gps"
-TOP_OF_HOUR, UPTIME, WRONG_YEAR, UNKNOWN = "top_of_hour", "uptime", "wrong_year", "unknown"
-# Kinds of jumps that the sensor's clock has no part in; what stepped between two packets.
-HOST, DELAY, SENSOR = "host", "delay", "sensor"
-# Domains whose clocks follow the world's time.
-EPOCHS = (UTC, TAI, GPS)
-IN_WORDS = {
-    UTC: "UTC",
-    TAI: "TAI",
-    GPS: "GPS time",
-    TOP_OF_HOUR: "past an hour, not synchronised",
-    UPTIME: "since power-on",
-    WRONG_YEAR: "a wrong date",
-    UNKNOWN: "unknown",
-}
+# Stamps below 1e9 s (2001) are no current date: the sensor counts from power-on.
+EPOCH_NS = 10**9 * NS_PER_S
+# Tolerance for the clock of the capture host.
+NEAR_NS = 2 * NS_PER_S
 HOUR_NS = 3600 * NS_PER_S
 DAY_NS = 24 * HOUR_NS
-# No sensor runs for three years on end; 1973 to 2001 is a calendar that was never set.
+# No sensor runs for three years without a break; dates from 1973 to 2001 are a calendar that was
+# never set.
 LONGEST_UPTIME_NS = 10**8 * NS_PER_S
 _HALF_A_YEAR_NS = 182 * DAY_NS
-# Sensors send within seconds of power-on, their clocks begin there.
-_STARTED_NS = 600 * NS_PER_S
-_LARGEST_ZONE_H = 14
-# Counters that wrap: of 32 bits in us and ns, and past the hour.
-_WRAPS_NS = (2**32 * 1000, 2**32, HOUR_NS, DAY_NS)
-_WRAP_ERROR_NS = 20 * NS_PER_MS
 
 
-def shifts_ns(utc_ns: int) -> tuple[tuple[str, int], ...]:
-    """How far clocks of each epoch domain are ahead of UTC; GPS also as counted from 1980."""
-    tai_s, gps_s = tai_utc_s(utc_ns), gps_utc_s(utc_ns)
-    shifts = ((UTC, 0), (TAI, tai_s), (GPS, gps_s), (GPS, gps_s - GPS_EPOCH_S))
-    return tuple((name, seconds * NS_PER_S) for name, seconds in shifts)
+def timescale(stamp_ns: int, host_ns: int) -> str:
+    """`utc`, `tai`, `uptime` or `unknown`, for a stamp and the receive time of its packet (UTC)."""
+    if stamp_ns < EPOCH_NS:
+        return UPTIME
+    for name, offset_ns in ((UTC, 0), (TAI, tai_utc_s(host_ns) * NS_PER_S)):
+        if abs(stamp_ns - host_ns - offset_ns) < NEAR_NS:
+            return name
+    return UNKNOWN
+
+
+def common_timescale(names: list[str]) -> str:
+    """Timescale of scans of several sensors: theirs if they agree, else unknown."""
+    return names[0] if len(set(names)) == 1 else UNKNOWN
 
 
 def domain_of(stamp_ns: int, offset_ns: int, period_ns: int) -> str:
-    """What a stamp counts that is `offset_ns` ahead of the recorder's clock (UTC).
+    """Domain of a clock that shows `stamp_ns` and is `offset_ns` ahead of the capture host (UTC).
 
-    period_ns: what the sensor leaves out and the recorder's clock gave (the hour), 0: nothing.
+    Finer than `timescale`. period_ns: range of the sensor's counter if the decoder completes it
+    from receive times (an hour), else 0.
     """
     if period_ns:
         return UTC if abs(offset_ns) < NEAR_NS else TOP_OF_HOUR
     host_ns = stamp_ns - offset_ns
     if host_ns >= EPOCH_NS:
-        for name, shift_ns in shifts_ns(host_ns):
-            if abs(offset_ns - shift_ns) < NEAR_NS:
+        for name, ahead_ns in _ahead_of_utc(host_ns):
+            if abs(offset_ns - ahead_ns) < NEAR_NS:
                 return name
     if stamp_ns < LONGEST_UPTIME_NS:
         return UPTIME
@@ -148,12 +138,29 @@ def domain_of(stamp_ns: int, offset_ns: int, period_ns: int) -> str:
     return UNKNOWN
 
 
-def whole_ns(difference_ns: int, utc_ns: int, error_ns: int) -> tuple[int, str] | None:
-    """The known difference that is met within `error_ns`, and its name; None if there is none."""
+def _ahead_of_utc(utc_ns: int) -> tuple[tuple[str, int], ...]:
+    """Difference to UTC of each epoch domain, ns; GPS time also as counted from 1980."""
+    tai_s = tai_utc_s(utc_ns)
+    gps_s = gps_utc_s(utc_ns)
+    ahead = ((UTC, 0), (TAI, tai_s), (GPS, gps_s), (GPS, gps_s - GPS_EPOCH_S))
+    return tuple((name, seconds * NS_PER_S) for name, seconds in ahead)
+
+
+# -- differences of clocks ------------------------------------------------------------------------
+
+_LARGEST_ZONE_H = 14
+
+
+def known_difference(difference_ns: int, utc_ns: int, error_ns: int) -> tuple[int, str] | None:
+    """The known difference of two timescales within `error_ns` of a value, and its name; or None.
+
+    Known are differences of UTC, TAI and GPS time at `utc_ns`, and whole days, hours and seconds.
+    """
     if abs(difference_ns) <= error_ns:
         return None
     sign = 1 if difference_ns > 0 else -1
-    tai_s, gps_s = tai_utc_s(utc_ns), gps_utc_s(utc_ns)
+    tai_s = tai_utc_s(utc_ns)
+    gps_s = gps_utc_s(utc_ns)
     known = (
         (tai_s, f"{tai_s} s: TAI - UTC"),
         (gps_s, f"{gps_s} s: GPS - UTC"),
@@ -171,25 +178,40 @@ def whole_ns(difference_ns: int, utc_ns: int, error_ns: int) -> tuple[int, str] 
     ):
         count = round(abs(difference_ns) / unit_ns)
         if count and (most is None or count <= most):
-            whole = sign * count * unit_ns
-            if abs(difference_ns - whole) <= error_ns:
-                return whole, f"{count} whole {unit}"
+            whole_ns = sign * count * unit_ns
+            if abs(difference_ns - whole_ns) <= error_ns:
+                return whole_ns, f"{count} whole {unit}"
     return None
 
 
+def format_difference(value_ns: int) -> str:
+    """A difference as text: in ms below a second, else in s."""
+    if abs(value_ns) < NS_PER_S:
+        return f"{value_ns / NS_PER_MS:+.3f} ms"
+    return f"{value_ns / NS_PER_S:+.6f} s"
+
+
+# -- kinds of jumps -------------------------------------------------------------------------------
+
+# Jumps that are not of the sensor's clock: the capture host's clock stepped; the transport delay of
+# one sensor changed.
+HOST = "host"
+DELAY = "delay"
+# What stepped between two packets: stamps (`sensor`) or receive times (HOST).
+SENSOR = "sensor"
+# A sensor sends within seconds of power-on, when its clock starts.
+_STARTED_NS = 600 * NS_PER_S
+# Ranges of counters: 32 bits of us and ns, the hour, the day.
+_WRAPS_NS = (2**32 * 1000, 2**32, HOUR_NS, DAY_NS)
+_WRAP_ERROR_NS = 20 * NS_PER_MS
+
+
 def kind_of_jump(before_ns: int, after_ns: int, size_ns: int, period_ns: int) -> str:
-    """`forward`, `backward`, `restart` or `wrap`: what a sensor's clock did between two stamps."""
-    # An hour that was found anew may also go up; counters only fall back.
+    """`forward`, `backward`, `restart` or `wrap`: how a sensor's clock moved between two stamps."""
+    # Counters wrap backward only; an hour that the decoder corrects may also move forward.
     wraps_ns = {period_ns} if size_ns > 0 else {period_ns, *_WRAPS_NS}
     if any(abs(abs(size_ns) - wrap_ns) < _WRAP_ERROR_NS for wrap_ns in wraps_ns - {0}):
         return "wrap"
     if after_ns < before_ns and after_ns < _STARTED_NS:
         return "restart"
     return "forward" if size_ns > 0 else "backward"
-
-
-def in_seconds(value_ns: int) -> str:
-    """A difference for people: ms below a second, else s."""
-    if abs(value_ns) < NS_PER_S:
-        return f"{value_ns / NS_PER_MS:+.3f} ms"
-    return f"{value_ns / NS_PER_S:+.6f} s"

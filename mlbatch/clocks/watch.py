@@ -1,8 +1,7 @@
-"""The clock doctor: what a sensor's clock counts, how far it is off, how fast it drifts, its jumps.
+"""Estimator of one sensor's clock: domain, offset, drift and jumps (docs/clocks.md).
 
-A `ClockWatch` is fed with the stamps of one sensor's packets and their arrivals, and tells a
-`ClockFinding`; `clock_compare.compare` holds those of several sensors against each other (the page
-docs/clocks.md says how it decides, and what it cannot know).
+`ClockWatch` takes the stamps and receive times of the packets of a sensor and gives a
+`ClockEstimate`. The capture host's clock is the reference, and is taken for UTC.
 """
 
 from __future__ import annotations
@@ -10,60 +9,48 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.clocks.envelope import Bins, Line
-from mlbatch.clocks.steps import Course, Step, course_of
+from mlbatch.clocks.envelope import Envelope, PacketBins
+from mlbatch.clocks.steps import ClockTrack, Step, track_of
 from mlbatch.clocks.timescale import (
     DELAY,
+    DESCRIPTION,
     EPOCHS,
     HOST,
-    IN_WORDS,
     UNKNOWN,
     domain_of,
-    in_seconds,
+    format_difference,
     kind_of_jump,
-    whole_ns,
+    known_difference,
 )
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
-__all__ = [
-    "ClockFinding",
-    "ClockWatch",
-    "Jump",
-    "Stretch",
-    "steady",
-    "stretch_of",
-    "whole_ns",
-]
-
-# A step between packets that is looked at at once; the same as batching/intake.py.
+# A step between two packets that ends a segment at once; the same as in `batching.intake`.
 HARD_NS = NS_PER_S
 LIMIT_NS = 2**31 * NS_PER_S
-# A clock that steps more often tells no time.
-MOST_STRETCHES = 64
-# Packets are looked at so many at a time: one by one they would cost a hundred times as much.
-_AT_ONCE = 4096
-# What also the fastest packet may have taken from its stamp to the recorder.
-SHORTEST_WAY_NS = NS_PER_MS
-# What a queue may hold packets back for; recordings as short as that show no fast packet.
+# With more segments the clock is unsteady, and later packets are not used.
+MAX_SEGMENTS = 64
+# Packets that are evaluated together; one by one would take a hundred times as long.
+_BATCH = 4096
+# Upper limit of the shortest transport delay.
+SHORTEST_DELAY_NS = NS_PER_MS
+# Longest delay by a queue; in a recording this short, all packets may be delayed.
 BURST_NS = 20 * NS_PER_MS
 _PPM = 1e6
-Pending: TypeAlias = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """A clock that does not go on as it did.
+    """A step of a clock.
 
-    host_ns: arrival of the first packet after it; stamp_before_ns, stamp_after_ns: of the packets
-    around it; size_ns: how far the sensor's clock moved against the recorder's; kind: forward,
-    backward, restart or wrap of the sensor's clock; host: the recorder's clock stepped, the stamps
-    went on; delay: so did they, but packets of this sensor alone took longer (less: positive) from
-    then on. side: `sensor` or `host` by what stepped between the two packets, "" after a pause.
+    host_ns: receive time of the first packet after it; stamp_before_ns, stamp_after_ns: stamps of
+    the packets before and after it; size_ns: change of stamp minus receive time. kind: `forward`,
+    `backward`, `restart` or `wrap` of the sensor's clock; `host`: the capture host's clock stepped;
+    `delay`: the transport delay of this sensor alone changed (longer: negative). side: `sensor` or
+    `host`, what stepped between the two packets, "" after a pause.
     """
 
     host_ns: int
@@ -73,24 +60,25 @@ class Jump:
     kind: str
     side: str
 
-    def in_words(self) -> str:
-        """For people."""
-        before_s, after_s = self.stamp_before_ns / NS_PER_S, self.stamp_after_ns / NS_PER_S
+    def describe(self) -> str:
+        """The jump as text."""
+        at_s = self.host_ns / NS_PER_S
         if self.kind == HOST:
-            size = in_seconds(-self.size_ns)
-            return f"the recorder's clock stepped by {size} at {self.host_ns / NS_PER_S:.3f} s"
+            size = format_difference(-self.size_ns)
+            return f"the capture host's clock stepped by {size} at {at_s:.3f} s"
         if self.kind == DELAY:
-            way = "longer" if self.size_ns < 0 else "less long"
-            size = in_seconds(abs(self.size_ns)).lstrip("+")
-            return f"packets took {size} {way} from {self.host_ns / NS_PER_S:.3f} s on"
-        return (
-            f"{self.kind} by {in_seconds(self.size_ns)}: from {before_s:.6f} s to {after_s:.6f} s"
-        )
+            change = "longer" if self.size_ns < 0 else "shorter"
+            size = format_difference(abs(self.size_ns)).lstrip("+")
+            return f"the transport delay became {size} {change} at {at_s:.3f} s"
+        before_s = self.stamp_before_ns / NS_PER_S
+        after_s = self.stamp_after_ns / NS_PER_S
+        size = format_difference(self.size_ns)
+        return f"{self.kind} by {size}: from {before_s:.6f} s to {after_s:.6f} s"
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """A clock between two jumps: first and last stamp and arrival, ns; domain; its envelope."""
+class Segment:
+    """A clock between two jumps: first and last stamp and receive time (ns), domain, envelope."""
 
     first_stamp_ns: int
     last_stamp_ns: int
@@ -98,19 +86,20 @@ class Stretch:
     last_host_ns: int
     packets: int
     domain: str
-    line: Line
+    envelope: Envelope
 
 
 @dataclass(frozen=True, slots=True)
-class ClockFinding:
-    """What is known of a sensor's clock; see docs/clocks.md.
+class ClockEstimate:
+    """Estimate of a sensor's clock.
 
-    domain: utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest stretch;
-    offset_ns: stamp minus arrival of the fastest packets, in the middle of it (`at_host_ns`), and
-    its uncertainty; drift_ppm: rate of the sensor's clock against the recorder's, None if too
-    short to tell; resolution_ns: what all steps of stamps are multiples of (0: no step);
-    jitter_p50_ns, jitter_p99_ns: how much later packets arrive than the fastest; damaged: packets
-    whose stamp fits neither the one before nor the one after; unsteady: more jumps than are kept.
+    domain: utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest segment;
+    offset_ns: stamp minus receive time of the fastest packets in the middle of it (`at_host_ns`),
+    and its uncertainty; drift_ppm: rate of the sensor's clock relative to the capture host's, None
+    if the recording is too short; resolution_ns: greatest common divisor of all steps of stamps (0:
+    no step); jitter_p50_ns, jitter_p99_ns: delay of packets relative to the fastest; damaged:
+    packets whose stamp fits neither the one before nor the one after; unsteady: more than
+    MAX_SEGMENTS segments; mode: time source that the sensor reports.
     """
 
     packets: int
@@ -125,7 +114,7 @@ class ClockFinding:
     resolution_ns: int
     jitter_p50_ns: int
     jitter_p99_ns: int
-    stretches: tuple[Stretch, ...]
+    segments: tuple[Segment, ...]
     unsteady: bool
     mode: str = ""
 
@@ -134,61 +123,87 @@ class ClockFinding:
         """Jumps of the sensor's own clock."""
         return tuple(jump for jump in self.jumps if jump.kind not in (HOST, DELAY))
 
-    def in_words(self) -> str:
-        """One line for people."""
-        text = f"clock: {IN_WORDS[self.domain]}, {in_seconds(self.offset_ns)} to the recorder"
+    def describe(self) -> str:
+        """The estimate as one line."""
+        offset = format_difference(self.offset_ns)
+        text = f"clock: {DESCRIPTION[self.domain]}, {offset} to the capture host"
         text += f" (+-{self.uncertainty_ns / NS_PER_MS:.3f} ms)"
-        whole = whole_ns(self.offset_ns, self.at_host_ns, HARD_NS // 2)
-        if self.domain not in ("uptime", "utc") and whole is not None:
-            name = whole[1]
+        known = known_difference(self.offset_ns, self.at_host_ns, HARD_NS // 2)
+        if self.domain not in ("uptime", "utc") and known is not None:
+            name = known[1]
             text += f", about {name}" if "second" not in name else ""
         if self.drift_ppm is not None:
             text += f", drift {self.drift_ppm:+.2f} +-{self.drift_uncertainty_ppm:.2f} ppm"
         for jump in self.jumps:
-            text += f"; {jump.in_words()}"
-        return text + ("; it jumps again and again" if self.unsteady else "")
+            text += f"; {jump.describe()}"
+        return text + (f"; more than {MAX_SEGMENTS - 1} jumps" if self.unsteady else "")
 
 
 class ClockWatch:
-    """Watches the clock of one sensor; memory does not grow with the recording.
+    """Estimates the clock of one sensor from its packets, in bounded memory.
 
-    period_ns: what the sensor's stamps leave out and the recorder's clock gave (an hour for
-    Velodyne), 0: nothing; mode: the maker's word for the source of its time, passed on.
+    The estimate does not depend on how packets are grouped into batches.
     """
 
     def __init__(self, *, period_ns: int = 0, mode: str = "") -> None:
+        """Properties of the sensor.
+
+        period_ns: range of the counter if the decoder completes stamps from receive times (an hour
+        for Velodyne), else 0; mode: time source that the sensor reports.
+        """
         self.damaged = 0
         self._period_ns = period_ns
         self._mode = mode
-        self._bins: list[Bins] = []
-        self._last: int | None = None
-        self._pending: Pending | None = None
+        # One for each segment between steps above HARD_NS.
+        self._bins: list[PacketBins] = []
+        self._last_offset_ns: int | None = None
+        # Stamp and receive time of a packet after a step, until the next one confirms it.
+        self._pending: tuple[int, int] | None = None
         self._unsteady = False
-        self._told: ClockFinding | None = None
+        self._estimate: ClockEstimate | None = None
         self._queue: list[tuple[I64Array, I64Array]] = []
         self._queued = 0
 
     def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
-        """Add packets (P,) in order of arrival: newest stamp of each, and its arrival.
+        """Add packets (P,) in order of receive time: newest stamp and receive time of each.
 
-        The arrays are kept for a while: they must not be changed.
+        The arrays are kept until enough packets are collected: do not change them.
         """
-        self._told = None
+        self._estimate = None
         self._queue.append((stamp_ns, host_ns))
         self._queued += len(stamp_ns)
-        if self._queued >= _AT_ONCE:
-            self._look()
+        if self._queued >= _BATCH:
+            self._evaluate()
 
-    def _look(self) -> None:
-        """Take in what was added; what is known does not depend on how it was grouped."""
+    def estimate(self) -> ClockEstimate | None:
+        """The estimate so far; None before the first packet."""
+        if self._estimate is None:
+            self._estimate = self._make_estimate()
+        return self._estimate
+
+    def track(self) -> ClockTrack | None:
+        """Ranges, envelopes and steps so far; None before the first packet."""
+        self._evaluate()
+        tables = [table for table in (one.table() for one in self._bins) if table is not None]
+        if not tables and self._pending is not None:
+            alone = PacketBins()
+            alone.add(*(np.array([value], np.int64) for value in self._pending))
+            tables = [table for table in (alone.table(),) if table is not None]
+        return track_of(tables) if tables else None
+
+    def _evaluate(self) -> None:
+        """Put the queued packets into bins, cut at steps above HARD_NS."""
         if not self._queue:
             return
-        stamp_ns, host_ns = (np.concatenate(parts) for parts in zip(*self._queue, strict=True))
-        self._queue, self._queued = [], 0
+        stamp_ns = np.concatenate([stamp_ns for stamp_ns, _ in self._queue])
+        host_ns = np.concatenate([host_ns for _, host_ns in self._queue])
+        self._queue = []
+        self._queued = 0
         sane = (stamp_ns >= 0) & (stamp_ns < LIMIT_NS) & (host_ns >= 0) & (host_ns < LIMIT_NS)
         if not sane.all():
             self.damaged += int(np.count_nonzero(~sane))
-            stamp_ns, host_ns = stamp_ns[sane], host_ns[sane]
+            stamp_ns = stamp_ns[sane]
+            host_ns = host_ns[sane]
         if self._pending is not None:
             stamp_ns = np.concatenate([[self._pending[0]], stamp_ns])
             host_ns = np.concatenate([[self._pending[1]], host_ns])
@@ -199,107 +214,106 @@ class ClockWatch:
         breaks = np.flatnonzero(np.abs(np.diff(offset_ns)) > HARD_NS) + 1
         edges = [0, *breaks.tolist(), len(stamp_ns)]
         for begin, end in pairwise(edges):
-            self._run(stamp_ns[begin:end], host_ns[begin:end], is_last=end == len(stamp_ns))
+            self._add_run(stamp_ns[begin:end], host_ns[begin:end], is_last=end == len(stamp_ns))
 
-    def _run(self, stamp_ns: I64Array, host_ns: I64Array, *, is_last: bool) -> None:
-        """Packets that follow each other without a hard step."""
-        first, last = int(stamp_ns[0] - host_ns[0]), int(stamp_ns[-1] - host_ns[-1])
-        goes_on = self._last is not None and abs(first - self._last) <= HARD_NS
-        if len(stamp_ns) == 1 and not goes_on:
-            # One packet proves no step: the next one tells.
+    def _add_run(self, stamp_ns: I64Array, host_ns: I64Array, *, is_last: bool) -> None:
+        """Add packets without a step above HARD_NS between them."""
+        first_ns = int(stamp_ns[0] - host_ns[0])
+        continues = (
+            self._last_offset_ns is not None and abs(first_ns - self._last_offset_ns) <= HARD_NS
+        )
+        if len(stamp_ns) == 1 and not continues:
+            # One packet alone is no step, unless the next one confirms it.
             if is_last:
                 self._pending = int(stamp_ns[0]), int(host_ns[0])
             else:
                 self.damaged += 1
             return
-        if not goes_on:
-            if len(self._bins) == MOST_STRETCHES:
+        if not continues:
+            if len(self._bins) == MAX_SEGMENTS:
                 self._unsteady = True
                 return
-            self._bins.append(Bins())
+            self._bins.append(PacketBins())
         self._bins[-1].add(stamp_ns, host_ns)
-        self._last = last
+        self._last_offset_ns = int(stamp_ns[-1] - host_ns[-1])
 
-    def finding(self) -> ClockFinding | None:
-        """What is known so far; None before the first packet."""
-        if self._told is None:
-            self._told = self._found()
-        return self._told
-
-    def _found(self) -> ClockFinding | None:
-        course = self.course()
-        if course is None:
+    def _make_estimate(self) -> ClockEstimate | None:
+        track = self.track()
+        if track is None:
             return None
-        longest = max(range(len(course.parts)), key=lambda at: course.parts[at].packets)
-        part, line = course.parts[longest], course.lines[longest]
+        longest = max(range(len(track.parts)), key=lambda at: track.parts[at].packets)
+        part = track.parts[longest]
+        envelope = track.envelopes[longest]
         at_ns = part.first[1] + part.span_ns // 2
-        stretches = tuple(
-            _stretch(course, number, self._period_ns) for number in range(len(course.parts))
+        segments = tuple(
+            _segment(track, number, self._period_ns) for number in range(len(track.parts))
         )
-        jumps = tuple(_jump(step, self._period_ns) for step in course.steps)
-        quantum = 0
+        jumps = tuple(_jump(step, self._period_ns) for step in track.steps)
+        quantum_ns = 0
         for one in self._bins:
-            quantum = int(np.gcd(quantum, one.quantum_ns))
-        p50, p99 = _jitter(course)
-        drift = _drift(course)
-        scatter_ns = round(3 * line.scatter_ns) + quantum * (quantum <= NS_PER_MS)
+            quantum_ns = int(np.gcd(quantum_ns, one.quantum_ns))
+        p50_ns, p99_ns = _jitter(track)
+        drift = _drift(track)
+        scatter_ns = round(3 * envelope.scatter_ns) + quantum_ns * (quantum_ns <= NS_PER_MS)
         burst_ns = BURST_NS * BURST_NS // max(part.span_ns, BURST_NS)
-        return ClockFinding(
+        return ClockEstimate(
             packets=sum(one.packets for one in self._bins) + (not self._bins),
             damaged=self.damaged + (self._pending is not None and bool(self._bins)),
-            domain=_domain(stretches, jumps, longest),
-            offset_ns=int(line.at(np.array([at_ns], np.int64))[0]),
-            uncertainty_ns=SHORTEST_WAY_NS + scatter_ns + burst_ns,
+            domain=_domain(segments, jumps, longest),
+            offset_ns=int(envelope.at(np.array([at_ns], np.int64))[0]),
+            uncertainty_ns=SHORTEST_DELAY_NS + scatter_ns + burst_ns,
             at_host_ns=at_ns,
             drift_ppm=None if drift is None else drift[0] * _PPM,
             drift_uncertainty_ppm=None if drift is None else drift[1] * _PPM,
             jumps=jumps,
-            resolution_ns=quantum,
-            jitter_p50_ns=p50,
-            jitter_p99_ns=p99,
-            stretches=stretches,
+            resolution_ns=quantum_ns,
+            jitter_p50_ns=p50_ns,
+            jitter_p99_ns=p99_ns,
+            segments=segments,
             unsteady=self._unsteady,
             mode=self._mode,
         )
 
-    def course(self) -> Course | None:
-        """Parts, envelopes and steps; None before the first packet."""
-        self._look()
-        tracks = [track for track in (one.track() for one in self._bins) if track is not None]
-        if not tracks and self._pending is not None:
-            alone = Bins()
-            alone.add(*(np.array([value], np.int64) for value in self._pending))
-            tracks = [track for track in (alone.track(),) if track is not None]
-        return course_of(tracks) if tracks else None
 
-
-def steady(finding: ClockFinding, kinds: Collection[str] = (HOST,)) -> tuple[Stretch, ...]:
-    """The stretches by a recorder's clock that never stepped; kinds: jumps taken for its steps."""
-    moved_ns, stretches = 0, [finding.stretches[0]]
-    for jump, one in zip(finding.jumps, finding.stretches[1:], strict=True):
+def without_host_steps(
+    estimate: ClockEstimate, kinds: Collection[str] = (HOST,)
+) -> tuple[Segment, ...]:
+    """Segments by a capture host's clock that never stepped; kinds: jumps counted as its steps."""
+    moved_ns = 0
+    segments = [estimate.segments[0]]
+    for jump, one in zip(estimate.jumps, estimate.segments[1:], strict=True):
         if jump.kind in kinds:
             moved_ns -= jump.size_ns
-        line = replace(
-            one.line,
-            host_ns=one.line.host_ns - moved_ns,
-            offset_ns=one.line.offset_ns + moved_ns,
+        envelope = replace(
+            one.envelope,
+            host_ns=one.envelope.host_ns - moved_ns,
+            offset_ns=one.envelope.offset_ns + moved_ns,
         )
-        first_ns, last_ns = one.first_host_ns - moved_ns, one.last_host_ns - moved_ns
-        stretches.append(replace(one, first_host_ns=first_ns, last_host_ns=last_ns, line=line))
-    return tuple(stretches)
+        segments.append(
+            replace(
+                one,
+                first_host_ns=one.first_host_ns - moved_ns,
+                last_host_ns=one.last_host_ns - moved_ns,
+                envelope=envelope,
+            )
+        )
+    return tuple(segments)
 
 
-def stretch_of(
-    stretches: Sequence[Stretch], stamp_ns: I64Array, host_ns: I64Array | None = None
+def segment_of(
+    segments: Sequence[Segment], stamp_ns: I64Array, host_ns: I64Array | None = None
 ) -> I64Array:
-    """Which stretch stamps belong to, from 0; where stretches share stamps, their arrival tells."""
-    if len(stretches) == 1:
+    """Index of the segment that each stamp belongs to.
+
+    host_ns: receive times, to separate segments with the same stamps (a clock that was set back).
+    """
+    if len(segments) == 1:
         return np.zeros(stamp_ns.shape, np.int64)
     away = np.stack(
         [
             _outside(stamp_ns, one.first_stamp_ns, one.last_stamp_ns)
             + (0 if host_ns is None else _outside(host_ns, one.first_host_ns, one.last_host_ns))
-            for one in stretches
+            for one in segments
         ]
     )
     nearest: I64Array = away.argmin(axis=0)
@@ -307,58 +321,62 @@ def stretch_of(
 
 
 def _outside(value: I64Array, low: int, high: int) -> I64Array:
+    """Distance of values from an interval."""
     away: I64Array = np.maximum(low - value, 0) + np.maximum(value - high, 0)
     return away
 
 
-def _stretch(course: Course, number: int, period_ns: int) -> Stretch:
-    part, line = course.parts[number], course.lines[number]
-    offset_ns = int(line.offset_ns[len(line.offset_ns) // 2])
-    return Stretch(
-        part.first[0],
-        part.last[0],
-        part.first[1],
-        part.last[1],
-        part.packets,
-        domain_of(part.first[0], offset_ns, period_ns),
-        line,
+def _segment(track: ClockTrack, number: int, period_ns: int) -> Segment:
+    part = track.parts[number]
+    envelope = track.envelopes[number]
+    offset_ns = int(envelope.offset_ns[len(envelope.offset_ns) // 2])
+    return Segment(
+        first_stamp_ns=part.first[0],
+        last_stamp_ns=part.last[0],
+        first_host_ns=part.first[1],
+        last_host_ns=part.last[1],
+        packets=part.packets,
+        domain=domain_of(part.first[0], offset_ns, period_ns),
+        envelope=envelope,
     )
 
 
-def _domain(stretches: Sequence[Stretch], jumps: Sequence[Jump], longest: int) -> str:
-    """Of the longest stretch; a recorder's clock that was set may tell it before or after only."""
-    named = [one.domain for one in stretches if one.domain in EPOCHS]
-    if stretches[longest].domain == UNKNOWN and named and all(one.kind == HOST for one in jumps):
+def _domain(segments: Sequence[Segment], jumps: Sequence[Jump], longest: int) -> str:
+    """Domain of the longest segment; if unknown, of another one between steps of the host only."""
+    named = [one.domain for one in segments if one.domain in EPOCHS]
+    if segments[longest].domain == UNKNOWN and named and all(one.kind == HOST for one in jumps):
         return named[0]
-    return stretches[longest].domain
+    return segments[longest].domain
 
 
 def _jump(step: Step, period_ns: int) -> Jump:
-    before, after = step.before[0], step.after[0]
-    is_host = step.side == HOST
-    kind = HOST if is_host else kind_of_jump(before, after, step.size_ns, period_ns)
-    return Jump(step.after[1], before, after, step.size_ns, kind, step.side)
+    before_ns = step.before[0]
+    after_ns = step.after[0]
+    kind = HOST
+    if step.side != HOST:
+        kind = kind_of_jump(before_ns, after_ns, step.size_ns, period_ns)
+    return Jump(step.after[1], before_ns, after_ns, step.size_ns, kind, step.side)
 
 
-def _jitter(course: Course) -> tuple[int, int]:
-    """Median and 99th percentile of how far packets lie below the envelope, ns."""
+def _jitter(track: ClockTrack) -> tuple[int, int]:
+    """Median and 99th percentile of the distance of packets from the envelope, ns."""
     late = []
-    for part, line in zip(course.parts, course.lines, strict=True):
+    for part, envelope in zip(track.parts, track.envelopes, strict=True):
         host_ns, offset_ns = part.samples()
-        late.append(np.maximum(line.at(host_ns) - offset_ns, 0))
+        late.append(np.maximum(envelope.at(host_ns) - offset_ns, 0))
     p50, p99 = np.quantile(np.concatenate(late), [0.5, 0.99], method="inverted_cdf").tolist()
     return int(p50), int(p99)
 
 
-def _drift(course: Course) -> tuple[float, float] | None:
-    """Rate over all stretches, longer ones counting more; and its error."""
+def _drift(track: ClockTrack) -> tuple[float, float] | None:
+    """Rate over all ranges, weighted by the cube of their length, and its error; None: no rate."""
     known = [
-        (float(part.span_ns) ** 3, line)
-        for part, line in zip(course.parts, course.lines, strict=True)
-        if np.isfinite(line.rate_error)
+        (float(part.span_ns) ** 3, envelope)
+        for part, envelope in zip(track.parts, track.envelopes, strict=True)
+        if np.isfinite(envelope.rate_error)
     ]
     total = sum(weight for weight, _ in known)
     if not total:
         return None
-    rate = sum(weight * line.rate for weight, line in known) / total
-    return rate, sum(weight * line.rate_error for weight, line in known) / total
+    rate = sum(weight * envelope.rate for weight, envelope in known) / total
+    return rate, sum(weight * envelope.rate_error for weight, envelope in known) / total

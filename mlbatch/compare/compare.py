@@ -1,193 +1,223 @@
-"""What `mlbatch compare` tells: sets of joined turns against windows, on the same columns.
+"""`mlbatch compare`: sets of joined sweeps against windows, from the same columns.
 
-Only stamps and rotor positions are read. The columns are those of the batching, from the window
-before its start (eq. 1) to the end, so that all ways are given the same.
+Only timestamps and rotor positions are read. The columns are those of the batching, from the window
+before its start (eq. 1) to the end, for all join policies.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from mlbatch.batching.windows import Window
-from mlbatch.compare.statistics import HEAD, Figures, Tally, WayReport
+from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
 from mlbatch.compare.sweeps import (
-    Collected,
-    Nearest,
-    Newest,
-    Turn,
-    TurnCutter,
-    TurnSet,
-    Way,
-    in_order,
+    CollectedSweeps,
+    JoinPolicy,
+    NearestSweeps,
+    NewestSweeps,
+    Sweep,
+    SweepCutter,
+    SweepSet,
+    publication_order,
 )
-from mlbatch.discovery.discover import Note
-from mlbatch.discovery.extrinsics import Mounted
+from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
-from mlbatch.pipeline import accounts
+from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 SCHEMA = "mlbatch.compare/1"
 WINDOWS = "windows (mlbatch)"
-# Half a turn at the usual 10 Hz, and a whole one.
+# Half a revolution at 10 Hz.
 DEFAULT_TOLERANCE_NS = 50 * NS_PER_MS
+# One revolution at 10 Hz.
 DEFAULT_TIMEOUT_NS = 100 * NS_PER_MS
 Value: TypeAlias = str | int | float | Sequence["Value"] | Mapping[str, "Value"] | None
 
 
 @dataclass(frozen=True, slots=True)
-class SensorTurns:
-    """The whole turns of a sensor; turn_ms: their usual length, None where none was seen."""
+class SensorSweeps:
+    """The whole sweeps of a sensor; sweep_ms: median length, None without a whole sweep."""
 
     name: str
     model: str
-    turns: int
-    turn_ms: float | None
+    sweeps: int
+    sweep_ms: float | None
+
+    def as_json(self) -> dict[str, Value]:
+        """The sensor in the JSON document."""
+        return {
+            "name": self.name,
+            "model": self.model,
+            "turns": self.sweeps,
+            "turn_ms": self.sweep_ms,
+        }
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How far apart the nearest turns may begin, and how long turns are collected; ns."""
+    """Parameters of the join policies."""
 
+    # Approximate time: largest difference between the begins of sweeps.
     tolerance_ns: int = DEFAULT_TOLERANCE_NS
+    # Timeout collate: longest time that a set is open.
     timeout_ns: int = DEFAULT_TIMEOUT_NS
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """All ways on one recording; the last one is ours."""
+    """Sets of all join policies on one recording, and, last, the windows."""
 
     rate_hz: str
     period_ms: float
     tolerance_ms: float
     timeout_ms: float
     compared_s: float
-    sensors: tuple[SensorTurns, ...]
-    ways: tuple[WayReport, ...]
+    sensors: tuple[SensorSweeps, ...]
+    reports: tuple[SetReport, ...]
     notes: tuple[Note, ...] = ()
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
-        return [list(HEAD), *(way.row() for way in self.ways)]
+        return [list(HEAD), *(report.row() for report in self.reports)]
 
     def title(self) -> str:
-        """What was compared, in a line."""
+        """One line on what was compared."""
         sensors = ", ".join(
-            f"{one.name} ({one.turns} turns"
-            + (")" if one.turn_ms is None else f" of {one.turn_ms:.1f} ms)")
+            f"{one.name} ({one.sweeps} sweeps"
+            + (")" if one.sweep_ms is None else f" of {one.sweep_ms:.1f} ms)")
             for one in self.sensors
         )
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
 
     def as_json(self) -> dict[str, Value]:
-        """For programs."""
-        told: dict[str, Value] = asdict(replace(self, notes=()))
-        del told["notes"]
-        return {"schema": SCHEMA, **told}
+        """The JSON document."""
+        return {
+            "schema": SCHEMA,
+            "rate_hz": self.rate_hz,
+            "period_ms": self.period_ms,
+            "tolerance_ms": self.tolerance_ms,
+            "timeout_ms": self.timeout_ms,
+            "compared_s": self.compared_s,
+            "sensors": [sensor.as_json() for sensor in self.sensors],
+            "ways": [report.as_json() for report in self.reports],
+        }
 
 
 class Joiner:
-    """Gives the turns of all sensors to each of the ways, and counts what they make of them."""
+    """Cuts windows into sweeps, joins them by each policy, and measures the sets."""
 
-    def __init__(self, cutters: Sequence[TurnCutter], ways: Sequence[Way], period_ns: int) -> None:
+    def __init__(
+        self, cutters: Sequence[SweepCutter], policies: Sequence[JoinPolicy], period_ns: int
+    ) -> None:
         self._cutters = list(cutters)
-        self._ways = [(way, Tally(way.name, len(cutters), period_ns)) for way in ways]
+        self._policies = [
+            (policy, SetStatistics(policy.name, len(cutters), period_ns)) for policy in policies
+        ]
+        # Columns of all whole sweeps.
         self._columns = 0
+        # Lengths of the whole sweeps of each sensor.
         self.lengths_ns = [array("q") for _ in cutters]
 
     def add(self, window: Window) -> None:
-        """Take the columns of the next window."""
+        """Add the columns of the next window."""
         ended = []
-        for number, cutter in enumerate(self._cutters):
-            own = window.sensor == number
-            ended += cutter.take(window.stamp_ns[own], window.encoder[own])
-        for turn in in_order(ended):
-            self._columns += turn.columns
-            self.lengths_ns[turn.sensor].append(turn.ready_ns - turn.first_ns)
-            for way, tally in self._ways:
-                for joined in way.publish(turn):
-                    tally.add(joined)
+        for index, cutter in enumerate(self._cutters):
+            own = window.sensor == index
+            ended += cutter.push(window.stamp_ns[own], window.encoder[own])
+        for sweep in publication_order(ended):
+            self._columns += sweep.columns
+            self.lengths_ns[sweep.sensor].append(sweep.ready_ns - sweep.first_ns)
+            for policy, statistics in self._policies:
+                for joined in policy.publish(sweep):
+                    statistics.add(joined)
 
-    def reports(self) -> list[WayReport]:
-        """The figures of all ways."""
-        return [tally.report(self._columns, way.waiting) for way, tally in self._ways]
+    def reports(self) -> list[SetReport]:
+        """Figures of each policy."""
+        return [
+            statistics.report(self._columns, policy.waiting)
+            for policy, statistics in self._policies
+        ]
 
 
 def compare(job: Job, settings: Settings | None = None) -> Comparison:
-    """Join turns in several ways, and batch the same columns by windows."""
+    """Join the sweeps of a recording by each policy, and batch the same columns by windows."""
     settings = settings or Settings()
-    # Where the sensors sit plays no part; whole turns may reach into the partial windows.
-    wishes = replace(job.wishes, identity_extrinsics=True)
-    run = Conversion(replace(job, wishes=wishes, keep_partial=True))
-    sensors, period_ns = [sensor.detected for sensor in run.sensors], int(NS_PER_S / run.grid.rate)
-    if len(sensors) < 2:
+    # Extrinsics are not used. Partial windows are read: sweeps may begin or end in them.
+    selection = replace(job.selection, identity_extrinsics=True)
+    run = Conversion(replace(job, selection=selection, keep_partial=True))
+    count = len(run.sensors)
+    if count < 2:
         raise RecordingError(
-            f"{job.recordings[0]}: compare: wanted two or more lidars, whose turns can be joined, "
-            f"got {sensors[0].name} alone; give all recordings of the session"
+            f"{job.recordings[0]}: compare: expected two or more lidars, found "
+            f"{run.sensors[0].name} only; give all recordings of the session"
         )
-    count = len(sensors)
-    ways = (
-        Newest(count),
-        Nearest(count, settings.tolerance_ns),
-        Collected(count, settings.timeout_ns),
+    period_ns = int(NS_PER_S / run.grid.rate)
+    policies = (
+        NewestSweeps(count),
+        NearestSweeps(count, settings.tolerance_ns),
+        CollectedSweeps(count, settings.timeout_ns),
     )
-    joiner = Joiner([_cutter(number, one) for number, one in enumerate(sensors)], ways, period_ns)
-    ours = Tally(WINDOWS, count, period_ns)
-    columns, length_ns = _join(run, joiner, ours)
+    joiner = Joiner([_cutter(sensor) for sensor in run.sensors], policies, period_ns)
+    windows = SetStatistics(WINDOWS, count, period_ns)
+    columns, length_ns = _run(run, joiner, windows)
     return Comparison(
         rate_hz=rate_text(run.grid.rate),
         period_ms=float(NS_PER_S / run.grid.rate / NS_PER_MS),
         tolerance_ms=settings.tolerance_ns / NS_PER_MS,
         timeout_ms=settings.timeout_ns / NS_PER_MS,
         compared_s=length_ns / NS_PER_S,
-        sensors=tuple(map(_sensor_turns, sensors, joiner.lengths_ns)),
-        ways=(*joiner.reports(), ours.report(columns)),
+        sensors=tuple(map(_sensor_sweeps, run.sensors, joiner.lengths_ns)),
+        reports=(*joiner.reports(), windows.report(columns)),
         notes=tuple(run.notes),
     )
 
 
-def _join(run: Conversion, joiner: Joiner, ours: Tally) -> tuple[int, int]:
-    """Run through all windows; gives the columns that were due in ours, and the time of all."""
-    columns, first_ns, end_ns = 0, None, 0
-    held: Window | None = None
+def _run(run: Conversion, joiner: Joiner, statistics: SetStatistics) -> tuple[int, int]:
+    """Read all windows; returns the number of columns due in them, and their length in ns."""
+    columns = 0
+    first_ns: int | None = None
+    end_ns = 0
+    previous: Window | None = None
     for window in run.windows():
         joiner.add(window)
         first_ns = window.start_ns if first_ns is None else first_ns
         end_ns = window.end_ns
-        if held is not None:
-            ours.add(_parts(held, len(run.sensors)))
-            columns += len(held.stamp_ns)
-        # As in a conversion, the head and the window of the very last stamp do not count.
-        held = window if window.index >= 0 else None
+        if previous is not None:
+            statistics.add(_sweeps_of(previous, len(run.sensors)))
+            columns += len(previous.stamp_ns)
+        # As in a conversion, the head and the window of the last timestamp are not counted.
+        previous = window if window.index >= 0 else None
     run.session.refuse_absent()
     if not columns or first_ns is None:
-        raise RecordingError(accounts.why_nothing(run))
+        raise RecordingError(run_report.why_no_scan(run))
     late = sum(dropped.get("late", 0) for dropped in run.batcher.dropped)
     return columns + late, end_ns - first_ns
 
 
-def _parts(window: Window, sensors: int) -> TurnSet:
-    """What a window holds of each sensor."""
-    parts: list[Turn | None] = []
-    for number in range(sensors):
-        stamp_ns = window.stamp_ns[window.sensor == number]
-        parts.append(
-            Turn(number, int(stamp_ns[0]), int(stamp_ns[-1]), window.end_ns, len(stamp_ns))
-            if len(stamp_ns)
-            else None
-        )
+def _sweeps_of(window: Window, sensors: int) -> SweepSet:
+    """The columns of each sensor in a window."""
+    parts: list[Sweep | None] = []
+    for index in range(sensors):
+        stamp_ns = window.stamp_ns[window.sensor == index]
+        part = None
+        if len(stamp_ns):
+            first_ns = int(stamp_ns[0])
+            part = Sweep(index, first_ns, int(stamp_ns[-1]), window.end_ns, len(stamp_ns))
+        parts.append(part)
     return tuple(parts)
 
 
-def _cutter(number: int, sensor: Mounted) -> TurnCutter:
-    angles = sensor.found.lidar.beams.angle_rad
-    return TurnCutter(number, None if angles is None else len(angles))
+def _cutter(sensor: Sensor) -> SweepCutter:
+    angles = sensor.lidar.beams.angle_rad
+    return SweepCutter(sensor.index, None if angles is None else len(angles))
 
 
-def _sensor_turns(sensor: Mounted, lengths_ns: array[int]) -> SensorTurns:
-    usual = Figures.of(lengths_ns).p50
-    return SensorTurns(sensor.name, sensor.found.lidar.model, len(lengths_ns), usual)
+def _sensor_sweeps(sensor: Sensor, lengths_ns: array[int]) -> SensorSweeps:
+    median_ms = Distribution.of(lengths_ns).p50
+    return SensorSweeps(sensor.name, sensor.lidar.model, len(lengths_ns), median_ms)

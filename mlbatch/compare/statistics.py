@@ -1,27 +1,38 @@
-"""Figures of the sets that one way to join columns makes: how long they are, what they use."""
+"""Statistics of sets of sweeps: time spans, and how often columns are used."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from mlbatch.compare.sweeps import Turn, TurnSet
+from mlbatch.compare.sweeps import Sweep, SweepSet
 from mlbatch.units import NS_PER_MS
 
-# A turn is stale in a set whose newest column is more than this many periods newer than its own.
+# A sweep is stale in a set whose newest column is more than this many periods newer than its own.
 STALE_PERIODS = 2
 HEAD = (
-    *("joined by", "sets", "without a sensor", "stale", "span min", "p50", "p99", "max"),
-    *("apart p50", "max", "columns", "used twice", "never used"),
+    "joined by",
+    "sets",
+    "without a sensor",
+    "stale",
+    "span min",
+    "p50",
+    "p99",
+    "max",
+    "apart p50",
+    "max",
+    "columns",
+    "used twice",
+    "never used",
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """Distribution of a time over sets, ms; None where there was nothing to measure."""
+class Distribution:
+    """Distribution of a time over sets, ms; None without values."""
 
     min: float | None = None
     p50: float | None = None
@@ -29,8 +40,8 @@ class Figures:
     max: float | None = None
 
     @classmethod
-    def of(cls, values_ns: array[int]) -> Figures:
-        """By nearest rank: values that occurred."""
+    def of(cls, values_ns: array[int]) -> Distribution:
+        """Quantiles by nearest rank, without interpolation."""
         if not values_ns:
             return cls()
         values_ms = np.frombuffer(values_ns, np.int64) / NS_PER_MS
@@ -39,87 +50,117 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class WayReport:
-    """What came of one way to make sets.
+class SetReport:
+    """Figures of the sets of one join policy, or of windows."""
 
-    span_ms: of all columns of a set; apart_ms: between the middles of its sensors' columns;
-    columns: those that sets could be made of.
-    """
-
-    way: str
+    policy: str
     sets: int
+    # Sets in which a sensor has no sweep.
     without_a_sensor: int
+    # Sets with a stale sweep.
     stale: int
-    span_ms: Figures
-    apart_ms: Figures
+    # From the first column of a set to its last.
+    span_ms: Distribution
+    # Between the midpoints of the sensors' sweeps in a set.
+    apart_ms: Distribution
+    # Columns that the sets could use.
     columns: int
+    # Columns in more than one set.
     used_twice: int
+    # Columns in no set.
     never_used: int
 
     def row(self) -> list[str]:
-        """Cells for people, as HEAD."""
-        span, apart = self.span_ms, self.apart_ms
+        """Cells of the table, as HEAD."""
+        span = self.span_ms
+        apart = self.apart_ms
         return [
-            *(self.way, str(self.sets), str(self.without_a_sensor), str(self.stale)),
-            *map(_ms, (span.min, span.p50, span.p99, span.max, apart.p50, apart.max)),
-            *(str(self.columns), _share(self.used_twice, self.columns)),
-            _share(self.never_used, self.columns),
+            self.policy,
+            str(self.sets),
+            str(self.without_a_sensor),
+            str(self.stale),
+            *map(_ms_text, (span.min, span.p50, span.p99, span.max, apart.p50, apart.max)),
+            str(self.columns),
+            _percentage(self.used_twice, self.columns),
+            _percentage(self.never_used, self.columns),
         ]
 
+    def as_json(self) -> dict[str, str | int | dict[str, float | None]]:
+        """The policy in the JSON document."""
+        return {
+            "way": self.policy,
+            "sets": self.sets,
+            "without_a_sensor": self.without_a_sensor,
+            "stale": self.stale,
+            "span_ms": asdict(self.span_ms),
+            "apart_ms": asdict(self.apart_ms),
+            "columns": self.columns,
+            "used_twice": self.used_twice,
+            "never_used": self.never_used,
+        }
 
-class Tally:
-    """Counts the sets of one way; sets are added in order, and so are the turns of each sensor."""
 
-    def __init__(self, way: str, sensors: int, period_ns: int) -> None:
-        self._way = way
+class SetStatistics:
+    """Measures the sets of one policy, which are added in order, as are the sweeps of a sensor."""
+
+    def __init__(self, policy: str, sensors: int, period_ns: int) -> None:
+        self._policy = policy
         self._stale_ns = STALE_PERIODS * period_ns
-        self._last: list[Turn | None] = [None] * sensors
-        self._repeated = [False] * sensors
-        self._spans_ns, self._aparts_ns = array("q"), array("q")
-        self._sets = self._without = self._stale = self._used = self._twice = 0
+        # Last sweep of each sensor, and whether more than one set uses it.
+        self._last: list[Sweep | None] = [None] * sensors
+        self._is_reused = [False] * sensors
+        self._spans_ns = array("q")
+        self._aparts_ns = array("q")
+        self._sets = 0
+        self._without = 0
+        self._stale = 0
+        # Columns used at least once, and more than once.
+        self._used = 0
+        self._used_twice = 0
 
-    def add(self, joined: TurnSet) -> None:
-        """Count a set, which has at least one turn."""
-        present = [turn for turn in joined if turn is not None]
-        newest_ns = max(turn.last_ns for turn in present)
-        middles = [turn.middle_ns for turn in present]
+    def add(self, joined: SweepSet) -> None:
+        """Measure a set of at least one sweep."""
+        present = [sweep for sweep in joined if sweep is not None]
+        newest_ns = max(sweep.last_ns for sweep in present)
+        middles_ns = [sweep.middle_ns for sweep in present]
         self._sets += 1
         self._without += len(present) < len(joined)
-        self._stale += any(turn.last_ns < newest_ns - self._stale_ns for turn in present)
-        self._spans_ns.append(newest_ns - min(turn.first_ns for turn in present))
+        self._stale += any(sweep.last_ns < newest_ns - self._stale_ns for sweep in present)
+        self._spans_ns.append(newest_ns - min(sweep.first_ns for sweep in present))
         if len(present) > 1:
-            self._aparts_ns.append(max(middles) - min(middles))
-        for turn in present:
-            self._use(turn)
+            self._aparts_ns.append(max(middles_ns) - min(middles_ns))
+        for sweep in present:
+            self._use(sweep)
 
-    def report(self, columns: int, waiting: Sequence[Turn] = ()) -> WayReport:
-        """The figures; columns: of all turns; waiting: turns of which nothing is decided."""
-        undecided = sum(turn.columns for turn in waiting if turn is not self._last[turn.sensor])
-        return WayReport(
-            self._way,
-            self._sets,
-            self._without,
-            self._stale,
-            Figures.of(self._spans_ns),
-            Figures.of(self._aparts_ns),
-            columns - undecided,
-            self._twice,
-            columns - undecided - self._used,
+    def report(self, columns: int, waiting: Sequence[Sweep] = ()) -> SetReport:
+        """The figures; columns: of all sweeps; waiting: sweeps that later sets might use."""
+        undecided = sum(sweep.columns for sweep in waiting if sweep is not self._last[sweep.sensor])
+        return SetReport(
+            policy=self._policy,
+            sets=self._sets,
+            without_a_sensor=self._without,
+            stale=self._stale,
+            span_ms=Distribution.of(self._spans_ns),
+            apart_ms=Distribution.of(self._aparts_ns),
+            columns=columns - undecided,
+            used_twice=self._used_twice,
+            never_used=columns - undecided - self._used,
         )
 
-    def _use(self, turn: Turn) -> None:
-        sensor = turn.sensor
-        if self._last[sensor] is not turn:
-            self._last[sensor], self._repeated[sensor] = turn, False
-            self._used += turn.columns
-        elif not self._repeated[sensor]:
-            self._repeated[sensor] = True
-            self._twice += turn.columns
+    def _use(self, sweep: Sweep) -> None:
+        sensor = sweep.sensor
+        if self._last[sensor] is not sweep:
+            self._last[sensor] = sweep
+            self._is_reused[sensor] = False
+            self._used += sweep.columns
+        elif not self._is_reused[sensor]:
+            self._is_reused[sensor] = True
+            self._used_twice += sweep.columns
 
 
-def _ms(value: float | None) -> str:
+def _ms_text(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}"
 
 
-def _share(count: int, whole: int) -> str:
+def _percentage(count: int, whole: int) -> str:
     return f"{100 * count / whole:.1f} %" if whole else "-"

@@ -1,1 +1,6 @@
-"""What a session of recordings contains: sensors, calibrations, extrinsics."""
+"""Discovery: the sensors of a session, found in its recordings.
+
+`discover` reads the first seconds (`probe`, `sampler`), matches packets with calibrations
+(`match`), places the sensors on the body (`extrinsics`) and assigns later packets to them
+(`router`). `inspect` is a view of its result.
+"""

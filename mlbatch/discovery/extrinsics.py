@@ -1,7 +1,9 @@
-"""What a recording says of where its sensors sit: transforms, robot description.
+"""Extrinsics of the sensors of a session, from sources in order of trust.
 
-Facts: facts/messages.md sections 2 and 6. Extrinsics in the order rig, /tf_static, constant /tf,
-fixed joints of the URDF, metadata; what disagrees is told, what is unclear is not used.
+The order: rig, /tf_static, constant /tf, fixed joints of the URDF, metadata. The first source with
+an answer is used; a warning names others that differ from it. Transforms and joints form one tree
+of frames, so that a chain may pass through edges of several sources; what is ambiguous is not used.
+Sources: docs/sources/messages.md sections 2 and 6.
 """
 
 from __future__ import annotations
@@ -9,470 +11,437 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import Literal, NoReturn, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.discovery.sampler import Found
+from mlbatch.discovery.types import DetectedSensor, Note, Pose
 from mlbatch.errors import RigError
 from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig
 from mlbatch.types import StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
 # Parent, child, translation x, y, z in metres, quaternion x, y, z, w.
-Stated: TypeAlias = tuple[str, str, Sequence[float], Sequence[float]]
-# By sensor: (4, 4) body_from_sensor in metres, or the name of a frame.
-Extrinsics: TypeAlias = Mapping[str, F64Array | str]
-# In the order in which they are believed.
+Transform: TypeAlias = tuple[str, str, Sequence[float], Sequence[float]]
+# Sources whose edges form the tree, in order of trust.
 TREE_SOURCES = ("tf_static", "tf", "urdf")
+# Poses farther apart contradict each other.
 MAX_APART_M = 1e-3
 MAX_APART_RAD = 0.1 * RAD_PER_DEG
-# Sources print their numbers with different digits; a difference at the bound is none.
+# Sources print their numbers with different digits; a difference at the bound is accepted.
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something to warn of: a short code, the sensor it is about (or ""), one line."""
-
-    code: str
-    sensor: str
-    message: str
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Mount:
-    """Where a sensor sits: (4, 4) body_from_sensor in metres, whose word it is, frames walked.
-
-    source: rig, tf_static, tf, urdf, metadata or identity; a chain over several sources goes by
-    the one that is believed least, `leading` by the one believed most. chain: "base_link ->
-    os_sensor", "" where none was walked.
-    """
-
-    body_from_sensor: F64Array
-    source: str
-    chain: str = ""
-    leading: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mounting:
-    """All sensors of a session on their body."""
+class Extrinsics:
+    """Poses of all sensors of a session in one body frame, and warnings."""
 
     body_frame: str
-    mounts: dict[str, Mount]
-    findings: tuple[Finding, ...]
+    poses: dict[str, Pose]
+    notes: tuple[Note, ...]
 
 
 @dataclass(slots=True)
-class _Watched:
-    """A transform of /tf as it was first stated, and whether another value ever followed."""
+class _TfTransform:
+    """A transform of /tf: its first value, and whether all others are equal."""
 
-    stated: Stated
+    first: Transform
     count: int = 0
     is_constant: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seat:
-    """A frame of the tree in which a sensor sits."""
-
-    candidate: Candidate
-    chain: Chain
-
-    @property
-    def mount(self) -> Mount:
-        """Points are in the sensor frame: what its lidar frame adds is taken off again."""
-        matrix, correction = self.chain.matrix, self.candidate.sensor_from_frame
-        if correction is not None:
-            matrix = compose(matrix, inverse(correction))
-        sources = {edge.source for edge in self.chain.edges}
-        words = [source for source in TREE_SOURCES if source in sources] or TREE_SOURCES
-        # Without edges the body frame is the sensor's own, which any source may have named.
-        return Mount(matrix, words[-1] if sources else words[0], str(self.chain), words[0])
-
-
-@dataclass(slots=True)
-class _Search:
-    """Seats under a body frame by sensor, and for the others why they have none."""
-
-    body: str = ""
-    seats: dict[str, _Seat] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-
-
-class Knowledge:
-    """Collects what the messages of a session say; `mount` then tells where the sensors sit."""
+class ExtrinsicsSources:
+    """Transforms and robot descriptions of a session; `resolve` gives the poses of its sensors."""
 
     def __init__(self) -> None:
-        self._static, self._urdf = FrameTree(), FrameTree()
-        self._watched: dict[tuple[str, str], _Watched] = {}
-        # By child: why a stated edge is not used. Told only to those who miss it.
+        self._static = FrameTree()
+        self._urdf = FrameTree()
+        self._tf: dict[tuple[str, str], _TfTransform] = {}
+        # By child frame: why an edge is not used.
         self._unused: dict[str, str] = {}
-        self._findings: list[Finding] = []
+        self._notes: list[Note] = []
 
-    def add_transforms(self, source: Literal["tf_static", "tf"], edges: Iterable[Stated]) -> None:
-        """Add the transforms of one message; in /tf_static the last one of a child counts."""
-        for parent, child, translation_m, xyzw in edges:
-            stated = (clean(parent), clean(child), tuple(translation_m), tuple(xyzw))
+    def add_transforms(
+        self, source: Literal["tf_static", "tf"], transforms: Iterable[Transform]
+    ) -> None:
+        """Add the transforms of one message; in /tf_static the last one of a child is used."""
+        for parent, child, translation_m, xyzw in transforms:
+            transform = (clean(parent), clean(child), tuple(translation_m), tuple(xyzw))
             if source == "tf_static":
-                self._add(self._static, stated, source)
+                self._add_edge(self._static, transform, source)
                 continue
-            watched = self._watched.setdefault(stated[:2], _Watched(stated))
-            watched.count += 1
-            watched.is_constant &= watched.stated == stated
+            known = self._tf.setdefault(transform[:2], _TfTransform(transform))
+            known.count += 1
+            known.is_constant &= known.first == transform
 
     def add_urdf(self, text: str) -> None:
-        """Add the fixed joints of a robot description; one that cannot be read is a finding."""
+        """Add the fixed joints of a robot description; an unreadable one gives a warning."""
         # Few recordings have one.
         from mlbatch.frames.urdf import joints
 
         try:
             for joint in joints(text):
-                parent, child = clean(joint.parent), clean(joint.child)
+                parent = clean(joint.parent)
+                child = clean(joint.child)
                 if joint.is_fixed:
                     self._urdf.add(Edge(parent, child, joint.matrix, "urdf"))
                 else:
-                    told = f"{joint.name} ({parent} -> {child}) of the URDF is not fixed"
-                    self._unused[child] = f"joint {told} but {joint.kind or 'without a type'}"
+                    self._unused[child] = (
+                        f"joint {joint.name} ({parent} -> {child}) of the URDF is not fixed but "
+                        f"{joint.kind or 'without a type'}"
+                    )
         except RigError as err:
-            self._findings.append(Finding("urdf", "", str(err)))
+            self._notes.append(Note("urdf", "", str(err)))
 
-    def mount(
+    def resolve(
         self,
         sensor_frames: Mapping[str, Sequence[Candidate]],
-        rig_extrinsics: Extrinsics,
+        rig_extrinsics: Mapping[str, F64Array | str],
         metadata_extrinsics: Mapping[str, F64Array],
         body_frame: str | None,
         *,
         identity_extrinsics: bool = False,
-    ) -> Mounting:
-        """Place all sensors; RigError if two or more should be, and some have no extrinsics.
+    ) -> Extrinsics:
+        """Poses of all sensors; RigError if one of several sensors has no extrinsics.
 
-        sensor_frames: by sensor, frames it may have (`frames.candidates`); rig_extrinsics: (4, 4)
-        or the name of a frame; metadata_extrinsics: (4, 4) body_from_sensor, metres.
+        sensor_frames: by sensor, frames it may have; rig_extrinsics: (4, 4) body_from_sensor, m, or
+        the name of a frame; metadata_extrinsics: (4, 4) body_from_sensor, m; body_frame: that of
+        the rig; identity_extrinsics: sensors without extrinsics are at the body origin.
         """
-        trees = self._all_trees()
+        trees = self._trees()
         named = {name: frame for name, frame in rig_extrinsics.items() if isinstance(frame, str)}
-        wanted = {
+        sensor_frames = {
             name: [named_frame(named[name], frames)] if name in named else frames
             for name, frames in sensor_frames.items()
         }
-        seeker = _Seeker(FrameTree.merged(trees.values()), wanted, self._unused)
-        search = seeker.best() if body_frame is None else seeker.under(clean(body_frame))
+        tree = FrameTree.merged(trees.values())
+        finder = _FrameFinder(tree, sensor_frames, self._unused)
+        found = finder.best() if body_frame is None else finder.under(clean(body_frame))
         for name, frame in named.items():
-            if name not in search.seats:
-                raise _no_frame(name, clean(frame), seeker.tree, search.reasons)
-        told: dict[str, Extrinsics] = {"rig": rig_extrinsics, "metadata": metadata_extrinsics}
-        mounts, findings = dict[str, Mount](), list(self._findings)
+            if name not in found.poses:
+                _refuse_frame(name, clean(frame), tree, found.reasons)
+        poses: dict[str, Pose] = {}
+        notes = list(self._notes)
         for name in sensor_frames:
-            options = _options(name, search, told)
-            mounts[name] = options[0] if options else Mount(np.eye(4), "identity")
-            if options:
-                others = [*options[1:], *_other_words(name, search, trees)]
-                findings += dict.fromkeys(_contradictions(name, options[0], others))
-                findings += self._constants(name, search, options[0])
-            if name in search.reasons and mounts[name].source != "rig":
-                findings.append(Finding("extrinsics_frame", name, search.reasons[name]))
-        missing = [name for name in mounts if mounts[name].source == "identity"]
-        if missing and len(mounts) > 1 and not identity_extrinsics:
-            raise _refused(missing, search.reasons)
-        body = body_frame or _body(mounts, search)
-        return Mounting(body, mounts, (*findings, *_mixed(mounts, body_frame, body)))
+            answers = _answers(name, rig_extrinsics, found, metadata_extrinsics)
+            poses[name] = answers[0] if answers else Pose.identity()
+            if answers:
+                others = [*answers[1:], *_poses_by_source(name, found, trees)]
+                notes += dict.fromkeys(_contradictions(name, poses[name], others))
+                notes += self._constant_tf(name, poses[name])
+            if name in found.reasons and poses[name].source != "rig":
+                notes.append(_note("extrinsics_frame", name, found.reasons[name]))
+        missing = [name for name, pose in poses.items() if not pose.is_known]
+        if missing and len(poses) > 1 and not identity_extrinsics:
+            _refuse_unknown(missing, found.reasons)
+        body = body_frame or _body_frame(poses, found.body)
+        if body_frame is None:
+            notes += _assumed_frames(poses, body)
+        return Extrinsics(body, poses, tuple(notes))
 
-    def _add(self, tree: FrameTree, stated: Stated, source: str) -> None:
+    def _add_edge(self, tree: FrameTree, transform: Transform, source: str) -> None:
         try:
-            tree.add(edge_of(*stated, source))
+            tree.add(edge_of(*transform, source))
         except RigError as err:
-            self._unused[stated[1]] = str(err)
+            self._unused[transform[1]] = str(err)
 
-    def _all_trees(self) -> dict[str, FrameTree]:
-        """The edges of every source, those of /tf only where they never changed."""
+    def _trees(self) -> dict[str, FrameTree]:
+        """Edges of every source, in order of trust; of /tf those that never changed."""
         constant = FrameTree()
-        for (parent, child), watched in self._watched.items():
-            if watched.is_constant:
-                self._add(constant, watched.stated, "tf")
+        for (parent, child), transform in self._tf.items():
+            if transform.is_constant:
+                self._add_edge(constant, transform.first, "tf")
             else:
                 self._unused[child] = f"/tf changes {parent} -> {child} during the recording"
-        return dict(zip(TREE_SOURCES, (self._static, constant, self._urdf), strict=True))
+        return {"tf_static": self._static, "tf": constant, "urdf": self._urdf}
 
-    def _constants(self, name: str, search: _Search, mount: Mount) -> Iterator[Finding]:
-        """What was taken for static although /tf is for things that move."""
-        seat = search.seats.get(name)
-        if seat is None or mount.source in ("rig", "metadata"):
-            return
-        for edge in seat.chain.edges:
+    def _constant_tf(self, name: str, pose: Pose) -> Iterator[Note]:
+        """Warnings about edges of /tf, which is for moving frames, used as static ones."""
+        for edge in () if pose.chain is None else pose.chain.edges:
             if edge.source == "tf":
-                count = self._watched[edge.parent, edge.child].count
-                text = f"/tf never changed {edge} in {count} message(s): taken as static"
-                yield Finding("constant_tf", name, text)
+                count = self._tf[edge.parent, edge.child].count
+                text = f"/tf never changed {edge} in {count} message(s): used as static"
+                yield _note("constant_tf", name, text)
 
 
-def _no_frame(name: str, frame: str, tree: FrameTree, reasons: Mapping[str, str]) -> RigError:
-    """The error about a frame of the rig that leads nowhere."""
-    if not tree.frames:
-        return RigError(
-            f"sensor {name}: extrinsics by frame ({frame}) need a recording "
-            "with /tf_static, which captures do not have; give translation_m and a rotation"
+def place(
+    sensors: Sequence[DetectedSensor],
+    sources: ExtrinsicsSources,
+    table: StreamTable,
+    rig: Rig | None,
+    *,
+    calibration_topics: Collection[str] = (),
+    identity_extrinsics: bool,
+) -> Extrinsics:
+    """Set the poses of all sensors; RigError if one of several sensors has no extrinsics.
+
+    calibration_topics: topics with calibrations of sensors.
+    """
+    vendors = Counter(sensor.lidar.vendor for sensor in sensors)
+    frames = {
+        sensor.name: candidates(
+            sensor.lidar.vendor,
+            _places(table, sensor, calibration_topics),
+            alone=vendors[sensor.lidar.vendor] == 1,
+            sensor_from_lidar=sensor.lidar.sensor_from_lidar,
         )
-    reason = reasons[name] if frame in tree and name in reasons else tree.unknown(frame)
-    remedy = "correct it, or give translation_m and a rotation"
-    return RigError(f"sensor {name}: extrinsics by frame ({frame}): {reason}; {remedy}")
+        for sensor in sensors
+    }
+    by_rig = {
+        sensor.name: sensor.rig.extrinsics
+        for sensor in sensors
+        if sensor.rig is not None and sensor.rig.extrinsics is not None
+    }
+    by_metadata = {
+        sensor.name: sensor.lidar.extrinsics
+        for sensor in sensors
+        if sensor.lidar.extrinsics is not None
+    }
+    body_frame = None if rig is None else rig.body_frame
+    extrinsics = sources.resolve(
+        frames, by_rig, by_metadata, body_frame, identity_extrinsics=identity_extrinsics
+    )
+    for sensor in sensors:
+        sensor.pose = extrinsics.poses[sensor.name]
+    return extrinsics
+
+
+def _places(
+    table: StreamTable, sensor: DetectedSensor, calibration_topics: Collection[str]
+) -> list[str]:
+    """Topics of a sensor's packets, else of its calibration, else its name: the base of frames."""
+    topics = sorted({table.streams[stream].topic for stream in sensor.streams} - {""})
+    if not topics and sensor.lidar.calibration in calibration_topics:
+        topics = [sensor.lidar.calibration]
+    return topics or [sensor.name]
+
+
+# -- frames of the tree ---------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _FramesFound:
+    """Frames of sensors under a body frame; reasons: why the other sensors have none."""
+
+    body: str = ""
+    frames: dict[str, Candidate] = field(default_factory=dict)
+    poses: dict[str, Pose] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class _Seeker:
-    """Looks for the sensors' frames in a tree; unused: by child, why an edge is not in it."""
+class _FrameFinder:
+    """Finds the frames of sensors in a tree.
+
+    candidates: by sensor; unused: by child frame, why an edge is missing in the tree.
+    """
 
     tree: FrameTree
-    wanted: Mapping[str, Sequence[Candidate]]
+    candidates: Mapping[str, Sequence[Candidate]]
     unused: Mapping[str, str]
 
-    def best(self) -> _Search:
-        """Seats under base_link if all hang on it, else under their nearest common ancestor."""
-        found = self._under_a_top()
-        frames, base = [one.candidate.frame for one in found.seats.values()], DEFAULT_BODY_FRAME
+    def best(self) -> _FramesFound:
+        """Frames under base_link if it is above all of them, else under their common ancestor."""
+        found = self._under_a_root()
+        frames = [one.frame for one in found.frames.values()]
+        base = DEFAULT_BODY_FRAME
         if frames and base in self.tree and self.tree.ancestor([base, *frames]) == base:
             return self.under(base)
-        # A frame alone is its own ancestor, which says nothing of a body.
+        # A single frame is its own ancestor, and no body frame.
         shared = self.tree.ancestor(frames) if len(frames) > 1 else None
         if shared is not None:
             return self.under(shared)
         text = "no frame of another sensor is connected with its own"
-        alone = dict.fromkeys(found.seats, text) if len(self.wanted) > 1 else {}
-        return _Search(reasons=found.reasons | alone)
+        alone = dict.fromkeys(found.poses, text) if len(self.candidates) > 1 else {}
+        return _FramesFound(reasons=found.reasons | alone)
 
-    def under(self, body: str) -> _Search:
-        """Seats that are connected with `body`; a frame is the seat of one sensor."""
-        search = _Search(body)
-        for name in self.wanted:
-            self._seat(name, search)
-        owners = Counter(seat.candidate.frame for seat in search.seats.values())
-        for name, seat in list(search.seats.items()):
-            frame = seat.candidate.frame
-            if owners[frame] > 1:
-                del search.seats[name]
-                search.reasons[name] = f"frame {frame} could be that of {owners[frame]} sensors"
-        return search
+    def under(self, body: str) -> _FramesFound:
+        """Frames that are connected with `body`, each of one sensor only."""
+        found = _FramesFound(body)
+        for name in self.candidates:
+            self._find(name, found)
+        owners = Counter(one.frame for one in found.frames.values())
+        for name, candidate in list(found.frames.items()):
+            count = owners[candidate.frame]
+            if count > 1:
+                del found.frames[name]
+                del found.poses[name]
+                found.reasons[name] = f"frame {candidate.frame} could be that of {count} sensors"
+        return found
 
-    def _under_a_top(self) -> _Search:
-        """Seats under the topmost frame that most sensors hang on."""
+    def _under_a_root(self) -> _FramesFound:
+        """Frames under the root that most sensors are connected with."""
         tree = self.tree
-        frames = [one.frame for among in self.wanted.values() for one in among]
-        tops = sorted({tree.top(frame)[0] for frame in frames if frame in tree})
-        searches = [self.under(top) for top in tops or [""]]
-        most = max(len(search.seats) for search in searches)
-        best = [search for search in searches if len(search.seats) == most]
+        frames = [one.frame for candidates in self.candidates.values() for one in candidates]
+        roots = sorted({tree.top(frame)[0] for frame in frames if frame in tree})
+        results = [self.under(root) for root in roots or [""]]
+        most = max(len(found.poses) for found in results)
+        best = [found for found in results if len(found.poses) == most]
         if len(best) > 1 and DEFAULT_BODY_FRAME in tree:
-            home = tree.top(DEFAULT_BODY_FRAME)[0]
-            best = [search for search in best if search.body == home] or best
-        if len(best) == 1 or len(self.wanted) == 1:
+            root = tree.top(DEFAULT_BODY_FRAME)[0]
+            best = [found for found in best if found.body == root] or best
+        if len(best) == 1 or len(self.candidates) == 1:
             return best[0]
         text = f"nothing connects the frames {' and '.join(one.body for one in best)}"
-        return _Search(reasons=dict.fromkeys(self.wanted, text))
+        return _FramesFound(reasons=dict.fromkeys(self.candidates, text))
 
-    def _seat(self, name: str, search: _Search) -> None:
-        """Find the frame of one sensor; the lowest rank counts, and must be clear."""
-        known = [one for one in self.wanted[name] if one.frame in self.tree]
-        seats, reasons = list[_Seat](), dict[str, None]()
-        for one in sorted(known, key=lambda one: one.rank):
+    def _find(self, name: str, found: _FramesFound) -> None:
+        """Find the frame of one sensor: the connected one of lowest rank, if it is unambiguous."""
+        connected: list[tuple[Candidate, Pose]] = []
+        reasons: dict[str, None] = {}
+        known = [one for one in self.candidates[name] if one.frame in self.tree]
+        for candidate in sorted(known, key=lambda one: one.rank):
             try:
-                chain = self.tree.chain(search.body, one.frame)
+                chain = self.tree.chain(found.body, candidate.frame)
             except RigError as err:
                 reasons[str(err)] = None
                 continue
             if chain is not None:
-                seats.append(_Seat(one, chain))
+                connected.append((candidate, _tree_pose(chain, candidate)))
                 continue
-            why = self.unused.get(self.tree.top(one.frame)[0], "")
-            text = f"nothing connects frame {one.frame} with {search.body}"
+            why = self.unused.get(self.tree.top(candidate.frame)[0], "")
+            text = f"nothing connects frame {candidate.frame} with {found.body}"
             reasons[f"{text}: {why}" if why else text] = None
-        best = [seat for seat in seats if seat.candidate.rank == seats[0].candidate.rank]
-        for other in best[1:]:
-            if _gap(best[0].mount, other.mount):
-                pair = f"{best[0].candidate.frame} and {other.candidate.frame}"
-                search.reasons[name] = f"frames {pair} could both be its own"
+        if not connected:
+            if reasons:
+                found.reasons[name] = "; ".join(reasons)
+            elif self.tree.frames:
+                frames = some(self.tree.frames)
+                found.reasons[name] = (
+                    f"none of the recording's frames ({frames}) is named as its driver would name "
+                    "it"
+                )
+            return
+        best, pose = connected[0]
+        for other, other_pose in connected[1:]:
+            if other.rank == best.rank and _gap(pose, other_pose):
+                found.reasons[name] = f"frames {best.frame} and {other.frame} could both be its own"
                 return
-        if best:
-            search.seats[name] = best[0]
-        elif reasons:
-            search.reasons[name] = "; ".join(reasons)
-        elif self.tree.frames:
-            search.reasons[name] = (
-                f"none of the recording's frames ({some(self.tree.frames)}) can be told as its own"
-            )
+        found.frames[name] = best
+        found.poses[name] = pose
 
 
-def _options(name: str, search: _Search, told: Mapping[str, Extrinsics]) -> list[Mount]:
-    """What is known of a sensor's place, the most believed first."""
-    rig, metadata = (told[source].get(name) for source in ("rig", "metadata"))
-    found = [Mount(rig, "rig")] if isinstance(rig, np.ndarray) else []
-    found += [search.seats[name].mount] if name in search.seats else []
-    return found + ([Mount(metadata, "metadata")] if isinstance(metadata, np.ndarray) else [])
+def _tree_pose(chain: Chain, candidate: Candidate) -> Pose:
+    """Pose of a sensor by its chain; points are in the sensor frame, not in the lidar frame."""
+    matrix = chain.matrix
+    if candidate.sensor_from_frame is not None:
+        matrix = compose(matrix, inverse(candidate.sensor_from_frame))
+    return Pose(matrix, _chain_sources(chain)[-1], chain)
 
 
-def _other_words(name: str, search: _Search, trees: Mapping[str, FrameTree]) -> Iterator[Mount]:
-    """Where a sensor would sit if each source in turn were believed before all others."""
-    seat = search.seats.get(name)
-    if seat is None:
+def _chain_sources(chain: Chain) -> list[str]:
+    """Sources of the edges of a chain, most trusted first."""
+    used = {edge.source for edge in chain.edges}
+    # Without edges the body frame is the sensor's own, which any source may name.
+    return [source for source in TREE_SOURCES if source in used] or [TREE_SOURCES[0]]
+
+
+# -- answers of the sources -----------------------------------------------------------------------
+
+
+def _answers(
+    name: str,
+    rig: Mapping[str, F64Array | str],
+    found: _FramesFound,
+    metadata: Mapping[str, F64Array],
+) -> list[Pose]:
+    """Poses of a sensor by rig, tree and metadata: in order of trust."""
+    answers = []
+    by_rig = rig.get(name)
+    if isinstance(by_rig, np.ndarray):
+        answers.append(Pose(by_rig, "rig"))
+    if name in found.poses:
+        answers.append(found.poses[name])
+    if name in metadata:
+        answers.append(Pose(metadata[name], "metadata"))
+    return answers
+
+
+def _poses_by_source(
+    name: str, found: _FramesFound, trees: Mapping[str, FrameTree]
+) -> Iterator[Pose]:
+    """Poses of a sensor if each source of the tree were the most trusted one."""
+    if name not in found.frames:
         return
+    candidate = found.frames[name]
     for source, tree in trees.items():
         others = [other for other in trees.values() if other is not tree]
-        whole = FrameTree.merged([tree, *others])
         try:
-            chain = whole.chain(search.body, seat.candidate.frame)
+            chain = FrameTree.merged([tree, *others]).chain(found.body, candidate.frame)
         except RigError:
             continue
         if chain is not None and any(edge.source == source for edge in chain.edges):
-            yield replace(_Seat(seat.candidate, chain).mount, source=source)
+            yield replace(_tree_pose(chain, candidate), source=source)
 
 
-def _contradictions(name: str, chosen: Mount, others: Iterable[Mount]) -> Iterator[Finding]:
+def _contradictions(name: str, used: Pose, others: Iterable[Pose]) -> Iterator[Note]:
+    """Warnings about poses that differ from the one that is used."""
     for other in others:
-        gap = _gap(chosen, other)
+        gap = _gap(used, other)
         if gap:
-            used = chosen.leading if other.source == chosen.source else chosen.source
-            chain = chosen.chain or other.chain
+            source = used.source
+            if used.chain is not None and other.source == source:
+                source = _chain_sources(used.chain)[0]
+            chain = used.chain or other.chain
             text = (
-                f"its extrinsics of {used} and of {other.source} differ by {gap}"
-                f"{f' ({chain})' if chain else ''}; {used} is used, correct the wrong one"
+                f"its extrinsics of {source} and of {other.source} differ by {gap}"
+                f"{'' if chain is None else f' ({chain})'}; {source} is used, correct the wrong one"
             )
-            yield Finding("extrinsics_contradict", name, text)
+            yield _note("extrinsics_contradict", name, text)
 
 
-def _gap(first: Mount, second: Mount) -> str:
-    """How far two poses are apart, in words; "" if no more than sources may be."""
-    apart_m, apart_rad = difference(first.body_from_sensor, second.body_from_sensor)
+def _gap(one: Pose, other: Pose) -> str:
+    """Difference of two poses as text; "" if it is tolerable."""
+    apart_m, apart_rad = difference(one.body_from_sensor, other.body_from_sensor)
     if apart_m <= MAX_APART_M + _ROUNDING and apart_rad <= MAX_APART_RAD + _ROUNDING:
         return ""
     return f"{apart_m * MM_PER_M:.1f} mm and {apart_rad / RAD_PER_DEG:.2f} degrees"
 
 
-def _mixed(mounts: Mapping[str, Mount], given: str | None, body: str) -> Iterator[Finding]:
-    """Metadata do not name their body frame; beside a tree it is a guess which one they mean."""
-    sources = {mount.source for mount in mounts.values()}
-    if given is None and "metadata" in sources and sources.intersection(TREE_SOURCES):
-        for name, mount in mounts.items():
-            if mount.source == "metadata":
-                text = f"the extrinsics of its metadata are taken to be those in frame {body}"
-                yield Finding("extrinsics_mixed", name, text)
+def _assumed_frames(poses: Mapping[str, Pose], body: str) -> Iterator[Note]:
+    """Warnings where metadata, which do not name their body frame, are used with a tree."""
+    if any(pose.source in TREE_SOURCES for pose in poses.values()):
+        for name, pose in poses.items():
+            if pose.source == "metadata":
+                text = f"the extrinsics of its metadata are assumed to refer to frame {body}"
+                yield _note("extrinsics_mixed", name, text)
 
 
-def _body(mounts: Mapping[str, Mount], search: _Search) -> str:
-    """The body frame where nobody names one; a single sensor without a place keeps its own."""
-    sources = {mount.source for mount in mounts.values()}
-    if sources.intersection(TREE_SOURCES):
-        return search.body
-    is_alone = sources == {"identity"} and len(mounts) == 1
-    return next(iter(mounts)) if is_alone else DEFAULT_BODY_FRAME
+def _body_frame(poses: Mapping[str, Pose], tree_body: str) -> str:
+    """Body frame without a rig: of the tree, else base_link; own frame of an unplaced sensor."""
+    if any(pose.source in TREE_SOURCES for pose in poses.values()):
+        return tree_body
+    if len(poses) == 1:
+        ((name, pose),) = poses.items()
+        return DEFAULT_BODY_FRAME if pose.is_known else name
+    return DEFAULT_BODY_FRAME
 
 
-def _refused(missing: Sequence[str], reasons: Mapping[str, str]) -> RigError:
+def _note(code: str, name: str, text: str) -> Note:
+    return Note(code, name, f"sensor {name}: {text}")
+
+
+def _refuse_frame(name: str, frame: str, tree: FrameTree, reasons: Mapping[str, str]) -> NoReturn:
+    """Raise RigError for a frame of the rig without a chain."""
+    if not tree.frames:
+        raise RigError(
+            f"sensor {name}: extrinsics by frame ({frame}) need a recording "
+            "with /tf_static, which captures do not have; give translation_m and a rotation"
+        )
+    reason = reasons[name] if frame in tree and name in reasons else tree.unknown(frame)
+    remedy = "correct it, or give translation_m and a rotation"
+    raise RigError(f"sensor {name}: extrinsics by frame ({frame}): {reason}; {remedy}")
+
+
+def _refuse_unknown(missing: Sequence[str], reasons: Mapping[str, str]) -> NoReturn:
     known = [f"{name}: {reasons[name]}" for name in missing if name in reasons]
-    return RigError(
-        f"extrinsics unknown for {', '.join(missing)}; wanted for every sensor when there are "
+    raise RigError(
+        f"extrinsics unknown for {', '.join(missing)}; required for every sensor when there are "
         "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
         "extrinsic), or accept the body origin with --identity-extrinsics"
         + (f" ({'; '.join(known)})" if known else "")
     )
-
-
-# Where the sensors of a session sit on their body, by all that is known.
-
-
-@dataclass(slots=True)
-class Mounted:
-    """A sensor with its place on the body and its wishes from the rig (or their defaults).
-
-    extrinsics_source: whose word it is; chain: frames walked from body to sensor, "" where none
-    was; offset_ns: added to its stamps.
-    """
-
-    found: Found
-    body_from_sensor: F64Array
-    extrinsics_source: str
-    rig: RigSensor | None = None
-    chain: str = ""
-    offset_ns: int = 0
-
-    @property
-    def name(self) -> str:
-        """Name in all outputs."""
-        return self.found.name
-
-    @property
-    def origin(self) -> str:
-        """Source and chain in words, as "tf_static: base_link -> left/os_sensor"."""
-        return f"{self.extrinsics_source}: {self.chain}" if self.chain else self.extrinsics_source
-
-
-def mount(
-    table: StreamTable,
-    found: Sequence[Found],
-    rigged: Sequence[RigSensor | None],
-    rig: Rig | None,
-    knowledge: Knowledge,
-    *,
-    metadata_topics: Collection[str] = (),
-    identity_extrinsics: bool,
-) -> tuple[list[Mounted], Mounting]:
-    """Place all sensors; RigError where two or more should be, and some have no extrinsics.
-
-    rigged: what the rig says of each sensor, None without a rig; metadata_topics: those that gave
-    calibrations.
-    """
-    makers = Counter(sensor.lidar.maker for sensor in found)
-    frames = {
-        sensor.name: candidates(
-            sensor.lidar.maker,
-            _places(table, sensor, metadata_topics),
-            alone=makers[sensor.lidar.maker] == 1,
-            sensor_from_lidar=sensor.lidar.sensor_from_lidar,
-        )
-        for sensor in found
-    }
-    named = dict(zip((sensor.name for sensor in found), rigged, strict=True))
-    mounting = knowledge.mount(
-        frames,
-        {
-            name: entry.extrinsics
-            for name, entry in named.items()
-            if entry is not None and entry.extrinsics is not None
-        },
-        {
-            sensor.name: sensor.lidar.extrinsics
-            for sensor in found
-            if sensor.lidar.extrinsics is not None
-        },
-        None if rig is None else rig.body_frame,
-        identity_extrinsics=identity_extrinsics,
-    )
-    mounts = mounting.mounts
-    mounted = [
-        Mounted(
-            sensor,
-            mounts[sensor.name].body_from_sensor,
-            mounts[sensor.name].source,
-            named[sensor.name],
-            mounts[sensor.name].chain,
-        )
-        for sensor in found
-    ]
-    return mounted, mounting
-
-
-def in_words(finding: Finding) -> str:
-    """A finding as a line that names its sensor."""
-    return f"sensor {finding.sensor}: {finding.message}" if finding.sensor else finding.message
-
-
-def _places(table: StreamTable, sensor: Found, metadata_topics: Collection[str]) -> list[str]:
-    """Words for where a sensor sits: topics of its packets, else of its metadata, else its name."""
-    topics = sorted({table.streams[stream].topic for stream, _ in sensor.kinds} - {""})
-    if not topics and sensor.lidar.calibration in metadata_topics:
-        topics = [sensor.lidar.calibration]
-    return topics or [sensor.name]

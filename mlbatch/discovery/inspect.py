@@ -1,11 +1,10 @@
-"""What `inspect` tells: every stream of a session, what it is, and what is missing."""
+"""`mlbatch inspect`: the result of discovery as a table, as JSON and as a rig file."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -14,97 +13,106 @@ from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.clouds import CloudRecording
 from mlbatch.decode.packet_ring import PacketRing
-from mlbatch.discovery.discover import describe, lacks_decoder, named, packet_types
-from mlbatch.discovery.extrinsics import Mounted, in_words, mount
-from mlbatch.discovery.match import match, shared_by
-from mlbatch.discovery.probe import calibrations_for, first_seconds, look, with_clouds
-from mlbatch.discovery.router import Role, Router
-from mlbatch.discovery.sampler import (
-    Found,
-    Kind,
-    Sampler,
-    clock_watch,
-    has_receive_times,
-    split_by_kind,
+from mlbatch.discovery.discover import (
+    Discovery,
+    SensorSelection,
+    discover,
+    lacks_decoder,
+    name_kind,
+    packet_types,
 )
+from mlbatch.discovery.match import describe, shared_address
+from mlbatch.discovery.probe import first_seconds
+from mlbatch.discovery.router import Role
+from mlbatch.discovery.sampler import clock_watch, split_by_kind
+from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
-from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import merge, open_recording
+from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector
 from mlbatch.rig.write import write_rig
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 MS_PER_S = NS_PER_S // NS_PER_MS
-Value: TypeAlias = str | int | float | None
 HEAD = (
-    *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
-    *("clock", "calibration", "extrinsics", "missing"),
+    "stream",
+    "what",
+    "sensor",
+    "packets",
+    "Hz",
+    "lost",
+    "seconds",
+    "clock",
+    "calibration",
+    "extrinsics",
+    "missing",
 )
+# Warnings that concern a conversion; the table shows missing metadata and decoders.
+_CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "calibration", "not_seen_yet"})
 
 
 @dataclass(frozen=True, slots=True)
 class StreamReport:
-    """One kind of packets: where from, what, how many; times by the recorder's clock.
+    """One packet kind: origin, description, counts; times are receive times.
 
-    offset_ms: first stamp minus its arrival; extrinsics: where they come from, or "".
+    offset_ms: first timestamp minus its receive time; extrinsics: their source, or "".
     """
 
     stream: str
-    what: str
-    sensor: str
-    model: str
-    mode: str
-    serial: str
-    bytes: int
-    packets: int
-    rate_hz: float
-    lost: int | None
-    first_host_ns: int
-    last_host_ns: int
-    timescale: str
-    offset_ms: float | None
-    calibration: str
-    extrinsics: str
-    missing: str
+    what: str = ""
+    sensor: str = ""
+    model: str = ""
+    mode: str = ""
+    serial: str = ""
+    bytes: int = 0
+    packets: int = 0
+    rate_hz: float = 0.0
+    lost: int | None = None
+    first_host_ns: int = 0
+    last_host_ns: int = 0
+    timescale: str = ""
+    offset_ms: float | None = None
+    calibration: str = ""
+    extrinsics: str = ""
+    missing: str = ""
 
     def row(self) -> list[str]:
-        """Cells for people, as HEAD."""
+        """Cells of the table, as HEAD."""
         clock = self.timescale
         if self.offset_ms is not None:
-            near = abs(self.offset_ms) < MS_PER_S
-            offset = f"{self.offset_ms:+.3f} ms" if near else f"{self.offset_ms / MS_PER_S:+.3f} s"
+            is_near = abs(self.offset_ms) < MS_PER_S
+            offset = (
+                f"{self.offset_ms:+.3f} ms" if is_near else f"{self.offset_ms / MS_PER_S:+.3f} s"
+            )
             clock += f" {offset}"
         return [
-            *(self.stream, self.what, self.sensor, str(self.packets), f"{self.rate_hz:.1f}"),
+            self.stream,
+            self.what,
+            self.sensor,
+            str(self.packets),
+            f"{self.rate_hz:.1f}",
             "" if self.lost is None else str(self.lost),
             f"{(self.last_host_ns - self.first_host_ns) / NS_PER_S:.3f}",
-            *(clock, self.calibration, self.extrinsics, self.missing),
+            clock,
+            self.calibration,
+            self.extrinsics,
+            self.missing,
         ]
 
 
-@dataclass(slots=True)
-class _Count:
-    """What a pass over the first seconds shows of one sensor."""
-
-    ring: PacketRing
-    loss: PacketLoss
-    watch: ClockWatch
-    first: tuple[int, int] | None = None
-
-
 @dataclass(frozen=True, slots=True)
-class Survey:
+class Inspection:
     """All streams of the first 10 seconds of a session.
 
-    files: metadata by sensor, where they lie in a file and not in the recording itself.
+    streams: one for each packet kind; files: metadata of sensors that are files, by name of the
+    sensor; clocks: None without timestamps.
     """
 
     streams: tuple[StreamReport, ...]
-    sensors: tuple[Mounted, ...]
+    sensors: tuple[DetectedSensor, ...]
     body_frame: str = DEFAULT_BODY_FRAME
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -115,152 +123,163 @@ class Survey:
         return [list(HEAD), *(stream.row() for stream in self.streams)]
 
     def as_json(self) -> dict[str, object]:
-        """For programs."""
+        """The JSON document of `--json`."""
         return {
             "schema": "mlbatch.inspect/1",
             "streams": [asdict(stream) for stream in self.streams],
             "notes": list(self.notes),
-            "clocks": {} if self.clocks is None else _as_json(self.clocks),
+            "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
         }
 
     def clock_lines(self) -> list[str]:
-        """What the clock doctor says, for people."""
-        return [] if self.clocks is None else self.clocks.in_words()
+        """Verdicts on the clocks, as text."""
+        return [] if self.clocks is None else self.clocks.describe()
 
     def rig_text(self, folder: Path) -> str:
-        """A rig file for these sensors; identity extrinsics are marked as to be measured."""
+        """A rig file for these sensors; unknown extrinsics are the identity, with a comment."""
         if not self.sensors:
             raise RigError(
-                "--write-rig: wanted at least one lidar with its metadata, got none; "
+                "--write-rig: expected at least one lidar with its metadata, found none; "
                 "give --metadata FILE"
             )
-        sensors = tuple(
-            RigSensor(
-                name=sensor.name,
-                stream=_selector(sensor.found),
-                metadata=self.files.get(sensor.name),
-                extrinsics=sensor.body_from_sensor
-                if _is_placed(sensor)
-                # As angles, which are easier to fill in than a matrix.
-                else from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        sensors = []
+        comments = {}
+        for sensor in self.sensors:
+            # As angles, which are easier to replace than a matrix.
+            extrinsics = from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            comments[sensor.name] = "extrinsics unknown: measure them"
+            if sensor.pose.is_known:
+                extrinsics = sensor.pose.body_from_sensor
+                comments[sensor.name] = f"extrinsics of {sensor.pose.describe()}"
+            sensors.append(
+                RigSensor(
+                    name=sensor.name,
+                    stream=sensor.selector,
+                    metadata=self.files.get(sensor.name),
+                    extrinsics=extrinsics,
+                )
             )
-            for sensor in self.sensors
-        )
-        notes = {
-            sensor.name: f"extrinsics of {sensor.origin}"
-            if _is_placed(sensor)
-            else "extrinsics unknown: measure them"
-            for sensor in self.sensors
-        }
-        return write_rig(Rig(sensors, self._body_frame()), folder, notes)
-
-    def _body_frame(self) -> str:
-        """The body frame, unless it has the name of a sensor, which a rig refuses."""
+        # A rig refuses a body frame with the name of a sensor.
         names = {sensor.name for sensor in self.sensors}
-        return DEFAULT_BODY_FRAME if self.body_frame in names else self.body_frame
+        body_frame = DEFAULT_BODY_FRAME if self.body_frame in names else self.body_frame
+        return write_rig(Rig(tuple(sensors), body_frame), folder, comments)
 
 
-def _selector(sensor: Found) -> StreamSelector:
-    if sensor.lidar.carries_serial:
-        return StreamSelector(serial=sensor.lidar.serial)
-    return sensor.selector
+def inspect(
+    recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool = False
+) -> Inspection:
+    """Inspect the first 10 s of recordings, with the metadata given or in their directories.
 
-
-def _is_placed(sensor: Mounted) -> bool:
-    return sensor.extrinsics_source != "identity"
-
-
-def survey(recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool = False) -> Survey:
-    """Look at the first 10 s of recordings, with the metadata given or found beside them.
-
-    whole: loss and clocks are those of the whole recordings.
+    whole: measure loss and clocks on the whole recordings.
     """
     table = StreamTable()
-    opened = with_clouds([open_recording(path, table) for path in recordings], table, ())
-    sampler, learner = look(opened, table)
-    calibrations, looked = calibrations_for(recordings, metadata)
-    files = {str(one.path): one.path for one in calibrations if one.path is not None}
-    calibrations += learner.calibrations()
-    matched = match(sampler, calibrations, {})
-    found = matched.sensors
-    mounted, mounting = mount(
+    discovery = discover(
+        [open_recording(path, table) for path in recordings],
         table,
-        found,
-        [None] * len(found),
-        None,
-        learner.knowledge,
-        metadata_topics=learner.metadata_topics,
-        identity_extrinsics=True,
+        SensorSelection(metadata=tuple(metadata), identity_extrinsics=True),
+        to_convert=False,
     )
-    for sensor in found:
-        streams = [table.streams[stream] for stream, _ in sensor.kinds]
-        sensor.selector = StreamSelector(streams[0].source_ip, streams[0].port, streams[0].topic)
-    counts = _count(opened, found, table.untimed, whole=whole)
-    router = Router(table, found, sampler.samples)
-    types = packet_types(opened)
-    reports = tuple(
-        _report(sampler, kind, mounted, counts, _owner(sampler, kind, found, router), types)
-        for kind in sampler.samples
+    measured = _measure(discovery, whole=whole)
+    types = packet_types(discovery.recordings)
+    streams = tuple(
+        _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
     )
-    notes = [f"{recording.path.name}: {text}" for recording in opened for text in recording.notes]
-    notes += [
-        f"{recording.path.name}: {text}"
-        for recording in opened
-        if isinstance(recording, CloudRecording)
-        for text in recording.verdicts
-    ]
-    notes += [*learner.faults, *map(in_words, mounting.findings)]
-    notes += filter(None, (shared_by(sampler, sensor) for sensor in found))
-    if not sampler.samples:
-        notes.append("no UDP packet in the first 10 seconds")
-    elif not found:
-        names = ", ".join(path.name for path in looked) or "none"
-        notes.append(f"no lidar with its metadata; files looked at: {names}")
-    used = {
-        sensor.name: files[sensor.lidar.calibration]
-        for sensor in found
-        if sensor.lidar.calibration in files
-    }
-    named = [(one.name, count.watch.finding()) for one, count in zip(found, counts, strict=True)]
-    findings = [(name, finding) for name, finding in named if finding is not None]
-    clocks = compare(findings) if findings else None
-    return Survey(reports, tuple(mounted), mounting.body_frame, used, tuple(notes), clocks)
+    for sensor in discovery.sensors:
+        sensor.selector = _selector(table, sensor)
+    findings = [(sensor.name, one.watch.estimate()) for sensor, one in measured.items()]
+    known = [(name, finding) for name, finding in findings if finding is not None]
+    files = {str(path): path for path in discovery.examined}
+    return Inspection(
+        streams=streams,
+        sensors=tuple(discovery.sensors),
+        body_frame=discovery.frame_id,
+        files={
+            sensor.name: files[sensor.lidar.calibration]
+            for sensor in discovery.sensors
+            if sensor.lidar.calibration in files
+        },
+        notes=tuple(_notes(discovery)),
+        clocks=compare(known) if known else None,
+    )
 
 
-def _count(
-    recordings: Sequence[Recording],
-    found: Sequence[Found],
-    untimed: Collection[int],
-    *,
-    whole: bool,
-) -> list[_Count]:
-    counts = [_counting(sensor.lidar) for sensor in found]
+def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
+    """How a rig identifies the packets of a sensor."""
+    if sensor.lidar.carries_serial:
+        return StreamSelector(serial=sensor.lidar.serial)
+    stream = table.streams[min(sensor.kinds).stream]
+    return StreamSelector(stream.source_ip, stream.port, stream.topic)
+
+
+def _notes(discovery: Discovery) -> Iterator[str]:
+    """Damage, times of decoded clouds, contradictions, shared addresses, missing lidars."""
+    for recording in discovery.recordings:
+        for text in recording.notes:
+            yield f"{recording.path.name}: {text}"
+    for recording in discovery.recordings:
+        for text in recording.verdicts if isinstance(recording, CloudRecording) else ():
+            yield f"{recording.path.name}: {text}"
+    for note in discovery.notes:
+        if note.code not in _CONVERSION_ONLY:
+            yield note.message
+    for sensor in discovery.sensors:
+        problem = shared_address(discovery.sampler, sensor)
+        if problem:
+            yield problem
+    if not discovery.sampler.kinds:
+        yield "no UDP packet in the first 10 seconds"
+    elif not discovery.sensors:
+        names = ", ".join(path.name for path in discovery.examined) or "none"
+        yield f"no lidar with its metadata; files examined: {names}"
+
+
+# -- loss and clocks ------------------------------------------------------------------------------
+
+
+class _Measured:
+    """Loss and clock of one sensor; first: its first timestamp and receive time, ns."""
+
+    def __init__(self, sensor: DetectedSensor) -> None:
+        lidar = sensor.lidar
+        packet_ns = lidar.columns_per_packet * lidar.column_period_ns
+        self.ring = PacketRing(lidar.packet_size, lidar.records)
+        self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
+        self.watch: ClockWatch = clock_watch(lidar)
+        self.first: tuple[int, int] | None = None
+
+
+def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Measured]:
+    """Loss and clock of each sensor, in the first seconds or the whole session."""
+    measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
+    recordings = discovery.recordings
     for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
-            for sensor, count in zip(found, counts, strict=True):
+            for sensor in discovery.sensors:
                 if kind not in sensor.kinds:
                     continue
-                packets, _ = count.ring.store(batch.data, batch.start[index], None)
-                good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
-                hosts_ns = batch.host_ns[index[good]]
-                heads = sensor.lidar.heads(packets[good], hosts_ns)
-                count.loss.add(sensor.lidar.sequence(packets[good]), heads, hosts_ns)
-                _, newest_ns = extremes(heads)
-                if has_receive_times(untimed, sensor):
-                    count.watch.add(newest_ns[newest_ns > NEVER], hosts_ns[newest_ns > NEVER])
-                if count.first is None and heads.valid.any():
+                lidar = sensor.lidar
+                one = measured[sensor]
+                packets, _ = one.ring.store(batch.data, batch.start[index], None)
+                good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+                host_ns = batch.host_ns[index[good]]
+                heads = lidar.heads(packets[good], host_ns)
+                one.loss.add(lidar.sequence(packets[good]), heads, host_ns)
+                if discovery.sampler.has_receive_times(sensor):
+                    _, newest_ns = extremes(heads)
+                    known = newest_ns > NEVER
+                    one.watch.add(newest_ns[known], host_ns[known])
+                if one.first is None and heads.valid.any():
                     row, column = np.argwhere(heads.valid)[0]
-                    host_ns = int(batch.host_ns[index[good]][row])
-                    count.first = int(heads.stamp_ns[row, column]), host_ns
-    return counts
+                    one.first = int(heads.stamp_ns[row, column]), int(host_ns[row])
+    return measured
 
 
-def _as_json(clocks: Comparison) -> dict[str, object]:
-    """The clock doctor's findings for programs; times in ms, arrivals in ns."""
+def _clocks_as_json(clocks: Comparison) -> dict[str, object]:
+    """Clocks in the JSON document; times in ms, receive times in ns."""
     return {
         "verdict": clocks.verdict,
         "bound_ms": None if clocks.bound_ns is None else clocks.bound_ns / NS_PER_MS,
-        "lines": clocks.in_words(),
+        "lines": clocks.describe(),
         "sensors": [
             {
                 "name": name,
@@ -273,55 +292,58 @@ def _as_json(clocks: Comparison) -> dict[str, object]:
                     for one in finding.jumps
                 ],
             }
-            for name, finding in clocks.findings
+            for name, finding in clocks.estimates
         ],
     }
 
 
-def _counting(lidar: Lidar) -> _Count:
-    """Nothing counted yet."""
-    packet_ns = lidar.columns_per_packet * lidar.column_period_ns
-    ring = PacketRing(lidar.packet_size, lidar.records)
-    return _Count(ring, PacketLoss(lidar.sequence_modulus, packet_ns), clock_watch(lidar))
+# -- streams --------------------------------------------------------------------------------------
 
 
-def _owner(sampler: Sampler, kind: Kind, found: Sequence[Found], router: Router) -> str:
-    """Name of the sensor that sends a kind of packets beside its lidar packets; empty if none."""
-    route = router.route(kind, np.frombuffer(sampler.samples[kind][0], np.uint8))
-    return found[route.sensors[0]].name if route.role in (Role.IMU, Role.BAD_SIZE) else ""
-
-
-def _report(
-    sampler: Sampler,
-    kind: Kind,
-    mounted: Sequence[Mounted],
-    counts: Sequence[_Count],
-    owner: str,
+def _stream_report(
+    discovery: Discovery,
+    kind: PacketKind,
+    measured: Mapping[DetectedSensor, _Measured],
     types: Mapping[str, str],
 ) -> StreamReport:
-    first_ns, last_ns = sampler.span_ns[kind]
-    packets = sampler.packets[kind]
-    at = next((n for n, sensor in enumerate(mounted) if kind in sensor.found.kinds), None)
-    lidar = None if at is None else mounted[at].found.lidar
-    first = None if at is None else counts[at].first
-    what = "" if lidar is not None else describe(sampler, kind) or ""
-    missing = "decoder" if lacks_decoder(what) else "metadata" if "lidar" in what else ""
-    return StreamReport(
-        stream=str(sampler.table.streams[kind[0]]),
-        what=named(sampler, kind, types) if lidar is None else f"{lidar.model} {lidar.mode}",
-        sensor=owner if at is None else mounted[at].name,
-        model="" if lidar is None else lidar.model,
-        mode="" if lidar is None else lidar.mode,
-        serial="" if lidar is None else lidar.serial,
-        bytes=kind[1],
-        packets=packets,
-        rate_hz=(packets - 1) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else 0.0,
-        lost=None if at is None else counts[at].loss.lost,
-        first_host_ns=first_ns,
-        last_host_ns=last_ns,
+    """Report of one kind; types: message types by topic."""
+    sampler = discovery.sampler
+    samples = sampler.kinds[kind]
+    # Routing first: it may add a kind to its sensor.
+    payload = np.frombuffer(samples.payloads[0], np.uint8)
+    route = discovery.router.route(kind, payload)
+    span_ns = samples.last_host_ns - samples.first_host_ns
+    report = StreamReport(
+        stream=str(sampler.table.streams[kind.stream]),
+        bytes=kind.size,
+        packets=samples.packets,
+        rate_hz=(samples.packets - 1) * NS_PER_S / span_ns if span_ns > 0 else 0.0,
+        first_host_ns=samples.first_host_ns,
+        last_host_ns=samples.last_host_ns,
+    )
+    sensor = next((one for one in discovery.sensors if kind in one.kinds), None)
+    if sensor is None:
+        what = describe(sampler, kind) or ""
+        missing = "decoder" if lacks_decoder(what) else "metadata" if "lidar" in what else ""
+        is_owned = route.role in (Role.IMU, Role.BAD_SIZE)
+        return replace(
+            report,
+            what=name_kind(sampler, kind, types),
+            sensor=discovery.sensors[route.sensors[0]].name if is_owned else "",
+            missing=missing,
+        )
+    lidar = sensor.lidar
+    first = measured[sensor].first
+    return replace(
+        report,
+        what=f"{lidar.model} {lidar.mode}",
+        sensor=sensor.name,
+        model=lidar.model,
+        mode=lidar.mode,
+        serial=lidar.serial,
+        lost=measured[sensor].loss.lost,
         timescale="" if first is None else timescale(*first),
         offset_ms=None if first is None else (first[0] - first[1]) / NS_PER_MS,
-        calibration="" if lidar is None else Path(lidar.calibration).name,
-        extrinsics=mounted[at].origin if at is not None and _is_placed(mounted[at]) else "",
-        missing=missing,
+        calibration=Path(lidar.calibration).name,
+        extrinsics=sensor.pose.describe() if sensor.pose.is_known else "",
     )

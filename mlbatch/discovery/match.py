@@ -1,7 +1,7 @@
-"""Which calibration the packets of a stream were made with, by their bytes.
+"""Matching of packets with calibrations, with and without a rig, by the content of the packets.
 
-A calibration is of one unit (Ouster metadata, HESAI angles) or shared by all of a model; of those
-every stream is a sensor of its own. What a rig says of it besides: `_rigged.py`.
+A calibration is of one unit (Ouster metadata, HESAI angles) or shared by all units of a model; of a
+shared one every stream is a sensor of its own. File names play no part.
 """
 
 from __future__ import annotations
@@ -10,79 +10,48 @@ import ipaddress
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
-from mlbatch.discovery.sampler import Found, Kind, Sampler, as_rows
+from mlbatch.arrays import BoolArray, F64Array, I64Array, median
+from mlbatch.discovery.sampler import Sampler
+from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import READABLE, Calibration, Evidence, Lidar, ModelFile
-from mlbatch.rig.rig import StreamSelector
+from mlbatch.rig.rig import RigSensor, StreamSelector
 from mlbatch.types import Heads, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Sensors, the kinds that are of none, and why calibrations that fit could not be used."""
+    """Sensors, kinds of no sensor, and why a matching calibration of a kind could not be used."""
 
-    sensors: list[Found]
-    unknown: list[Kind]
-    failures: dict[Kind, str] = field(default_factory=dict)
+    sensors: list[DetectedSensor]
+    unknown: list[PacketKind]
+    failures: dict[PacketKind, str] = field(default_factory=dict)
+
+
+# -- the scorer -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A calibration that fits packets."""
+    """A calibration that matches packets; number: its index."""
 
     score: int
     number: int
     lidar: Lidar
 
 
-def match(
-    sampler: Sampler, calibrations: Sequence[Calibration], options: Mapping[str, str]
-) -> Matched:
-    """Sensors of a recording without a rig.
-
-    Raises RecordingError where the packets do not tell which of several calibrations is theirs.
-    """
-    every = [*calibrations, *sensors.built_in()]
-    found: dict[tuple[int, int], Found] = {}
-    matched = Matched([], [])
-    for kind in sampler.samples:
-        fits, failure = best_fits(sampler.evidence(kind), every, options)
-        if failure:
-            matched.failures[kind] = failure
-        if not fits:
-            matched.unknown.append(kind)
-        for fit in fits:
-            key = fit.number, kind[0] if every[fit.number].is_shared else -1
-            sensor = found.setdefault(key, Found("", fit.lidar))
-            sensor.notes += other_size(sampler.table, sensor.lidar, kind)
-            if sensor.lidar.packet_size in (kind[1], kind[1] - 1):
-                sensor.kinds.add(kind)
-    _refuse_shared(sampler.table, found, every)
-    matched.sensors.extend(sorted(found.values(), key=lambda one: _order(sampler.table, one)))
-    _name_all(sampler.table, matched.sensors)
-    return matched
-
-
-def _name_all(table: StreamTable, found: Sequence[Found]) -> None:
-    """After the namespace of its topics if that tells a place, else maker and serial number."""
-    counts: dict[str, int] = {}
-    for sensor in found:
-        maker = sensor.lidar.maker.lower()
-        counts[maker] = counts.get(maker, 0) + 1
-        topic = min((table.streams[stream].topic for stream, _ in sensor.kinds), default="")
-        place = "_".join(part for part in namespace(topic) if part not in GENERIC)
-        if place and place[0].isalpha() and place.replace("_", "").isalnum():
-            sensor.name = place
-        else:
-            sensor.name = f"{maker}_{sensor.lidar.serial or counts[maker]}"
+class _Candidate(NamedTuple):
+    score: int
+    number: int
+    evidence: Evidence
 
 
 def best_fits(
@@ -91,90 +60,142 @@ def best_fits(
     options: Mapping[str, str],
     model: str | None = None,
 ) -> tuple[list[Fit], str]:
-    """The sensors that sent a kind; several when the packets of units are mixed in it.
+    """Best calibration of each sensor that sent packets of a kind, and a failure or "".
 
-    model: that of the rig; it may be another one than the packets name. Second comes why a
-    calibration that fits best could not be used.
+    Several units may send packets of one kind. model: that of the rig, which may differ from the
+    one in the packets. Failure: why a best calibration could not be used.
     """
-    fits: dict[bytes, list[tuple[int, int, Evidence]]] = {}
+    groups: dict[bytes, list[_Candidate]] = {}
     for number, own, part in _parts(evidence, calibrations, options):
-        score = calibrations[number].fit(part)
-        if score > 0 or (score == READABLE and calibrations[number].model == model):
-            fits.setdefault(own, []).append((score, number, part))
-    best, failure = [], ""
-    for group in fits.values():
+        calibration = calibrations[number]
+        score = calibration.fit(part)
+        if score > 0 or (score == READABLE and calibration.model == model):
+            groups.setdefault(own.tobytes(), []).append(_Candidate(score, number, part))
+    fits: list[Fit] = []
+    failure = ""
+    for group in groups.values():
         if model is not None:
-            # A file of the unit knows more than what is built in for a model.
-            group = [one for one in group if _is_of(calibrations[one[1]], model)] or group
-        top = max(score for score, _, _ in group)
-        first = [(number, part) for score, number, part in group if score == top]
-        _refuse_ambiguous(evidence, [calibrations[number] for number, _ in first])
-        number, part = first[0]
+            # A file of the unit is preferred to the built-in calibration of its model.
+            group = [one for one in group if _may_be(calibrations[one.number], model)] or group
+        score = max(one.score for one in group)
+        best = [one for one in group if one.score == score]
+        _refuse_ambiguous(evidence, [calibrations[one.number] for one in best])
+        number = best[0].number
         try:
-            best.append(Fit(top, number, calibrations[number].lidar(options, part)))
+            lidar = calibrations[number].lidar(options, best[0].evidence)
+            fits.append(Fit(score, number, lidar))
         except RigError as err:
             failure = str(err)
-            if top == READABLE:
+            if score == READABLE:
                 what = sensors.describe(evidence.size, evidence.sample) or "others"
                 failure = f"its packets are {what}, not {model}, as which they were read: {err}"
-    return best, failure
+    return fits, failure
 
 
-def _is_of(calibration: Calibration, model: str) -> bool:
+def _may_be(calibration: Calibration, model: str) -> bool:
     return calibration.model == model or not calibration.is_shared
 
 
 def _parts(
     evidence: Evidence, calibrations: Sequence[Calibration], options: Mapping[str, str]
-) -> Iterator[tuple[int, bytes, Evidence]]:
-    """Of each calibration the packets that may be its own: only serial numbers tell them apart."""
+) -> Iterator[tuple[int, BoolArray, Evidence]]:
+    """Of each calibration: index, mask (k,) of packets that may be its own, and their evidence.
+
+    Only serial numbers separate the packets of units.
+    """
     everything = np.ones(len(evidence.sample), np.bool_)
     for number, calibration in enumerate(calibrations):
         if calibration.is_shared or not calibration.serial:
-            yield number, everything.tobytes(), evidence
+            yield number, everything, evidence
             continue
         try:
             lidar = calibration.lidar(options, evidence)
         except RigError:
-            continue  # One that is switched off sends nothing.
+            continue  # The output of this sensor is off.
         if evidence.size not in (lidar.packet_size, lidar.packet_size + 1):
             continue
         own = lidar.owns(evidence.sample[:, : lidar.packet_size])
         if own.any():
             part = replace(evidence, sample=evidence.sample[own], host_ns=evidence.host_ns[own])
-            yield number, own.tobytes(), part
+            yield number, own, part
 
 
 def _refuse_ambiguous(evidence: Evidence, calibrations: Sequence[Calibration]) -> None:
-    """Several calibrations that fit alike are one only if they are of one unit."""
+    """Raise RecordingError for equally good calibrations of several units."""
     files = [one for one in calibrations if one.path is not None]
     if len({one.serial or str(one.path) for one in files}) > 1:
         names = ", ".join(str(one.path) for one in files)
         raise RecordingError(
             f"packets of {evidence.stream} ({evidence.size} bytes) carry no serial number and "
-            f"fit {len(files)} metadata files: {names}; wanted one; name the sensor of each "
+            f"match {len(files)} metadata files: {names}; expected one; name the sensor of each "
             "source with stream.source_ip in a rig file (--rig), or give only its --metadata"
         )
 
 
-def _refuse_shared(
-    table: StreamTable, found: Mapping[tuple[int, int], Found], calibrations: Sequence[Calibration]
-) -> None:
-    """One unit sends from one place, unless its serial number says that it moved."""
+def _other_size(table: StreamTable, lidar: Lidar, kind: PacketKind) -> list[str]:
+    """A warning about packets of a lidar whose size differs from its first ones."""
+    size = lidar.packet_size
+    if kind.size in (size, size + 1):
+        return []
+    return [
+        f"{table.streams[kind.stream]}: expected packets of {size} bytes as at first, found "
+        f"{kind.size} bytes as well, which are rejected as bad_size; split the recording where the "
+        "settings of the lidar change"
+    ]
+
+
+# -- without a rig --------------------------------------------------------------------------------
+
+
+def match(
+    sampler: Sampler, calibrations: Sequence[Calibration], options: Mapping[str, str]
+) -> Matched:
+    """Sensors of a recording without a rig.
+
+    Raises RecordingError where several calibrations match packets equally well.
+    """
+    every = [*calibrations, *sensors.built_in()]
+    # By index of the calibration, and by stream where it is shared.
+    found: dict[tuple[int, int], DetectedSensor] = {}
+    matched = Matched([], [])
+    for kind in sampler.kinds:
+        fits, failure = best_fits(sampler.evidence(kind), every, options)
+        if failure:
+            matched.failures[kind] = failure
+        if not fits:
+            matched.unknown.append(kind)
+        for fit in fits:
+            stream = kind.stream if every[fit.number].is_shared else -1
+            sensor = found.setdefault((fit.number, stream), DetectedSensor("", fit.lidar))
+            sensor.notes += _other_size(sampler.table, sensor.lidar, kind)
+            if sensor.lidar.packet_size in (kind.size, kind.size - 1):
+                sensor.kinds.add(kind)
     for (number, _), sensor in found.items():
-        streams = sorted({str(table.streams[stream]) for stream, _ in sensor.kinds})
-        if len(streams) > 1 and not sensor.lidar.carries_serial:
-            raise RecordingError(
-                f"metadata {calibrations[number].path} fits the packets of {len(streams)} "
-                f"streams ({'; '.join(streams)}), which carry no serial number; wanted a metadata "
-                "file each; name them in a rig file (--rig) with stream.source_ip"
-            )
+        _refuse_several_streams(sampler.table, sensor, every[number])
+    matched.sensors.extend(sorted(found.values(), key=lambda one: _order(sampler.table, one)))
+    _name_all(sampler.table, matched.sensors)
+    return matched
 
 
-def _order(table: StreamTable, sensor: Found) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
-    """By serial number, else source IP and port, else topic."""
-    streams = (table.streams[number] for number, _ in sensor.kinds)
-    places = tuple(sorted((_ip_number(s.source_ip), s.port, s.topic) for s in streams))
+def _refuse_several_streams(
+    table: StreamTable, sensor: DetectedSensor, calibration: Calibration
+) -> None:
+    """Raise RecordingError if a unit without serial number would send on several streams."""
+    streams = sorted(str(table.streams[stream]) for stream in sensor.streams)
+    if len(streams) > 1 and not sensor.lidar.carries_serial:
+        raise RecordingError(
+            f"metadata {calibration.path} matches the packets of {len(streams)} "
+            f"streams ({'; '.join(streams)}), which carry no serial number; expected a metadata "
+            "file each; name them in a rig file (--rig) with stream.source_ip"
+        )
+
+
+def _order(
+    table: StreamTable, sensor: DetectedSensor
+) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
+    """Sort key: serial number, else source IP and port, else topic."""
+    streams = (table.streams[kind.stream] for kind in sensor.kinds)
+    places = tuple(sorted((_ip_number(one.source_ip), one.port, one.topic) for one in streams))
     if sensor.lidar.serial.isdigit():
         return (0, int(sensor.lidar.serial), places)
     return (1, 0, places)
@@ -184,248 +205,273 @@ def _ip_number(text: str) -> int:
     return int(ipaddress.ip_address(text)) if text else 0
 
 
-def other_size(table: StreamTable, lidar: Lidar, kind: Kind) -> list[str]:
-    """What is wrong with packets that are the lidar's, but of another size than its first ones."""
-    size = lidar.packet_size
-    if kind[1] in (size, size + 1):
-        return []
-    return [
-        f"{table.streams[kind[0]]}: wanted packets of {size} bytes as at first, got {kind[1]} "
-        "bytes as well, which are rejected as bad_size; split the recording where the settings "
-        "of the lidar change"
-    ]
+def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
+    """Name sensors after the namespace of their topics, else by vendor and serial number."""
+    counts: dict[str, int] = {}
+    for sensor in found:
+        vendor = sensor.lidar.vendor.lower()
+        counts[vendor] = counts.get(vendor, 0) + 1
+        topic = min((table.streams[stream].topic for stream in sensor.streams), default="")
+        place = "_".join(part for part in namespace(topic) if part not in GENERIC)
+        if place and place[0].isalpha() and place.replace("_", "").isalnum():
+            sensor.name = place
+        else:
+            sensor.name = f"{vendor}_{sensor.lidar.serial or counts[vendor]}"
 
 
-# Which packets are of which sensor of a rig, and with which calibration they were made.
+# -- with a rig -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """A sensor of the rig: where it sends from, its model if named, its possible calibrations."""
+class ExpectedSensor:
+    """A sensor of the rig, and calibrations it may have; options: of the command line."""
 
-    name: str
-    selector: StreamSelector
+    rig: RigSensor
     calibrations: Sequence[Calibration]
-    decode: Mapping[str, str]
-    model: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.rig.name
+
+    @property
+    def selector(self) -> StreamSelector:
+        """Streams it may send on."""
+        return self.rig.stream or StreamSelector()
+
+    @property
+    def decode(self) -> dict[str, str]:
+        """Options of its decoder: the rig's before those of the command line."""
+        return {**self.options, **self.rig.decode}
+
+    def usable(self) -> list[Calibration]:
+        """Calibrations of its serial number; those that leave the model open take the rig's."""
+        serial = self.selector.serial
+        usable = [one for one in self.calibrations if not serial or one.serial in ("", serial)]
+        model = self.rig.model
+        if model is None:
+            return usable
+        return [
+            (one.for_model(model) or one)
+            if isinstance(one, ModelFile) and (one.path is not None or one.model == model)
+            else one
+            for one in usable
+        ]
 
 
-def match_rig(sampler: Sampler, wanted: Sequence[Wanted], origin: Path) -> Matched:
+def match_rig(sampler: Sampler, expected: Sequence[ExpectedSensor], origin: Path) -> Matched:
     """Sensors of a rig, in its order; origin: the rig file.
 
-    Raises RigError where a sensor has no calibration.
+    Raises RigError for a sensor without a matching calibration.
     """
-    seen = [_find(sampler, one, origin) for one in wanted]
-    heard = [sensor for sensor in seen if sensor is not None]
-    _refuse_same(sampler.table, heard, origin)
-    taken = {kind for sensor in heard for kind in sensor.kinds}
-    unknown = [kind for kind in sampler.samples if kind not in taken]
-    used = {sensor.lidar.calibration for sensor in heard}
+    detected = [_detect(sampler, one, origin) for one in expected]
+    seen = [sensor for sensor in detected if sensor is not None]
+    _refuse_same_packets(sampler.table, seen, origin)
+    taken = {kind for sensor in seen for kind in sensor.kinds}
+    unknown = [kind for kind in sampler.kinds if kind not in taken]
+    used = {sensor.lidar.calibration for sensor in seen}
     found = [
         sensor or _silent(sampler, one, unknown, used, origin)
-        for sensor, one in zip(seen, wanted, strict=True)
+        for sensor, one in zip(detected, expected, strict=True)
     ]
     return Matched(found, unknown)
 
 
-def is_model(wanted: str, got: str) -> bool:
-    """Whether a lidar is of the model that the rig names."""
-    alike = {model.like for model in sensors.models() if model.name == wanted}
+def is_model(expected: str, found: str) -> bool:
+    """True if a lidar may be of the model that the rig names."""
+    reported_as = {model.same_packets_as for model in sensors.models() if model.name == expected}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
-    return got in alike or got.replace("-", "").startswith(wanted.replace("-", ""))
+    return found in reported_as or found.replace("-", "").startswith(expected.replace("-", ""))
 
 
-def _find(sampler: Sampler, wanted: Wanted, origin: Path) -> Found | None:
-    """The sensor by its packets; None where there is none yet."""
-    serial = wanted.selector.serial
-    usable = _usable(wanted)
-    _refuse_none(wanted, usable, origin)
-    scored: dict[int, tuple[Fit, set[Kind]]] = {}
-    failures, serials, models = list[str](), set[str](), set[str]()
-    for kind in sampler.samples:
-        if not wanted.selector.selects(sampler.table.streams[kind[0]]):
+@dataclass(slots=True)
+class _Match:
+    """The best fit of one calibration, and the kinds it fits."""
+
+    fit: Fit
+    kinds: set[PacketKind]
+
+
+def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> DetectedSensor | None:
+    """A sensor of the rig by its packets; None if it sent none."""
+    serial = expected.selector.serial
+    usable = expected.usable()
+    if not usable:
+        _refuse_no_metadata(expected, origin)
+    matches: dict[int, _Match] = {}
+    failures: list[str] = []
+    other_serials: set[str] = set()
+    other_models: set[str] = set()
+    for kind in sampler.kinds:
+        if not expected.selector.selects(sampler.table.streams[kind.stream]):
             continue
-        fits, failure = best_fits(sampler.evidence(kind), usable, wanted.decode, wanted.model)
-        failures += [failure] if failure else []
+        evidence = sampler.evidence(kind)
+        fits, failure = best_fits(evidence, usable, expected.decode, expected.rig.model)
+        if failure:
+            failures.append(failure)
         for fit in fits:
             if serial and fit.lidar.serial != serial:
-                serials.add(fit.lidar.serial)
-            elif wanted.model is not None and not is_model(wanted.model, fit.lidar.model):
-                models.add(fit.lidar.model)
+                other_serials.add(fit.lidar.serial)
+            elif expected.rig.model is not None and not is_model(
+                expected.rig.model, fit.lidar.model
+            ):
+                other_models.add(fit.lidar.model)
             else:
-                before, kinds = scored.get(fit.number, (fit, set[Kind]()))
-                scored[fit.number] = max(before, fit, key=_score), kinds | {kind}
-    if not scored:
-        own = any(one.serial == serial for one in usable)
-        if failures and not (serial and own):
-            raise RigError(f"{origin}: sensor {wanted.name}: {failures[0]}")
-        if serial and not own:
-            _refuse_serial(wanted, serials - {""}, origin)
-        _refuse_model(wanted, models, origin)
-        return None
-    return _chosen(sampler, wanted, list(scored.values()), origin)
-
-
-def _usable(wanted: Wanted) -> list[Calibration]:
-    serial = wanted.selector.serial
-    usable = [one for one in wanted.calibrations if not serial or one.serial in ("", serial)]
-    return [_named(one, wanted.model) for one in usable]
-
-
-def _named(calibration: Calibration, model: str | None) -> Calibration:
-    """What is built in for the model that the rig names knows so: packets may leave it open."""
-    if model != calibration.model or not isinstance(calibration, ModelFile):
-        return calibration
-    return calibration.for_model(model) or calibration
+                known = matches.setdefault(fit.number, _Match(fit, set()))
+                known.kinds.add(kind)
+                if fit.score > known.fit.score:
+                    known.fit = fit
+    if matches:
+        return _chosen(sampler, expected, list(matches.values()), origin)
+    has_own_file = any(one.serial == serial for one in usable)
+    start = f"{origin}: sensor {expected.name}:"
+    if failures and not (serial and has_own_file):
+        raise RigError(f"{start} {failures[0]}")
+    if serial and not has_own_file:
+        found = ", ".join(sorted(other_serials - {""}))
+        if not found:
+            _refuse_no_metadata(expected, origin)
+        raise RigError(
+            f"{start} expected packets of serial number {serial}, found those of {found}; correct "
+            "the serial"
+        )
+    if other_models:
+        raise RigError(
+            f"{start} expected packets of the model {expected.rig.model}, found those of "
+            f"{', '.join(sorted(other_models))}; correct model, stream or metadata"
+        )
+    return None
 
 
 def _chosen(
-    sampler: Sampler, wanted: Wanted, scored: Sequence[tuple[Fit, set[Kind]]], origin: Path
-) -> Found:
-    """The only sensor that fits; packets that are merely readable do not count beside others."""
-    sure = [one for one in scored if one[0].score != READABLE] or scored
-    fit, kinds = max(sure, key=lambda one: one[0].score)
-    units = {one.lidar.serial or str(one.number) for one, _ in sure}
-    streams = {str(sampler.table.streams[kind[0]]) for _, those in sure for kind in those}
-    if len(units) > 1 or (len(streams) > 1 and not fit.lidar.carries_serial):
-        models = sorted({one.lidar.model for one, _ in sure})
+    sampler: Sampler, expected: ExpectedSensor, matches: Sequence[_Match], origin: Path
+) -> DetectedSensor:
+    """The only sensor that matches; merely readable packets count only without others."""
+    sure = [one for one in matches if one.fit.score != READABLE] or matches
+    best = max(sure, key=lambda one: one.fit.score)
+    lidar = best.fit.lidar
+    units = {one.fit.lidar.serial or str(one.fit.number) for one in sure}
+    streams = {str(sampler.table.streams[kind.stream]) for one in sure for kind in one.kinds}
+    if len(units) > 1 or (len(streams) > 1 and not lidar.carries_serial):
+        models = sorted({one.fit.lidar.model for one in sure})
         raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted packets of one lidar, got those of several "
-            f"({', '.join(models)}) on {', '.join(sorted(streams))}; name its stream (source_ip, "
-            "port, topic or serial)"
+            f"{origin}: sensor {expected.name}: expected packets of one lidar, found those of "
+            f"several ({', '.join(models)}) on {', '.join(sorted(streams))}; name its stream "
+            "(source_ip, port, topic or serial)"
         )
-    found = Found(wanted.name, fit.lidar, wanted.selector, kinds)
-    if fit.score == READABLE:
-        what = sensors.describe(*_first_of(sampler, kinds)) or "another model"
-        found.notes.append(f"read as {fit.lidar.model}, which the rig names; it looks like {what}")
-    for kind in sorted(kinds):
-        found.notes += other_size(sampler.table, fit.lidar, kind)
+    found = DetectedSensor(expected.name, lidar, expected.selector, best.kinds, rig=expected.rig)
+    if best.fit.score == READABLE:
+        what = describe(sampler, min(best.kinds)) or "another model"
+        found.notes.append(f"read as {lidar.model}, which the rig names; it looks like {what}")
+    for kind in sorted(best.kinds):
+        found.notes += _other_size(sampler.table, lidar, kind)
     return found
 
 
-def _refuse_same(table: StreamTable, found: Sequence[Found], origin: Path) -> None:
-    """Two sensors of a rig share packets only where serial numbers tell these apart."""
+def describe(sampler: Sampler, kind: PacketKind) -> str | None:
+    """Description of the packets of a kind by their content; None if no vendor knows them."""
+    evidence = sampler.evidence(kind)
+    return sensors.describe(evidence.size, evidence.sample)
+
+
+def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], origin: Path) -> None:
+    """Raise RigError if sensors of a rig share packets that carry no serial number."""
     for number, one in enumerate(found):
         for other in found[:number]:
             apart = one.lidar.carries_serial and one.lidar.serial != other.lidar.serial
             shared = sorted(one.kinds & other.kinds)
             if shared and not apart:
                 raise RigError(
-                    f"{origin}: sensors {other.name} and {one.name}: wanted a stream each, got "
-                    f"{table.streams[shared[0][0]]} for both; name the stream of each (source_ip, "
-                    "port, topic or serial)"
+                    f"{origin}: sensors {other.name} and {one.name}: expected a stream each, found "
+                    f"{table.streams[shared[0].stream]} for both; name the stream of each "
+                    "(source_ip, port, topic or serial)"
                 )
 
 
-def _score(fit: Fit) -> int:
-    return fit.score
-
-
-def _first_of(sampler: Sampler, kinds: set[Kind]) -> tuple[int, U8Array]:
-    evidence = sampler.evidence(min(kinds))
-    return evidence.size, evidence.sample
-
-
-def _refuse_none(wanted: Wanted, usable: Sequence[Calibration], origin: Path) -> None:
-    if not usable:
-        serial = wanted.selector.serial
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: no metadata"
-            + (f" with serial number {serial}" if serial else "")
-            + f" among {_paths(wanted.calibrations)}; give it as `metadata:` of the sensor, or "
-            "with --metadata"
-        )
-
-
-def _refuse_serial(wanted: Wanted, others: Collection[str], origin: Path) -> None:
-    """A serial number that neither packets nor files bear; others: those of the packets."""
-    if not others:
-        _refuse_none(wanted, (), origin)
+def _refuse_no_metadata(expected: ExpectedSensor, origin: Path) -> NoReturn:
+    serial = expected.selector.serial
     raise RigError(
-        f"{origin}: sensor {wanted.name}: wanted packets of serial number "
-        f"{wanted.selector.serial}, got those of {', '.join(sorted(others))}; correct the serial"
+        f"{origin}: sensor {expected.name}: no metadata"
+        + (f" with serial number {serial}" if serial else "")
+        + f" among {_paths(expected.calibrations)}; give it as `metadata:` of the sensor, or "
+        "with --metadata"
     )
-
-
-def _refuse_model(wanted: Wanted, models: Collection[str], origin: Path) -> None:
-    """Packets that are of other models than the rig says."""
-    if models:
-        raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted packets of the model {wanted.model}, got "
-            f"those of {', '.join(sorted(models))}; correct model, stream or metadata"
-        )
 
 
 def _silent(
     sampler: Sampler,
-    wanted: Wanted,
-    unknown: Sequence[Kind],
+    expected: ExpectedSensor,
+    unknown: Sequence[PacketKind],
     used: Collection[str],
     origin: Path,
-) -> Found:
-    """A sensor of which no packet was seen; used: calibrations of those that were."""
-    lidar, carried = None, _carried(sampler, wanted.selector, unknown)
-    own = _own(wanted, used)
+) -> DetectedSensor:
+    """A sensor of the rig that sent no packet; used: calibrations of those that did."""
+    start = f"{origin}: sensor {expected.name}:"
+    lidar: Lidar | None = None
+    others = _lidars_on(sampler, expected.selector, unknown)
+    own = _own_calibrations(expected, used)
     if len(own) == 1:
         try:
-            lidar = own[0].lidar(wanted.decode, None)
+            lidar = own[0].lidar(expected.decode, None)
         except RigError as err:
-            if not carried or own[0].path is None:
-                raise RigError(f"{origin}: sensor {wanted.name}: {err}") from err
-    if carried:
-        _refuse_carried(wanted, own, lidar, carried, origin)
+            if not others or own[0].path is None:
+                raise RigError(f"{start} {err}") from err
+    if others:
+        _refuse_other_lidars(expected, own, lidar, others, origin)
     if lidar is None:
-        selector = f" ({wanted.selector})" if str(wanted.selector) else ""
+        selector = f" ({expected.selector})" if str(expected.selector) else ""
         which = f"which of {_paths(own)} is its metadata" if own else "its model"
         remedy = "`metadata:`" if own else "`metadata:` or `model:`"
         raise RigError(
-            f"{origin}: sensor {wanted.name}: wanted a packet of it{selector} in the first 10 "
-            f"seconds, got none to tell {which}; correct its stream, or give {remedy}"
+            f"{start} expected a packet of it{selector} in the first 10 seconds, found none to "
+            f"decide {which}; correct its stream, or give {remedy}"
         )
-    return Found(wanted.name, lidar, wanted.selector)
+    return DetectedSensor(expected.name, lidar, expected.selector, rig=expected.rig)
 
 
-def _refuse_carried(
-    wanted: Wanted, own: Sequence[Calibration], lidar: Lidar | None, carried: str, origin: Path
+def _refuse_other_lidars(
+    expected: ExpectedSensor,
+    own: Sequence[Calibration],
+    lidar: Lidar | None,
+    others: str,
+    origin: Path,
 ) -> None:
-    """A silent sensor whose place other packets come from, or that they surely stand for."""
-    start = f"{origin}: sensor {wanted.name}: wanted"
+    """Raise RigError if other lidars' packets are on the stream of a silent sensor."""
+    start = f"{origin}: sensor {expected.name}: expected"
     if not own:
         raise RigError(
-            f"{start} metadata that fit {carried}, got none; give them as `metadata:` of the "
+            f"{start} metadata that match {others}, found none; give them as `metadata:` of the "
             "sensor, or with --metadata"
         )
-    is_placed = bool(wanted.selector.source_ip or wanted.selector.topic)
-    if is_placed or (len(own) == 1 and not _tells_serial(lidar)):
+    has_stream = bool(expected.selector.source_ip or expected.selector.topic)
+    # Its own packets, had there been any, would be recognised among others by serial number.
+    has_serial = lidar is not None and lidar.carries_serial
+    if has_stream or (len(own) == 1 and not has_serial):
         is_built_in = any(one.path is None for one in own)
-        which = f"of the model {wanted.model}" if is_built_in else f"that fit {_paths(own)}"
-        raise RigError(f"{start} packets {which}, got {carried}; correct model, stream or metadata")
+        which = f"of the model {expected.rig.model}" if is_built_in else f"that match {_paths(own)}"
+        remedy = "correct model, stream or metadata"
+        raise RigError(f"{start} packets {which}, found {others}; {remedy}")
 
 
-def _tells_serial(lidar: Lidar | None) -> bool:
-    """Whether the sensor's own packets would have been known among others."""
-    return lidar is not None and lidar.carries_serial
-
-
-def _own(wanted: Wanted, used: Collection[str]) -> list[Calibration]:
-    """Calibrations that may be those of a silent sensor: files, or what its model has built in."""
-    usable = _usable(wanted)
+def _own_calibrations(expected: ExpectedSensor, used: Collection[str]) -> list[Calibration]:
+    """Calibrations a silent sensor may have: unused files, else the built-in one of its model."""
+    usable = expected.usable()
     own = [one for one in usable if one.path is not None]
-    if len(wanted.calibrations) > 1:
+    if len(expected.calibrations) > 1:
         own = [one for one in own if str(one.path) not in used]
-    if wanted.model is None:
+    if expected.rig.model is None:
         return own
-    named = [one for one in usable if one.model == wanted.model]
+    named = [one for one in usable if one.model == expected.rig.model]
     return [one for one in named if one.path is not None] or named or own
 
 
-def _carried(sampler: Sampler, selector: StreamSelector, kinds: Sequence[Kind]) -> str:
-    """Lidars whose packets a selector selects, though none fits; "" where there are none."""
+def _lidars_on(sampler: Sampler, selector: StreamSelector, kinds: Sequence[PacketKind]) -> str:
+    """Descriptions of the lidars among the kinds that a selector selects, or ""."""
     found = []
     for kind in kinds:
-        stream, what = sampler.table.streams[kind[0]], None
-        if selector.selects(stream):
-            what = sensors.describe(*_first_of(sampler, {kind}))
+        stream = sampler.table.streams[kind.stream]
+        what = describe(sampler, kind) if selector.selects(stream) else None
         if what is not None and "lidar" in what:
             found.append(f"{what} ({stream})")
     return ", ".join(found)
@@ -436,83 +482,83 @@ def _paths(calibrations: Sequence[Calibration]) -> str:
     return ", ".join(names) or "the files given"
 
 
-# Several lidars behind one address: their packets cannot be told apart, and must not be mixed.
+# -- several lidars at one address ----------------------------------------------------------------
 #
-# The columns of a packet follow those of the one before. Where packets of one stream overlap in
-# time, some of them or with the rotor elsewhere, or where stamps step to and fro, more than one
-# lidar sends. Repeated packets and packets out of order do not look so.
+# The columns of a packet follow those of the packet before. More than one lidar sends on a stream
+# if a part of its packets overlap in time, or if all overlap with the rotor at other angles, or if
+# timestamps step back and forth. Duplicate and reordered packets give no such steps.
 
-# Steps from packet to packet, by the time from the first to the last column of one: those that
-# overlap, with a margin for rounded stamps, and those of packets with none between them.
-_WITHIN, _NEXT = 0.95, 2.5
-# Steps of several lidars, of those between packets that follow each other.
-_MANY, _ALL = 0.15, 0.9
-_FEWEST_STEPS = 8
-# A rotor is elsewhere, by what it turns in a step, and by what angles are rounded to.
-_ELSEWHERE, _RESOLUTION_TURNS = 0.25, 1e-3
-_TURN = 2.0**32
+# Of the time from the first to the last column of a packet: steps to the next packet that overlap
+# (with a margin for rounded timestamps), and steps between neighbours in time.
+_OVERLAP = 0.95
+_NEIGHBOUR = 2.5
+# Shares of the steps between neighbours that are foreign: by several lidars, by all steps.
+_SEVERAL = 0.15
+_ALL = 0.9
+_MIN_STEPS = 8
+# Deviation of the rotor from its usual step: share of the step, and rounding of angles.
+_ROTOR_SHARE = 0.25
+_ROTOR_ROUNDING = 1e-3  # revolutions
+_REVOLUTION_TICKS = 2.0**32
 
 
-def shared_by(sampler: Sampler, sensor: Found) -> str:
-    """What is wrong with a sensor's stream that several lidars share, or ""."""
-    for kind in sorted(sensor.kinds):
-        if kind in sampler.samples:
-            heads = _heads(sampler, kind, sensor.lidar)
-            step_ns = _foreign_step_ns(heads, sensor.lidar)
-            if step_ns is not None:
-                span_ns = median(_spans_ns(heads))
-                return (
-                    f"sensor {sensor.name}: {sampler.table.streams[kind[0]]}: wanted packets of "
-                    f"one {sensor.lidar.model}, got packets of {span_ns / NS_PER_MS:.3f} ms that "
-                    f"step by {step_ns / NS_PER_MS:+.3f} ms: several lidars share the address; "
-                    "give each an address or a port of its own and record again"
-                )
+def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
+    """Error text if several lidars send on a stream of a sensor, else ""."""
+    lidar = sensor.lidar
+    for kind in sorted(sensor.kinds & sampler.kinds.keys()):
+        packets, host_ns = sampler.good_samples(kind, lidar)
+        heads = lidar.heads(packets, host_ns)
+        whole = heads.valid.all(axis=1)
+        heads = Heads(heads.stamp_ns[whole], heads.encoder[whole], heads.valid[whole])
+        step_ns = _foreign_step_ns(heads, lidar)
+        if step_ns is not None:
+            span_ns = median(_spans_ns(heads))
+            return (
+                f"sensor {sensor.name}: {sampler.table.streams[kind.stream]}: expected packets of "
+                f"one {lidar.model}, found packets of {span_ns / NS_PER_MS:.3f} ms that "
+                f"step by {step_ns / NS_PER_MS:+.3f} ms: several lidars share the address; "
+                "give each an address or a port of its own and record again"
+            )
     return ""
 
 
-def _heads(sampler: Sampler, kind: Kind, lidar: Lidar) -> Heads:
-    """Those of the good samples of a kind all of whose columns are valid."""
-    packets = as_rows(sampler.samples[kind], kind[1])[:, : lidar.packet_size]
-    hosts_ns = np.array(sampler.sample_host_ns[kind], np.int64)
-    good = lidar.owns(packets) & (lidar.faults(packets) == 0)
-    heads = lidar.heads(packets[good], hosts_ns[good])
-    whole = heads.valid.all(axis=1)
-    return Heads(heads.stamp_ns[whole], heads.encoder[whole], heads.valid[whole])
-
-
 def _spans_ns(heads: Heads) -> F64Array:
-    """(P,) from the first column of each packet to the last."""
+    """(P,) time from the first to the last column of each packet."""
     return np.asarray(heads.stamp_ns[:, -1] - heads.stamp_ns[:, 0], np.float64)
 
 
 def _foreign_step_ns(heads: Heads, lidar: Lidar) -> float | None:
-    """A usual step of those that one lidar cannot make; None where there are hardly any."""
+    """Median of the steps that one lidar cannot make; None if there are too few."""
     span_ns = _spans_ns(heads)
     step_ns = np.diff(heads.stamp_ns[:, 0]).astype(np.float64)
     near_ns = np.minimum(span_ns[1:], span_ns[:-1])
-    to_and_fro = step_ns < -NS_PER_S
-    overlaps = (step_ns != 0) & (np.abs(step_ns) < _WITHIN * near_ns)
-    foreign = overlaps | to_and_fro
-    steps = (step_ns != 0) & (np.abs(step_ns) < _NEXT * near_ns) | to_and_fro
-    count, foreigners = int(np.count_nonzero(steps)), int(np.count_nonzero(foreign))
-    if count < _FEWEST_STEPS or foreigners < _MANY * count:
+    back_and_forth = step_ns < -NS_PER_S
+    overlaps = (step_ns != 0) & (np.abs(step_ns) < _OVERLAP * near_ns)
+    foreign = overlaps | back_and_forth
+    steps = (step_ns != 0) & (np.abs(step_ns) < _NEIGHBOUR * near_ns) | back_and_forth
+    count = int(np.count_nonzero(steps))
+    foreign_count = int(np.count_nonzero(foreign))
+    if count < _MIN_STEPS or foreign_count < _SEVERAL * count:
         return None
-    if foreigners > _ALL * count and not to_and_fro.any():
-        # Either two lidars half a packet apart, or one whose pace is not what we know.
+    if foreign_count > _ALL * count and not back_and_forth.any():
+        # Two lidars half a packet apart, or one whose column period differs from the known one.
         rows = np.flatnonzero(steps)
-        elsewhere = _off_course(heads, rows, step_ns[rows], lidar)
-        if np.count_nonzero(elsewhere) < _MANY * count:
+        elsewhere = _is_rotor_elsewhere(heads, rows, step_ns[rows], lidar)
+        if np.count_nonzero(elsewhere) < _SEVERAL * count:
             return None
     return median(step_ns[foreign])
 
 
-def _off_course(heads: Heads, rows: I64Array, step_ns: F64Array, lidar: Lidar) -> BoolArray:
-    """At which of the steps (n,) from these packets the rotor did not turn as on the whole."""
+def _is_rotor_elsewhere(heads: Heads, rows: I64Array, step_ns: F64Array, lidar: Lidar) -> BoolArray:
+    """(n,) True for steps after packets `rows` (n,) in which the rotor leaves its usual speed."""
     positions = lidar.beams.angle_rad
     first = heads.encoder[:, 0]
-    angle = rotor_ticks(first) / _TURN if positions is None else first / len(positions)
-    turned = np.diff(angle)[rows]
+    if positions is None:
+        revolutions = rotor_ticks(first) / _REVOLUTION_TICKS
+    else:
+        revolutions = first / len(positions)
+    turned = np.diff(revolutions)[rows]
     turned -= np.rint(turned)
     usual = step_ns * (turned.sum() / max(abs(step_ns.sum()), 1.0))
     off = np.abs(turned - usual - np.rint(turned - usual))
-    return np.asarray(off > np.maximum(_ELSEWHERE * np.abs(usual), _RESOLUTION_TURNS), np.bool_)
+    return np.asarray(off > np.maximum(_ROTOR_SHARE * np.abs(usual), _ROTOR_ROUNDING), np.bool_)

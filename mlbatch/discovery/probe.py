@@ -1,4 +1,7 @@
-"""A first look at a session: its first seconds, and the calibrations that lie beside it."""
+"""The first seconds of a session, and the calibrations in and around its recordings.
+
+Sources: docs/sources/messages.md sections 2 (calibrations) and 6 (transforms).
+"""
 
 from __future__ import annotations
 
@@ -9,44 +12,62 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch import readers, sensors
-from mlbatch.discovery.extrinsics import Knowledge
+from mlbatch import readers, ros, sensors
+from mlbatch.discovery.extrinsics import ExtrinsicsSources
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
-from mlbatch.readers import holds_packets, merge
-from mlbatch.rig.rig import Rig
+from mlbatch.readers import has_packets, merge
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
 
-LOOK_NS = 10 * NS_PER_S
-_ASKED = 16
-# Calibrations are searched beside the recording under these suffixes, and told by content.
-SIDECAR_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
+# Length of the part that is probed.
+PROBE_NS = 10 * NS_PER_S
+# Packets of a kind in a batch that are checked for being a lidar's.
+_CHECKED = 16
+# Suffixes of calibration files in the recording's directory; vendors recognise them by content.
+CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
 METADATA_SUFFIX = ".json"
-# No calibration of one sensor comes near; tables and documents of a dataset are not opened.
-MAX_SIDECAR_BYTES = 2_000_000
+# Well above any calibration of one sensor; larger tables of a dataset are not opened.
+MAX_CALIBRATION_FILE_BYTES = 2_000_000
 BAG_METADATA = "metadata.yaml"
+
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+TEXT_TYPE = "std_msgs/String"
+BYTES_TYPE = "std_msgs/UInt8MultiArray"
+# Last parts of topics.
+METADATA = "metadata"
+DESCRIPTION = "robot_description"
+STATIC = "tf_static"
+# Angle file of the lidar, published by HESAI ROS_2.0.
+CORRECTIONS = "lidar_corrections"
+# Added to scores: a calibration recorded with the packets is preferred to a file.
+_RECORDED_SCORE = 10_000
+
+
+# -- recordings -----------------------------------------------------------------------------------
 
 
 def with_clouds(
-    recordings: Sequence[Recording], table: StreamTable, named: Collection[str]
+    recordings: Sequence[Recording], table: StreamTable, topics: Collection[str]
 ) -> list[Recording]:
-    """The recordings, with decoded clouds as packets: of the topics named (in the rig).
+    """The recordings, with decoded clouds on `topics` (those in the rig) as packets.
 
-    Where nothing is named and the session holds no raw packets, all its clouds are taken.
+    Without topics: all clouds, if the session contains no raw packets.
     """
-    topics = [topic for recording in recordings for topic in recording.topics]
-    if not topics:
+    recorded = [topic for recording in recordings for topic in recording.topics]
+    if not recorded:
         return list(recordings)
     # Not loaded for captures.
-    from mlbatch.clouds import CloudRecording, Layout, cloud_topics
+    from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+    from mlbatch.ros.point_packets import Layout
 
-    clouds = {topic.name: topic for topic in cloud_topics(topics)}
-    # A capture has no topics, and nothing but packets.
-    raw = any(not recording.topics for recording in recordings) or any(map(holds_packets, topics))
-    chosen = [topic for name, topic in clouds.items() if name in named or (not raw and not named)]
+    clouds = {topic.name: topic for topic in cloud_topics(recorded)}
+    # A capture has no topics, only packets.
+    has_captures = any(not recording.topics for recording in recordings)
+    is_raw = has_captures or any(map(has_packets, recorded))
+    chosen = [cloud for name, cloud in clouds.items() if name in topics or not (is_raw or topics)]
     if not chosen:
         return list(recordings)
     layouts: dict[str, Layout] = {}
@@ -54,98 +75,92 @@ def with_clouds(
 
 
 def is_without_packets(recording: Recording) -> bool:
-    """Whether a recording can only hold messages beside the packets of others."""
-    if not recording.topics or any(map(holds_packets, recording.topics)):
+    """True if a recording has no packet topics, only messages."""
+    if not recording.topics or any(map(has_packets, recording.topics)):
         return False
-    # As above.
-    from mlbatch.clouds import CloudRecording
+    # Not loaded for captures.
+    from mlbatch.readers.bag.clouds import CloudRecording
 
     clouds = recording.topics_of_clouds if isinstance(recording, CloudRecording) else ()
     return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
 
 
-def look(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, Learner]:
-    """Look at the first 10 s of a session: its packets, and the messages that tell of sensors."""
-    sampler, learner = Sampler(table), Learner()
-    listen(recordings)
+def probe(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, MetadataCollector]:
+    """Read the first 10 s of a session: samples of its packets, and its metadata messages."""
+    sampler = Sampler(table)
+    collector = MetadataCollector()
+    subscribe(recordings)
     for batch in first_seconds(recordings):
         sampler.add(batch)
-        learner.add(batch)
+        collector.add(batch)
     for recording in recordings:
         recording.keep = frozenset()
-    return sampler, learner
+    return sampler, collector
 
 
 def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
-    """The packets up to 10 s after the first lidar packet, whatever the size of the batches.
+    """Yield all packets up to 10 s after the first lidar packet.
 
-    A capture is often started long before the lidars are.
+    A capture may start long before the lidars do. The end does not depend on the size of batches.
     """
-    until_ns: int | None = None
+    end_ns: int | None = None
     with contextlib.closing(merge(recordings)) as batches:
         for batch in batches:
-            if until_ns is None:
-                began_ns = _lidars_begin_ns(batch)
-                until_ns = None if began_ns is None else began_ns + LOOK_NS
-            if until_ns is None:
+            if end_ns is None:
+                begin_ns = _first_lidar_host_ns(batch)
+                end_ns = None if begin_ns is None else begin_ns + PROBE_NS
+            if end_ns is None:
                 yield batch
                 continue
-            over = np.flatnonzero(batch.host_ns > until_ns)
-            if len(over):
-                yield replace(batch.take(slice(0, int(over[0]))), messages=batch.messages)
+            later = np.flatnonzero(batch.host_ns > end_ns)
+            if len(later):
+                yield replace(batch.take(slice(0, int(later[0]))), messages=batch.messages)
                 return
             yield batch
 
 
-def _lidars_begin_ns(batch: PacketBatch) -> int | None:
-    """Arrival of the first packet of a kind that looks like a lidar's.
+def _first_lidar_host_ns(batch: PacketBatch) -> int | None:
+    """Receive time of the first packet of a kind that is described as a lidar's.
 
-    A few packets are asked: device packets may come first on the topic of the others.
+    Several packets are checked: device packets may come first on the same topic.
     """
     begins_ns = []
-    for (_, size), index in split_by_kind(batch):
-        asked = batch.start[index[:_ASKED], None] + np.arange(size)
-        text = sensors.describe(size, batch.data[asked])
+    for kind, index in split_by_kind(batch):
+        checked = batch.start[index[:_CHECKED], None] + np.arange(kind.size)
+        text = sensors.describe(kind.size, batch.data[checked])
         if text is not None and "lidar" in text:
             begins_ns.append(int(batch.host_ns[index[0]]))
     return min(begins_ns, default=None)
 
 
-def calibrations_for(
+# -- calibration files ----------------------------------------------------------------------------
+
+
+def find_calibrations(
     recordings: Sequence[Path], given: Sequence[Path]
 ) -> tuple[list[Calibration], list[Path]]:
-    """Calibrations that were given, else those beside the recordings; and the files looked at."""
+    """Calibrations in the files given, else in the recordings' directories; and files examined."""
     if given:
         return [read_given(path) for path in given], list(given)
-    looked: list[Path] = []
-    found = []
-    for folder in dict.fromkeys(map(_folder_of, recordings)):
+    found: list[Calibration] = []
+    examined: list[Path] = []
+    for folder in dict.fromkeys(map(_calibration_folder, recordings)):
         for path in sorted(path for path in folder.iterdir() if _may_be_calibration(path)):
-            # A file beside the recording was never named by the user: a foreign one is no error.
+            # The user did not name this file, so that an unusable one is no error.
             try:
                 calibration = sensors.read_calibration(path)
             except RigError:
-                looked.append(path)
+                examined.append(path)
                 continue
             if calibration is not None:
                 found.append(calibration)
             if calibration is not None or path.suffix.lower() == METADATA_SUFFIX:
-                looked.append(path)
-    return found, looked
-
-
-def calibrations_besides(
-    rig: Rig | None, recordings: Sequence[Path], given: Sequence[Path]
-) -> tuple[list[Calibration], list[Path]]:
-    """The same; nothing where the rig names the file of every sensor."""
-    # All makers would be asked for all files beside the recordings.
-    if rig is not None and not given and all(one.metadata for one in rig.sensors):
-        return [], []
-    return calibrations_for(recordings, given)
+                examined.append(path)
+    return found, examined
 
 
 def fault_of(path: Path) -> str:
-    """What is wrong with a calibration beside the recording that could not be used, or ""."""
+    """Why a file in the recording's directory is no usable calibration, or ""."""
     try:
         sensors.read_calibration(path)
     except RigError as err:
@@ -153,137 +168,134 @@ def fault_of(path: Path) -> str:
     return ""
 
 
-def _folder_of(recording: Path) -> Path:
-    """Where calibrations of a recording lie: beside it, or beside the folder of a ROS 2 bag."""
-    folder = recording.parent
-    return folder.parent if (folder / BAG_METADATA).is_file() else folder
-
-
-def _may_be_calibration(path: Path) -> bool:
-    is_one = path.suffix.lower() in SIDECAR_SUFFIXES and path.name != BAG_METADATA
-    return is_one and path.is_file() and path.stat().st_size <= MAX_SIDECAR_BYTES
-
-
 def read_given(path: Path) -> Calibration:
-    """The calibration in a file that the user named; RigError if it is none."""
+    """The calibration in a file that the user named; RigError for another kind of file."""
     calibration = sensors.read_calibration(path)
     if calibration is None:
         raise RigError(
-            f"{path}: wanted the metadata or calibration of a lidar, got another kind of file; "
+            f"{path}: expected the metadata or calibration of a lidar, found another kind of file; "
             "give the file that the sensor's driver or recorder saved"
         )
     return calibration
 
 
-# What the messages of a session teach about its sensors, before the first packet is converted.
-#
-# Facts: facts/messages.md section 2 (calibrations) and section 6 (transforms).
-
-TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-TEXT_TYPE = "std_msgs/String"
-BYTES_TYPE = "std_msgs/UInt8MultiArray"
-METADATA, DESCRIPTION, STATIC = "metadata", "robot_description", "tf_static"
-# HESAI ROS_2.0 publishes the angle file of the lidar there.
-CORRECTIONS = "lidar_corrections"
-# A calibration that was recorded with the packets beats one that lies beside the recording.
-_FITS_TOPIC = 10_000
+def _calibration_folder(recording: Path) -> Path:
+    """Directory of a recording; of a file inside a ROS 2 bag, that of the bag."""
+    folder = recording.parent
+    return folder.parent if (folder / BAG_METADATA).is_file() else folder
 
 
-def teaches(topic: Topic) -> bool:
-    """Whether the messages of a topic say something of sensors."""
+def _may_be_calibration(path: Path) -> bool:
+    has_suffix = path.suffix.lower() in CALIBRATION_SUFFIXES and path.name != BAG_METADATA
+    return has_suffix and path.is_file() and path.stat().st_size <= MAX_CALIBRATION_FILE_BYTES
+
+
+# -- metadata messages ----------------------------------------------------------------------------
+
+
+def is_metadata(topic: Topic) -> bool:
+    """True for topics with calibrations, transforms or a robot description."""
     if topic.type == TEXT_TYPE:
-        return _tail(topic) in (METADATA, DESCRIPTION)
+        return _last_part(topic) in (METADATA, DESCRIPTION)
     if topic.type == BYTES_TYPE:
-        return _tail(topic) == CORRECTIONS
-    return topic.type in TRANSFORM_TYPES or readers.holds_corrections(topic)
+        return _last_part(topic) == CORRECTIONS
+    return topic.type in TRANSFORM_TYPES or readers.has_corrections(topic)
 
 
-def listen(recordings: Iterable[Recording]) -> None:
-    """Have recordings hand over the messages that teach."""
+def subscribe(recordings: Iterable[Recording]) -> None:
+    """Have recordings deliver their metadata messages."""
     for recording in recordings:
-        recording.keep = frozenset(topic.name for topic in recording.topics if teaches(topic))
+        recording.keep = frozenset(topic.name for topic in recording.topics if is_metadata(topic))
 
 
-class Learner:
-    """Takes messages; then tells calibrations, transforms and what could not be understood."""
+class MetadataCollector:
+    """Collects calibrations and extrinsics from messages.
+
+    extrinsics: transforms and robot descriptions; faults: why messages could not be read.
+    """
 
     def __init__(self) -> None:
-        self.knowledge = Knowledge()
+        self.extrinsics = ExtrinsicsSources()
         self.faults: list[str] = []
-        self._texts: dict[str, bytes] = {}
+        self._calibration_texts: dict[str, bytes] = {}
 
     def add(self, batch: PacketBatch) -> None:
-        """Learn from the messages of a batch; one that cannot be read is a fault, told once."""
+        """Add the messages of a batch; each fault is noted once."""
         for message in batch.messages:
-            self._try(message)
+            self._add(message)
 
-    def _try(self, message: Message) -> None:
+    def _add(self, message: Message) -> None:
         try:
-            self._learn(message)
+            self._read(message)
         except MlbatchError as err:
             if str(err) not in self.faults:
                 self.faults.append(str(err))
 
-    def _learn(self, message: Message) -> None:
+    def _read(self, message: Message) -> None:
         topic = message.topic
+        last_part = _last_part(topic)
         if topic.type in TRANSFORM_TYPES:
-            stated = readers.decode_transforms(topic, message.data)
-            self.knowledge.add_transforms("tf_static" if _tail(topic) == STATIC else "tf", stated)
-        elif topic.type == TEXT_TYPE and _tail(topic) == METADATA:
-            # Of several, the first: it is the one under which the recording began.
-            self._texts.setdefault(topic.name, readers.decode_string(topic, message.data).encode())
-        elif topic.type == BYTES_TYPE and _tail(topic) == CORRECTIONS:
-            self._texts.setdefault(topic.name, readers.decode_bytes(topic, message.data))
+            transforms = ros.decode_transforms(topic, message.data)
+            self.extrinsics.add_transforms("tf_static" if last_part == STATIC else "tf", transforms)
+        elif topic.type == TEXT_TYPE and last_part == METADATA:
+            self._add_text(topic, ros.decode_string(topic, message.data).encode())
+        elif topic.type == BYTES_TYPE and last_part == CORRECTIONS:
+            self._add_text(topic, ros.decode_bytes(topic, message.data))
         elif topic.type == readers.CORRECTION_TYPE:
-            self._texts.setdefault(topic.name, message.data)
-        elif topic.type == TEXT_TYPE and _tail(topic) == DESCRIPTION:
-            self.knowledge.add_urdf(readers.decode_string(topic, message.data))
+            self._add_text(topic, message.data)
+        elif topic.type == TEXT_TYPE and last_part == DESCRIPTION:
+            self.extrinsics.add_urdf(ros.decode_string(topic, message.data))
+
+    def _add_text(self, topic: Topic, text: bytes) -> None:
+        """Keep the first text of a topic: the settings at the start of the recording."""
+        self._calibration_texts.setdefault(topic.name, text)
 
     @property
-    def metadata_topics(self) -> tuple[str, ...]:
-        """Topics of metadata that spoke."""
-        return tuple(self._texts)
+    def calibration_topics(self) -> tuple[str, ...]:
+        """Topics with a text that should be a calibration."""
+        return tuple(self._calibration_texts)
 
     def calibrations(self) -> list[Calibration]:
-        """Calibrations in metadata topics; a text that is none is a fault."""
+        """Calibrations in messages; a text that is none is noted as a fault."""
         found: list[Calibration] = []
-        for topic, text in self._texts.items():
+        for topic, text in self._calibration_texts.items():
             try:
                 calibration = sensors.parse_calibration(Path(topic), text)
             except MlbatchError as err:
                 self.faults.append(str(err))
                 continue
             if calibration is None:
-                self.faults.append(f"{topic}: wanted the metadata of a lidar, got another text")
+                self.faults.append(f"{topic}: expected the metadata of a lidar, found another text")
             else:
-                found.append(TopicCalibration(calibration, topic, tuple(self._texts)))
+                found.append(TopicCalibration(calibration, topic, self.calibration_topics))
         return found
 
 
 class TopicCalibration:
-    """A calibration that was recorded: of the packets in its own namespace, or of a capture."""
+    """A recorded calibration: of the packets in its topic's namespace, or of a capture."""
 
-    def __init__(self, inner: Calibration, topic: str, others: Sequence[str]) -> None:
+    def __init__(self, inner: Calibration, topic: str, topics: Sequence[str]) -> None:
+        """topics: all topics with calibrations."""
         self.path = inner.path
         self.model = inner.model
         self.serial = inner.serial
         self.is_shared = inner.is_shared
         self._inner = inner
         self._topic = topic
-        self._others = others
+        self._topics = topics
 
     def fit(self, evidence: Evidence) -> int:
-        """As the calibration itself; 0 for packets of another namespace."""
+        """Score of the calibration itself; 0 for packets of another namespace."""
         topic = evidence.stream.topic
-        if topic and nearest_topic(topic, self._others) != self._topic:
+        if topic and nearest_topic(topic, self._topics) != self._topic:
             return 0
         score = self._inner.fit(evidence)
-        return score + _FITS_TOPIC if score and topic else score
+        return score + _RECORDED_SCORE if score and topic else score
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
-        """The sensor."""
+        """Decoder of the sensor."""
         return self._inner.lidar(options, evidence)
 
 
-def _tail(topic: Topic) -> str:
+def _last_part(topic: Topic) -> str:
     return topic.name.rsplit("/", 1)[-1]

@@ -1,8 +1,7 @@
 """Assignment of packets to sensors: by stream, payload size and what the packets contain.
 
-A *kind* is a stream together with a payload size. Discovery matches the kinds of the first seconds
-with calibrations or the rig; a kind that appears later joins a sensor only if its packets identify
-the sensor.
+Discovery matches the packet kinds of the first seconds with calibrations or the rig; a kind that
+appears later joins a sensor only if its packets identify the sensor.
 """
 
 from __future__ import annotations
@@ -12,7 +11,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mlbatch.arrays import U8Array
-from mlbatch.discovery.sampler import Found, Kind, is_beside
+from mlbatch.discovery.sampler import are_neighbours
+from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.rig.rig import StreamSelector
 from mlbatch.types import Stream, StreamTable
 
@@ -28,84 +28,89 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Where the packets of a kind go: numbers of sensors that may own them."""
+    """Destination of the packets of a kind; sensors: indices of those that may have sent them."""
 
     role: Role
     sensors: tuple[int, ...] = ()
-    what: str = ""
 
 
 class Router:
-    """Tells for every kind which sensors it may come from; remembers the answer.
+    """Decides which sensors the packets of a kind may come from, once for each kind.
 
-    early: the kinds from which the sensors were found.
+    early: kinds from which the sensors were detected.
     """
 
-    def __init__(self, table: StreamTable, found: Sequence[Found], early: Collection[Kind]) -> None:
+    def __init__(
+        self, table: StreamTable, sensors: Sequence[DetectedSensor], early: Collection[PacketKind]
+    ) -> None:
         self._table = table
-        self._found = list(found)
+        self._sensors = list(sensors)
         self._early = frozenset(early)
-        self._routes: dict[Kind, Route] = {}
+        self._routes: dict[PacketKind, Route] = {}
 
-    def route(self, kind: Kind, payload: U8Array) -> Route:
-        """Route of a kind; payload is one of its packets, looked at only the first time."""
+    def route(self, kind: PacketKind, payload: U8Array) -> Route:
+        """Route of a kind; payload: one of its packets, read for the first of a kind only."""
         known = self._routes.get(kind)
         if known is None:
-            known = self._routes[kind] = self._decide(kind, payload)
+            known = self._decide(kind, payload)
+            self._routes[kind] = known
         return known
 
-    def _decide(self, kind: Kind, payload: U8Array) -> Route:
-        stream, size = self._table.streams[kind[0]], kind[1]
+    def _decide(self, kind: PacketKind, payload: U8Array) -> Route:
+        stream = self._table.streams[kind.stream]
         owners = tuple(
             number
-            for number, sensor in enumerate(self._found)
-            if size in (sensor.lidar.packet_size, sensor.lidar.packet_size + 1)
+            for number, sensor in enumerate(self._sensors)
+            if kind.size in (sensor.lidar.packet_size, sensor.lidar.packet_size + 1)
             and self._may_own(sensor, kind, stream, payload)
         )
         if owners:
             self._join(kind, owners)
             return Route(Role.LIDAR, owners)
-        imu = self._imu_owner(stream, size)
+        imu = self._imu_owner(stream, kind.size)
         if imu is not None:
             return Route(Role.IMU, (imu,))
-        for number, sensor in enumerate(self._found):
-            if any(stream_number == kind[0] for stream_number, _ in sensor.kinds):
+        for number, sensor in enumerate(self._sensors):
+            if kind.stream in sensor.streams:
                 return Route(Role.BAD_SIZE, (number,))
         return Route(Role.UNASSIGNED)
 
-    def _join(self, kind: Kind, owners: Sequence[int]) -> None:
-        """A sensor is known to send a kind: what comes beside it may be its IMU."""
+    def _join(self, kind: PacketKind, owners: Sequence[int]) -> None:
+        """Add a kind to its sensors; unassigned neighbours may then be their IMU packets."""
         for number in owners:
-            if kind not in self._found[number].kinds:
-                self._found[number].kinds.add(kind)
+            kinds = self._sensors[number].kinds
+            if kind not in kinds:
+                kinds.add(kind)
                 self._routes = {
                     other: route
                     for other, route in self._routes.items()
                     if route.role is not Role.UNASSIGNED
                 }
 
-    def _may_own(self, sensor: Found, kind: Kind, stream: Stream, payload: U8Array) -> bool:
+    def _may_own(
+        self, sensor: DetectedSensor, kind: PacketKind, stream: Stream, payload: U8Array
+    ) -> bool:
         if kind in sensor.kinds:
             return True
         if not sensor.selector.selects(stream):
             return False
-        # A stream that was not there at the start joins only by the serial number it carries,
-        # or because the rig says where the sensor sends from.
+        # A later stream joins only by the serial number in its packets, or by the rig's selector.
         if sensor.selector == StreamSelector() and not sensor.lidar.carries_serial:
             return False
-        # One packet, which may be damaged, must not speak for all of a stream that begins late:
-        # each of its packets is looked at.
+        # Of a later stream, each packet is checked as it is read: one of them may be damaged.
         size = sensor.lidar.packet_size
         return kind not in self._early or bool(sensor.lidar.owns(payload[None, :size])[0])
 
     def _imu_owner(self, stream: Stream, size: int) -> int | None:
-        """The sensor whose IMU this is: same source, and, among twins, the port it announces."""
+        """The sensor whose IMU sends this: a neighbour; of several, by the IMU port of each."""
         near = [
             number
-            for number, sensor in enumerate(self._found)
+            for number, sensor in enumerate(self._sensors)
             if sensor.lidar.is_imu(size)
-            and any(is_beside(self._table.streams[other], stream) for other, _ in sensor.kinds)
+            and any(
+                are_neighbours(self._table.streams[other.stream], stream) for other in sensor.kinds
+            )
         ]
         if len(near) > 1 and not stream.topic:
-            near = [n for n in near if self._found[n].lidar.imu_port == stream.port]
+            near = [n for n in near if self._sensors[n].lidar.imu_port == stream.port]
         return near[0] if len(near) == 1 else None

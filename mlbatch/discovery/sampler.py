@@ -1,201 +1,208 @@
-"""Which stream is which sensor: by what the packets say, never by file name.
-
-A *kind* is a stream together with a payload size. At the start the kinds of the first seconds are
-matched with calibrations or the rig's selectors (`matching.py`); later kinds join a sensor only if
-their packets prove to be its own.
-"""
+"""Samples of the packets of every stream, by which sensors are recognised and measured."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.clocks.watch import ClockWatch
+from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.frames.naming import same_namespace
 from mlbatch.lidar.interface import Beside, Evidence, Lidar
-from mlbatch.rig.rig import StreamSelector
 from mlbatch.types import PacketBatch, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
-Kind = tuple[int, int]  # (number of the stream, payload size)
+# First packets of a kind that are kept.
 SAMPLES_PER_KIND = 16
 SAMPLE_EVERY_NS = NS_PER_S // 4
-# Less of a recording does not tell how much a sensor sends.
+# Rates are not measured on less.
 SHORTEST_NS = 2 * NS_PER_S
-# Different first words of a kind that are looked out for; most makers change them in every packet.
-MOST_BEGINNINGS = 8
-# No lidar sends so many kinds; a camera does, and a recorder that copies files.
-MOST_BESIDE = 64
-_WORD = 4
+# Packets with a new first word are kept up to this count; most vendors change it in every packet.
+MAX_FIRST_WORDS = 8
+# No lidar sends so many kinds; cameras and file transfers do.
+MAX_NEIGHBOURS = 64
+_WORD_BYTES = 4
 
 
 @dataclass(slots=True)
-class Found:
-    """A sensor: its name, how to read it, and the kinds of packets seen of it so far."""
+class KindSamples:
+    """Samples and counts of one packet kind; times are receive times.
 
-    name: str
-    lidar: Lidar
-    selector: StreamSelector = field(default_factory=StreamSelector)
-    kinds: set[Kind] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
+    payloads, host_ns: of the packets that were kept; packets: count of all; first_words: of the
+    packets kept for their first word; keep_next: True after the first packet of a quarter of a
+    second.
+    """
+
+    payloads: list[bytes]
+    host_ns: list[int]
+    packets: int
+    first_host_ns: int
+    last_host_ns: int
+    first_words: set[int]
+    keep_next: bool = False
+
+    def arrays(self) -> tuple[U8Array, I64Array]:
+        """Kept payloads (k, size) and their receive times (k,)."""
+        payloads = np.frombuffer(b"".join(self.payloads), np.uint8)
+        rows = payloads.reshape(len(self.payloads), len(self.payloads[0]))
+        return rows, np.array(self.host_ns, np.int64)
 
 
 @dataclass(slots=True)
 class Sampler:
-    """Collects the first payloads of every kind, and counts them all."""
+    """Keeps the first packets of every kind and some later ones, and counts them all.
+
+    kinds: samples of each kind, in receive order of their first packets.
+    """
 
     table: StreamTable
-    samples: dict[Kind, list[bytes]] = field(default_factory=dict)
-    sample_host_ns: dict[Kind, list[int]] = field(default_factory=dict)
-    packets: dict[Kind, int] = field(default_factory=dict)
-    span_ns: dict[Kind, tuple[int, int]] = field(default_factory=dict)
-    beginnings: dict[Kind, set[int]] = field(default_factory=dict)
-    _neighbours: dict[str, list[Kind]] = field(default_factory=dict)
+    kinds: dict[PacketKind, KindSamples] = field(default_factory=dict)
+    _kinds_of_ip: dict[str, list[PacketKind]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
-        """Look at a batch."""
+        """Sample a batch."""
         for kind, index in split_by_kind(batch):
-            if kind not in self.samples:
-                source = self.table.streams[kind[0]].source_ip
-                self._neighbours.setdefault(source, []).append(kind)
-            kept = self.samples.setdefault(kind, [])
-            hosts_ns = self.sample_host_ns.setdefault(kind, [])
-            for at in self._telling(kind, index, batch):
+            first_ns = int(batch.host_ns[index[0]])
+            samples = self.kinds.get(kind)
+            if samples is None:
+                source_ip = self.table.streams[kind.stream].source_ip
+                self._kinds_of_ip.setdefault(source_ip, []).append(kind)
+                samples = KindSamples([], [], 0, first_ns, 0, set())
+                self.kinds[kind] = samples
+            for at in _rows_to_keep(samples, kind, index, batch):
                 begin = int(batch.start[at])
-                kept.append(batch.data[begin : begin + kind[1]].tobytes())
-                hosts_ns.append(int(batch.host_ns[at]))
-            self.packets[kind] = self.packets.get(kind, 0) + len(index)
-            first_ns, last_ns = int(batch.host_ns[index[0]]), int(batch.host_ns[index[-1]])
-            self.span_ns[kind] = self.span_ns.get(kind, (first_ns, 0))[0], last_ns
+                samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
+                samples.host_ns.append(int(batch.host_ns[at]))
+            samples.packets += len(index)
+            samples.last_host_ns = int(batch.host_ns[index[-1]])
 
-    def _telling(self, kind: Kind, index: I64Array, batch: PacketBatch) -> list[int]:
-        """Which packets of a kind to keep: the first ones, then two of every quarter of a second.
+    def evidence(self, kind: PacketKind) -> Evidence:
+        """Samples of a kind and of its neighbours, as vendors recognise them."""
+        stream = self.table.streams[kind.stream]
+        near = (
+            other
+            for other in self._kinds_of_ip[stream.source_ip]
+            if other != kind and are_neighbours(self.table.streams[other.stream], stream)
+        )
+        neighbours = tuple(
+            Beside(self.table.streams[other.stream], other.size, *self.kinds[other].arrays())
+            for other in itertools.islice(near, MAX_NEIGHBOURS)
+        )
+        return Evidence(stream, kind.size, *self.kinds[kind].arrays(), neighbours)
 
-        Several sensors may share a kind, and one of them may start later than the others. The
-        choice follows arrival times, so that it does not depend on the size of batches. Kept too
-        are the first packets that begin differently: on a topic, device packets may hide among
-        many times as many others.
-        """
-        first = SAMPLES_PER_KIND - min(SAMPLES_PER_KIND, self.packets.get(kind, 0))
-        host_ns = batch.host_ns[index]
-        tick = np.concatenate([[self.span_ns.get(kind, (0, 0))[1]], host_ns]) // SAMPLE_EVERY_NS
-        fresh = tick[1:] != tick[:-1]
-        fresh[1:] |= fresh[:-1]
-        fresh[:first] = True
-        beginnings = self.beginnings.setdefault(kind, set())
-        if kind[1] >= _WORD and len(beginnings) < MOST_BEGINNINGS:
-            words = batch.data[batch.start[index, None] + np.arange(_WORD)].view("<u4")[:, 0]
-            values, at = np.unique(words, return_index=True)
-            for value, row in sorted(zip(values.tolist(), at.tolist(), strict=True), key=_second):
-                if value not in beginnings and len(beginnings) < MOST_BEGINNINGS:
-                    beginnings.add(value)
-                    fresh[row] = True
-        chosen: list[int] = index[fresh].tolist()
-        return chosen
+    def good_samples(self, kind: PacketKind, lidar: Lidar) -> tuple[U8Array, I64Array]:
+        """Packets (k, packet_size) of a kind that a lidar sent intact, receive times (k,)."""
+        packets, host_ns = self.kinds[kind].arrays()
+        packets = packets[:, : lidar.packet_size]
+        good = lidar.owns(packets) & (lidar.faults(packets) == 0)
+        return packets[good], host_ns[good]
 
-    def clock_offset_ns(self, sensor: Found) -> int | None:
-        """First stamp of a sensor in the samples minus its arrival; None if there is none."""
+    def first_host_ns(self, sensor: DetectedSensor) -> int | None:
+        """Receive time of the first packet of a sensor; None if it sent none."""
+        known = sensor.kinds & self.kinds.keys()
+        return min((self.kinds[kind].first_host_ns for kind in known), default=None)
+
+    def has_receive_times(self, sensor: DetectedSensor) -> bool:
+        """True if the packets of a sensor have receive times of their own; see `StreamTable`."""
+        return not sensor.streams & self.table.untimed
+
+    def clock_offset_ns(self, sensor: DetectedSensor) -> int | None:
+        """First timestamp of a sensor minus its receive time; None without valid columns."""
         firsts = []
         for kind in sensor.kinds:
-            packets = as_rows(self.samples[kind], kind[1])[:, : sensor.lidar.packet_size]
-            hosts_ns = np.array(self.sample_host_ns[kind], np.int64)
-            heads = sensor.lidar.heads(packets, hosts_ns)
-            good = sensor.lidar.owns(packets) & (sensor.lidar.faults(packets) == 0)
-            rows = (heads.valid.any(axis=1) & good).nonzero()[0]
+            packets, host_ns = self.good_samples(kind, sensor.lidar)
+            heads = sensor.lidar.heads(packets, host_ns)
+            rows = np.flatnonzero(heads.valid.any(axis=1))
             if len(rows):
                 row = int(rows[0])
                 stamp_ns = int(heads.stamp_ns[row, int(heads.valid[row].argmax())])
-                host_ns = self.sample_host_ns[kind][row]
-                firsts.append((host_ns, stamp_ns - host_ns))
+                firsts.append((int(host_ns[row]), stamp_ns - int(host_ns[row])))
         return min(firsts)[1] if firsts else None
 
-    def columns_per_s(self, sensor: Found) -> float | None:
-        """Columns that a sensor sends in a second where nothing is lost; None if it is not known.
+    def columns_per_s(self, sensor: DetectedSensor) -> float | None:
+        """Columns per second that a sensor sends without loss; None if unknown.
 
-        What it would send over whole turns, times the share of it that was seen, in percent: rates
-        that were measured must not depend on when packets arrive.
+        The nominal rate times the share of columns that is sent, rounded to percent: the figure
+        must not depend on receive times.
         """
         period_ns = sensor.lidar.column_period_ns
-        shares = [self._share(sensor, kind, period_ns) for kind in sensor.kinds if period_ns]
+        if not period_ns:
+            return None
+        shares = [self._share_sent(kind, sensor.lidar) for kind in sensor.kinds]
         share = max((share for share in shares if share is not None), default=0.0)
         return round(share, 2) * NS_PER_S / period_ns if share else None
 
-    def _share(self, sensor: Found, kind: Kind, period_ns: float) -> float | None:
-        """Valid columns that were sent between two samples, by what a whole turn would hold."""
-        lidar = sensor.lidar
-        packets = as_rows(self.samples[kind], kind[1])[:, : lidar.packet_size]
-        hosts_ns = np.array(self.sample_host_ns[kind], np.int64)
-        good = lidar.owns(packets) & (lidar.faults(packets) == 0)
-        packets, hosts_ns = packets[good], hosts_ns[good]
-        if len(packets) < 2 or hosts_ns[-1] - hosts_ns[0] < SHORTEST_NS:
+    def _share_sent(self, kind: PacketKind, lidar: Lidar) -> float | None:
+        """Valid columns sent per column of whole revolutions, from the first sample to the last."""
+        packets, host_ns = self.good_samples(kind, lidar)
+        if len(packets) < 2 or host_ns[-1] - host_ns[0] < SHORTEST_NS:
             return None
-        heads, number = lidar.heads(packets, hosts_ns), lidar.sequence(packets)
-        first, last = 0, len(packets) - 1
-        sent = self.packets[kind] - 1
-        counted = (number >= 0).nonzero()[0]
+        heads = lidar.heads(packets, host_ns)
+        number = lidar.sequence(packets)
+        first = 0
+        last = len(packets) - 1
+        sent = self.kinds[kind].packets - 1
+        counted = np.flatnonzero(number >= 0)
         if lidar.sequence_modulus and len(counted) > 1:
-            first, last = int(counted[0]), int(counted[-1])
+            first = int(counted[0])
+            last = int(counted[-1])
             sent = int(number[last] - number[first]) % lidar.sequence_modulus
         passed_ns = int(heads.stamp_ns[last].max() - heads.stamp_ns[first].max())
         valid = float(heads.valid.sum(axis=1).mean())
-        return sent * valid * period_ns / passed_ns if passed_ns > 0 else None
-
-    def evidence(self, kind: Kind) -> Evidence:
-        """What is known of a kind."""
-        stream = self.table.streams[kind[0]]
-        near = (
-            other
-            for other in self._neighbours[stream.source_ip]
-            if other != kind and is_beside(self.table.streams[other[0]], stream)
-        )
-        beside = tuple(
-            Beside(self.table.streams[other[0]], other[1], *self._sample(other))
-            for other in itertools.islice(near, MOST_BESIDE)
-        )
-        return Evidence(stream, kind[1], *self._sample(kind), beside)
-
-    def _sample(self, kind: Kind) -> tuple[U8Array, I64Array]:
-        rows = as_rows(self.samples[kind], kind[1])
-        return rows, np.array(self.sample_host_ns[kind], np.int64)
+        return sent * valid * lidar.column_period_ns / passed_ns if passed_ns > 0 else None
 
 
-def _second(pair: tuple[int, int]) -> int:
-    return pair[1]
+def _rows_to_keep(
+    samples: KindSamples, kind: PacketKind, index: I64Array, batch: PacketBatch
+) -> list[int]:
+    """Which packets of a kind to keep: the first ones, then two of every quarter of a second.
+
+    Several sensors may share a kind, and one of them may start later than the others. The choice
+    follows receive times, so that it does not depend on the size of batches. The first packets
+    with each first word are kept as well: device packets may be rare among others on one topic.
+    """
+    host_ns = batch.host_ns[index]
+    last_host_ns = samples.last_host_ns
+    tick = np.concatenate([[last_host_ns], host_ns]) // SAMPLE_EVERY_NS
+    is_first = tick[1:] != tick[:-1]
+    keep = is_first | np.concatenate([[samples.keep_next], is_first[:-1]])
+    samples.keep_next = bool(is_first[-1])
+    keep[: max(SAMPLES_PER_KIND - samples.packets, 0)] = True
+    if kind.size >= _WORD_BYTES and len(samples.first_words) < MAX_FIRST_WORDS:
+        words = batch.data[batch.start[index, None] + np.arange(_WORD_BYTES)].view("<u4")[:, 0]
+        values, rows = np.unique(words, return_index=True)
+        for at in np.argsort(rows, kind="stable").tolist():
+            value = int(values[at])
+            if value not in samples.first_words and len(samples.first_words) < MAX_FIRST_WORDS:
+                samples.first_words.add(value)
+                keep[rows[at]] = True
+    chosen: list[int] = index[keep].tolist()
+    return chosen
 
 
-def as_rows(payloads: Sequence[bytes], size: int) -> U8Array:
-    """Payloads of one size as (k, size) uint8."""
-    return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), size)
-
-
-def split_by_kind(batch: PacketBatch) -> list[tuple[Kind, I64Array]]:
-    """Packets of a batch by stream and size: ((stream, size), indices in arrival order)."""
+def split_by_kind(batch: PacketBatch) -> list[tuple[PacketKind, I64Array]]:
+    """Indices of the packets of each kind in a batch, in receive order."""
     if not len(batch):
         return []
     key = batch.stream << 17 | batch.size
     if bool((key == key[0]).all()):
-        return [((int(batch.stream[0]), int(batch.size[0])), np.arange(len(batch)))]
+        only = PacketKind(int(batch.stream[0]), int(batch.size[0]))
+        return [(only, np.arange(len(batch)))]
     order = key.argsort(kind="stable")
     key = key[order]
     edges = (np.flatnonzero(key[1:] != key[:-1]) + 1).tolist()
     return [
-        ((int(key[begin]) >> 17, int(key[begin]) & 0x1FFFF), order[begin:end])
+        (PacketKind(int(key[begin]) >> 17, int(key[begin]) & 0x1FFFF), order[begin:end])
         for begin, end in itertools.pairwise([0, *edges, len(key)])
     ]
 
 
-def is_beside(one: Stream, other: Stream) -> bool:
-    """Whether two streams may be of one sensor: same source IP, or topics of one namespace."""
+def are_neighbours(one: Stream, other: Stream) -> bool:
+    """True if two streams may be of one sensor: same source IP, or topics of one namespace."""
     return one.source_ip == other.source_ip and same_namespace(one.topic, other.topic)
-
-
-def has_receive_times(untimed: Collection[int], sensor: Found) -> bool:
-    """True if the packets of a sensor have receive times of their own; untimed: see StreamTable."""
-    return not any(stream in untimed for stream, _ in sensor.kinds)
 
 
 def clock_watch(lidar: Lidar) -> ClockWatch:

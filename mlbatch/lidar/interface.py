@@ -21,17 +21,17 @@ class SensorModel:
     """A row of `mlbatch sensors`: a supported model.
 
     returns: supported numbers of returns; clock, calibration: their sources; verified: how the
-    model was tested; like: the model that is reported instead, if packets do not differ.
+    model was tested; same_packets_as: the model that is reported instead, as packets are equal.
     """
 
     name: str
-    maker: str
+    vendor: str
     channels: int
     returns: tuple[int, ...]
     clock: str
     calibration: str
     verified: str
-    like: str = ""
+    same_packets_as: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class Records:
 class Lidar(Protocol):
     """Decoder of the packets of one physical sensor."""
 
-    maker: str
+    vendor: str
     model: str
     # "" if unknown.
     serial: str

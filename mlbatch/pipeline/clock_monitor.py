@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, JumpGuard, extremes
 from mlbatch.clocks.compare import Comparison, compare
-from mlbatch.clocks.watch import ClockFinding
-from mlbatch.discovery.discover import Note
+from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import clock_watch
+from mlbatch.discovery.types import Note
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import PacketBatch
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
 
 SYNCHRONISED = "synchronised"
 # Warning codes by kind of clock step.
@@ -79,9 +79,9 @@ class ClockMonitor:
         for sensor, found in zip(self._sensors, fit(watches, to), strict=True):
             sensor.clock.map = found
 
-    def findings(self) -> list[tuple[str, ClockFinding]]:
+    def findings(self) -> list[tuple[str, ClockEstimate]]:
         """Name and clock of each sensor that gave timestamps of its own."""
-        found = ((sensor.name, sensor.clock.watch.finding()) for sensor in self._sensors)
+        found = ((sensor.name, sensor.clock.watch.estimate()) for sensor in self._sensors)
         return [(name, finding) for name, finding in found if finding is not None]
 
     def comparison(self) -> Comparison | None:
@@ -95,12 +95,12 @@ class ClockMonitor:
         if comparison is None:
             return []
         notes = []
-        for name, finding in comparison.findings:
+        for name, finding in comparison.estimates:
             for jump in finding.jumps:
-                text = f"{name}: {jump.in_words()}"
+                text = f"{name}: {jump.describe()}"
                 notes.append(Note(_WARNINGS.get(jump.kind, "clock_jump"), name, text))
         notes += [
-            Note("clocks", "", pair.in_words())
+            Note("clocks", "", pair.describe())
             for pair in comparison.pairs
             if pair.verdict != SYNCHRONISED
         ]

@@ -15,9 +15,9 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
-from mlbatch.discovery.discover import Note
+from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
-from mlbatch.pipeline import accounts
+from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
@@ -262,7 +262,7 @@ class Conversion:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""
         if self.info is None or self.info.timescale not in ("utc", "tai"):
             return None
-        if self.job.wishes.host_clock:
+        if self.job.selection.host_clock:
             return 0
         offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
         return next(offsets, None)
@@ -272,7 +272,7 @@ class Conversion:
         for sensor in self.sensors:
             self._complete_ledger(sensor)
         self._refuse_rejected()
-        for note in (*accounts.late_notes(self), *self.session.clocks.notes()):
+        for note in (*run_report.final_notes(self), *self.session.clocks.notes()):
             self.warn(note)
         # A later message may be the first without receive times.
         self.session.refuse_untimed()
@@ -281,7 +281,7 @@ class Conversion:
             # A date may be so far from an uptime clock that no window was reached.
             self._check_dates(common_timescale(names))
         if self.table is None or not self.table.rows:
-            raise NoScanError(accounts.why_nothing(self))
+            raise NoScanError(run_report.why_no_scan(self))
 
     def _complete_ledger(self, sensor: Sensor) -> None:
         """Add what batching and decoding counted."""

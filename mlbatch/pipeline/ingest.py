@@ -10,7 +10,8 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Arrival
 from mlbatch.discovery.router import Role, Router
-from mlbatch.discovery.sampler import Kind, split_by_kind
+from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.discovery.types import PacketKind
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.sensors import content_keys
@@ -40,8 +41,8 @@ class Ingest:
         self, router: Router, sensors: Sequence[Sensor], stamp_map: StampMap | None = None
     ) -> None:
         """stamp_map: applied to timestamps before they are batched; None: unchanged."""
-        self.unassigned: dict[Kind, int] = {}
-        self.samples: dict[Kind, U8Array] = {}
+        self.unassigned: dict[PacketKind, int] = {}
+        self.samples: dict[PacketKind, U8Array] = {}
         self._router = router
         self._sensors = list(sensors)
         self._stamp_map = stamp_map
@@ -55,7 +56,7 @@ class Ingest:
         own: list[list[I64Array]] = [[] for _ in self._sensors]
         ingested = Ingested([None] * len(self._sensors), [])
         owned = np.zeros(len(batch), bool)
-        shared: list[tuple[Kind, I64Array]] = []
+        shared: list[tuple[PacketKind, I64Array]] = []
         for kind, index in split_by_kind(batch):
             route = self._router.route(kind, _payload(batch, int(index[0]), kind))
             if route.role is Role.LIDAR:
@@ -95,7 +96,7 @@ class Ingest:
                 owner[left[lidar.owns(packets)]] = number
         return owner
 
-    def _unassign(self, kind: Kind, batch: PacketBatch, index: I64Array) -> None:
+    def _unassign(self, kind: PacketKind, batch: PacketBatch, index: I64Array) -> None:
         if not len(index):
             return
         self.unassigned[kind] = self.unassigned.get(kind, 0) + len(index)
@@ -174,7 +175,7 @@ class Ingest:
         return fresh[len(keys) - len(key) :]
 
 
-def _payload(batch: PacketBatch, number: int, kind: Kind) -> U8Array:
+def _payload(batch: PacketBatch, number: int, kind: PacketKind) -> U8Array:
     """Payload of one packet of a kind."""
     begin = int(batch.start[number])
-    return batch.data[begin : begin + kind[1]]
+    return batch.data[begin : begin + kind.size]

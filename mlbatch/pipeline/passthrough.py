@@ -46,7 +46,9 @@ class Passthrough:
             [sensor.clock.imu_offset_ns for sensor in sensors],
             has_place=IMU in job.extras,
         )
-        self.messages = MessageQueue(job.passed, MESSAGE_ENCODINGS & job.extras, job.part.begin_ns)
+        self.messages = MessageQueue(
+            job.passed, MESSAGE_ENCODINGS & job.extras, job.segment.begin_ns
+        )
 
     def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
         """Raise UsageError for a pattern that matches no topic of the recordings."""

@@ -1,12 +1,10 @@
-"""What a conversion would fail on at its end, told at its start."""
+"""Checks at the start of what a conversion would fail on at its end."""
 
 from __future__ import annotations
 
 import math
 import shutil
 from pathlib import Path
-
-import typer
 
 from mlbatch.errors import ExportError
 from mlbatch.pipeline.job import Job
@@ -23,38 +21,38 @@ from mlbatch.writers import (
 )
 
 # Outputs of whole recordings took 0.51 to 7 times their bytes (sparse LEGACY packets to MCAP; dense
-# low-rate ones to npz): nothing that would fit is refused.
+# low-rate ones to npz), so that an output that fits is never refused.
 LEAST_OUTPUT = 4
 _BYTES_PER_MB = 1_000_000
 
 
-def place(job: Job, output: Path, name: str) -> None:
-    """Refuse an output that would take the place of what is read; name: of its format."""
+def check_output(job: Job, output: Path, name: str) -> None:
+    """Raise ExportError if the output would overwrite an input; name: of its format."""
     check_name(output)
     target = output.resolve()
     for path in job.recordings:
         recording = path.resolve()
         if recording == target:
             raise ExportError(
-                f"{output}: wanted an output besides the recordings, got one of them; "
+                f"{output}: expected an output that is no recording, found one of the inputs; "
                 "choose another name"
             )
         if recording.is_dir() and recording in target.parents:
             raise ExportError(
-                f"{output}: wanted an output outside the recordings, got one inside {path}; "
+                f"{output}: expected an output outside the recordings, found one inside {path}; "
                 "choose another folder"
             )
     own = [file.resolve() for file in _own_files(output, name)]
     for path in _read_by(job):
         if path.resolve() in own or target in path.resolve().parents:
             raise ExportError(
-                f"{output}: wanted an output that leaves {path} as it is, got one that writes "
-                "there; choose another name"
+                f"{output}: expected an output that does not overwrite {path}, found one that "
+                "does; choose another name"
             )
 
 
 def _own_files(output: Path, name: str) -> list[Path]:
-    """What a run to an output makes, or removes, besides what lies in an output folder."""
+    """Files that a run creates or removes, apart from those in an output folder."""
     files = [output, partial_path(output), old_path(output), state_path(output)]
     paths = report_paths(output, name)
     if paths.report.parent != output:
@@ -67,37 +65,37 @@ def _own_files(output: Path, name: str) -> list[Path]:
 
 
 def _read_by(job: Job) -> list[Path]:
-    """All files that a job names."""
-    return [*job.recordings, *job.wishes.metadata, *filter(None, [job.wishes.rig])]
+    """All files that a job names as input."""
+    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig])]
 
 
-def disk(job: Job, output: Path) -> None:
-    """Refuse a disk on which the output surely has no room; warn where it may have none."""
+def check_disk(job: Job, output: Path) -> str:
+    """Raise ExportError if the disk is too small; gives a warning if it may be, else ""."""
     if _is_limited(job):
-        return
+        return ""
     recorded = sum(path.stat().st_size for path in job.recordings if path.is_file())
     check_free_space(output, recorded // LEAST_OUTPUT)
     free = shutil.disk_usage(output.parent).free
     if free < recorded:
-        typer.echo(
-            f"mlbatch: warning: disk: {output}: {free // _BYTES_PER_MB} MB are free for a "
-            f"recording of {recorded // _BYTES_PER_MB} MB, which may not be enough",
-            err=True,
+        return (
+            f"disk: {output}: {free // _BYTES_PER_MB} MB are free for a recording of "
+            f"{recorded // _BYTES_PER_MB} MB, which may not be enough"
         )
+    return ""
 
 
 def _is_limited(job: Job) -> bool:
-    """Whether only a part is wanted, so that the output may be as small as one likes."""
-    wishes = job.wishes
+    """True if the options can make the output arbitrarily small."""
+    selection = job.selection
     ranges_m = [job.max_range_m]
-    if wishes.rig is not None:
-        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(wishes.rig).sensors]
+    if selection.rig is not None:
+        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(selection.rig).sensors]
     in_time = job.start is not None or job.end is not None
-    return in_time or min(ranges_m) < math.inf or bool(wishes.only or wishes.ignore)
+    return in_time or min(ranges_m) < math.inf or bool(selection.only or selection.ignore)
 
 
-def report(job: Job, path: Path | None, output: Path | None, name: str) -> None:
-    """Refuse a report that could not be written, or that would replace something else.
+def check_report(job: Job, path: Path | None, output: Path | None, name: str) -> None:
+    """Raise ExportError if the report cannot be written, or would overwrite another file.
 
     name: of the output's format.
     """
@@ -106,29 +104,29 @@ def report(job: Job, path: Path | None, output: Path | None, name: str) -> None:
     inside = output is not None and _is_inside(path, output, name)
     if output is not None and not inside and _is_of(path, output, name):
         raise ExportError(
-            f"{path}: wanted a report besides the files of the output, got the place of one; "
+            f"{path}: expected a report that is no file of the output, found one; "
             "choose another name for the report"
         )
     if not inside and not path.parent.is_dir():
         raise ExportError(
-            f"{path}: wanted a report in an existing folder, got {path.parent}, which is none; "
+            f"{path}: expected a report in an existing folder, found none at {path.parent}; "
             "create it (mkdir -p) or choose another"
         )
     if path.is_dir():
-        raise ExportError(f"{path}: wanted a file for the report, got a folder; add a name")
+        raise ExportError(f"{path}: expected a file for the report, found a folder; add a name")
     if path.exists() and any(one.exists() and path.samefile(one) for one in _read_by(job)):
         raise ExportError(
-            f"{path}: wanted a new file for the report, got one that is read; choose another"
+            f"{path}: expected a new file for the report, found an input; choose another"
         )
     if path.exists() and not _is_replaceable(path):
         raise ExportError(
-            f"{path}: wanted a new file or an earlier report, got something else; choose another "
+            f"{path}: expected a new file or an earlier report, found another file; choose another "
             "name for the report"
         )
 
 
 def _is_inside(path: Path, output: Path, name: str) -> bool:
-    """Whether a report lies in an output folder, by a name that nothing else there has."""
+    """True if the report is in the output folder, under a name of no other file there."""
     usual = report_paths(output, name).report
     if usual.parent != output or path.parent.absolute() != output.absolute():
         return False
@@ -136,15 +134,16 @@ def _is_inside(path: Path, output: Path, name: str) -> bool:
 
 
 def _is_of(path: Path, output: Path, name: str) -> bool:
-    """Whether a report would lie where a file of the output does, or in a folder that goes."""
-    place, own = path.resolve(), [file.resolve() for file in _own_files(output, name)]
+    """True if the report is a file of the output, or in a folder that is replaced."""
+    place = path.resolve()
+    own = [file.resolve() for file in _own_files(output, name)]
     if place == report_paths(output, name).report.resolve():
         return False
     return place in own or any(parent in own for parent in place.parents)
 
 
 def _is_replaceable(path: Path) -> bool:
-    """Whether a file is empty or a report: anything else may be somebody's only copy."""
+    """True if a file is empty or a report; any other file may be the only copy."""
     if not path.is_file():
         return False
     try:

@@ -1,8 +1,14 @@
-"""Going on where an interrupted conversion stopped, so that its output does not show it.
+"""Resuming an interrupted conversion, so that its output equals that of an uninterrupted one.
 
-Batching depends on nothing but packets and is cheap. So a resumed run reads and batches everything
-again, and leaves out what is slow: decoding and writing scans that the `.partial` already holds.
-What became of their points comes from the state file, all else is computed again.
+Batching depends on nothing but packets and is cheap. A resumed run reads and batches everything
+again, but skips what is slow: decoding and writing scans that the `.partial` already contains. The
+counters of their points come from the state file; all else is computed again.
+
+The state file `<OUTPUT>.partial.state` has one JSON object a line and only grows. The first line
+identifies the job; each later one adds the scans that are safe since the line before. A line is
+appended after the operating system has the data that it describes; a line cut off by a kill, and
+those after it, are ignored. Data reach the disk later: after a restart of the machine only lines
+before one with `synced` count.
 """
 
 from __future__ import annotations
@@ -34,16 +40,31 @@ from mlbatch.writers import (
     partial_path,
 )
 
-# A kill costs no more than what was done since the last line of the state file.
+# A kill costs no more than the work since the last line of the state file.
 INTERVAL_S = 0.5
+SCHEMA = "mlbatch.state/1"
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+# Fields of a job that are not part of its identity: digests of files and sensors replace them, or
+# the output does not depend on them.
+_NOT_IDENTITY = frozenset(
+    {"recordings", "selection", "segment", "extras", "fault_begin_ns", "jobs", "engine"}
+)
+_DIGITS = 12
+
+# Slots of a scan by outcome, one list a sensor; see `ledger.POINT_FATES`.
+Row: TypeAlias = list[list[int]]
+Line: TypeAlias = dict[str, object]
+
+
+# -- an earlier run ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class EarlierRun:
     """What an earlier run to the same output left.
 
-    state: to go on from, None: nothing; is_complete: the output stands alone under its name;
-    was_published: and the run that put it there was killed right after that.
+    state: None if there is nothing to resume; is_complete: the output exists, without a `.partial`;
+    was_published: it is complete, and the run was killed before it removed its state file.
     """
 
     state: State | None
@@ -51,13 +72,13 @@ class Found:
     was_published: bool
 
 
-def find(target: Path) -> Found:
-    """What is left of an earlier run to `target`; an error while another run writes it."""
+def find(target: Path) -> EarlierRun:
+    """Find what is left of an earlier run to `target`; ExportError while another run writes it."""
     state = read_state(state_path(target))
     has_partial = partial_path(target).exists()
     is_complete = target.exists() and not has_partial
-    can_go_on = state is not None and bool(state.rows) and has_partial
-    return Found(state if can_go_on else None, is_complete, is_complete and state is not None)
+    can_resume = state is not None and bool(state.rows) and has_partial
+    return EarlierRun(state if can_resume else None, is_complete, is_complete and state is not None)
 
 
 def forget(target: Path) -> None:
@@ -72,8 +93,8 @@ def abandon(target: Path) -> None:
     discard(target)
 
 
-def jump_in(job: Job) -> ClockJump | None:
-    """Where the clock of a sensor jumps; nothing is decoded."""
+def find_jump(job: Job) -> ClockJump | None:
+    """First clock step in the session of a job, None without; nothing is decoded."""
     run = Conversion(job)
     try:
         for _ in run.windows():
@@ -83,18 +104,24 @@ def jump_in(job: Job) -> ClockJump | None:
     return None
 
 
+# -- the run ----------------------------------------------------------------------------------
+
+
 class ResumeLog:
-    """How far the output of one run has come, in the run's memory and in its state file."""
+    """Progress of one output, in memory and in its state file.
+
+    recorded: scans in the state file.
+    """
 
     def __init__(
         self, target: Path, job: Job, name: str, options: WriterOptions, state: State | None
     ) -> None:
-        """name: of the format; state: of the run to continue, None: begin anew."""
+        """name: of the format; state: of the run to resume, None: start over."""
         self._target = target
-        self._identity = of_job(job, name, options)
-        self._part = str(job.part)
-        if state is not None and state.part != self._part:
-            # A part whose end was not known yet: not all of its scans are those of the shorter one.
+        self._identity = job_identity(job, name, options)
+        self._segment = str(job.segment)
+        if state is not None and state.segment != self._segment:
+            # The end of the segment was not known then: its last scans may be other ones now.
             state = None
         self._state = state
         self._file: StateFile | None = None
@@ -105,66 +132,63 @@ class ResumeLog:
 
     @property
     def done(self) -> int:
-        """Scans that the `.partial` already holds."""
+        """Scans that the `.partial` already contains."""
         return 0 if self._state is None else len(self._state.rows)
 
     @property
     def kept_bytes(self) -> int | None:
-        """What stays of the output's file; None: there is nothing to continue."""
+        """Bytes of the output's file to keep; None: nothing to resume."""
         return None if self._state is None else self._state.kept_bytes
 
     def join(self, run: Conversion) -> None:
-        """Refuse to continue what another job began, and tell the run which scans are done."""
-        self._identity |= of_inputs(run)
+        """Pass the finished scans to a run; UsageError if it is another job."""
+        self._identity |= input_identity(run)
         if self._state is None:
             return
         changed = difference(self._state.identity, self._identity)
         if changed:
             raise UsageError(
-                f"{partial_path(self._target)}: wanted the job of the interrupted run to go on "
-                f"with, got {changed}; give the same, or leave out --resume to begin anew"
+                f"{partial_path(self._target)}: expected the job of the interrupted run, found "
+                f"{changed}; give the same, or leave out --resume to start over"
             )
         run.earlier = iter(self._state.rows)
 
     def begin(self) -> None:
         """Open the state file, before the output: from now on no other run writes it."""
         is_new = self._state is None
-        state = self._state or State(self._identity, self._part)
+        state = self._state or State(self._identity, self._segment)
         self._file = StateFile(state_path(self._target), state, is_new=is_new)
         self._due_s = time.monotonic() + INTERVAL_S
 
-    def note(self, fates: Row, writer: ScanWriter) -> None:
-        """Take notice of a scan that was written or gone past, in the order of the scans.
-
-        fates: of the slots of every sensor in it.
-        """
+    def note(self, outcomes: Row, writer: ScanWriter) -> None:
+        """Note a scan that was written or skipped; call in the order of the scans."""
         self._given += 1
         if self._given <= self.done:
             return
-        self._waiting.append(fates)
+        self._waiting.append(outcomes)
         if time.monotonic() >= self._due_s:
             self._record(writer)
             self._due_s = time.monotonic() + INTERVAL_S
 
     def _record(self, writer: ScanWriter) -> None:
-        safe = writer.checkpoint()
-        # With several jobs later scans may be safe, of which nothing is known so far.
-        scans = min(safe.scans, self._given)
+        checkpoint = writer.checkpoint()
+        # With several jobs later scans may be safe, which were not noted yet.
+        scans = min(checkpoint.scans, self._given)
         fresh = scans - self.recorded
         if fresh > 0 and self._file is not None:
-            self._file.add([self._waiting.popleft() for _ in range(fresh)], safe.kept_bytes)
+            self._file.add([self._waiting.popleft() for _ in range(fresh)], checkpoint.kept_bytes)
             self.recorded = scans
 
     def complete(self) -> None:
-        """Refuse an output that holds more than the recording gives."""
+        """Raise UsageError if the `.partial` contains more scans than the recording gives."""
         if self._given < self.done:
             raise UsageError(
-                f"{partial_path(self._target)}: wanted {self.done} scans of the interrupted run "
-                f"again, got {self._given}; leave out --resume to begin anew"
+                f"{partial_path(self._target)}: expected the {self.done} scans of the interrupted "
+                f"run again, found {self._given}; leave out --resume to start over"
             )
 
     def sync(self) -> None:
-        """The run ends early: force to the disk what it has done."""
+        """Force what is done to the disk; call when the run ends early."""
         if self._file is None:
             return
         if partial_path(self._target).exists():
@@ -174,100 +198,88 @@ class ResumeLog:
             self._file.remove()
 
     def discard(self) -> None:
-        """The run ends without a scan: nothing of what it wrote stays."""
+        """Remove the output and its state; call when the run ends without a scan."""
         if self._file is not None:
             self._file.remove()
             self._file = None
             discard(self._target)
 
     def remove(self) -> None:
-        """The output has its final name."""
+        """Remove the state file; call when the output has its final name."""
         if self._file is not None:
             self._file.remove()
             self._file = None
 
 
-# The state file of an output under construction: from where a resumed run goes on.
-#
-# `<OUTPUT>.partial.state` has one JSON object a line and only grows. The first line says what is
-# made of what; each later one, which scans are safe since the one before. A line is appended
-# once the system has what it tells of; a line that a kill cut off counts for nothing, and those
-# after it.
-#
-# What the system has reaches the disk later. So after a restart of the machine only those lines
-# count that a clean end has forced to the disk (`synced`).
-
-SCHEMA = "mlbatch.state/1"
-_BOOT = Path("/proc/sys/kernel/random/boot_id")
-# Fates of the slots of every sensor in a scan; see `ledger.POINT_FATES`.
-Row: TypeAlias = list[list[int]]
-Line: TypeAlias = dict[str, object]
+# -- the state file ---------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
 class State:
-    """What a state file tells.
+    """Content of a state file.
 
-    identity: what is made of what; part: of the session; rows: of the scans that are safe;
-    kept_bytes: of the output's file that hold them; length: bytes of the lines that count.
+    identity: of the job, see `job_identity` and `input_identity`; segment: of the session; rows: of
+    the scans that are safe; kept_bytes: of the output's file with these scans; length: bytes of the
+    lines that count.
     """
 
     identity: dict[str, str]
-    part: str
+    segment: str
     rows: list[Row] = field(default_factory=list)
     kept_bytes: int = 0
     length: int = 0
 
 
 def state_path(target: Path) -> Path:
-    """Where the state of an output under construction lies."""
+    """Path of the state file of an output under construction."""
     partial = partial_path(target)
     return partial.with_name(f"{partial.name}.state")
 
 
 def read_state(path: Path) -> State | None:
-    """What a killed run left, None where that is nothing; an error while the run lives."""
+    """State that a killed run left, None if there is none; ExportError while the run lives."""
     try:
         with path.open("r+b") as file:
             _lock(file, path)
-            return _parsed(file)
+            return _parse(file)
     except FileNotFoundError:
         return None
     except OSError as err:
         raise ExportError(
-            f"{path}: wanted to read it, got {err.strerror!r}; leave out --resume to begin anew"
+            f"{path}: expected a readable state file, found {err.strerror!r}; leave out --resume "
+            "to start over"
         ) from err
 
 
 class StateFile:
-    """The state file of a run that goes on; while it is open no other run may use it."""
+    """The state file of a run; locked while it is open, so that no other run uses it."""
 
     def __init__(self, path: Path, state: State, *, is_new: bool) -> None:
         self._path = path
         with export_errors(path):
-            # Not emptied before it is ours.
+            # Truncated only after it is locked.
             self._file = io.FileIO(path, "a" if is_new else "r+")
             _lock(self._file, path)
             self._file.truncate(state.length)
             self._file.seek(state.length)
         boot: Line = {"boot": _boot()}
         if is_new:
-            boot |= {"schema": SCHEMA, "part": state.part, "identity": state.identity}
+            boot |= {"schema": SCHEMA, "part": state.segment, "identity": state.identity}
         self._append(boot)
 
     def add(self, rows: list[Row], kept_bytes: int) -> None:
-        """Say that these scans are safe, too, within so many bytes of the output's file."""
+        """Add scans that are safe within the first `kept_bytes` of the output's file."""
         self._append({"kept_bytes": kept_bytes, "scans": rows})
 
     def sync(self) -> None:
-        """Force to the disk what all lines tell of, as far as it will."""
+        """Force the output and the state to the disk, as far as possible."""
         with contextlib.suppress(OSError, ExportError):
             os.sync()
             self._append({"synced": True})
         self._file.close()
 
     def remove(self) -> None:
-        """The output is complete."""
+        """Remove the file: the output is complete."""
         with export_errors(self._path):
             self._path.unlink(missing_ok=True)
         self._file.close()
@@ -280,25 +292,28 @@ class StateFile:
 
 
 def _lock(file: io.FileIO | io.BufferedRandom, path: Path) -> None:
-    """Keep other runs away; the system frees the lock of a killed one."""
+    """Keep other runs away; the system releases the lock of a killed one."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as err:
         target = path.name.removesuffix(".partial.state")
         raise ExportError(
-            f"{path.with_name(target)}: wanted to write it alone, got another run that does; wait "
-            "for its end or choose another output"
+            f"{path.with_name(target)}: expected no other run that writes it, found one; wait for "
+            "its end or choose another output"
         ) from err
     except OSError:
-        # Some network file systems know no locks.
+        # Some network file systems have no locks.
         return
 
 
-def _parsed(file: io.BufferedRandom) -> State | None:
+def _parse(file: io.BufferedRandom) -> State | None:
     """The lines that count."""
     state: State | None = None
     rows: list[Row] = []
-    count, kept_bytes, now, boot = 0, 0, _boot(), ""
+    count = 0
+    kept_bytes = 0
+    now = _boot()
+    boot = ""
     for line, end in _lines(file):
         boot = str(line.get("boot", boot))
         if state is None:
@@ -313,7 +328,9 @@ def _parsed(file: io.BufferedRandom) -> State | None:
             rows += added
             kept_bytes = size
         if boot == now or "synced" in line:
-            count, state.kept_bytes, state.length = len(rows), kept_bytes, end
+            count = len(rows)
+            state.kept_bytes = kept_bytes
+            state.length = end
     if state is not None:
         state.rows = rows[:count]
     return state
@@ -342,36 +359,30 @@ def _head(line: Line) -> State | None:
 
 
 def _rows(found: object) -> list[Row] | None:
-    """Rows of numbers, or None if that is not what a line holds."""
+    """Rows of counts, None if the value of a line is something else."""
     if not isinstance(found, list):
         return None
     for row in found:
-        if not isinstance(row, list) or not all(isinstance(fates, list) for fates in row):
+        if not isinstance(row, list) or not all(isinstance(counts, list) for counts in row):
             return None
-        if not all(isinstance(n, int) and n >= 0 for fates in row for n in fates):
+        if not all(isinstance(n, int) and n >= 0 for counts in row for n in counts):
             return None
     return found
 
 
 def _boot() -> str:
-    """What changes with every start of the machine; "" where the system does not tell."""
+    """Identifier that changes with every start of the machine; "" where there is none."""
     try:
         return _BOOT.read_text().strip()
     except OSError:
         return ""
 
 
-# What an output is made of and how: only the same job may continue it.
-
-# Said by the files themselves, by the sensors, or not by options; or outputs do not depend on it.
-_ELSEWHERE = frozenset(
-    {"recordings", "wishes", "part", "extras", "fault_begin_ns", "jobs", "engine"}
-)
-_DIGITS = 12
+# -- the identity of a job --------------------------------------------------------------------
 
 
-def of_job(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
-    """Label and text of what a job says; name: of the format."""
+def job_identity(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
+    """Options of a job by name, as texts; name: of the format."""
     found = {"mlbatch": mlbatch.__version__, "numpy": np.__version__, "format": name}
     found["point layout"] = options.point_layout
     found["compression"] = options.compression
@@ -380,39 +391,41 @@ def of_job(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
     return found
 
 
-def of_inputs(run: Conversion) -> dict[str, str]:
-    """What the recordings are, and digests of what points are made with."""
+def input_identity(run: Conversion) -> dict[str, str]:
+    """Sizes and times of the recordings, digests of calibrations and poses."""
     found = {}
     for number, path in enumerate(run.job.recordings):
         found[f"recording {number + 1}"] = f"{path.name} ({_size_and_time(path)})"
     for sensor in run.sensors:
         lidar = sensor.lidar
-        what = (lidar.model, lidar.mode, lidar.beams, lidar.firing_ns, lidar.channel)
-        found[f"calibration of {sensor.name}"] = _digest(what)
-        found[f"pose of {sensor.name}"] = _digest((sensor.body_from_sensor, sensor.clock.offset_ns))
+        calibration = (lidar.model, lidar.mode, lidar.beams, lidar.firing_ns, lidar.channel)
+        found[f"calibration of {sensor.name}"] = _digest(calibration)
+        pose = (sensor.body_from_sensor, sensor.clock.offset_ns)
+        found[f"pose of {sensor.name}"] = _digest(pose)
     found["rig"] = _digest(run.session.setup.rig)
     found["sensors"] = ", ".join(sensor.name for sensor in run.sensors)
     return found
 
 
 def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:
-    """What differs, in words; "" if nothing does."""
+    """First difference between two identities, as text; "" if they are equal."""
     for key in (*old, *new):
-        before, now = old.get(key, "none"), new.get(key, "none")
+        before = old.get(key, "none")
+        now = new.get(key, "none")
         if before != now:
             return f"{key} {now or 'not given'!r} instead of {before or 'not given'!r}"
     return ""
 
 
 def _options(job: Job) -> Iterator[tuple[str, object]]:
-    for holder in (job, job.wishes):
+    for holder in (job, job.selection):
         for one in fields(holder):
-            if one.name not in _ELSEWHERE:
+            if one.name not in _NOT_IDENTITY:
                 yield one.name, getattr(holder, one.name)
 
 
 def _text(value: object) -> str:
-    """A value as a user would know it again, the same in every process."""
+    """A value as a user would write it, the same in every process."""
     if value is None or value == () or value == {}:
         return ""
     if isinstance(value, Mapping):
@@ -423,7 +436,7 @@ def _text(value: object) -> str:
 
 
 def _size_and_time(path: Path) -> str:
-    """Bytes and time of the last change of a recording, or of all files of its folder."""
+    """Size and last modification of a recording, or of all files of its folder."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     stats = [file.stat() for file in files]
     size = sum(one.st_size for one in stats)
@@ -440,14 +453,14 @@ def _digest(value: object) -> str:
 
 
 def _pieces(value: object) -> Iterator[bytes]:
-    """All of a value as bytes that do not depend on the process."""
+    """A value as bytes that are the same in every process."""
     if isinstance(value, np.ndarray):
         yield f"{value.dtype}{value.shape}".encode()
         yield np.ascontiguousarray(value).tobytes()
     elif is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield field.name.encode()
-            yield from _pieces(getattr(value, field.name))
+        for one in fields(value):
+            yield one.name.encode()
+            yield from _pieces(getattr(value, one.name))
     elif isinstance(value, Mapping):
         for key in sorted(value, key=str):
             yield str(key).encode()

@@ -12,20 +12,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mlbatch.errors import NoScanError, RecordingError
-from mlbatch.pipeline import accounts
+from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
 from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
-from mlbatch.report.report import ReportInputs, imbalances, report_text
+from mlbatch.report.report import RunReport, imbalances, report_text
 from mlbatch.types import RunInfo, Summary
 from mlbatch.writers import ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Called with the content of the report and the complete output, before that gets its final name.
-Last = Callable[[ReportInputs, Path], None]
+Last = Callable[[RunReport, Path], None]
 # Decode-ahead depth (scans) of the one thread that decodes.
 _AHEAD = 2
 # Tasks that wait for several threads.
@@ -38,7 +38,7 @@ def convert(
     progress: Progress | None = None,
     resume_log: ResumeLog | None = None,
     last: Last | None = None,
-) -> tuple[Conversion, ReportInputs]:
+) -> tuple[Conversion, RunReport]:
     """Run a job; returns the run and the content of its report.
 
     open_writer: None in a dry run; resume_log: of the output, so that the run can be resumed.
@@ -147,14 +147,14 @@ class _Output:
             self._resume_log.discard()
 
 
-def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> ReportInputs:
+def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> RunReport:
     """Write the last messages, check the ledgers and complete the output."""
     began_s = time.perf_counter()
     for item in run.passed_through(None):
         forward(item, writer)
-    for note in accounts.message_notes(run):
+    for note in run_report.message_notes(run):
         run.warn(note)
-    inputs = accounts.report_inputs(run)
+    inputs = run_report.run_report(run)
     broken = imbalances(inputs)
     if broken:
         raise RecordingError(f"the ledger does not balance, please report: {broken[0]}")
@@ -166,7 +166,7 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Re
     def complete(partial: Path) -> None:
         nonlocal inputs
         run.stages.write_s += time.perf_counter() - began_s
-        inputs = accounts.report_inputs(run)
+        inputs = run_report.run_report(run)
         if last is not None:
             last(inputs, partial)
 

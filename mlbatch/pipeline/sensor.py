@@ -11,7 +11,7 @@ from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.projector import Source
-from mlbatch.discovery.extrinsics import Mounted
+from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
 from mlbatch.report.ledger import SensorLedger
 from mlbatch.rig.rig import RigSensor
@@ -69,7 +69,7 @@ class Sensor:
     """
 
     index: int
-    detected: Mounted
+    detected: DetectedSensor
     clock: SensorClock
     limits: Limits
     ring_base: int
@@ -85,12 +85,12 @@ class Sensor:
     @property
     def lidar(self) -> Lidar:
         """Decoder of its packets."""
-        return self.detected.found.lidar
+        return self.detected.lidar
 
     @property
     def body_from_sensor(self) -> F64Array:
         """Extrinsics, (4, 4) float64, m."""
-        return self.detected.body_from_sensor
+        return self.detected.pose.body_from_sensor
 
     @property
     def rig(self) -> RigSensor | None:

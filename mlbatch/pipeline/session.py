@@ -11,23 +11,23 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.decode.kernels import choose_engine
-from mlbatch.discovery.discover import Note, Setup, absent, discover, untimed
-from mlbatch.discovery.extrinsics import Mounted
+from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
 from mlbatch.discovery.probe import is_without_packets
-from mlbatch.discovery.sampler import clock_watch, has_receive_times
+from mlbatch.discovery.sampler import clock_watch
+from mlbatch.discovery.types import DetectedSensor, Note
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.segments import ClippedRecording, Part
+from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
-from mlbatch.readers import merge, open_recording, use_engine
+from mlbatch.readers import merge, open_recording
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.faults.replay import FaultReplay
+    from mlbatch.faults import FaultReplay
 
 # A note for the user, no warning: how the times of decoded clouds were read.
 CLOUDS = "clouds"
@@ -49,10 +49,11 @@ class Session:
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
         self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
-        use_engine(opened, self.engine)
-        if job.part != Part():
-            opened = [ClippedRecording(recording, job.part) for recording in opened]
-        self.setup: Setup = discover(opened, streams, job.wishes)
+        for recording in opened:
+            recording.use_engine(self.engine)
+        if job.segment != TimeSegment():
+            opened = [ClippedRecording(recording, job.segment) for recording in opened]
+        self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
@@ -66,12 +67,10 @@ class Session:
         self.ingest = Ingest(
             self.setup.router, self.sensors, self.clocks.map_stamps if maps_stamps else None
         )
-        for note in self.setup.notes:
-            self.warn(note)
 
-    def _sensor(self, found: Mounted) -> Sensor:
+    def _sensor(self, found: DetectedSensor) -> Sensor:
         """The next sensor, with an empty ring and ledger."""
-        job, rig, lidar = self.job, found.rig, found.found.lidar
+        job, rig, lidar = self.job, found.rig, found.lidar
         sampler = self.setup.sampler
         ring_base = 0
         if self.sensors:
@@ -81,14 +80,14 @@ class Session:
             index=len(self.sensors),
             detected=found,
             clock=SensorClock(
-                by_host=job.wishes.host_clock or (rig is not None and rig.clock == "host"),
+                by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
                 offset_ns=found.offset_ns,
-                has_receive_times=has_receive_times(sampler.table.untimed, found.found),
+                has_receive_times=sampler.has_receive_times(found),
                 watch=clock_watch(lidar),
             ),
             limits=limits(job, rig),
             ring_base=ring_base,
-            columns_per_s=sampler.columns_per_s(found.found),
+            columns_per_s=sampler.columns_per_s(found),
             ring=new_ring(lidar),
         )
 
@@ -98,7 +97,7 @@ class Session:
         if not job.faults:
             return None
         # Not loaded for runs without faults.
-        from mlbatch.faults.replay import FaultReplay
+        from mlbatch.faults import FaultReplay
 
         replay = FaultReplay(job.faults, job.fault_seed, [one.name for one in self.sensors])
         replay.begin_ns = self.begin_ns if job.fault_begin_ns is None else job.fault_begin_ns
@@ -130,9 +129,8 @@ class Session:
 
         Not of the first packet read: bags hold many in a message, sensor by sensor.
         """
-        spans = self.setup.sampler.span_ns
-        kinds = [kind for sensor in self.setup.sensors for kind in sensor.found.kinds]
-        return min((spans[kind][0] for kind in kinds if kind in spans), default=None)
+        firsts_ns = map(self.setup.sampler.first_host_ns, self.setup.sensors)
+        return min((first_ns for first_ns in firsts_ns if first_ns is not None), default=None)
 
     @property
     def last_host_ns(self) -> int:
@@ -186,15 +184,14 @@ class Session:
         aligned = bool(self.job.align_clocks_to)
         option = "--align-clocks" if aligned else "--clock host"
         for sensor in self.sensors:
-            error = untimed(self.setup.sampler.table, sensor.detected.found, option)
-            if error is not None and (aligned or sensor.clock.by_host):
-                raise error
+            if aligned or sensor.clock.by_host:
+                refuse_untimed(self.setup.sampler.table, sensor.detected, option)
 
     def refuse_absent(self) -> None:
         """Raise RigError if a sensor that the rig requires sent no packet."""
         for sensor in self.sensors:
             if sensor.is_required and not sensor.ledger.packets.read:
-                raise absent(sensor.detected, self.job.wishes.rig)
+                refuse_absent(sensor.detected, self.job.selection.rig)
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""

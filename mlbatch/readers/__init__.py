@@ -1,4 +1,4 @@
-"""Readers of recordings. A module here without leading underscore is a plug-in for one container.
+"""Readers of recordings. Every module in `formats` is a plug-in for one container.
 
 A plug-in has `CONTAINER`, `recognises(head)` and `open_packets(path, streams)`, as in `Reader`;
 one for bags that are folders also `open_folder(folder, files, streams, notes)`.
@@ -13,50 +13,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers._merge import merge
-from mlbatch.readers._source import read_head
+from mlbatch.readers import formats
+from mlbatch.readers.merge import merge
+from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable, Topic
 
 if TYPE_CHECKING:
-    from mlbatch.readers._envelopes import CORRECTION_TYPE as CORRECTION_TYPE
-    from mlbatch.readers._knowledge import decode_bytes as decode_bytes
-    from mlbatch.readers._knowledge import decode_string as decode_string
-    from mlbatch.readers._knowledge import decode_transforms as decode_transforms
-    from mlbatch.readers._packet_types import Envelope
+    from mlbatch.readers.bag.packet_messages import Envelope
 
 __all__ = [
     "CORRECTION_TYPE",
     "Reader",
-    "decode_bytes",
-    "decode_string",
-    "decode_transforms",
-    "holds_corrections",
-    "holds_packets",
+    "has_corrections",
+    "has_packets",
     "merge",
     "open_recording",
     "readers",
-    "use_engine",
 ]
 
+# Own topic type of a calibration found among the packets.
+CORRECTION_TYPE = "mlbatch/HesaiCorrection"
 _SHOWN_BYTES = 8
-# What only messages need.
-_PLACES = {
-    "CORRECTION_TYPE": "_envelopes",
-    "decode_bytes": "_knowledge",
-    "decode_string": "_knowledge",
-    "decode_transforms": "_knowledge",
-}
-
-
-def __getattr__(name: str) -> object:
-    """Load what is asked for: captures hold no messages, and are not to wait for their types."""
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_PLACES[name]}"), name)
 
 
 class Reader(Protocol):
-    """What a plug-in module offers; `head` is the first 64 bytes after decompression."""
+    """A plug-in module; `head` is the first 64 bytes after decompression."""
 
     CONTAINER: str
 
@@ -80,38 +61,9 @@ class FolderReader(Reader, Protocol):
         ...
 
 
-def holds_packets(topic: Topic) -> bool:
-    """Whether the messages of a topic hold raw packets of lidars."""
-    return _envelope(topic) is not None
-
-
-def holds_corrections(topic: Topic) -> bool:
-    """Whether calibrations may stand among the packets of a topic, as CORRECTION_TYPE."""
-    envelope = _envelope(topic)
-    return envelope is not None and envelope.corrections
-
-
-def _envelope(topic: Topic) -> Envelope | None:
-    # As above: asked of topics only.
-    from mlbatch.readers._definitions import type_key
-    from mlbatch.readers._packet_types import PACKET_TYPES
-
-    return PACKET_TYPES.get(type_key(topic.type))
-
-
 def readers() -> list[Reader]:
     """All plug-ins, by name."""
     return [_reader(name) for name in _names()]
-
-
-def _names() -> list[str]:
-    """Names of the plug-ins; none is imported."""
-    modules = pkgutil.iter_modules(__path__)
-    return sorted(info.name for info in modules if not info.name.startswith("_"))
-
-
-def _reader(name: str) -> Reader:
-    return cast(Reader, importlib.import_module(f"{__name__}.{name}"))
 
 
 def open_recording(path: Path, streams: StreamTable) -> Recording:
@@ -121,24 +73,38 @@ def open_recording(path: Path, streams: StreamTable) -> Recording:
     return _reader_of(path).open_packets(path, streams)
 
 
-@runtime_checkable
-class _Compilable(Protocol):
-    """A recording that compiled loops can read; `engine` says whether they do."""
-
-    engine: str
+def has_packets(topic: Topic) -> bool:
+    """Whether the messages of a topic contain raw packets of lidars."""
+    return _envelope(topic) is not None
 
 
-def use_engine(recordings: Sequence[Recording], engine: str) -> None:
-    """Read from now on by the engine `numpy` or `numba`, where there is a choice."""
-    for recording in recordings:
-        if isinstance(recording, _Compilable):
-            recording.engine = engine
+def has_corrections(topic: Topic) -> bool:
+    """Whether calibrations may be among the packets of a topic, as CORRECTION_TYPE."""
+    envelope = _envelope(topic)
+    return envelope is not None and envelope.corrections
+
+
+def _envelope(topic: Topic) -> Envelope | None:
+    # Not loaded for captures, which have no topics.
+    from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+    from mlbatch.ros.definitions import type_key
+
+    return PACKET_TYPES.get(type_key(topic.type))
+
+
+def _names() -> list[str]:
+    """Names of the plug-ins; none is imported."""
+    return sorted(info.name for info in pkgutil.iter_modules(formats.__path__))
+
+
+def _reader(name: str) -> Reader:
+    return cast(Reader, importlib.import_module(f"{formats.__name__}.{name}"))
 
 
 def _reader_of(path: Path) -> Reader:
     """The plug-in that reads a file."""
     head = read_head(path)
-    # Importing them all takes longer than a short recording: the one that is likely comes first.
+    # Importing all of them takes longer than reading a short recording: the likely one first.
     likely = [suffix.lstrip(".") for suffix in path.suffixes]
     for name in sorted(_names(), key=lambda name: name not in likely):
         reader = _reader(name)
@@ -146,26 +112,26 @@ def _reader_of(path: Path) -> Reader:
             return reader
     containers = ", ".join(reader.CONTAINER for reader in readers())
     raise RecordingError(
-        f"{path}: wanted a recording ({containers}; also gzip or zstd of them), got a file that "
-        f"begins with {head[:_SHOWN_BYTES].hex(' ')}; check that it is the right file"
+        f"{path}: expected a recording ({containers}; also gzip or zstd of them), found a file "
+        f"that begins with {head[:_SHOWN_BYTES].hex(' ')}; check that it is the right file"
     )
 
 
 def _open_folder(path: Path, streams: StreamTable) -> Recording:
     """Open a bag that is a folder."""
-    from mlbatch.readers._folder import bag_folder
+    from mlbatch.readers.bag.folder import bag_folder
 
     folder = bag_folder(path)
     found = [_reader_of(file) for file in folder.files]
-    kinds = sorted({reader.CONTAINER for reader in found})
-    if len(kinds) > 1:
+    containers = sorted({reader.CONTAINER for reader in found})
+    if len(containers) > 1:
         raise RecordingError(
-            f"{path}: wanted a folder with the files of one bag, got several kinds "
-            f"({', '.join(kinds)}); name the files of one kind"
+            f"{path}: expected a folder with the files of one bag, found several kinds "
+            f"({', '.join(containers)}); name the files of one kind"
         )
     if not isinstance(found[0], FolderReader):
         raise RecordingError(
-            f"{path}: wanted the folder of a bag, got one with files of {kinds[0]}; "
+            f"{path}: expected the folder of a bag, found one with files of {containers[0]}; "
             "name the files inside it"
         )
     return found[0].open_folder(path, folder.files, streams, folder.notes)

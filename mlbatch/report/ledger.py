@@ -1,4 +1,4 @@
-"""Counters: everything read is written or counted with a reason (CONTRACT.md, section 4)."""
+"""Packet, column and point accounting: everything read is written or counted under a reason."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 
 from mlbatch.types import CaptureCounts
 
-# Closed lists: a new reason needs a line in the documentation.
-# `fragment`: a frame that its datagram's last fragment completed; it is in that datagram.
+# Closed lists, described in docs/report.md.
+# `fragment`: a frame whose content is in the datagram that its last fragment completed.
 CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 # `incomplete`: of windows left out by --drop-incomplete.
 COLUMN_REASONS = (
     *("before_start", "late", "tail", "head", "invalid", "outside_time", "incomplete"),
 )
-# `no_place`: the format of the output has none for them.
+# `no_place`: the output format cannot store them.
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
 # What becomes of a slot of a written column.
 POINT_FATES = ("no_return", "range", "box", "repeated", "written")
@@ -26,7 +26,7 @@ POINT_FATES = ("no_return", "range", "box", "repeated", "written")
 class PacketCounts:
     """Lidar packets of a sensor: read = accepted + sum(rejected).
 
-    lost: numbers missing in the sensor's own count; reordered: numbers that came after a later one.
+    lost: gaps in the sequence; reordered: packets received after a later one.
     """
 
     read: int = 0
@@ -36,7 +36,7 @@ class PacketCounts:
     reordered: int = 0
 
     def reject(self, reason: str, count: int = 1) -> None:
-        """Count packets that were not accepted."""
+        """Count rejected packets."""
         _add(self.rejected, reason, count)
 
 
@@ -49,7 +49,7 @@ class DecodedCounts:
     dropped: dict[str, int] = field(default_factory=dict)
 
     def drop(self, reason: str, count: int = 1) -> None:
-        """Count what was not written."""
+        """Count what is not written."""
         _add(self.dropped, reason, count)
 
 
@@ -87,7 +87,7 @@ class SensorLedger:
     imu_samples: DecodedCounts = field(default_factory=DecodedCounts)
 
     def check(self) -> list[str]:
-        """What does not balance, a line each; empty when all is accounted for."""
+        """Counters that do not balance, a line each; empty if all do."""
         packets, columns, points = self.packets, self.columns, self.points
         samples = self.imu_samples
         return [
@@ -102,7 +102,7 @@ class SensorLedger:
 
 
 def check_capture(counts: CaptureCounts) -> list[str]:
-    """What does not balance in the ledger of a reader, a line each."""
+    """Counters of a reader that do not balance, a line each."""
     fates = (counts.datagrams, *counts.skipped.values())
     return [
         *_balance("frames", counts.frames, fates),
@@ -111,18 +111,18 @@ def check_capture(counts: CaptureCounts) -> list[str]:
 
 
 def check_datagrams(datagrams: int, sensors: Sequence[SensorLedger], unassigned: int) -> list[str]:
-    """What does not balance between the recordings and the sensors, a line."""
+    """Imbalance between recordings and sensors, as a line."""
     fates = [(one.packets.read, one.imu_packets) for one in sensors]
     return _balance("datagrams", datagrams, (*itertools.chain(*fates), unassigned))
 
 
 def check_messages(topic: str, read: int, written: int, dropped: dict[str, int]) -> list[str]:
-    """What does not balance among the recorded messages of a topic, a line each."""
+    """Imbalance among the recorded messages of a topic, as a line."""
     return _balance(f"messages of {topic}", read, (written, *dropped.values()))
 
 
 def ordered(counts: dict[str, int], reasons: tuple[str, ...]) -> dict[str, int]:
-    """The reasons that were counted, in the order of their closed list."""
+    """The counted reasons, in the order of their closed list."""
     known = {reason: counts[reason] for reason in reasons if counts.get(reason)}
     return known | {reason: count for reason, count in sorted(counts.items()) if count}
 
@@ -135,7 +135,7 @@ def _add(counts: dict[str, int], reason: str, count: int) -> None:
 def _balance(what: str, total: int, fates: tuple[int, ...]) -> list[str]:
     if total == sum(fates):
         return []
-    return [f"{what}: wanted {total} accounted for, got {' + '.join(map(str, fates))}"]
+    return [f"{what}: expected {total} accounted for, found {' + '.join(map(str, fates))}"]
 
 
 def _unknown(what: str, counts: dict[str, int], reasons: tuple[str, ...]) -> list[str]:

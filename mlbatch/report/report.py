@@ -1,4 +1,4 @@
-"""What a run says of itself: report.json and a summary for people (CONTRACT.md, section 4)."""
+"""report.json and the summary of a run; see docs/report.md."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ from mlbatch.report.ledger import (
     check_messages,
     ordered,
 )
-from mlbatch.report.scan_table import ScanStatistics, ScanTable, Spread
+from mlbatch.report.scan_table import ScanStatistics
 from mlbatch.types import CaptureCounts
 from mlbatch.units import NS_PER_S
-
-__all__ = ["ScanStatistics", "ScanTable", "Spread"]
 
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 Section: TypeAlias = dict[str, Json]
@@ -44,7 +42,7 @@ class InputReport:
 
 @dataclass(frozen=True, slots=True)
 class Unassigned:
-    """A stream that no sensor claimed; `what` says what it looks like."""
+    """A stream of no sensor; what: description of its packets."""
 
     stream: str
     packets: int
@@ -53,7 +51,7 @@ class Unassigned:
 
 @dataclass(frozen=True, slots=True)
 class ClockReport:
-    """How a sensor's clock relates to the common one and to the recorder's."""
+    """A sensor's clock against the common one and that of the capture host."""
 
     source: str
     epoch: str
@@ -64,7 +62,7 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True)
 class SensorReport:
-    """One sensor; texts name files without their folders."""
+    """One sensor; calibration: file name without folder."""
 
     name: str
     model: str
@@ -80,7 +78,7 @@ class SensorReport:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Costs of a run; recorded_s: length of the recording; engine: what decoded it."""
+    """Costs of a run; recorded_s: length of the recording; engine: numpy or numba."""
 
     wall_s: float
     cpu_s: float
@@ -100,8 +98,8 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
-class Passed:
-    """Messages of a topic that were to pass through: read = written + sum(dropped)."""
+class ForwardedMessages:
+    """Recorded messages of a forwarded topic: read = written + sum(dropped)."""
 
     topic: str
     read: int
@@ -111,7 +109,7 @@ class Passed:
 
 @dataclass(frozen=True, slots=True)
 class FaultReport:
-    """A fault that was replayed, and how many packets it touched."""
+    """An injected fault, and the packets it affected."""
 
     fault: str
     packets: int
@@ -119,7 +117,7 @@ class FaultReport:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """A warning; `sensor` is empty where it concerns the run."""
+    """A warning; sensor: "" if it concerns the run."""
 
     code: str
     sensor: str
@@ -127,10 +125,10 @@ class Warned:
 
 
 @dataclass(frozen=True, slots=True)
-class ReportInputs:
-    """All that a report is made of; `t_init_ns` is None when the run never started.
+class RunReport:
+    """Content of a report; t_init_ns: None if no window was reached.
 
-    repeated: datagrams that faults had come twice, less those they removed.
+    repeated: datagrams that injected faults duplicated, less those they removed.
     """
 
     inputs: tuple[InputReport, ...]
@@ -144,13 +142,13 @@ class ReportInputs:
     unassigned: tuple[Unassigned, ...] = ()
     timing: Timing | None = None
     warnings: tuple[Warned, ...] = ()
-    messages: tuple[Passed, ...] = ()
+    messages: tuple[ForwardedMessages, ...] = ()
     faults: tuple[FaultReport, ...] = ()
     repeated: int = 0
 
 
-def build_report(run: ReportInputs) -> Section:
-    """The report in the order of the contract."""
+def build_report(run: RunReport) -> Section:
+    """The report as JSON values, in the order of docs/report.md."""
     return {
         "schema": SCHEMA,
         "version": mlbatch.__version__,
@@ -158,7 +156,7 @@ def build_report(run: ReportInputs) -> Section:
         "timescale": run.timescale,
         "grid": {
             "rate_hz": run.rate_hz,
-            # Text, since a period need not be whole: 200000000/3 at 15 Hz.
+            # Text, since a period may be a fraction: 200000000/3 at 15 Hz.
             "period_ns": str(NS_PER_S / Fraction(run.rate_hz)),
             "t_init_ns": run.t_init_ns,
             "slices": run.slices,
@@ -179,26 +177,26 @@ def build_report(run: ReportInputs) -> Section:
 
 
 def without_machine(report: Section, inputs: Sequence[InputReport]) -> Section:
-    """The report without timings and paths: what only depends on the recordings."""
+    """The report without timings and paths: the part that depends on the recordings alone."""
     kept = {key: value for key, value in report.items() if key != "timing"}
     kept["inputs"] = [{"bytes": item.bytes, "container": item.container} for item in inputs]
     return kept
 
 
-def report_text(run: ReportInputs, machine: bool = True, in_a_line: bool = False) -> str:
+def report_text(run: RunReport, machine: bool = True, in_a_line: bool = False) -> str:
     """report.json as text; `machine`: with timings and paths."""
     report = build_report(run)
     if not machine:
         report = without_machine(report, run.inputs)
     indent = None if in_a_line else 1
     text = json.dumps(report, indent=indent, ensure_ascii=False, allow_nan=False)
-    # Names of files need not be text: their odd bytes stand as escapes of JSON, which give the name
-    # back, where UTF-8 has no place for them.
+    # File names may contain bytes that are not UTF-8: write them as JSON escapes, which give the
+    # name back.
     return text.encode("utf-8", "backslashreplace").decode() + "\n"
 
 
-def imbalances(run: ReportInputs) -> list[str]:
-    """Ledgers of a run that do not balance, a line each."""
+def imbalances(run: RunReport) -> list[str]:
+    """Counters of a run that do not balance, a line each."""
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
     ledgers = [sensor.ledger for sensor in run.sensors]
     unassigned = sum(stream.packets for stream in run.unassigned)
@@ -210,8 +208,8 @@ def imbalances(run: ReportInputs) -> list[str]:
     return lines
 
 
-def summary_lines(run: ReportInputs) -> list[str]:
-    """The outcome of a run as a small table for people."""
+def summary_lines(run: RunReport) -> list[str]:
+    """Result of a run as a text table and two lines."""
     head = ("sensor", "model", "packets", "lost", "rejected", "columns", "dropped", "points")
     rows = [head, *(_summary_row(sensor) for sensor in run.sensors)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
@@ -239,7 +237,7 @@ def summary_lines(run: ReportInputs) -> list[str]:
 
 def _timing(timing: Timing) -> Section:
     costs: Section = asdict(timing)
-    # In the contract's place, before the rates that end the section.
+    # The rates come last, after realtime_factor.
     tail = {key: costs.pop(key) for key in ("points_per_s", "peak_rss_mb", "engine")}
     return {**costs, "realtime_factor": timing.realtime_factor, **tail}
 

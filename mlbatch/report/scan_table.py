@@ -1,4 +1,4 @@
-"""The table of a run's scans: scans.csv and figures for the report (CONTRACT.md, section 3)."""
+"""Table of the scans of a run: scans.csv, and statistics for the report."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mlbatch.errors import ExportError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
-# scans.csv stays in memory up to this size, then goes to a temporary file.
+# scans.csv is kept in memory up to this size, then in a temporary file.
 _SPOOL_BYTES = 2**20
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Distribution of a time over scans, ms; None when there was nothing to measure."""
+    """Distribution of a time over scans, ms; None without a value."""
 
     p50: float | None = None
     p99: float | None = None
@@ -31,7 +31,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class ScanStatistics:
-    """The scans of a run; span: last minus first column stamp; period: between scan starts."""
+    """The scans of a run; span: last minus first column timestamp; period: between scan starts."""
 
     written: int
     empty: int
@@ -43,14 +43,14 @@ class ScanStatistics:
 
 
 class ScanTable:
-    """Rows of scans.csv and what the report says of scans.
+    """Rows of scans.csv, and statistics of the scans.
 
-    Scans of one window or slice that are added one after the other (`--split`) share a row.
+    Consecutive scans of one window or slice (`--split`) share a row.
     """
 
     def __init__(self, info: RunInfo, columns_per_s: Sequence[float | None] = ()) -> None:
-        """columns_per_s: what each sensor sends where nothing is lost; None where unknown."""
-        # The table itself must not outlive this object: its text leaves by `text`.
+        """columns_per_s: nominal rate of each sensor; None if unknown."""
+        # Deleted with this object; `text` gives the content.
         self._file = tempfile.SpooledTemporaryFile(_SPOOL_BYTES)  # noqa: SIM115
         self._slices = info.slices
         self._open: _Row | None = None
@@ -67,7 +67,7 @@ class ScanTable:
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
     def add(self, scan: Scan) -> None:
-        """Add a scan that was written."""
+        """Add a written scan."""
         row = _Row.of(scan)
         if self._open is not None and self._open.key == row.key:
             self._open = self._open.joined(row)
@@ -77,7 +77,7 @@ class ScanTable:
 
     @property
     def rows(self) -> int:
-        """Windows or slices that were written."""
+        """Number of windows or slices written."""
         self._close_row()
         return self._written
 
@@ -92,8 +92,8 @@ class ScanTable:
     def statistics(self, empty: int, dropped_incomplete: int = 0) -> ScanStatistics:
         """Figures for the report.
 
-        empty: windows without any column; dropped_incomplete: those left out by
-        `--drop-incomplete`. Neither are written.
+        empty: windows without a column; dropped_incomplete: those left out by `--drop-incomplete`.
+        Neither are written.
         """
         self._close_row()
         return ScanStatistics(
@@ -116,14 +116,14 @@ class ScanTable:
         self._points += row.points
         if row.columns:
             self._spans_ns.append(row.last_stamp_ns - row.first_stamp_ns)
-        # Steps count slices: over a gap of empty windows the period stays what it was.
+        # Divided by the number of slices, so that empty windows do not change the period.
         step = row.key[0] * self._slices + row.key[1]
         if self._last is not None and step > self._last[0]:
             self._periods_ns.append((row.start_ns - self._last[1]) / (step - self._last[0]))
         self._last = (step, row.start_ns)
 
     def _missing(self, row: _Row) -> list[int | str]:
-        """Columns that each sensor should have sent in a window and did not; "" where unknown."""
+        """Missing columns of each sensor in a window, by its nominal rate; "" if unknown."""
         seconds = (row.end_ns - row.start_ns) / NS_PER_S
         return [
             "" if rate is None else max(0, round(rate * seconds) - count)
@@ -137,14 +137,14 @@ class ScanTable:
             self._file.write(line.getvalue().encode())
         except OSError as err:
             raise ExportError(
-                f"{tempfile.gettempdir()}: wanted room for the rows of scans.csv, got "
+                f"{tempfile.gettempdir()}: expected space for the rows of scans.csv, found "
                 f"{err.strerror!r}; free space there or set TMPDIR"
             ) from err
 
 
 @dataclass(slots=True)
 class _Row:
-    """A row of scans.csv; stamps mean nothing without columns."""
+    """A row of scans.csv; timestamps are only valid if there are columns."""
 
     key: tuple[int, int]
     start_ns: int
@@ -180,7 +180,7 @@ class _Row:
         )
 
     def joined(self, other: _Row) -> _Row:
-        """This row with another sensor's part of the same window."""
+        """This row and that of another sensor in the same window."""
         return _Row(
             self.key,
             self.start_ns,
@@ -197,7 +197,7 @@ class _Row:
         )
 
     def cells(self) -> list[int | str]:
-        """Values in the order of the header, but what the table adds."""
+        """Values in the order of the header, without those that the table adds."""
         total = sum(self.columns)
         stamps = (self.first_stamp_ns, self.last_stamp_ns) if total else ("", "")
         start = (*self.key, self.start_ns, self.end_ns, *stamps)
@@ -210,6 +210,6 @@ class _Row:
 def _spread(values_ms: F64Array) -> Spread:
     if not len(values_ms):
         return Spread()
-    # Nearest rank: a value that occurred, the same on every machine.
+    # Nearest rank: a measured value, the same on every machine.
     p50, p99 = np.quantile(values_ms, [0.5, 0.99], method="inverted_cdf").tolist()
     return Spread(p50, p99, float(values_ms.max()))

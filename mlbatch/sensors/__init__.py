@@ -1,7 +1,7 @@
-"""All makers' modules behind one door: models, calibration files, names of unknown streams.
+"""Lidar vendors as plug-ins: models, calibration files, names of unknown streams.
 
-A module of this package without a leading underscore is a plug-in, found by its name. It offers
-what `Plugin` lists.
+Each folder of this package is a vendor; its module `sensor` is the plug-in (`Plugin`), found by its
+place. Vendors are asked in alphabetical order, and a vendor is imported only when it is asked.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Protocol, cast
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.interface import Calibration, SensorModel
-from mlbatch.sensors._options import DECODE_OPTIONS
-from mlbatch.sensors._turning_lidar import content_keys
+from mlbatch.sensors.base import content_keys
+from mlbatch.sensors.options import DECODE_OPTIONS
 
 __all__ = [
     "DECODE_OPTIONS",
@@ -32,42 +32,41 @@ __all__ = [
     "read_calibration",
 ]
 
-# No calibration file comes near; what is larger is a recording or something else altogether.
+# Calibration files are far smaller; a larger file is a recording or something else.
 MAX_CALIBRATION_BYTES = 16_000_000
 
 
 class Plugin(Protocol):
-    """What a maker's module offers."""
+    """What the module `sensor` of a vendor offers."""
 
-    MAKER: str
+    VENDOR: str
     MODELS: tuple[SensorModel, ...]
-    # Calibrations that need no file: of models whose beams do not differ from unit to unit.
+    # Calibrations without a file: models whose beams do not differ from unit to unit.
     BUILT_IN: tuple[Calibration, ...]
 
     def read_calibration(self, path: Path, content: bytes) -> Calibration | None:
-        """The calibration in a file; None if it is not this maker's, RigError if unusable."""
+        """Parse a calibration file; None if it is another vendor's, RigError if it is damaged."""
         ...
 
     def describe(self, size: int, sample: U8Array) -> str | None:
-        """What payloads (k, size) of an unknown stream are; None if not this maker's."""
+        """Name payloads (k, size) of an unknown stream; None if they are not this vendor's."""
         ...
 
 
 def plugins() -> tuple[Plugin, ...]:
-    """The makers' modules, in the order of their names."""
-    return tuple(_one_by_one())
+    """All plug-ins, sorted by name."""
+    return tuple(_load_lazily())
 
 
-def _one_by_one() -> Iterator[Plugin]:
-    """The same; a maker's tables are loaded when it is asked, and those before could not answer."""
+def _load_lazily() -> Iterator[Plugin]:
+    """All plug-ins, sorted by name, each imported when the iterator reaches it."""
     for name in _names():
-        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}"))
+        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
 
 
 @lru_cache(maxsize=1)
 def _names() -> tuple[str, ...]:
-    names = (module.name for module in pkgutil.iter_modules(__path__))
-    return tuple(sorted(name for name in names if not name.startswith("_")))
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__) if module.ispkg))
 
 
 def models() -> tuple[SensorModel, ...]:
@@ -76,16 +75,16 @@ def models() -> tuple[SensorModel, ...]:
 
 
 def built_in() -> tuple[Calibration, ...]:
-    """Calibrations of all makers that need no file."""
+    """Calibrations of all vendors that need no file."""
     return tuple(calibration for plugin in plugins() for calibration in plugin.BUILT_IN)
 
 
 def read_calibration(path: Path) -> Calibration | None:
-    """The calibration in a file of any maker, or None if it is none; RigError if unreadable."""
+    """Read a calibration file of any vendor; None if it is none, RigError if it is unreadable."""
     try:
         if not path.is_file():
             kind = "a directory" if path.is_dir() else "no such file"
-            raise RigError(f"{path}: wanted a calibration file, got {kind}; check the path")
+            raise RigError(f"{path}: expected a calibration file, found {kind}; check the path")
         with path.open("rb") as file:
             content = file.read(MAX_CALIBRATION_BYTES + 1)
     except OSError as err:
@@ -96,12 +95,12 @@ def read_calibration(path: Path) -> Calibration | None:
 
 
 def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
-    """The calibration in a text from a file or a topic (`origin`), or None if it is none."""
-    found = (plugin.read_calibration(origin, content) for plugin in _one_by_one())
+    """Parse a calibration from a file or a topic (`origin`); None if it is none."""
+    found = (plugin.read_calibration(origin, content) for plugin in _load_lazily())
     return next((calibration for calibration in found if calibration is not None), None)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
-    """What payloads (k, size) of an unknown stream are, or None if no maker knows them."""
-    found = (plugin.describe(size, sample) for plugin in _one_by_one())
+    """Name payloads (k, size) of an unknown stream; None if no vendor knows them."""
+    found = (plugin.describe(size, sample) for plugin in _load_lazily())
     return next((text for text in found if text is not None), None)

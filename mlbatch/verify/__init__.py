@@ -1,19 +1,19 @@
-"""Proof of an output from the output alone: `verify(path)` gives a `Verdict`.
+"""Checks of an output from the output alone: `verify(path)` gives a `Verdict`.
 
-Nothing here is shared with the writers but the types: grid, formats and point layouts are written
-down once more, so that a fault on one side does not hide on the other.
+Grid, formats and point layouts are defined a second time: only types are shared with the writers,
+so that a fault of the writers is not hidden by the same fault here.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from mlbatch.verify.outputs import Proof, examine
-from mlbatch.verify.papers import Beside
+from mlbatch.verify.outputs import Output, check_output
+from mlbatch.verify.report_checks import ReportPlaces
 from mlbatch.verify.verdict import (
     CHECKS,
     Check,
-    Judge,
+    CheckLog,
     Verdict,
     VerifyError,
     Violation,
@@ -25,19 +25,21 @@ _PARTIAL = ".partial"
 
 
 def verify(path: Path, report: Path | None = None) -> Verdict:
-    """Prove an output; report: where the run was told to put it, None for its usual place.
+    """Check an output; report: path of `--report`, None for the usual one.
 
-    Raises VerifyError where there is nothing to judge.
+    Raises VerifyError if there is nothing to check.
     """
     if path.name.endswith(_PARTIAL):
         raise VerifyError(
-            f"{path}: wanted a finished output, got what an unfinished run left; convert again"
+            f"{path}: expected a finished output, found that of an unfinished run; convert again"
         )
     if not path.exists():
-        raise VerifyError(f"{path}: wanted an output, got no such file or folder; check the name")
-    judge = Judge()
-    left = path.with_name(path.name + _PARTIAL)
-    judge.passed("container")
-    if left.exists():
-        judge.blame("container", left.name, "no unfinished run beside the output", "one")
-    return examine(Proof(path, Beside.of(path, report), report is not None, judge))
+        raise VerifyError(
+            f"{path}: expected an output, found no such file or folder; check the name"
+        )
+    log = CheckLog()
+    unfinished = path.with_name(path.name + _PARTIAL)
+    log.ok("container")
+    if unfinished.exists():
+        log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
+    return check_output(Output(path, ReportPlaces.of(path, report), log))

@@ -1,31 +1,33 @@
-"""The proof itself: every scan, then what all of them add up to."""
+"""The checks of an output: each scan, then the sums of all scans."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
-
-from mlbatch.verify.agreement import check_report
-from mlbatch.verify.claims import Claims
-from mlbatch.verify.column_checks import Twins, check_columns
-from mlbatch.verify.geometry_checks import Geometry
-from mlbatch.verify.papers import Papers
-from mlbatch.verify.placing import Placing
-from mlbatch.verify.point_checks import (
+from mlbatch.verify.report_checks import (
+    ReportFiles,
+    RunMetadata,
+    check_ledgers,
+    check_period,
+    check_report,
+    poses_of,
+)
+from mlbatch.verify.scan import StoredScan
+from mlbatch.verify.scan_checks import (
+    DuplicateColumns,
+    GeometryChecks,
+    GridChecks,
+    check_columns,
     check_labels,
     check_times,
     fits_columns,
     valid_points,
 )
-from mlbatch.verify.report import check_grid, check_ledger, poses_of
-from mlbatch.verify.scan import HeldScan
-from mlbatch.verify.table import check_table
-from mlbatch.verify.tally import Tally
-from mlbatch.verify.verdict import Judge
+from mlbatch.verify.table import OutputTotals, check_table
+from mlbatch.verify.verdict import CheckLog
 
-# Sensors that one byte can name, where an output does not tell how many there are.
+# Values of one byte, for outputs without the number of sensors.
 _MOST_SENSORS = 256
 # Stamps end at 2^31 s; times of points are added to them in 64 bits.
 _MOST_NS = 2**62
@@ -34,84 +36,89 @@ _MOST_NS = 2**62
 class Examination:
     """Takes the scans of an output one after the other; arrays are only used during the call."""
 
-    def __init__(self, judge: Judge, where: str, claims: Claims, papers: Papers) -> None:
-        self.judge = judge
-        self._papers = papers
-        self._lines = claims.lines(where)
-        self._placing = Placing(judge, self._lines, claims.t_init_ns, where)
-        self._sensors = _MOST_SENSORS if claims.sensors is None else len(claims.sensors)
-        table = papers.table
-        if table is not None and claims.sensors is not None:
-            judge.equal("metadata", f"{table.where} sensors", claims.sensors, table.sensors)
-            if table.sensors != claims.sensors:
-                table = papers.table = None
-        self.tally = Tally(judge, self._sensors, table)
-        self._twins = Twins(judge)
-        poses = None if papers.report is None else poses_of(papers.report)
+    def __init__(
+        self, log: CheckLog, where: str, metadata: RunMetadata, files: ReportFiles
+    ) -> None:
+        self.log = log
+        self._files = files
+        self._grid = metadata.grid(where)
+        self._grid_checks = GridChecks(log, self._grid, metadata.t_init_ns, where)
+        self._sensors = _MOST_SENSORS if metadata.sensors is None else len(metadata.sensors)
+        table = files.table
+        if table is not None and metadata.sensors is not None:
+            log.equal("metadata", f"{table.where} sensors", metadata.sensors, table.sensors)
+            if table.sensors != metadata.sensors:
+                table = None
+                files.table = None
+        self.totals = OutputTotals(log, self._sensors, table)
+        self._duplicates = DuplicateColumns(log)
+        poses = None if files.report is None else poses_of(files.report)
         fits = poses is not None and len(poses) == self._sensors
-        self._geometry = Geometry(judge, poses if fits else None)
+        self._geometry = GeometryChecks(log, poses if fits else None)
 
-    def scan(self, scan: HeldScan) -> None:
-        """Hold one scan against the rules."""
-        judge = self.judge
+    def scan(self, scan: StoredScan) -> None:
+        """Check one scan."""
+        log = self.log
         for name, at_ns in (("start_ns", scan.start_ns), ("end_ns", scan.end_ns)):
             if at_ns is not None and abs(at_ns) >= _MOST_NS:
-                judge.blame("grid", f"{scan.where} {name}", "a time", at_ns)
+                log.fail("grid", f"{scan.where} {name}", "a time", at_ns)
                 return
-        place = self._placing.place(scan)
-        end_ns = self._end(scan)
-        named = check_columns(judge, scan, end_ns, self._sensors)
-        points = valid_points(judge, scan)
-        named &= check_labels(judge, scan, points, self._sensors)
+        place = self._grid_checks.check(scan)
+        end_ns = self._end_ns(scan)
+        fits = check_columns(log, scan, end_ns, self._sensors)
+        points = valid_points(log, scan)
+        fits &= check_labels(log, scan, points, self._sensors)
         if scan.column is not None and not fits_columns(scan):
             count = 0 if scan.column_stamp_ns is None else len(scan.column_stamp_ns)
-            judge.blame(
-                "order", f"{scan.where} column", f"numbers below {count}", int(scan.column.max())
-            )
-            named = False
-        if not named:
-            # Whatever is told by sensor or column would only repeat the fault.
-            scan.lidar_id = scan.column_lidar_id = scan.column_stamp_ns = scan.column = None
-            points = replace(points, lidar_id=None)
-        else:
+            where = f"{scan.where} column"
+            log.fail("order", where, f"numbers below {count}", int(scan.column.max()))
+            fits = False
+        if fits:
             self._geometry.check(scan, points)
-            self._twins.check(scan)
-        check_times(judge, scan, points, end_ns - scan.start_ns)
-        self.tally.add(scan, points, place)
+            self._duplicates.check(scan)
+        else:
+            # Checks by sensor or column would only repeat the violation.
+            scan.lidar_id = None
+            scan.column = None
+            scan.column_lidar_id = None
+            scan.column_stamp_ns = None
+            points = replace(points, lidar_id=None)
+        check_times(log, scan, points, end_ns - scan.start_ns)
+        self.totals.add(scan, points, place)
 
-    def _end(self, scan: HeldScan) -> int:
+    def _end_ns(self, scan: StoredScan) -> int:
         if scan.end_ns is not None:
             return scan.end_ns
-        if self._lines is not None:
-            return self._lines.bound(self._lines.number(scan.start_ns) + 1)
-        # Without a rate nothing tells where a scan ends.
+        if self._grid is not None:
+            return self._grid.bound(self._grid.number(scan.start_ns) + 1)
+        # Unknown without a rate.
         return scan.start_ns + 2**32
 
     def finish(self, *, split: bool) -> None:
-        """Hold the sums against table and report."""
+        """Check the sums against table and report."""
         if not split:
             self._check_rings()
-        table, report = self._papers.table, self._papers.report
+        table = self._files.table
+        report = self._files.report
         if table is not None:
-            check_table(self.judge, table, self._lines, self._placing.first)
-            self.tally.check_table()
+            check_table(self.log, table, self._grid, self._grid_checks.first)
+            self.totals.check_table()
         if report is not None:
-            check_ledger(report)
-            check_grid(report)
-            check_report(report, self.tally, table, self._lines)
+            check_ledgers(report)
+            check_period(report)
+            check_report(report, self.totals, table, self._grid)
 
     def _check_rings(self) -> None:
-        """Rings of a sensor follow those of all earlier ones."""
-        rings = self.tally.rings
-        met = [sensor for sensor in range(self._sensors) if sensor in rings.low_at]
-        self.judge.passed("rings", len(met))
-        for before, after in pairwise(met):
-            if rings.low[after] > rings.high[before]:
-                continue
-            highest = int(np.asarray(rings.high)[before])
-            self.judge.blame(
-                "rings",
-                f"{rings.low_at[after]} ({rings.high_at[before]})",
-                f"a ring above {highest}, the highest of sensor {before}",
-                int(rings.low[after]),
-            )
+        """Rings of a sensor follow those of all earlier sensors."""
+        rings = self.totals.rings
+        found = [sensor for sensor in range(self._sensors) if sensor in rings.low_at]
+        self.log.ok("rings", len(found))
+        for before, after in pairwise(found):
+            highest = int(rings.high[before])
+            if rings.low[after] <= highest:
+                self.log.fail(
+                    "rings",
+                    f"{rings.low_at[after]} ({rings.high_at[before]})",
+                    f"a ring above {highest}, the highest of sensor {before}",
+                    int(rings.low[after]),
+                )

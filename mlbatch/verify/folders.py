@@ -1,4 +1,4 @@
-"""Folders of one file a scan: which file is which scan (CONTRACT.md, section 3)."""
+"""Folders with a file for each scan: index, slice and sensor by name and folder."""
 
 from __future__ import annotations
 
@@ -7,74 +7,88 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.verify.verdict import Judge, VerifyError
+from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
-_NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?")
-# What a folder may hold besides; other files are nobody's business, unless they look like scans.
-_LIKE_SCANS = (".npz", ".ply", ".partial", ".mcap", ".bag")
+_NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
+# Files with other suffixes are ignored.
+_OUTPUTS = (".npz", ".ply", ".partial", ".mcap", ".bag")
 
 
 @dataclass(frozen=True, slots=True)
 class ScanFile:
-    """A file of a scan; slice: None where windows are whole; sensor: folder with `--split`."""
+    """A file of a scan."""
 
     path: Path
     where: str
+    # The folder, with `--split`.
     sensor: str | None
     index: int
+    # None where windows are not sliced.
     slice: int | None
+
+    def read(self) -> bytes:
+        """The bytes of the file."""
+        try:
+            return self.path.read_bytes()
+        except OSError as err:
+            raise DamageError("a readable file", str(err.strerror)) from err
+
+    def check_name(self, log: CheckLog, index: int, part: int, slices: int) -> None:
+        """Check the name against index and slice in the file."""
+        name = "head" if index < 0 else f"{index:06d}"
+        if slices > 1:
+            name += f"-{part}"
+        log.equal("names", self.where, name + self.path.suffix, self.path.name)
+
+    def sensor_index(self, log: CheckLog, sensors: tuple[str, ...]) -> int | None:
+        """Index of the sensor of the folder; None without `--split`."""
+        if self.sensor is None:
+            return None
+        if self.sensor in sensors:
+            return sensors.index(self.sensor)
+        log.fail("names", self.where, f"the folder of one of {', '.join(sensors)}", self.sensor)
+        return None
 
 
 def entries(folder: Path) -> list[Path]:
-    """What lies in a folder, by name."""
+    """The content of a folder, sorted by name."""
     try:
         return sorted(folder.iterdir())
     except OSError as err:
-        raise VerifyError(f"{folder}: wanted to read it, got {err.strerror!r}") from err
+        raise VerifyError(f"{folder}: expected a readable folder, found {err.strerror!r}") from err
 
 
-def scan_files(judge: Judge, folder: Path, suffix: str) -> list[ScanFile]:
-    """All files of scans, sensor by sensor, in the order of time; strange names are blamed."""
-    found = list(_of_folder(judge, folder, suffix, None))
+def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:
+    """All files of scans, sorted by sensor and time; unexpected names are violations."""
+    files = list(_files_of(log, folder, suffix, None))
     split = [
         file
         for entry in entries(folder)
         if entry.is_dir() and not entry.name.startswith(".")
-        for file in _of_folder(judge, entry, suffix, entry.name)
+        for file in _files_of(log, entry, suffix, entry.name)
     ]
-    if found and split:
-        first = split[0].where
-        judge.blame("names", first, "scans in the folder or in those of sensors", "both")
-    sliced = {file.slice is not None for file in (*found, *split)}
-    if len(sliced) > 1:
-        judge.blame("names", str(folder.name), "names with or without a slice", "both")
-    return sorted(
-        (*found, *split), key=lambda file: (file.sensor or "", file.index, file.slice or 0)
-    )
+    if files and split:
+        expected = "scans in the folder or in those of sensors"
+        log.fail("names", split[0].where, expected, "both")
+    files += split
+    if len({file.slice is None for file in files}) > 1:
+        log.fail("names", folder.name, "names with or without a slice", "both")
+    return sorted(files, key=lambda file: (file.sensor or "", file.index, file.slice or 0))
 
 
-def _of_folder(judge: Judge, folder: Path, suffix: str, sensor: str | None) -> Iterator[ScanFile]:
+def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> Iterator[ScanFile]:
     for path in entries(folder):
         where = path.name if sensor is None else f"{sensor}/{path.name}"
-        if path.suffix not in _LIKE_SCANS or path.is_dir():
+        if path.suffix not in _OUTPUTS or path.is_dir():
             continue
-        judge.passed("names")
+        log.ok("names")
         name = _NAME.fullmatch(path.stem)
         if name is None or path.suffix != suffix:
-            kind = "" if path.suffix == suffix else f" and {suffix}"
-            judge.blame(
-                "names", where, f"an index of six digits or head, perhaps -slice{kind}", path.name
-            )
+            expected = f"an index of six digits or head, perhaps with a slice, and {suffix}"
+            log.fail("names", where, expected, path.name)
             continue
-        index = -1 if name[2] else int(name[1])
-        if not name[2] and name[1] != f"{index:06d}":
-            judge.blame("names", where, f"{index:06d}", name[1])
-        yield ScanFile(path, where, sensor, index, None if name[3] is None else int(name[3]))
-
-
-def check_name(judge: Judge, file: ScanFile, index: int, part: int, slices: int) -> None:
-    """The name against what the file says of itself."""
-    wanted = "head" if index < 0 else f"{index:06d}"
-    if slices > 1:
-        wanted += f"-{part}"
-    judge.equal("names", file.where, wanted + file.path.suffix, file.path.name)
+        number, head, part = name.groups()
+        index = -1 if head else int(number)
+        if not head and number != f"{index:06d}":
+            log.fail("names", where, f"{index:06d}", number)
+        yield ScanFile(path, where, sensor, index, None if part is None else int(part))

@@ -1,29 +1,35 @@
-"""Outputs of messages, whatever their container: which topics there are, and what is on them.
+"""Outputs of messages in any container: topics, clouds, transforms and IMU samples.
 
-Source: facts/outputs.md section 4, CONTRACT.md section 3.
+Sources: docs/sources/outputs.md sections 2 to 4; sensor_msgs of ROS.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from mlbatch.arrays import F64Array
-from mlbatch.verify.claims import Claims
-from mlbatch.verify.clouds import held, read_cloud
-from mlbatch.verify.cursor import Cursor
-from mlbatch.verify.document import Document
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
+from mlbatch.verify.containers import Message
+from mlbatch.verify.encoding import MessageCursor
 from mlbatch.verify.examination import Examination
-from mlbatch.verify.report import poses_of
-from mlbatch.verify.verdict import DamageError, Judge
+from mlbatch.verify.report_checks import Document, RunMetadata, poses_of
+from mlbatch.verify.scan import StoredScan
+from mlbatch.verify.verdict import CheckLog, DamageError
 
-CLOUD, IMU, TRANSFORMS = "sensor_msgs/PointCloud2", "sensor_msgs/Imu", "tf2_msgs/TFMessage"
+CLOUD = "sensor_msgs/PointCloud2"
+IMU = "sensor_msgs/Imu"
+TRANSFORMS = "tf2_msgs/TFMessage"
 TF_STATIC = "/tf_static"
-# Of the sensor's own stamps: outside, they are refused.
+# Stamps outside are never written.
 _STAMP_LIMIT_NS = 2**31 * 10**9
-_LEAST_MESSAGE = 1e-6
+_LARGEST_ERROR = 1e-6
+_NS = 10**9
+# Orientation, angular velocity and linear acceleration, each with a covariance.
+_IMU_FLOATS = 4 + 9 + 3 + 9 + 3 + 9
 
 LIMITS = {
     "columns": "first and last column of a scan, by scans.csv; messages have no column stamps",
@@ -31,7 +37,7 @@ LIMITS = {
     "duplicates": "messages have no column stamps",
     "names": "one file",
 }
-# What a layout has no field for.
+# Layouts without a field for a check.
 LAYOUT_LIMITS = {
     "times": ("minimal",),
     "order": ("minimal",),
@@ -42,29 +48,196 @@ LAYOUT_LIMITS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """A message and where it stands; type: package/Type; encoding: cdr or ros1."""
+# -- point layouts --------------------------------------------------------------------------------
 
-    where: str
-    topic: str
-    type: str
-    encoding: str
-    log_ns: int
-    publish_ns: int
-    data: memoryview
+Records: TypeAlias = npt.NDArray[np.void]
+# Name, offset and type code of each field.
+Fields: TypeAlias = tuple[tuple[str, int, int], ...]
+_CODES = {"u1": 2, "<u2": 4, "<u4": 6, "<f4": 7, "<f8": 8}
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """A point layout."""
+
+    # Bytes of a point.
+    step: int
+    fields: Fields
+    # Field with the time of a point.
+    time: str | None
+    # Records; x, y and z also as one field xyz.
+    dtype: np.dtype[np.void]
+
+
+def _preset(step: int, time: str | None, text: str) -> Preset:
+    """A preset from `name:type@offset`, types as in numpy."""
+    names = []
+    types = []
+    offsets = []
+    for part in text.split():
+        name, _, rest = part.partition(":")
+        kind, _, offset = rest.partition("@")
+        names.append(name)
+        types.append(kind if kind == "u1" else f"<{kind}")
+        offsets.append(int(offset))
+    codes = [_CODES[kind] for kind in types]
+    dtype = np.dtype(
+        {
+            "names": ["xyz", *names],
+            "formats": [("<f4", 3), *types],
+            "offsets": [0, *offsets],
+            "itemsize": step,
+        }
+    )
+    return Preset(step, tuple(zip(names, offsets, codes, strict=True)), time, dtype)
+
+
+_XYZ = "x:f4@0 y:f4@4 z:f4@8"
+PRESETS = {
+    "standard": _preset(
+        24,
+        "time",
+        f"{_XYZ} intensity:f4@12 time:f4@16 ring:u2@20 return_type:u1@22 lidar_id:u1@23",
+    ),
+    "velodyne": _preset(22, "time", f"{_XYZ} intensity:f4@12 ring:u2@16 time:f4@18"),
+    "ouster": _preset(
+        48,
+        "t",
+        f"{_XYZ} intensity:f4@16 t:u4@20 reflectivity:u2@24 ring:u2@26 ambient:u2@28 range:u4@32",
+    ),
+    "hesai": _preset(26, "timestamp", f"{_XYZ} intensity:f4@12 ring:u2@16 timestamp:f8@18"),
+    "autoware": _preset(
+        32,
+        "time_stamp",
+        f"{_XYZ} intensity:u1@12 return_type:u1@13 channel:u2@14 azimuth:f4@16 elevation:f4@20 "
+        "distance:f4@24 time_stamp:u4@28",
+    ),
+    "kiss-icp": _preset(16, "time", f"{_XYZ} time:f4@12"),
+    "minimal": _preset(12, None, _XYZ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """A PointCloud2."""
+
+    stamp_ns: int
+    frame_id: str
+    # Name of its preset.
+    layout: str
+    # (height, width)
+    records: Records
+    is_dense: bool
+
+
+def read_cloud(cursor: MessageCursor) -> Cloud:
+    """One message; DamageError if it is damaged or of no preset."""
+    stamp_ns, frame_id = cursor.header()
+    height = cursor.integer("I")
+    width = cursor.integer("I")
+    fields = []
+    for _ in range(cursor.integer("I")):
+        name = cursor.text()
+        offset = cursor.integer("I")
+        code = cursor.integer("B")
+        count = cursor.integer("I")
+        if count != 1:
+            raise DamageError("fields of one value", f"{name} of {count}")
+        fields.append((name, offset, code))
+    big_endian = cursor.integer("B")
+    step = cursor.integer("I")
+    row = cursor.integer("I")
+    layouts = [
+        name for name, one in PRESETS.items() if (one.step, one.fields) == (step, tuple(fields))
+    ]
+    if not layouts or big_endian:
+        found = ", ".join(f"{name}@{offset} type {code}" for name, offset, code in fields)
+        raise DamageError("little-endian fields of a point layout", f"{found}; step {step}")
+    data = cursor.bytes_of(cursor.integer("I"))
+    if row != step * width or len(data) != row * height:
+        raise DamageError(
+            f"{height} rows of {width} points of {step} bytes",
+            f"rows of {row} bytes, {len(data)} in all",
+        )
+    is_dense = bool(cursor.integer("B"))
+    cursor.end("a PointCloud2")
+    records = np.frombuffer(data, PRESETS[layouts[0]].dtype).reshape(height, width)
+    return Cloud(stamp_ns, frame_id, layouts[0], records, is_dense)
+
+
+def stored_scan(cloud: Cloud, where: str, sensor: int | None) -> StoredScan:
+    """The message as a scan; an organized one is transposed: its rows are columns."""
+    organized = not cloud.is_dense
+    records = cloud.records.T if organized else cloud.records.reshape(-1)
+    names = {name for name, _, _ in PRESETS[cloud.layout].fields}
+    time_ns, step_ns = _times(cloud, records)
+    xyz: F32Array = records["xyz"]
+    scan = StoredScan(where, cloud.stamp_ns, xyz, organized, sensor)
+    scan.time_ns = time_ns
+    scan.time_step_ns = step_ns
+    # An intensity of one byte has no NaN for empty slots.
+    if "intensity" in names and records.dtype["intensity"].kind == "f":
+        intensity: F32Array = records["intensity"]
+        scan.intensity = intensity
+    if "range" in names:
+        range_m: F64Array = records["range"] / 1000.0
+        scan.range_m = range_m
+    if "distance" in names:
+        distance_m: F32Array = records["distance"]
+        scan.distance_m = distance_m
+    if "azimuth" in names:
+        angles_rad: tuple[F32Array, F32Array] = (records["azimuth"], records["elevation"])
+        scan.angles_rad = angles_rad
+    # The `channel` of `autoware` is a ring of its sensor, not of the run.
+    if "ring" in names:
+        ring: U16Array = records["ring"]
+        scan.ring = ring
+    if "return_type" in names:
+        return_type: U8Array = records["return_type"]
+        scan.return_type = return_type
+    if "lidar_id" in names:
+        lidar_id: U8Array = records["lidar_id"]
+        scan.lidar_id = lidar_id
+    return scan
+
+
+def _times(cloud: Cloud, records: Records) -> tuple[I64Array | None, int]:
+    """Times after the stamp, ns, and their largest error."""
+    name = PRESETS[cloud.layout].time
+    if name is None:
+        return None, 0
+    values = records[name]
+    if name in ("t", "time_stamp"):
+        return values.astype(np.int64), 0
+    if not np.isfinite(values).all():
+        raise DamageError(f"a finite {name}", "NaN or infinity")
+    if name == "time":
+        # Rounded toward zero: never later than the true time.
+        time_s: F64Array = np.clip(values.astype(np.float64), -4.0, 4e9 / _NS)
+        step_s = float(np.spacing(np.float32(np.abs(time_s).max(initial=0))))
+        return np.floor(time_s * _NS).astype(np.int64), int(step_s * _NS) + 1
+    # Times of the clock; those of empty slots are the start.
+    whole_s, rest_ns = divmod(cloud.stamp_ns, _NS)
+    after_s: F64Array = np.clip(values - whole_s, -4.0, 5.0)
+    step_s = float(np.spacing(np.abs(values).max(initial=0)))
+    return np.rint(after_s * _NS).astype(np.int64) - rest_ns, int(step_s * _NS) + 1
+
+
+# -- topics ---------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
-class Topics:
+class TopicChecks:
     """Takes the messages of an output one after the other."""
 
-    judge: Judge
-    claims: Claims
+    log: CheckLog
+    metadata: RunMetadata
     examination: Examination
     report: Document | None
+    # Of the first cloud.
     layout: str = ""
     organized: bool = False
+    # Messages by topic.
     counts: Counter[str] = field(default_factory=Counter)
     _split: bool | None = None
     _last_ns: dict[str, int] = field(default_factory=dict)
@@ -72,144 +245,147 @@ class Topics:
 
     @property
     def split(self) -> bool:
-        """Whether every sensor has a topic of its own."""
+        """Whether every sensor has its own topic."""
         return bool(self._split)
 
-    def take(self, message: Message) -> None:
-        """One message, in the order of the file."""
-        first = not self.counts
+    def check(self, message: Message) -> None:
+        """Check one message, in the order of the file."""
+        is_first = not self.counts
         self.counts[message.topic] += 1
-        sensors = self.claims.sensors or ()
-        owner = _owner(message.topic)
+        sensors = self.metadata.sensors or ()
+        # `/<sensor>/points` or `/<sensor>/imu`
+        head, _, tail = message.topic.rpartition("/")
+        owner = head.removeprefix("/")
         try:
             if message.topic == TF_STATIC:
-                self._transforms(message, first)
+                self._check_transforms(message, is_first)
             elif message.topic == "/points":
-                self._cloud(message, None)
-            elif owner[1] == "points" and owner[0] in sensors:
-                self._cloud(message, sensors.index(owner[0]))
-            elif owner[1] == "imu" and owner[0] in sensors:
-                self._imu(message, f"{owner[0]}_imu")
+                self._check_cloud(message, None)
+            elif tail == "points" and owner in sensors:
+                self._check_cloud(message, sensors.index(owner))
+            elif tail == "imu" and owner in sensors:
+                self._check_imu(message, f"{owner}_imu")
             elif message.type == IMU:
-                self._imu(message, None)
+                self._check_imu(message, None)
         except DamageError as err:
-            self.judge.blame("layout", message.where, err.wanted, err.got)
+            self.log.fail("layout", message.where, err.expected, err.found)
 
-    def _cloud(self, message: Message, sensor: int | None) -> None:
-        judge, where = self.judge, message.where
-        if not judge.equal("layout", f"{where} type", CLOUD, message.type):
+    def _check_cloud(self, message: Message, sensor: int | None) -> None:
+        log = self.log
+        where = message.where
+        if not log.equal("layout", f"{where} type", CLOUD, message.type):
             return
         if self._split is None:
             self._split = sensor is not None
-        judge.equal("layout", f"{where} topic with --split", self._split, sensor is not None)
-        cloud = read_cloud(Cursor.of_message(message.data, message.encoding))
+        log.equal("layout", f"{where} topic with --split", self._split, sensor is not None)
+        cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
         if not self.layout:
-            self.layout, self.organized = cloud.layout, not cloud.is_dense
-        judge.equal("layout", f"{where} point layout", self.layout, cloud.layout)
-        judge.equal("layout", f"{where} is_dense", not self.organized, cloud.is_dense)
+            self.layout = cloud.layout
+            self.organized = not cloud.is_dense
+        log.equal("layout", f"{where} point layout", self.layout, cloud.layout)
+        log.equal("layout", f"{where} is_dense", not self.organized, cloud.is_dense)
         if cloud.is_dense:
-            judge.equal("layout", f"{where} height", 1, len(cloud.records))
-        judge.equal("stamps", f"{where} log time", cloud.stamp_ns, message.log_ns)
-        judge.equal("stamps", f"{where} publish time", cloud.stamp_ns, message.publish_ns)
-        if self.claims.frame_id is not None:
-            judge.equal("metadata", f"{where} frame_id", self.claims.frame_id, cloud.frame_id)
-        self.examination.scan(held(cloud, where, sensor))
+            log.equal("layout", f"{where} height", 1, len(cloud.records))
+        log.equal("stamps", f"{where} log time", cloud.stamp_ns, message.log_ns)
+        log.equal("stamps", f"{where} publish time", cloud.stamp_ns, message.publish_ns)
+        if self.metadata.frame_id is not None:
+            log.equal("metadata", f"{where} frame_id", self.metadata.frame_id, cloud.frame_id)
+        self.examination.scan(stored_scan(cloud, where, sensor))
 
-    def _imu(self, message: Message, frame_id: str | None) -> None:
-        judge, where = self.judge, message.where
-        if not judge.equal("imu", f"{where} type", IMU, message.type):
+    def _check_imu(self, message: Message, frame_id: str | None) -> None:
+        """Check an IMU message; frame_id: None for a recorded one."""
+        log = self.log
+        where = message.where
+        if not log.equal("imu", f"{where} type", IMU, message.type):
             return
-        cursor = Cursor.of_message(message.data, message.encoding)
+        cursor = MessageCursor.of_message(message.data, message.encoding)
         stamp_ns, frame = cursor.header()
-        if not judge.equal("imu", f"{where} log time", stamp_ns, message.log_ns):
+        if not log.equal("imu", f"{where} log time", stamp_ns, message.log_ns):
             return
         if frame_id is None:
-            return  # A recorded message: its frame, values and order are its publisher's.
-        judge.equal("imu", f"{where} frame_id", frame_id, frame)
-        judge.equal("imu", f"{where} publish time", stamp_ns, message.publish_ns)
-        values = cursor.reals(4 + 9 + 3 + 9 + 3 + 9)
+            return  # Frame, values and order of a recorded message are those of its publisher.
+        log.equal("imu", f"{where} frame_id", frame_id, frame)
+        log.equal("imu", f"{where} publish time", stamp_ns, message.publish_ns)
+        values = cursor.floats(_IMU_FLOATS)
         cursor.end("an Imu message")
         if not np.isfinite(values).all():
-            judge.blame("imu", where, "numbers", values)
+            log.fail("imu", where, "finite numbers", values)
         if not 0 <= stamp_ns < _STAMP_LIMIT_NS:
-            judge.blame("imu", where, f"a stamp in [0, {_STAMP_LIMIT_NS}) ns", stamp_ns)
+            log.fail("imu", where, f"a stamp in [0, {_STAMP_LIMIT_NS}) ns", stamp_ns)
         last_ns = self._last_ns.get(message.topic, 0)
         if stamp_ns < last_ns:
-            judge.blame("imu", where, f"a stamp from {last_ns} on", stamp_ns)
+            log.fail("imu", where, f"a stamp of {last_ns} or later", stamp_ns)
         self._last_ns[message.topic] = max(stamp_ns, last_ns)
 
-    def _transforms(self, message: Message, first: bool) -> None:
-        judge, where = self.judge, message.where
-        judge.equal("tf_static", f"{where} place", "before all others", _place(first))
-        if not judge.equal("tf_static", f"{where} type", TRANSFORMS, message.type):
+    def _check_transforms(self, message: Message, is_first: bool) -> None:
+        log = self.log
+        where = message.where
+        place = "before all others" if is_first else "after others"
+        log.equal("tf_static", f"{where} place", "before all others", place)
+        if not log.equal("tf_static", f"{where} type", TRANSFORMS, message.type):
             return
-        cursor = Cursor.of_message(message.data, message.encoding)
-        names, poses = [], []
-        for _ in range(cursor.whole("I")):
+        cursor = MessageCursor.of_message(message.data, message.encoding)
+        names = []
+        translations = []
+        rotations = []
+        for _ in range(cursor.integer("I")):
             stamp_ns, frame = cursor.header()
-            judge.equal("tf_static", f"{where} stamp", message.log_ns, stamp_ns)
+            log.equal("tf_static", f"{where} stamp", message.log_ns, stamp_ns)
             self._frames.add(frame)
             names.append(cursor.text())
-            poses.append((np.array(cursor.reals(3)), np.array(cursor.reals(4))))
+            translations.append(np.array(cursor.floats(3)))
+            rotations.append(np.array(cursor.floats(4)))
         cursor.end("a TFMessage")
-        if self.claims.frame_id is not None:
-            judge.equal("tf_static", f"{where} frames", {self.claims.frame_id}, self._frames)
-        if self.claims.sensors is not None:
-            judge.equal("tf_static", f"{where} child frames", self.claims.sensors, tuple(names))
-        for name, (_, turn) in zip(names, poses, strict=True):
-            if not abs(float(turn @ turn) - 1) < _LEAST_MESSAGE:
-                judge.blame("tf_static", f"{where} {name}", "a unit quaternion", turn)
-        self._compare(where, names, poses)
+        if self.metadata.frame_id is not None:
+            log.equal("tf_static", f"{where} frames", {self.metadata.frame_id}, self._frames)
+        if self.metadata.sensors is not None:
+            log.equal("tf_static", f"{where} child frames", self.metadata.sensors, tuple(names))
+        poses = None if self.report is None else poses_of(self.report)
+        known = poses if poses is not None and len(poses) == len(names) else None
+        for i, name in enumerate(names):
+            rotation: F64Array = rotations[i]
+            if not abs(float(rotation @ rotation) - 1) < _LARGEST_ERROR:
+                log.fail("tf_static", f"{where} {name}", "a unit quaternion", rotation)
+            if known is not None:
+                self._check_pose(f"{where} {name}", translations[i], rotation, known[i])
 
-    def _compare(
-        self, where: str, names: list[str], poses: list[tuple[F64Array, F64Array]]
+    def _check_pose(
+        self, where: str, translation_m: F64Array, rotation: F64Array, pose: F64Array
     ) -> None:
-        """Poses against those of the report."""
-        said = None if self.report is None else poses_of(self.report)
-        if said is None or len(said) != len(poses):
-            return
-        for name, (place, turn), pose in zip(names, poses, said, strict=True):
-            near = np.allclose(place, pose[:3, 3], rtol=0, atol=_LEAST_MESSAGE) and np.allclose(
-                _rotation(turn), pose[:3, :3], rtol=0, atol=1e-3
-            )
-            self.judge.passed("tf_static")
-            if not near:
-                wanted = "the pose of the report"
-                self.judge.blame("tf_static", f"{where} {name}", wanted, [*place, *turn])
+        """Check a transform against a pose (4, 4) of the report."""
+        is_near = np.allclose(translation_m, pose[:3, 3], rtol=0, atol=_LARGEST_ERROR)
+        is_near &= np.allclose(_matrix(rotation), pose[:3, :3], rtol=0, atol=1e-3)
+        self.log.ok("tf_static")
+        if not is_near:
+            found = [*translation_m.tolist(), *rotation.tolist()]
+            self.log.fail("tf_static", where, "the pose of the report", found)
 
     def finish(self, where: str) -> None:
-        """Counts of messages; the sums of scans."""
-        self.judge.equal("tf_static", f"{where} messages", 1, self.counts[TF_STATIC])
+        """Check the counts of messages, and the sums of scans."""
+        log = self.log
+        log.equal("tf_static", f"{where} messages", 1, self.counts[TF_STATIC])
         self.examination.finish(split=self.split)
-        if self.report is None:
-            return
         report = self.report
-        for i, name in enumerate(self.claims.sensors or ()):
+        if report is None:
+            return
+        sensors = self.metadata.sensors or ()
+        for i, name in enumerate(sensors):
             path = ("sensors", i, "imu_samples", "written")
             written = report.number(*path)
-            self.judge.equal("imu", report.name(*path), self.counts[f"/{name}/imu"], written)
+            log.equal("imu", report.name(*path), self.counts[f"/{name}/imu"], written)
         own = {TF_STATIC, "/points"}
-        own |= {f"/{s}/{end}" for s in self.claims.sensors or () for end in ("points", "imu")}
+        for name in sensors:
+            own |= {f"/{name}/points", f"/{name}/imu"}
         said = {
-            report.text("messages", i, "topic"): report.number("messages", i, "written")
+            report.text("messages", i, "topic") or "": report.number("messages", i, "written")
             for i in range(report.length("messages"))
         }
-        for topic in sorted({topic or "" for topic in said} | set(self.counts) - own):
+        for topic in sorted(set(said) | set(self.counts) - own):
             count = self.counts[topic]
-            self.judge.equal("messages", f"{where} {topic}", said.get(topic, 0), count)
+            log.equal("messages", f"{where} {topic}", said.get(topic, 0), count)
 
 
-def _owner(topic: str) -> tuple[str, str]:
-    """Sensor and last part of `/<sensor>/points` or `/<sensor>/imu`."""
-    head, _, tail = topic.rpartition("/")
-    return head.removeprefix("/"), tail
-
-
-def _place(first: bool) -> str:
-    return "before all others" if first else "after others"
-
-
-def _rotation(quaternion: F64Array) -> F64Array:
+def _matrix(quaternion: F64Array) -> F64Array:
     """Rotation (3, 3) of a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion.tolist()
     return np.array(

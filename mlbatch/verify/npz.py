@@ -1,24 +1,32 @@
-"""A folder of npz files (CONTRACT.md, section 3): all that a scan holds can be held against it."""
+"""Folders of npz files: every value of a scan is checkable.
+
+`zipfile` reads the members and checks their checksums, `numpy` the headers of arrays.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import lru_cache
+from io import BytesIO
 from typing import cast
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
-from mlbatch.verify.claims import Claims
-from mlbatch.verify.folders import ScanFile, check_name
-from mlbatch.verify.scan import HeldScan
-from mlbatch.verify.verdict import DamageError, Judge
-from mlbatch.verify.zips import Array, array, members
+from mlbatch.verify.containers import check_unpacked_size, library_errors
+from mlbatch.verify.folders import ScanFile
+from mlbatch.verify.report_checks import RunMetadata
+from mlbatch.verify.scan import StoredScan
+from mlbatch.verify.verdict import CheckLog, DamageError
 
 SUFFIX = ".npz"
 SCHEMA = "mlbatch.scan/1"
-# Of points: type, and length of what follows the axes of the scan's shape.
+# Keys with a row for each point: type, and shape of the row.
 _POINTS = {
     "xyz": ("<f4", (3,)),
     "intensity": ("<f4", ()),
@@ -32,7 +40,11 @@ _DENSE = {"column": ("<u4", ())}
 _OPTIONAL = {"reflectivity": ("<u2", ())}
 _COLUMNS = {"column_stamp_ns": "<i8", "column_lidar_id": "|u1"}
 _NUMBERS = {
-    **dict.fromkeys(("start_ns", "end_ns", "index", "slice", "slices"), "<i8"),
+    "start_ns": "<i8",
+    "end_ns": "<i8",
+    "index": "<i8",
+    "slice": "<i8",
+    "slices": "<i8",
     "complete": "|b1",
 }
 _TEXTS = ("sensors", "frame_id", "rate_hz", "timescale", "schema")
@@ -41,166 +53,195 @@ _CONSTANT = ("slices", *_TEXTS)
 
 LIMITS = {
     "tf_static": "npz has no transforms",
-    "imu": "npz has no place for IMU samples",
-    "messages": "npz has no place for messages",
+    "imu": "npz has no IMU samples",
+    "messages": "npz has no messages",
     "stamps": "npz has no log times",
 }
-ORGANIZED_LIMITS = {"order": "columns only: organized scans keep no order within a column"}
+ORGANIZED_LIMITS = {"order": "columns only: organized scans have no order within a column"}
 
 Values = npt.NDArray[np.generic]
 
 
 @dataclass(slots=True)
 class NpzReader:
-    """Reads files of one folder; all of a run hold the same keys and constants."""
+    """Reads the files of one folder; all of a run have the same keys and constants."""
 
-    judge: Judge
+    log: CheckLog
     sensors: tuple[str, ...] = ()
     organized: bool = False
     _first: str = ""
     _keys: dict[str | None, frozenset[str]] = field(default_factory=dict)
+    # Bytes and values of the constants of the first scan.
     _constant: dict[str, bytes] = field(default_factory=dict)
+    _values: dict[str, Values] = field(default_factory=dict)
 
-    def begin(self, file: ScanFile) -> Claims:
-        """What the first scan says of the run."""
+    def begin(self, file: ScanFile) -> RunMetadata:
+        """Metadata of the run in the first scan."""
         data = _members(file)
         self._first = file.where
-        arrays = {key: array(key, data[key]) for key in _CONSTANT if key in data}
-        values = {key: one.values for key, one in arrays.items() if self._fits(file, key, one)}
-        self._constant = {key: bytes(data[key]) for key in values}
+        arrays = {key: _array(key, data[key]) for key in _CONSTANT if key in data}
+        self._values = {key: one for key, one in arrays.items() if self._fits(file, key, one)}
+        self._constant = {key: data[key] for key in self._values}
         xyz = data.get("xyz")
-        self.organized = xyz is not None and array("xyz", xyz).values.ndim == 3
+        self.organized = xyz is not None and _array("xyz", xyz).ndim == 3
+        values = self._values
         texts = {key: str(values[key]) for key in _TEXTS if key in values and key != "sensors"}
-        self.judge.equal("layout", f"{file.where} schema", SCHEMA, texts.get("schema"))
-        names = values.get("sensors")
-        if names is not None:
-            self.sensors = tuple(map(str, names.tolist()))
+        self.log.equal("layout", f"{file.where} schema", SCHEMA, texts.get("schema"))
+        if "sensors" in values:
+            self.sensors = tuple(map(str, values["sensors"].tolist()))
         slices = values.get("slices")
-        return Claims(
-            texts.get("rate_hz"),
-            None if slices is None else int(cast(I64Array, slices)),
-            None,
-            self.sensors or None,
-            texts.get("timescale"),
-            texts.get("frame_id"),
+        return RunMetadata(
+            rate=texts.get("rate_hz"),
+            slices=None if slices is None else int(cast(I64Array, slices)),
+            sensors=self.sensors or None,
+            timescale=texts.get("timescale"),
+            frame_id=texts.get("frame_id"),
         )
 
-    def _fits(self, file: ScanFile, key: str, found: Array) -> bool:
-        """Whether a constant is what it should be; a number that is none is blamed in each scan."""
-        axes = found.values.ndim
+    def _fits(self, file: ScanFile, key: str, values: Values) -> bool:
+        """Whether a constant has its type; a number of another type is a violation in each scan."""
+        kind = values.dtype.str
         if key not in _TEXTS:
-            return (found.kind, axes) == (_NUMBERS[key], 0)
-        wanted = "texts" if key == "sensors" else "a text"
-        got = f"{found.kind} of {axes} axes"
-        fits = found.kind.startswith("<U") and axes == (key == "sensors")
-        return self.judge.equal("layout", f"{file.where} {key}", wanted, wanted if fits else got)
+            return (kind, values.ndim) == (_NUMBERS[key], 0)
+        expected = "texts" if key == "sensors" else "a text"
+        fits = kind.startswith("<U") and values.ndim == (key == "sensors")
+        found = expected if fits else f"{kind} of {values.ndim} axes"
+        return self.log.equal("layout", f"{file.where} {key}", expected, found)
 
-    def scans(self, files: list[ScanFile]) -> Iterator[HeldScan]:
-        """Every scan that can be read; what cannot is blamed."""
+    def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
+        """Every readable scan; the others are violations."""
         for file in files:
             try:
                 scan = self._scan(file)
             except DamageError as err:
-                self.judge.blame("container", file.where, err.wanted, err.got)
+                self.log.fail("container", file.where, err.expected, err.found)
                 continue
-            self.judge.passed("container")
+            self.log.ok("container")
             if scan is not None:
                 yield scan
 
-    def _scan(self, file: ScanFile) -> HeldScan | None:
+    def _scan(self, file: ScanFile) -> StoredScan | None:
         data = _members(file)
         self._check_keys(file, data)
         values = {
-            key: array(key, raw)
+            key: self._values[key] if self._constant.get(key) == raw else _array(key, raw)
             for key, raw in data.items()
-            if key not in self._constant or bytes(raw) != self._constant[key]
         }
-        whole = True
+        types_fit = True
         for key, kind in self._kinds(data).items():
-            if key in values and values[key].kind != kind:
-                self.judge.blame("layout", f"{file.where} {key}", kind, values[key].kind)
-                whole = False
-        found = {key: one.values for key, one in values.items()}
-        if not whole or not self._check_shapes(file, found):
+            if key in values and values[key].dtype.str != kind:
+                self.log.fail("layout", f"{file.where} {key}", kind, values[key].dtype.str)
+                types_fit = False
+        if not types_fit or not self._check_shapes(file, values):
             return None
-        return self._held(file, found)
+        return self._stored(file, values)
 
-    def _check_keys(self, file: ScanFile, data: dict[str, memoryview]) -> None:
-        self.judge.passed("layout")
+    def _check_keys(self, file: ScanFile, data: dict[str, bytes]) -> None:
+        log = self.log
+        log.ok("layout")
         keys = self._keys.setdefault(file.sensor, frozenset(data))
         if keys != data.keys():
             changed = ", ".join(sorted(keys ^ data.keys()))
-            self.judge.blame(
-                "layout", file.where, "the keys of the first scan", f"not so: {changed}"
-            )
+            log.fail("layout", file.where, "the keys of the first scan", f"a difference: {changed}")
         for key, raw in self._constant.items():
-            if key in data and bytes(data[key]) != raw:
-                got = array(key, data[key]).values
-                self.judge.blame("metadata", f"{file.where} {key}", f"as in {self._first}", got)
-        self.judge.passed("metadata", len(self._constant))
+            if key in data and data[key] != raw:
+                found = _array(key, data[key])
+                log.fail("metadata", f"{file.where} {key}", f"as in {self._first}", found)
+        log.ok("metadata", len(self._constant))
 
-    def _kinds(self, data: dict[str, memoryview]) -> dict[str, str]:
-        """Types by key; what must be there and is not is damage."""
+    def _kinds(self, data: dict[str, bytes]) -> dict[str, str]:
+        """Types by key; missing keys are damage."""
         points = _POINTS | ({} if self.organized else _DENSE)
-        needed = {key: kind for key, (kind, _) in points.items()} | _COLUMNS | _NUMBERS
-        missing = [key for key in (*needed, *_TEXTS) if key not in data]
+        required = {key: kind for key, (kind, _) in points.items()} | _COLUMNS | _NUMBERS
+        missing = [key for key in (*required, *_TEXTS) if key not in data]
         if missing:
             raise DamageError("all keys of a scan", f"no {', '.join(missing)}")
-        return needed | {key: kind for key, (kind, _) in _OPTIONAL.items()}
+        return required | {key: kind for key, (kind, _) in _OPTIONAL.items()}
 
-    def _check_shapes(self, file: ScanFile, found: dict[str, Values]) -> bool:
-        """Whether all point arrays have one shape, and the others theirs."""
+    def _check_shapes(self, file: ScanFile, values: dict[str, Values]) -> bool:
+        """Check that point arrays have one shape, column arrays another, and numbers none."""
         points = _POINTS | _OPTIONAL | ({} if self.organized else _DENSE)
         axes = 2 if self.organized else 1
-        shape = found["time_ns"].shape
-        wanted = {key: shape + tail for key, (_, tail) in points.items()}
-        wanted |= dict.fromkeys(_COLUMNS, found["column_stamp_ns"].shape[:1])
-        wanted |= dict.fromkeys(_NUMBERS, ())
-        if self.organized:
-            wanted |= dict.fromkeys(_COLUMNS, shape[:1])
-        good = True
-        for key, own in wanted.items():
-            if key in found and (found[key].shape != own or len(shape) != axes):
-                self.judge.blame("layout", f"{file.where} {key}", f"shape {own}", found[key].shape)
-                good = False
-        return good
+        shape = values["time_ns"].shape
+        columns = shape[:1] if self.organized else values["column_stamp_ns"].shape[:1]
+        expected = {key: shape + row for key, (_, row) in points.items()}
+        expected |= dict.fromkeys(_COLUMNS, columns)
+        expected |= dict.fromkeys(_NUMBERS, ())
+        fits = True
+        for key, own in expected.items():
+            if key in values and (values[key].shape != own or len(shape) != axes):
+                self.log.fail("layout", f"{file.where} {key}", f"shape {own}", values[key].shape)
+                fits = False
+        return fits
 
-    def _held(self, file: ScanFile, found: dict[str, Values]) -> HeldScan:
-        constant = {key: array(key, memoryview(raw)).values for key, raw in self._constant.items()}
-        number = {key: int(cast(I64Array, found.get(key, constant.get(key)))) for key in _NUMBERS}
-        check_name(self.judge, file, number["index"], number["slice"], number["slices"])
-        scan = HeldScan(
+    def _stored(self, file: ScanFile, values: dict[str, Values]) -> StoredScan:
+        number = {key: int(cast(I64Array, values[key])) for key in _NUMBERS}
+        file.check_name(self.log, number["index"], number["slice"], number["slices"])
+        return StoredScan(
             where=file.where,
             start_ns=number["start_ns"],
             end_ns=number["end_ns"],
             index=number["index"],
             slice=number["slice"],
             complete=bool(number["complete"]),
-            xyz=cast(F32Array, found["xyz"]),
+            xyz=cast(F32Array, values["xyz"]),
             organized=self.organized,
-            intensity=cast(F32Array, found["intensity"]),
-            range_m=cast(F32Array, found["range_m"]),
-            time_ns=cast(I64Array, found["time_ns"].astype(np.int64)),
-            ring=cast(U16Array, found["ring"]),
-            return_type=cast(U8Array, found["return_type"]),
-            lidar_id=cast(U8Array, found["lidar_id"]),
-            column=cast("U32Array | None", found.get("column")),
-            column_stamp_ns=cast(I64Array, found["column_stamp_ns"]),
-            column_lidar_id=cast(U8Array, found["column_lidar_id"]),
+            sensor=file.sensor_index(self.log, self.sensors),
+            intensity=cast(F32Array, values["intensity"]),
+            range_m=cast(F32Array, values["range_m"]),
+            time_ns=cast(I64Array, values["time_ns"].astype(np.int64)),
+            ring=cast(U16Array, values["ring"]),
+            return_type=cast(U8Array, values["return_type"]),
+            lidar_id=cast(U8Array, values["lidar_id"]),
+            column=cast("U32Array | None", values.get("column")),
+            column_stamp_ns=cast(I64Array, values["column_stamp_ns"]),
+            column_lidar_id=cast(U8Array, values["column_lidar_id"]),
         )
-        if file.sensor is None:
-            return scan
-        if file.sensor not in self.sensors:
-            wanted = f"the folder of one of {', '.join(self.sensors)}"
-            self.judge.blame("names", file.where, wanted, file.sensor)
-            return scan
-        return replace(scan, sensor=self.sensors.index(file.sensor))
 
 
-def _members(file: ScanFile) -> dict[str, memoryview]:
-    try:
-        data = file.path.read_bytes()
-    except OSError as err:
-        raise DamageError("a file that can be read", str(err.strerror)) from err
-    found = members(data)
-    return {name.removesuffix(".npy"): member for name, member in found.items()}
+def _members(file: ScanFile) -> dict[str, bytes]:
+    """The bytes of each array by key."""
+    data = file.read()
+    found: dict[str, bytes] = {}
+    with library_errors("a zip with whole members"), ZipFile(BytesIO(data)) as archive:
+        members = archive.infolist()
+        check_unpacked_size(sum(member.file_size for member in members), len(data))
+        for member in members:
+            if member.filename in found:
+                raise DamageError(f"one member {member.filename}", "two")
+            if member.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
+                method = f"method {member.compress_type}"
+                raise DamageError(f"member {member.filename} stored or deflated", method)
+            # Unpacks no more than the declared size.
+            with archive.open(member) as stream:
+                content = stream.read(member.file_size)
+            if len(content) != member.file_size:
+                expected = f"{member.file_size} bytes of member {member.filename}"
+                raise DamageError(expected, str(len(content)))
+            found[member.filename] = content
+    return {name.removesuffix(".npy"): content for name, content in found.items()}
+
+
+def _array(key: str, data: bytes) -> Values:
+    """The array in an npy of version 1.0."""
+    with library_errors(f"{key} as an npy"):
+        begin = 10 + int.from_bytes(data[8:10], "little")
+        shape, dtype = _npy_header(data[:begin])
+        count = math.prod(shape)
+        if begin + count * dtype.itemsize != len(data):
+            raise DamageError(f"{key}: {count} values of {dtype.str}", f"{len(data) - begin} bytes")
+        values: Values = np.frombuffer(data, dtype, count, begin).reshape(shape)
+    return values
+
+
+@lru_cache(maxsize=256)
+def _npy_header(head: bytes) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
+    """Shape and type in a header; the same ones are in every scan, and slow to parse."""
+    stream = BytesIO(head)
+    version = read_magic(stream)
+    if version != (1, 0):
+        raise DamageError("npy version 1.0", str(version))
+    shape, is_fortran, dtype = read_array_header_1_0(stream)
+    if is_fortran or dtype.hasobject:
+        raise DamageError("numbers in C order", head[10:].decode("latin-1"))
+    return shape, dtype

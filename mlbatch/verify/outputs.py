@@ -1,4 +1,7 @@
-"""Each kind of output: where its scans and papers are, and what it leaves open."""
+"""The kinds of outputs: how each is read, and what it cannot show.
+
+Libraries of a format are loaded only for outputs of that format.
+"""
 
 from __future__ import annotations
 
@@ -6,196 +9,201 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.verify import mcap, messages, npz, ply, rosbag1
-from mlbatch.verify.claims import Claims
+from mlbatch.verify import messages, npz, ply
 from mlbatch.verify.examination import Examination
 from mlbatch.verify.folders import entries, scan_files
-from mlbatch.verify.mcap import McapFile
-from mlbatch.verify.messages import LAYOUT_LIMITS, Topics
-from mlbatch.verify.papers import (
+from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
+from mlbatch.verify.report_checks import (
     TABLE,
-    Beside,
-    Papers,
-    check_copies,
-    claims_of_grid,
-    inner_papers,
-    read_papers,
+    ReportFiles,
+    ReportPlaces,
+    RunMetadata,
+    metadata_of_grid,
 )
-from mlbatch.verify.rosbag1 import BagFile
-from mlbatch.verify.rosbag2 import METADATA, bag_file, check_metadata
-from mlbatch.verify.verdict import DamageError, Judge, Verdict, VerifyError
+from mlbatch.verify.verdict import CheckLog, DamageError, Verdict, VerifyError
 
+_METADATA = "metadata.yaml"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_BAG_MAGIC = b"#ROSBAG V2.0\n"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
-_NO_REPORT = "no report beside it; give it with --report"
-_FOREIGN = "wanted an output of mlbatch (a folder of npz or PLY files, an MCAP file, a bag)"
+_NO_REPORT = "no report in or next to the output; give it with --report"
+_FOREIGN = "expected an output of mlbatch (a folder of npz or PLY files, an MCAP file, a bag)"
+_NAME_ONE = "name the output of `mlbatch convert`"
 
 
 @dataclass(frozen=True, slots=True)
-class Proof:
-    """An output under examination; asked: `--report` was given."""
+class Output:
+    """An output to check."""
 
     path: Path
-    beside: Beside
-    asked: bool
-    judge: Judge
+    places: ReportPlaces
+    log: CheckLog
 
     def verdict(
-        self, name: str, examination: Examination, limits: dict[str, str], papers: Papers
+        self, name: str, examination: Examination, limits: dict[str, str], files: ReportFiles
     ) -> Verdict:
-        """The end."""
-        judge, tally = self.judge, examination.tally
-        if papers.report is None:
+        """The result after all checks; limits: why checks are not or only partly possible."""
+        totals = examination.totals
+        if files.report is None:
             limits = dict.fromkeys(("ledger", "report", "t_init"), _NO_REPORT) | limits
-        if not tally.scans and not judge.violations:
-            raise VerifyError(f"{self.path}: wanted scans, got none; convert again")
+        if not totals.scans and not self.log.violations:
+            raise VerifyError(f"{self.path}: expected scans, found none; convert again")
         return Verdict(
             path=str(self.path),
             format=name,
-            scans=tally.scans,
-            points=tally.points,
-            columns=tally.columns if tally.knows_columns else None,
-            checks=judge.checks(limits),
-            violations=tuple(judge.violations),
+            scans=totals.scans,
+            points=totals.points,
+            columns=totals.columns if totals.knows_columns else None,
+            checks=self.log.outcomes(limits),
+            violations=tuple(self.log.violations),
         )
 
 
-def examine(proof: Proof) -> Verdict:
-    """Find out what an output is, and prove it."""
-    path = proof.path
+def check_output(output: Output) -> Verdict:
+    """Check an output of any kind."""
+    path = output.path
     if path.is_dir():
-        kind = _kind_of_folder(path)
-        return kind(proof)
+        check = _check_of_folder(path)
+        return check(output)
     try:
         with path.open("rb") as file:
             head = file.read(16)
     except OSError as err:
-        raise VerifyError(f"{path}: wanted to read it, got {err.strerror!r}") from err
-    if head.startswith(mcap.MAGIC):
-        return _of_mcap(proof, path, "mcap", Claims())
-    if head.startswith(rosbag1.MAGIC):
-        return _of_rosbag1(proof)
-    what = "an empty file" if not head else "a file of another kind"
-    raise VerifyError(f"{path}: {_FOREIGN}, got {what}; name the output of `mlbatch convert`")
+        raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+    if head.startswith(_MCAP_MAGIC):
+        return _check_mcap(output, path, "mcap")
+    if head.startswith(_BAG_MAGIC):
+        return _check_bag(output)
+    kind = "an empty file" if not head else "a file of another kind"
+    raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
 
 
-def _kind_of_folder(path: Path) -> Callable[[Proof], Verdict]:
+def _check_of_folder(path: Path) -> Callable[[Output], Verdict]:
     inside = entries(path)
-    if any(entry.name == METADATA for entry in inside):
-        return _of_rosbag2
+    if any(entry.name == _METADATA for entry in inside):
+        return _check_rosbag2
     folders = [entry for entry in inside if entry.is_dir() and not entry.name.startswith(".")]
     names = [*inside, *(inner for folder in folders for inner in entries(folder))]
-    for suffix, kind in ((npz.SUFFIX, _of_npz), (ply.SUFFIX, _of_ply)):
+    for suffix, check in ((npz.SUFFIX, _check_npz), (ply.SUFFIX, _check_ply)):
         if any(entry.suffix == suffix for entry in names):
-            return kind
-    what = "an empty folder" if not inside else "a folder without scans"
-    raise VerifyError(f"{path}: {_FOREIGN}, got {what}; name the output of `mlbatch convert`")
+            return check
+    kind = "an empty folder" if not inside else "a folder without scans"
+    raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
 
 
-def _of_npz(proof: Proof) -> Verdict:
-    reader = npz.NpzReader(proof.judge)
-    return _of_files(proof, "npz", npz.SUFFIX, reader, npz.LIMITS | {"geometry": _RANGES})
+def _check_npz(output: Output) -> Verdict:
+    reader = npz.NpzReader(output.log)
+    limits = npz.LIMITS | {"geometry": _RANGES}
+    return _check_files(output, "npz", npz.SUFFIX, reader, limits)
 
 
-def _of_ply(proof: Proof) -> Verdict:
-    return _of_files(proof, "ply", ply.SUFFIX, ply.PlyReader(proof.judge), ply.LIMITS)
+def _check_ply(output: Output) -> Verdict:
+    return _check_files(output, "ply", ply.SUFFIX, ply.PlyReader(output.log), ply.LIMITS)
 
 
-def _of_files(
-    proof: Proof,
+def _check_files(
+    output: Output,
     name: str,
     suffix: str,
     reader: npz.NpzReader | ply.PlyReader,
     limits: dict[str, str],
 ) -> Verdict:
-    judge = proof.judge
-    papers = read_papers(judge, proof.beside, asked=proof.asked)
-    if not proof.beside.table.exists():
-        judge.blame("table", TABLE, "the table of scans", "none")
-    files = scan_files(judge, proof.path, suffix)
-    if not files:
-        raise VerifyError(f"{proof.path}: wanted files of scans, got strange names only")
+    log = output.log
+    files = ReportFiles.read(log, output.places)
+    if not output.places.table.exists():
+        log.fail("table", TABLE, "the table of scans", "none")
+    scans = scan_files(log, output.path, suffix)
+    if not scans:
+        raise VerifyError(f"{output.path}: expected files of scans, found strange names only")
     try:
-        own = reader.begin(files[0])
+        own = reader.begin(scans[0])
     except DamageError as err:
         raise VerifyError(
-            f"{files[0].path}: {err}; restore the first scan, or convert again"
+            f"{scans[0].path}: {err}; restore the first scan, or convert again"
         ) from err
-    claims = papers.claims(judge, own)
-    examination = Examination(judge, str(proof.path), claims, papers)
-    for scan in reader.scans(files):
+    metadata = files.metadata(log, own)
+    examination = Examination(log, str(output.path), metadata, files)
+    for scan in reader.scans(scans):
         examination.scan(scan)
-    examination.finish(split=files[0].sensor is not None)
+    examination.finish(split=scans[0].sensor is not None)
     if isinstance(reader, npz.NpzReader) and reader.organized:
         limits = limits | npz.ORGANIZED_LIMITS
-    return proof.verdict(name, examination, limits, papers)
+    return output.verdict(name, examination, limits, files)
 
 
-def _of_rosbag2(proof: Proof) -> Verdict:
-    file, about = bag_file(proof.judge, proof.path)
+def _check_rosbag2(output: Output) -> Verdict:
+    from mlbatch.verify.rosbag2 import check_metadata, open_bag
 
-    def check(topics: Topics, span_ns: tuple[int, int]) -> None:
-        check_metadata(proof.judge, about, file.name, topics.counts, span_ns)
+    path, about = open_bag(output.log, output.path)
 
-    return _of_mcap(proof, file, "rosbag2", Claims(), check)
+    def check_yaml(topics: TopicChecks, span_ns: tuple[int, int]) -> None:
+        check_metadata(output.log, about, path.name, topics.counts, span_ns)
+
+    return _check_mcap(output, path, "rosbag2", check_yaml)
 
 
-def _of_mcap(
-    proof: Proof,
+def _check_mcap(
+    output: Output,
     path: Path,
     name: str,
-    claims: Claims,
-    check: Callable[[Topics, tuple[int, int]], None] | None = None,
+    check_yaml: Callable[[TopicChecks, tuple[int, int]], None] | None = None,
 ) -> Verdict:
-    judge, where = proof.judge, path.name
-    file = McapFile(judge, path, where)
+    from mlbatch.verify.mcap_file import McapFile
+
+    log = output.log
+    where = path.name
+    file = McapFile(log, path, where)
     grid = file.metadata.get("mlbatch.grid")
     if grid is None:
         raise VerifyError(
-            f"{path}: wanted an MCAP file of mlbatch, with a metadata record mlbatch.grid, got one "
-            f"of {file.library or 'an unknown writer'!r}; name the output of `mlbatch convert`"
+            f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
+            f"one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
         )
-    judge.equal("metadata", f"{where} profile", "ros2", file.profile)
+    log.equal("metadata", f"{where} profile", "ros2", file.profile)
     attachment = file.attachments.get(TABLE)
-    papers = inner_papers(judge, path, file.metadata.get("mlbatch.report"), attachment)
-    check_copies(judge, papers, attachment, proof.beside, asked=proof.asked)
-    claims = papers.claims(judge, claims_of_grid(judge, where, grid))
-    examination = Examination(judge, str(path), claims, papers)
-    topics = Topics(judge, claims, examination, papers.report)
+    files = ReportFiles.inside(log, path, file.metadata.get("mlbatch.report"), attachment)
+    files.check_copies(log, attachment, output.places)
+    metadata = files.metadata(log, metadata_of_grid(log, where, grid))
+    examination = Examination(log, str(path), metadata, files)
+    topics = TopicChecks(log, metadata, examination, files.report)
     for message in file.messages():
-        topics.take(message)
+        topics.check(message)
     topics.finish(where)
-    if check is not None:
-        check(topics, file.span_ns)
-    return proof.verdict(_named(name, topics), examination, _limits(topics), papers)
+    if check_yaml is not None:
+        check_yaml(topics, file.span_ns)
+    return output.verdict(_format(name, topics), examination, _limits(topics), files)
 
 
-def _of_rosbag1(proof: Proof) -> Verdict:
-    judge, path = proof.judge, proof.path
-    papers = read_papers(judge, proof.beside, asked=proof.asked)
-    claims = papers.claims(judge, Claims())
-    examination = Examination(judge, str(path), claims, papers)
-    topics = Topics(judge, claims, examination, papers.report)
-    for message in BagFile(judge, path, path.name).messages():
-        topics.take(message)
+def _check_bag(output: Output) -> Verdict:
+    from mlbatch.verify.rosbag1 import LIMITS, BagFile
+
+    log = output.log
+    path = output.path
+    files = ReportFiles.read(log, output.places)
+    metadata = files.metadata(log, RunMetadata())
+    examination = Examination(log, str(path), metadata, files)
+    topics = TopicChecks(log, metadata, examination, files.report)
+    for message in BagFile(log, path, path.name).messages():
+        topics.check(message)
     topics.finish(path.name)
-    limits = _limits(topics) | rosbag1.LIMITS
-    if claims.rate is None:
-        limits |= dict.fromkeys(("grid", "index"), f"a bag does not tell its rate; {_NO_REPORT}")
-    if papers.table is None:
-        limits |= dict.fromkeys(("columns", "table"), f"no {TABLE} beside it")
-    return proof.verdict(_named("rosbag1", topics), examination, limits, papers)
+    limits = _limits(topics) | LIMITS
+    if metadata.rate is None:
+        limits |= dict.fromkeys(("grid", "index"), f"a bag has no rate; {_NO_REPORT}")
+    if files.table is None:
+        limits |= dict.fromkeys(("columns", "table"), f"no {TABLE} next to the output")
+    return output.verdict(_format("rosbag1", topics), examination, limits, files)
 
 
-def _named(name: str, topics: Topics) -> str:
+def _format(name: str, topics: TopicChecks) -> str:
     return f"{name}, {topics.layout}" if topics.layout else name
 
 
-def _limits(topics: Topics) -> dict[str, str]:
-    """What messages of this layout leave open."""
+def _limits(topics: TopicChecks) -> dict[str, str]:
+    """What messages of a layout cannot show."""
     own = {
         check: f"the point layout {topics.layout} has no field for it"
         for check, layouts in LAYOUT_LIMITS.items()
-        if topics.layout in layouts and not topics.judge.judged[check]
+        if topics.layout in layouts and not topics.log.checked[check]
     }
     if topics.layout == "ouster":
         own["geometry"] = _RANGES

@@ -1,75 +1,82 @@
-"""metadata.yaml of a ROS 2 bag against the file that it describes (facts/outputs.md, section 4)."""
+"""ROS 2 bags: metadata.yaml, checked against the MCAP file of the bag.
+
+Source: docs/sources/outputs.md section 4.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
-from mlbatch.verify.verdict import Judge, VerifyError
+import yaml
+
+from mlbatch.verify.verdict import CheckLog, VerifyError
 
 METADATA = "metadata.yaml"
 _VERSION = 5
-_LARGEST_BYTES = 1 << 22
+_LARGEST_BYTES = 1 << 20
 Yaml: TypeAlias = "dict[str, Yaml] | list[Yaml] | str | int | float | bool | None"
 
 
-def bag_file(judge: Judge, folder: Path) -> tuple[Path, Yaml]:
-    """The MCAP file of a bag, and what metadata.yaml says."""
-    # Only bags need it.
-    import yaml
+class PlainLoader(yaml.SafeLoader):
+    """Refuses aliases: a few of them can expand to gigabytes."""
 
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Compose all nodes but aliases."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
+
+def open_bag(log: CheckLog, folder: Path) -> tuple[Path, Yaml]:
+    """The MCAP file of a bag, and the content of metadata.yaml."""
     path = folder / METADATA
     try:
         if path.stat().st_size > _LARGEST_BYTES:
-            raise VerifyError(f"{path}: wanted a few lines, got more than 4 MiB")
-        root: Yaml = yaml.safe_load(path.read_text(encoding="utf-8"))
+            raise VerifyError(f"{path}: expected a few lines, found more than 1 MiB; restore it")
+        root: Yaml = yaml.load(path.read_text(encoding="utf-8"), PlainLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as err:
         text = " ".join(str(err).split())
-        raise VerifyError(f"{path}: wanted YAML, got {text}; restore it") from err
-    about = _at(root, "rosbag2_bagfile_information")
+        raise VerifyError(f"{path}: expected YAML, found {text}; restore it") from err
+    about = _value_at(root, "rosbag2_bagfile_information")
     files = sorted(found for found in folder.iterdir() if found.suffix == ".mcap")
     names = [found.name for found in files]
-    judge.equal(
-        "names", f"{METADATA} relative_file_paths", names, _at(about, "relative_file_paths")
-    )
+    said = _value_at(about, "relative_file_paths")
+    log.equal("names", f"{METADATA} relative_file_paths", names, said)
     if len(files) != 1:
-        raise VerifyError(f"{folder}: wanted a bag with one MCAP file, got {len(files)}")
+        raise VerifyError(
+            f"{folder}: expected a bag with one MCAP file, found {len(files)}; convert again"
+        )
     return files[0], about
 
 
 def check_metadata(
-    judge: Judge, about: Yaml, name: str, counts: Counter[str], span_ns: tuple[int, int]
+    log: CheckLog, about: Yaml, name: str, counts: Counter[str], span_ns: tuple[int, int]
 ) -> None:
-    """What metadata.yaml says against what was read."""
+    """Check the content of metadata.yaml against the messages of the file `name`."""
     first_ns, last_ns = span_ns
-    duration = {"nanoseconds": last_ns - first_ns}
-    start = {"nanoseconds_since_epoch": first_ns}
     total = counts.total()
-    wanted: dict[str, Yaml] = {
+    times: dict[str, Yaml] = {
+        "starting_time": {"nanoseconds_since_epoch": first_ns},
+        "duration": {"nanoseconds": last_ns - first_ns},
+        "message_count": total,
+    }
+    expected: dict[str, Yaml] = {
         "version": _VERSION,
         "storage_identifier": "mcap",
-        "duration": cast(Yaml, duration),
-        "starting_time": cast(Yaml, start),
-        "message_count": total,
-        "files": [
-            {
-                "path": name,
-                "starting_time": cast(Yaml, start),
-                "duration": cast(Yaml, duration),
-                "message_count": total,
-            }
-        ],
+        **times,
+        "files": [{"path": name, **times}],
     }
-    for key, value in wanted.items():
-        judge.equal("metadata", f"{METADATA} {key}", value, _at(about, key))
-    topics = _at(about, "topics_with_message_count")
+    for key, value in expected.items():
+        log.equal("metadata", f"{METADATA} {key}", value, _value_at(about, key))
+    topics = _value_at(about, "topics_with_message_count")
     said = {}
     for topic in topics if isinstance(topics, list) else []:
-        name_of = _at(_at(topic, "topic_metadata"), "name")
-        said[str(name_of)] = _at(topic, "message_count")
-    judge.equal("metadata", f"{METADATA} topics", dict(counts), said)
+        name_of = _value_at(_value_at(topic, "topic_metadata"), "name")
+        said[str(name_of)] = _value_at(topic, "message_count")
+    log.equal("metadata", f"{METADATA} topics", dict(counts), said)
 
 
-def _at(value: Yaml, key: str) -> Yaml:
+def _value_at(value: Yaml, key: str) -> Yaml:
     return value.get(key) if isinstance(value, dict) else None

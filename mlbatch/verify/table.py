@@ -1,6 +1,6 @@
-"""scans.csv as it stands in an output (CONTRACT.md, section 3): parsed, and held against itself.
+"""scans.csv: parsed, checked on its own, and checked against the sums of the scans.
 
-Columns that later versions add are left alone.
+Columns that later versions add are ignored.
 """
 
 from __future__ import annotations
@@ -11,19 +11,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.verify.grid import Lines
-from mlbatch.verify.verdict import Judge
+from mlbatch.verify.scan import COLUMN_NS, Points, StoredScan
+from mlbatch.verify.scan_checks import Grid
+from mlbatch.verify.verdict import CheckLog
 
-START = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns")
-COUNTS = ("points", "columns")
-_COLUMNS, _GAP = "columns_", "max_gap_ns_"
-# csv refuses longer cells than 128 KiB by itself.
+_FIRST = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns")
+_COUNTS = ("points", "columns")
+_COLUMNS = "columns_"
+_GAP = "max_gap_ns_"
 _WORDS = {"true": True, "false": False}
+# Below and above all times.
+_EARLY_NS = -(2**62)
+_LATE_NS = 2**62
 
 
 @dataclass(slots=True)
 class Table:
-    """Rows of scans.csv, (n,) int64 each; columns_of, gap_ns: (n, s); complete: (n,) bool."""
+    """Rows of scans.csv, (n,) int64 each; (n, s) by sensor."""
 
     where: str
     sensors: tuple[str, ...]
@@ -35,8 +39,10 @@ class Table:
     last_ns: I64Array
     points: I64Array
     columns: I64Array
+    # (n, s)
     columns_of: I64Array
     gap_ns: I64Array
+    # (n,) bool
     complete: BoolArray
     _rows: dict[tuple[int, int], int] = field(default_factory=dict)
 
@@ -51,53 +57,57 @@ class Table:
         return self._rows.get((index, part))
 
     def name(self, row: int) -> str:
-        """A row as a person finds it; the first line is the header."""
+        """File and line of a row; line 1 is the header."""
         return f"{self.where} line {row + 2}"
 
 
-def read_table(judge: Judge, where: str, text: str) -> Table | None:
-    """Parse scans.csv; what cannot be used is blamed."""
+def read_table(log: CheckLog, where: str, text: str) -> Table | None:
+    """Parse scans.csv; None if it is not usable, which is a violation."""
     try:
         lines = list(csv.reader(text.splitlines()))
     except csv.Error as err:
-        judge.blame("table", where, "lines of comma-separated values", str(err))
+        log.fail("table", where, "lines of comma-separated values", str(err))
         return None
-    if not lines or tuple(lines[0][: len(START)]) != START:
-        judge.blame(
-            "table", f"{where} line 1", ",".join(START), ",".join(lines[0] if lines else [])
-        )
+    head = lines[0] if lines else []
+    if tuple(head[: len(_FIRST)]) != _FIRST:
+        log.fail("table", f"{where} line 1", ",".join(_FIRST), ",".join(head))
         return None
-    head = lines[0]
-    sensors = tuple(name[len(_COLUMNS) :] for name in head if name.startswith(_COLUMNS))
-    wanted = [*COUNTS, *(_COLUMNS + name for name in sensors), "complete"]
-    wanted += [_GAP + name for name in sensors]
-    missing = [name for name in wanted if name not in head]
-    short = next((i for i, line in enumerate(lines) if len(line) != len(head)), None)
-    if missing or short is not None or not sensors:
-        got = f"{len(lines[short])} cells in line {short + 1}" if short is not None else "none"
-        judge.blame("table", where, f"columns {', '.join(missing) or 'in every line'}", got)
-        return None
-    cells = dict(zip(head, zip(*lines[1:], strict=True), strict=True)) if lines[1:] else {}
-    if not cells:
-        judge.blame("table", where, "a line for each scan", "none")
-        return None
-    return _numbers(judge, where, sensors, cells)
-
-
-def _numbers(
-    judge: Judge, where: str, sensors: tuple[str, ...], cells: dict[str, tuple[str, ...]]
-) -> Table | None:
-    names = [*START, *COUNTS, *(_COLUMNS + name for name in sensors)]
+    sensors = tuple(name.removeprefix(_COLUMNS) for name in head if name.startswith(_COLUMNS))
+    names = [*_FIRST, *_COUNTS]
+    names += [_COLUMNS + name for name in sensors]
     names += [_GAP + name for name in sensors]
-    found = {name: _column(judge, where, name, cells[name]) for name in names}
-    if any(column is None for column in found.values()):
+    missing = [name for name in (*names, "complete") if name not in head]
+    if missing or not sensors:
+        log.fail("table", where, f"columns {', '.join(missing) or 'of sensors'}", "none")
         return None
-    number = {name: column for name, column in found.items() if column is not None}
-    odd = next((i for i, cell in enumerate(cells["complete"]) if cell not in _WORDS), None)
-    if odd is not None:
-        got = cells["complete"][odd]
-        judge.blame("table", f"{where} line {odd + 2} complete", "true or false", got)
+    for number, line in enumerate(lines):
+        if len(line) != len(head):
+            log.fail("table", f"{where} line {number + 1}", f"{len(head)} cells", len(line))
+            return None
+    if len(lines) == 1:
+        log.fail("table", where, "a line for each scan", "none")
         return None
+    cells = dict(zip(head, zip(*lines[1:], strict=True), strict=True))
+    return _parsed(log, where, sensors, names, cells)
+
+
+def _parsed(
+    log: CheckLog,
+    where: str,
+    sensors: tuple[str, ...],
+    names: list[str],
+    cells: dict[str, tuple[str, ...]],
+) -> Table | None:
+    number: dict[str, I64Array] = {}
+    for name in names:
+        values = _integers(log, where, name, cells[name])
+        if values is None:
+            return None
+        number[name] = values
+    for row, cell in enumerate(cells["complete"]):
+        if cell not in _WORDS:
+            log.fail("table", f"{where} line {row + 2} complete", "true or false", cell)
+            return None
     return Table(
         where=where,
         sensors=sensors,
@@ -115,80 +125,298 @@ def _numbers(
     )
 
 
-def _column(judge: Judge, where: str, name: str, cells: tuple[str, ...]) -> I64Array | None:
-    """A column of numbers; None where a cell is none, which is blamed."""
-    try:
-        return np.array([int(cell) for cell in cells], np.int64)
-    except (ValueError, OverflowError):
-        row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        judge.blame("table", f"{where} line {row + 2} {name}", "a number", cells[row])
+def _integers(log: CheckLog, where: str, name: str, cells: tuple[str, ...]) -> I64Array | None:
+    """A column of integers; None if a cell is none, which is a violation."""
+    values = [_integer(cell) for cell in cells]
+    if None in values:
+        row = values.index(None)
+        log.fail("table", f"{where} line {row + 2} {name}", "a number", cells[row])
         return None
+    return np.array(values, np.int64)
 
 
-def _is_number(cell: str) -> bool:
+def _integer(cell: str) -> int | None:
     try:
-        return -(2**63) <= int(cell) < 2**63
+        value = int(cell)
     except ValueError:
-        return False
+        return None
+    return value if -(2**63) <= value < 2**63 else None
 
 
-def check_table(judge: Judge, table: Table, lines: Lines | None, first: int | None) -> None:
-    """Hold the table against itself; `first`: number of scan 0's window."""
-    _check_columns(judge, table)
-    key = table.index * (1 if lines is None else lines.slices) + table.slice
+def check_table(log: CheckLog, table: Table, grid: Grid | None, first: int | None) -> None:
+    """Check the table on its own; `first`: number of the window of scan 0."""
+    rows = _RowChecks(log, table)
+    rows.check_columns()
+    key = table.index * (1 if grid is None else grid.slices) + table.slice
     back = key[1:] <= key[:-1]
-    _none(judge, table, "table", 1, back, "index and slice", "later ones than before", key[1:])
-    if lines is None:
+    rows.none("table", "index and slice", back, "later ones than before", key[1:], skipped=1)
+    if grid is None:
         return
     if first is None:
-        first = lines.number(int(table.start_ns[0])) // lines.slices - int(table.index[0])
-    # Whole numbers of any size: what is claimed may lie anywhere.
-    numbers = [number + first * lines.slices for number in key.tolist()]
+        first = grid.number(int(table.start_ns[0])) // grid.slices - int(table.index[0])
+    # Python integers: the values of a damaged table may be anywhere.
+    numbers = [number + first * grid.slices for number in key.tolist()]
     for name, column, after in (("start_ns", table.start_ns, 0), ("end_ns", table.end_ns, 1)):
-        bounds = np.array([lines.bound(q + after) for q in numbers])
-        wrong = column != bounds
-        at = int(wrong.argmax()) if wrong.any() else 0
-        _none(judge, table, "grid", 0, wrong, name, str(bounds[at]), column)
-    strange = (table.slice < 0) | (table.slice >= lines.slices)
-    wanted = f"a slice below {lines.slices}"
-    _none(judge, table, "index", 0, strange, "slice", wanted, table.slice)
-    _none(judge, table, "index", 0, table.index < -1, "index", "-1 or more", table.index)
+        bounds = np.array([grid.bound(q + after) for q in numbers])
+        bad = column != bounds
+        at = int(bad.argmax()) if bad.any() else 0
+        rows.none("grid", name, bad, str(bounds[at]), column)
+    bad = (table.slice < 0) | (table.slice >= grid.slices)
+    rows.none("index", "slice", bad, f"a slice below {grid.slices}", table.slice)
+    rows.none("index", "index", table.index < -1, "-1 or more", table.index)
 
 
-def _check_columns(judge: Judge, table: Table) -> None:
-    early = (table.first_ns < table.start_ns) | (table.first_ns > table.last_ns)
-    wanted = "a stamp from start_ns to last_stamp_ns"
-    _none(judge, table, "columns", 0, early, "first_stamp_ns", wanted, table.first_ns)
-    late = table.last_ns >= table.end_ns
-    wanted = "a stamp before end_ns"
-    _none(judge, table, "columns", 0, late, "last_stamp_ns", wanted, table.last_ns)
-    total: I64Array = table.columns_of.sum(axis=1)
-    wrong = (table.columns != total) | (table.columns <= 0) | (table.columns_of < 0).any(axis=1)
-    wanted = "the sum of the sensors', above 0"
-    _none(judge, table, "table", 0, wrong, "columns", wanted, table.columns)
-    _none(judge, table, "table", 0, table.points < 0, "points", "0 or more", table.points)
-    span_ns = (table.last_ns - table.first_ns)[:, None]
-    # Steps between columns, of which there are one less, add up to at most the span.
-    wide: BoolArray = np.any((table.gap_ns < 0) | (table.gap_ns > span_ns), axis=1)
-    widest: I64Array = table.gap_ns.max(axis=1)
-    wanted = "a step no longer than from first to last stamp"
-    _none(judge, table, "table", 0, wide, "max_gap_ns", wanted, widest)
+@dataclass(frozen=True, slots=True)
+class _RowChecks:
+    """Checks of rows; a violation names the line of the first bad one."""
 
+    log: CheckLog
+    table: Table
 
-def _none(
-    judge: Judge,
-    table: Table,
-    check: str,
-    shift: int,
-    bad: BoolArray,
-    name: str,
-    wanted: str,
-    values: I64Array,
-) -> None:
-    """Wanted: no row is bad; `shift`: rows that precede the first judged one."""
-    judge.passed(check, len(bad))
-    if bad.any():
+    def none(
+        self,
+        check: str,
+        name: str,
+        bad: BoolArray,
+        expected: str,
+        values: I64Array | BoolArray,
+        skipped: int = 0,
+    ) -> None:
+        """Check that no row is bad; `skipped`: rows before the first one in `bad`."""
+        self.log.ok(check, len(bad))
+        if not bad.any():
+            return
         at = int(bad.argmax())
         count = int(np.count_nonzero(bad))
         more = f" ({count} lines)" if count > 1 else ""
-        judge.blame(check, f"{table.name(at + shift)} {name}", wanted, f"{values[at]}{more}")
+        where = f"{self.table.name(at + skipped)} {name}"
+        self.log.fail(check, where, expected, f"{values[at]}{more}")
+
+    def equal(self, name: str, said: I64Array, found: I64Array) -> None:
+        """Check a column of the table against the scans."""
+        bad = said != found
+        at = int(bad.argmax()) if bad.any() else 0
+        self.none("table", name, bad, f"{found[at]} of the scan", said)
+
+    def check_columns(self) -> None:
+        """Check stamps, counts and gaps."""
+        table = self.table
+        bad = (table.first_ns < table.start_ns) | (table.first_ns > table.last_ns)
+        expected = "a stamp from start_ns to last_stamp_ns"
+        self.none("columns", "first_stamp_ns", bad, expected, table.first_ns)
+        bad = table.last_ns >= table.end_ns
+        self.none("columns", "last_stamp_ns", bad, "a stamp before end_ns", table.last_ns)
+        total: I64Array = table.columns_of.sum(axis=1)
+        bad = (table.columns != total) | (table.columns <= 0) | (table.columns_of < 0).any(axis=1)
+        expected = "the sum of the sensors, above 0"
+        self.none("table", "columns", bad, expected, table.columns)
+        self.none("table", "points", table.points < 0, "0 or more", table.points)
+        # Steps between columns of one sensor add up to at most the span.
+        span_ns = (table.last_ns - table.first_ns)[:, None]
+        wide: BoolArray = np.any((table.gap_ns < 0) | (table.gap_ns > span_ns), axis=1)
+        widest: I64Array = table.gap_ns.max(axis=1)
+        expected = "a step no longer than from first to last stamp"
+        self.none("table", "max_gap_ns", wide, expected, widest)
+
+
+# -- sums of the scans ----------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Rings:
+    """Lowest and highest ring of each sensor, (s,) int64, and the first point on it."""
+
+    low: I64Array
+    high: I64Array
+    low_at: dict[int, str] = field(default_factory=dict)
+    high_at: dict[int, str] = field(default_factory=dict)
+
+    def add(self, sensor: int, scan: StoredScan, points: Points) -> None:
+        """Add the points of one sensor of a scan."""
+        ring = points.ring
+        owner = points.lidar_id
+        if ring is None:
+            return
+        own = ring if owner is None else ring[owner == sensor]
+        if not len(own):
+            return
+        low = int(own.min())
+        high = int(own.max())
+        if low < self.low[sensor]:
+            self.low[sensor] = low
+            self.low_at[sensor] = _first_point(scan, points, sensor, low)
+        if high > self.high[sensor]:
+            self.high[sensor] = high
+            self.high_at[sensor] = _first_point(scan, points, sensor, high)
+
+
+def _first_point(scan: StoredScan, points: Points, sensor: int, ring: int) -> str:
+    """The first point of a sensor on a ring."""
+    found = points.ring == ring
+    if points.lidar_id is not None:
+        found &= points.lidar_id == sensor
+    at = int(np.argmax(found))
+    if points.valid is not None:
+        at = int(np.flatnonzero(points.valid)[at])
+    return f"{scan.point} {at} of sensor {sensor}"
+
+
+class _RowTotals:
+    """What was found for each row of the table, (n,) each; (n, s) by sensor."""
+
+    def __init__(self, count: int, sensors: int) -> None:
+        self.scans = np.zeros(count, np.int64)
+        self.points = np.zeros(count, np.int64)
+        self.columns = np.zeros(count, np.int64)
+        self.columns_of = np.zeros((count, sensors), np.int64)
+        self.gap_ns = np.zeros((count, sensors), np.int64)
+        # Stamps of columns.
+        self.first_ns = np.full(count, _LATE_NS)
+        self.last_ns = np.full(count, _EARLY_NS)
+        # Times of points.
+        self.oldest_ns = np.full(count, _LATE_NS)
+        self.newest_ns = np.full(count, _EARLY_NS)
+        self.incomplete = np.zeros(count, bool)
+
+    def add(self, row: int, scan: StoredScan, points: Points, columns_of: I64Array | None) -> None:
+        """Add a scan to its row."""
+        self.scans[row] += 1
+        self.points[row] += points.count
+        self.columns[row] += len(scan.xyz) if scan.organized else 0
+        self.incomplete[row] |= scan.complete is False
+        if points.time_ns is not None and points.count:
+            oldest_ns = scan.start_ns + int(points.time_ns.min())
+            newest_ns = scan.start_ns + int(points.time_ns.max())
+            self.oldest_ns[row] = min(self.oldest_ns[row], oldest_ns)
+            self.newest_ns[row] = max(self.newest_ns[row], newest_ns)
+        if columns_of is not None:
+            self.columns_of[row] += columns_of
+        stamps = scan.column_stamp_ns
+        owner = scan.column_lidar_id
+        if stamps is None or owner is None or not len(stamps):
+            return
+        self.first_ns[row] = min(self.first_ns[row], int(stamps.min()))
+        self.last_ns[row] = max(self.last_ns[row], int(stamps.max()))
+        for sensor in range(self.gap_ns.shape[1]):
+            own = stamps[owner == sensor]
+            if len(own) > 1:
+                gap_ns = int(np.diff(own).max())
+                self.gap_ns[row, sensor] = max(self.gap_ns[row, sensor], gap_ns)
+
+
+class OutputTotals:
+    """Sums of the scans of an output, in all and by row of scans.csv."""
+
+    def __init__(self, log: CheckLog, sensors: int, table: Table | None) -> None:
+        self.scans = 0
+        self.points = 0
+        self.columns = 0
+        # By sensor, (s,).
+        self.points_of = np.zeros(sensors, np.int64)
+        self.columns_of = np.zeros(sensors, np.int64)
+        self.rings = Rings(np.full(sensors, _LATE_NS), np.full(sensors, -1))
+        # What all scans of the output show.
+        self.knows_points = True
+        self.knows_columns = True
+        self.knows_owners = True
+        self.knows_complete = True
+        self.knows_times = True
+        # Largest error of times of points.
+        self.time_step_ns = 0
+        self._log = log
+        self._sensors = sensors
+        self._table = table
+        self._rows = None if table is None else _RowTotals(len(table), sensors)
+
+    def add(self, scan: StoredScan, points: Points, place: tuple[int, int] | None) -> None:
+        """Add a scan; place: its index and slice."""
+        self.scans += 1
+        self.points += points.count
+        self.knows_points &= self._add_points(scan, points)
+        self.knows_complete &= scan.complete is not None
+        self.knows_times &= points.time_ns is not None
+        self.time_step_ns = max(self.time_step_ns, scan.time_step_ns)
+        columns_of = self._add_columns(scan)
+        if self._rows is None or self._table is None or place is None:
+            return
+        row = self._table.row(*place)
+        if row is None:
+            expected = f"a line for index {place[0]}, slice {place[1]}"
+            self._log.fail("table", f"{self._table.where} ({scan.where})", expected, "none")
+        else:
+            self._rows.add(row, scan, points, columns_of)
+
+    def _add_points(self, scan: StoredScan, points: Points) -> bool:
+        """Count points by sensor; False if a scan does not show sensors."""
+        owner = points.lidar_id
+        only = self._only_sensor(scan)
+        if only is not None:
+            self.points_of[only] += points.count
+            self.rings.add(only, scan, points)
+            return True
+        if owner is None:
+            return False
+        counts = np.bincount(owner, minlength=self._sensors)[: self._sensors]
+        self.points_of += counts
+        for sensor in np.flatnonzero(counts).tolist():
+            self.rings.add(sensor, scan, points)
+        return True
+
+    def _only_sensor(self, scan: StoredScan) -> int | None:
+        """The sensor of all points of a scan, if known."""
+        return 0 if self._sensors == 1 else scan.sensor
+
+    def _add_columns(self, scan: StoredScan) -> I64Array | None:
+        """Count columns; those of the scan by sensor, None if not shown."""
+        if scan.column_lidar_id is not None:
+            found = np.bincount(scan.column_lidar_id, minlength=self._sensors)
+            counts: I64Array = found[: self._sensors]
+            self.columns += len(scan.column_lidar_id)
+            self.columns_of += counts
+            return counts
+        self.knows_owners = False
+        if not scan.organized:
+            self.knows_columns = False
+            return None
+        self.columns += len(scan.xyz)
+        only = self._only_sensor(scan)
+        if only is None:
+            return None
+        own = np.zeros(self._sensors, np.int64)
+        own[only] = len(scan.xyz)
+        return own
+
+    def check_table(self) -> None:
+        """Check scans.csv against the sums."""
+        table = self._table
+        rows = self._rows
+        if table is None or rows is None or not self.scans:
+            return
+        checks = _RowChecks(self._log, table)
+        checks.none("table", "scan", rows.scans == 0, "a scan of this line", rows.scans)
+        checks.equal("points", table.points, rows.points)
+        if self.knows_owners:
+            checks.equal("first_stamp_ns", table.first_ns, rows.first_ns)
+            checks.equal("last_stamp_ns", table.last_ns, rows.last_ns)
+            for sensor, name in enumerate(table.sensors):
+                columns = table.columns_of[:, sensor]
+                checks.equal(f"{_COLUMNS}{name}", columns, rows.columns_of[:, sensor])
+                checks.equal(f"{_GAP}{name}", table.gap_ns[:, sensor], rows.gap_ns[:, sensor])
+        elif self.knows_columns:
+            checks.equal("columns", table.columns, rows.columns)
+        if self.knows_complete:
+            bad = table.complete == rows.incomplete
+            checks.none("table", "complete", bad, "the value in the scan", table.complete)
+        if self.knows_times:
+            self._check_times(checks, rows)
+
+    def _check_times(self, checks: _RowChecks, rows: _RowTotals) -> None:
+        """Points begin and end with the stamps of their columns."""
+        table = checks.table
+        some = rows.newest_ns > _EARLY_NS
+        early = some & (rows.oldest_ns + self.time_step_ns < table.first_ns)
+        expected = "the oldest point at it or later"
+        checks.none("table", "first_stamp_ns", early, expected, rows.oldest_ns)
+        late = some & (rows.newest_ns - self.time_step_ns >= table.last_ns + COLUMN_NS)
+        expected = f"the newest point less than {COLUMN_NS} ns after it"
+        checks.none("table", "last_stamp_ns", late, expected, rows.newest_ns)

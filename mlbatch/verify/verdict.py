@@ -1,4 +1,4 @@
-"""What a proof of an output says: its checks, what broke them, and what its format leaves open."""
+"""The result of `verify`: its checks, the violations, and what an output cannot show."""
 
 from __future__ import annotations
 
@@ -11,87 +11,91 @@ import numpy as np
 from mlbatch.arrays import BoolArray
 from mlbatch.errors import MlbatchError
 
-# Every check with what it proves, in the order in which a verdict shows them.
+# Every check and what it requires, in the order in which a verdict shows them.
 CHECKS = {
-    "container": "files are whole: lengths, indexes, checksums; nothing under .partial",
-    "names": "every file of a scan bears its index and slice, and is in its place",
+    "container": "files are complete: lengths, indexes, checksums; no .partial output",
+    "names": "the name of a file is the index and slice of its scan",
     "layout": "keys or fields of points, their types and shapes",
-    "metadata": "rate, slices, sensors, frame and timescale are the same wherever they stand",
+    "metadata": "rate, slices, sensors, frame and timescale are the same everywhere",
     "grid": "windows and slices begin and end on the grid: no gap, no overlap, no drift",
     "index": "index and slice are those of the window, and increase",
-    "t_init": "scan 0 begins at t_init, a line of the grid",
+    "t_init": "scan 0 begins at t_init, a bound of the grid",
     "stamps": "log time, publish time and header stamp are the start of the window",
-    "columns": "every column's stamp lies inside its window",
-    "order": "stamps never decrease; points lie in the order of their columns",
-    "times": "no point is older than its column, or later than its end",
-    "finite": "coordinates and ranges are numbers; empty slots of organized scans are empty",
-    "geometry": "points lie as far from their sensor as was measured",
-    "sensors": "lidar_id names a sensor, that of the column",
+    "columns": "the stamp of a column is inside its window",
+    "order": "stamps never decrease; points are in the order of their columns",
+    "times": "no point is before its column, or after the end of its column",
+    "finite": "coordinates and ranges are finite; empty slots of organized scans are empty",
+    "geometry": "the distance of a point from its sensor is the measured range",
+    "sensors": "lidar_id is a sensor, that of the column",
     "rings": "rings of different sensors are different, in the order of the sensors",
-    "returns": "return types are those of the table",
-    "duplicates": "no column is there twice",
-    "table": "scans.csv and the scans agree",
-    "ledger": "everything that was read is written or counted",
-    "report": "counts and figures of the report are those of the output",
+    "returns": "return types are in the table",
+    "duplicates": "no column occurs twice",
+    "table": "scans.csv agrees with the scans",
+    "ledger": "every packet, column and point is written or counted",
+    "report": "counts and figures of the report agree with the output",
     "tf_static": "one message before all others places every sensor",
-    "imu": "IMU messages never step back, at the time of their header",
-    "messages": "recorded messages that pass through are as many as the report says",
+    "imu": "IMU messages are in order of time, at the time of their header",
+    "messages": "the counts of forwarded messages agree with the report",
 }
 # Violations that are kept; all are counted.
-MOST_KEPT = 1000
+MAX_KEPT = 1000
+_MAX_TEXT = 160
 
 
 class VerifyError(MlbatchError):
-    """An output that cannot be judged: missing, foreign, damaged beyond reading."""
+    """An output that cannot be checked: missing, of another program, damaged beyond reading."""
 
 
 class DamageError(Exception):
-    """Bytes that are not what their format wants; says what was wanted and got."""
+    """Bytes that do not follow their format."""
 
-    def __init__(self, wanted: str, got: str) -> None:
-        super().__init__(f"wanted {wanted}, got {got}")
-        self.wanted = wanted
-        self.got = got
+    def __init__(self, expected: str, found: str) -> None:
+        super().__init__(f"expected {expected}, found {found}")
+        self.expected = expected
+        self.found = found
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """What broke a check; `where`: file, then scan, column or point."""
+    """A value that breaks a check; `where`: file, then scan, column or point."""
 
     check: str
     where: str
-    wanted: str
-    got: str
+    expected: str
+    found: str
 
     def __str__(self) -> str:
-        return f"{self.check}: {self.where}: wanted {self.wanted}, got {self.got}"
+        return f"{self.check}: {self.where}: expected {self.expected}, found {self.found}"
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Outcome of a check; judged: how many things were held against it; limit: what stays open."""
+    """Outcome of a check."""
 
     name: str
-    judged: int
+    # Number of values that were checked.
+    checked: int
     violations: int
+    # Reason why nothing, or only a part, is checkable in this output.
     limit: str
 
     @property
     def outcome(self) -> str:
-        """One of ok, violated, not provable."""
+        """One of ok, violated, not checkable."""
         if self.violations:
             return "violated"
-        return "ok" if self.judged else "not provable"
+        return "ok" if self.checked else "not checkable"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The proof of one output; columns: None where the format does not show them."""
+    """The result for one output."""
 
     path: str
     format: str
     scans: int
     points: int
+    # None where the format does not show columns.
     columns: int | None
     checks: tuple[Check, ...]
     violations: tuple[Violation, ...]
@@ -103,56 +107,65 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing was broken."""
+        """Whether there is no violation."""
         return self.count == 0
 
 
 @dataclass(slots=True)
-class Judge:
-    """Collects what was judged and what broke."""
+class CheckLog:
+    """Counts checked values and collects violations."""
 
-    judged: Counter[str] = field(default_factory=Counter)
-    broken: Counter[str] = field(default_factory=Counter)
+    checked: Counter[str] = field(default_factory=Counter)
+    failed: Counter[str] = field(default_factory=Counter)
     violations: list[Violation] = field(default_factory=list)
 
-    def passed(self, check: str, count: int = 1) -> None:
-        """Note that `count` things were held against a check."""
-        self.judged[check] += count
+    def ok(self, check: str, count: int = 1) -> None:
+        """Count `count` checked values."""
+        self.checked[check] += count
 
-    def blame(self, check: str, where: str, wanted: object, got: object) -> None:
-        """Note a violation."""
-        self.broken[check] += 1
-        if len(self.violations) < MOST_KEPT:
-            self.violations.append(Violation(check, where, _short(wanted), _short(got)))
+    def fail(self, check: str, where: str, expected: object, found: object) -> None:
+        """Add a violation."""
+        self.failed[check] += 1
+        if len(self.violations) < MAX_KEPT:
+            self.violations.append(Violation(check, where, _short(expected), _short(found)))
 
-    def equal(self, check: str, where: str, wanted: object, got: object) -> bool:
-        """Hold one value against another."""
-        self.judged[check] += 1
-        if wanted == got:
+    def equal(self, check: str, where: str, expected: object, found: object) -> bool:
+        """Check one value against another."""
+        self.checked[check] += 1
+        if expected == found:
             return True
-        self.blame(check, where, wanted, got)
+        self.fail(check, where, expected, found)
         return False
 
     def none(
-        self, check: str, where: str, bad: BoolArray, wanted: str, got: Callable[[int], object]
+        self,
+        check: str,
+        where: str,
+        bad: BoolArray,
+        expected: str,
+        found: Callable[[int], object],
     ) -> bool:
-        """Wanted: nothing is bad. Names the first that is by its flat index, and how many are."""
-        self.judged[check] += bad.size
+        """Check that no value is bad; a violation has the flat index of the first, and the count.
+
+        found: value at a flat index.
+        """
+        self.checked[check] += bad.size
         if not bad.any():
             return True
-        first, count = int(bad.argmax()), int(np.count_nonzero(bad))
+        first = int(bad.argmax())
+        count = int(np.count_nonzero(bad))
         more = f" ({count} of {bad.size})" if count > 1 else ""
-        self.blame(check, f"{where} {first}", wanted, f"{got(first)}{more}")
+        self.fail(check, f"{where} {first}", expected, f"{found(first)}{more}")
         return False
 
-    def checks(self, limits: dict[str, str]) -> tuple[Check, ...]:
-        """All checks and their outcome; limits: what stays open in this output, by check."""
+    def outcomes(self, limits: dict[str, str]) -> tuple[Check, ...]:
+        """All checks; limits: by check, why it is not or only partly checkable."""
         return tuple(
             Check(
                 name,
-                self.judged[name],
-                self.broken[name],
-                limits.get(name, "" if self.judged[name] else "nothing of the kind in this output"),
+                self.checked[name],
+                self.failed[name],
+                limits.get(name, "" if self.checked[name] else "no such data in this output"),
             )
             for name in CHECKS
         )
@@ -160,4 +173,4 @@ class Judge:
 
 def _short(value: object) -> str:
     text = " ".join(str(value).split())
-    return text if len(text) <= 160 else f"{text[:157]}..."
+    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 3]}..."

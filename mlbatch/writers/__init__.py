@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from mlbatch.errors import UsageError
-from mlbatch.writers import formats
 from mlbatch.writers.atomic import (
     REPORT_JSON,
     SCANS_CSV,
@@ -33,6 +29,7 @@ from mlbatch.writers.base import (
     WriterModule,
     WriterOptions,
 )
+from mlbatch.writers.formats import format_module, format_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,21 +73,15 @@ LATER_SUFFIXES = {
 }
 
 
-@lru_cache(maxsize=1)
-def format_names() -> tuple[str, ...]:
-    """Return the names of all formats, sorted, without importing them."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(formats.__path__)))
-
-
 def plugin(name: str) -> WriterModule:
-    """Return the module of a format."""
+    """Return the module of a format, UsageError for an unknown one."""
     if name not in format_names():
         later = " (not in this version)" if name in LATER_FORMATS else ""
         raise UsageError(
             f"--format: expected one of {', '.join(format_names())}, found {name!r}{later}; "
             "choose one"
         )
-    return cast(WriterModule, importlib.import_module(f"{formats.__name__}.{name}"))
+    return format_module(name)
 
 
 def choose_format(target: Path, asked: str | None) -> str:

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.errors import ExportError
+from mlbatch.writers.formats import format_module, format_names
 
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
-_OWN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(npz|ply)|scans\.csv|report\.json")
+_SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(\w+)")
 # The same for a ROS 2 bag. Recorders write such files as well: a scans.csv marks our own.
 _OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
@@ -89,7 +90,14 @@ class Output:
 
 def is_taken(name: str) -> bool:
     """Return whether a run may write a file of this name into an output folder."""
-    return bool(_OWN_FILE.fullmatch(name) or _OWN_BAG_FILE.fullmatch(name))
+    return _is_own_file(name) or bool(_OWN_BAG_FILE.fullmatch(name))
+
+
+def _is_own_file(name: str) -> bool:
+    scan = _SCAN_FILE.fullmatch(name)
+    if scan is None:
+        return name in (SCANS_CSV, REPORT_JSON)
+    return scan[3] in format_names() and format_module(scan[3]).SUFFIX is None
 
 
 def is_report(path: Path) -> bool:
@@ -205,7 +213,7 @@ def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
             continue
         if deep and entry.is_dir() and not entry.is_symlink():
             yield from _strangers(entry, deep=False)
-        elif not (_OWN_FILE.fullmatch(entry.name) or is_report(entry)):
+        elif not (_is_own_file(entry.name) or is_report(entry)):
             yield entry
 
 

@@ -37,8 +37,8 @@ from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Summary, Topic
-from mlbatch.writers._ros2_types import definition, is_known, qos, qos_in_numbers
 from mlbatch.writers.atomic import SCANS_CSV
 from mlbatch.writers.base import NO_COMPRESSION
 from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32

@@ -17,10 +17,10 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.ros.definitions import FIELD_CODES
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
-from mlbatch.writers._ros2_types import FIELD_CODES
-from mlbatch.writers._wire import Wire
-from mlbatch.writers.atomic import SCANS_CSV, Output, export_errors, side_path, write_text
+from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
 from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions
 from mlbatch.writers.output_file import borrow
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_of
@@ -93,7 +93,7 @@ def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
     return frozenset({IMU, *encodings}) | (frozenset() if layout is None else layout.extras)
 
 
-def layout_of(options: WriterOptions) -> Layout:
+def _layout_of(options: WriterOptions) -> Layout:
     """Return the point layout of the options."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)
     if layout is None:
@@ -108,14 +108,26 @@ class MessageWriter:
     """Writes a run as messages; those before the first scan wait, since /tf_static is first."""
 
     def __init__(
-        self, output: Output, info: RunInfo, options: WriterOptions, wire: NewWire, opener: OpenFile
+        self,
+        target: Path,
+        info: RunInfo,
+        options: WriterOptions,
+        wire: NewWire,
+        opener: OpenFile,
+        *,
+        folder: bool = False,
     ) -> None:
-        self._output = output
+        """opener: opens the file at the path of the partial output; folder: in that folder."""
+        # Before anything is created, as it may be refused.
+        self._layout = _layout_of(options)
+        keep = options.kept_bytes is not None
+        self._output = prepare(target, options.overwrite, folder, keep)
         self._info = info
         self._wire = wire
-        self._layout = layout_of(options)
         self.idle: list[CloudMessage] = []  # buffers that no job uses
         self._waiting: list[ImuSamples | Message] = []
+        self._waiting_samples = 0
+        self._waiting_bytes = 0
         self._begun = False
         # For each scan that is not in a written chunk: the number of its chunk.
         self._chunk_of_scan: deque[int] = deque()
@@ -126,8 +138,8 @@ class MessageWriter:
                 self._topics[number] = f"/{sensor.name}/points"
         imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
         self._own = frozenset({_TF_STATIC, *self._topics.values(), *imu})
-        with export_errors(output.partial):
-            self._file = opener(output.partial, options.kept_bytes)
+        with export_errors(self._output.partial):
+            self._file = opener(self._output.partial, options.kept_bytes)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
@@ -214,9 +226,11 @@ class MessageWriter:
                 self._send(item)
                 return
             self._waiting.append(item)
-            samples = sum(len(i.stamp_ns) for i in self._waiting if isinstance(i, ImuSamples))
-            size = sum(len(i.data) for i in self._waiting if isinstance(i, Message))
-            if samples >= WAITING_SAMPLES or size >= WAITING_BYTES:
+            if isinstance(item, Message):
+                self._waiting_bytes += len(item.data)
+            else:
+                self._waiting_samples += len(item.stamp_ns)
+            if self._waiting_samples >= WAITING_SAMPLES or self._waiting_bytes >= WAITING_BYTES:
                 self._begin(None)
 
     def _begin(self, start_ns: int | None) -> None:
@@ -224,9 +238,12 @@ class MessageWriter:
         if self._begun:
             return
         self._begun = True
-        stamps = [stamp_ns for item in self._waiting for stamp_ns in _first_stamp(item)]
-        if start_ns is not None:
-            stamps.append(start_ns)
+        stamps = [] if start_ns is None else [start_ns]
+        for item in self._waiting:
+            if isinstance(item, Message):
+                stamps.append(item.host_ns)
+            else:
+                stamps += item.stamp_ns.tolist()
         stamp_ns = min(stamps, default=0)
         transforms = static_transforms(self._info, stamp_ns, self._wire)
         self._file.send(_TF_STATIC, "tf2_msgs/TFMessage", stamp_ns, transforms, latched=True)
@@ -302,13 +319,6 @@ class _CloudJob(ScanJob):
     def commit(self) -> None:
         self._chunks.commit()
         self._writer.idle.append(self._cloud)
-
-
-def _first_stamp(item: ImuSamples | Message) -> list[int]:
-    """Return the earliest log time of an item, nothing for no samples."""
-    if isinstance(item, Message):
-        return [item.host_ns]
-    return [int(item.stamp_ns.min())] if len(item.stamp_ns) else []
 
 
 class CloudMessage:

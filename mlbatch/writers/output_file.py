@@ -197,5 +197,5 @@ def _not_as_before(path: Path) -> ExportError:
     """Return the error about data whose pieces end elsewhere than in the interrupted run."""
     return ExportError(
         f"{path}: expected the scans of the interrupted run, found others; leave out --resume to "
-        "start again"
+        "start over"
     )

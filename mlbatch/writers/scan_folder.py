@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -11,14 +10,14 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare
 from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, Checkpoint, ScanJob, WriterOptions
-from mlbatch.writers.output_file import WriteBehind, borrow, drop_from_cache
+from mlbatch.writers.output_file import Bytes, WriteBehind, borrow, drop_from_cache, write_all
 
 
-class Saver(Protocol):
+class Encoder(Protocol):
     """Encoder of one format; owns scratch, so each thread needs its own."""
 
-    def save(self, file: io.FileIO, scan: Scan) -> None:
-        """Write the file of one scan."""
+    def encode(self, scan: Scan) -> Sequence[Bytes]:
+        """Return the file of a scan in parts, valid until the next call."""
         ...
 
 
@@ -36,20 +35,20 @@ class FolderWriter:
         target: Path,
         info: RunInfo,
         options: WriterOptions,
-        suffix: str,
-        saver: Callable[[], Saver],
+        name: str,
+        encoder: Callable[[], Encoder],
     ) -> None:
-        """saver: creates the saver of a thread."""
+        """name: of the format, the suffix of its files; encoder: creates one for a thread."""
         if options.point_layout != DEFAULT_POINT_LAYOUT:
             raise UsageError(
-                f"--point-layout: expected {DEFAULT_POINT_LAYOUT} for {suffix} files, found "
+                f"--point-layout: expected {DEFAULT_POINT_LAYOUT} for {name}, found "
                 f"{options.point_layout}; write a .mcap, since presets are fields of PointCloud2"
             )
         keep = options.kept_bytes is not None
         self._output = prepare(target, options.overwrite, folder=True, keep=keep)
-        self._suffix = suffix
-        self._saver = saver
-        self._idle: list[Saver] = []
+        self._name = name
+        self._encoder = encoder
+        self._idle: list[Encoder] = []
         self._committed = 0
         self._behind = WriteBehind()
         self._folders: dict[int | None, Path] = {None: self._output.partial}
@@ -92,12 +91,12 @@ class FolderWriter:
 
     def save(self, scan: Scan, path: Path) -> int:
         """Write the file of a scan; returns its size in bytes. Any thread."""
-        saver = borrow(self._idle, self._saver)
+        encoder = borrow(self._idle, self._encoder)
         with export_errors(path), path.open("wb", buffering=0) as file:
-            saver.save(file, scan)
+            write_all(file, encoder.encode(scan))
             size = file.tell()
             drop_from_cache(file.fileno(), 0, size)
-        self._idle.append(saver)
+        self._idle.append(encoder)
         return size
 
     def count(self, path: Path, size: int) -> None:
@@ -107,8 +106,8 @@ class FolderWriter:
             self._behind.add(path, size)
 
     def _path(self, scan: Scan, sensor: int | None) -> Path:
-        name = scan_name(scan.index, scan.slice, scan.slices) + self._suffix
-        return self._folders[sensor] / name
+        stem = scan_name(scan.index, scan.slice, scan.slices)
+        return self._folders[sensor] / f"{stem}.{self._name}"
 
     def _sensor_folders(self, info: RunInfo) -> dict[int | None, Path]:
         folders: dict[int | None, Path] = {}

@@ -76,7 +76,7 @@ def test_every_stamp_lies_in_exactly_one_slice(stamp_ns: int, rate: Fraction, sl
     grid = Grid(rate, slices)
     q = grid.index_of(stamp_ns)
     assert grid.bound(q) <= stamp_ns < grid.bound(q + 1)
-    # Bounds never step back, so no other slice can hold the stamp.
+    # Bounds never step back, so no other slice contains the stamp.
     assert grid.bound(q - 1) <= grid.bound(q) <= grid.bound(q + 1) <= grid.bound(q + 2)
     assert grid.floor_bound(stamp_ns) == grid.bound(q)
 
@@ -105,7 +105,7 @@ def test_first_window_is_the_next_one_to_begin(t0max: int, rate: Fraction, slice
 
 
 def test_a_grid_without_windows_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"^rate: wanted a positive number of Hz, got 0$"):
+    with pytest.raises(UsageError, match=r"^rate: expected a positive number of Hz, found 0$"):
         Grid(Fraction(0))
-    with pytest.raises(UsageError, match=r"^slices: wanted 1 or more a window, got 0$"):
+    with pytest.raises(UsageError, match=r"^slices: expected 1 or more a window, found 0$"):
         Grid(Fraction(10), slices=0)

@@ -1,4 +1,4 @@
-"""The door of one sensor, worked by hand; times in ms, the step that is believed is 1 s."""
+"""The intake of one sensor, worked by hand; times in ms, steps above 1 s need confirmation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Arrival, Delivery, Intake
+from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Accepted, Arrival, Intake
 from mlbatch.errors import ClockError
 from mlbatch.types import Heads
 
@@ -17,7 +17,7 @@ Stamps = Sequence[float]
 
 
 def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps] = ()) -> Arrival:
-    """Packets of equal width, their stamps in ms; they arrive 1 ms after their largest stamp."""
+    """Packets of equal width, stamps in ms; received 1 ms after their largest stamp."""
     stamps = np.array([[round(stamp * MS) for stamp in packet] for packet in packets], np.int64)
     count = len(packets)
     return Arrival(
@@ -33,8 +33,8 @@ def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps]
     )
 
 
-def _stamps_ms(delivery: Delivery) -> list[list[float]]:
-    rows: list[list[float]] = (delivery.packets.heads.stamp_ns / MS).tolist()
+def _stamps_ms(accepted: Accepted) -> list[list[float]]:
+    rows: list[list[float]] = (accepted.packets.heads.stamp_ns / MS).tolist()
     return rows
 
 
@@ -45,9 +45,9 @@ def _alone(*stamps_ms: float, first_key: int = 0) -> Arrival:
 
 def test_good_packets_pass_untouched() -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival([10, 20], [30, 40]))
-    assert _stamps_ms(delivery) == [[10, 20], [30, 40]]
-    assert delivery.newest_ns.tolist() == [20 * MS, 40 * MS]
+    accepted = intake.accept(_arrival([10, 20], [30, 40]))
+    assert _stamps_ms(accepted) == [[10, 20], [30, 40]]
+    assert accepted.newest_ns.tolist() == [20 * MS, 40 * MS]
     assert intake.rejected == {}
 
 
@@ -79,7 +79,7 @@ def test_packets_without_identity_are_never_duplicates() -> None:
 
 
 @pytest.mark.parametrize(("between", "rejected"), [(DUPLICATE_REACH - 1, 1), (DUPLICATE_REACH, 0)])
-def test_a_number_comes_back_after_a_while(between: int, rejected: int) -> None:
+def test_numbers_repeat_after_a_while(between: int, rejected: int) -> None:
     """Frame ids wrap: what is far back is another packet."""
     intake = Intake("left")
     intake.accept(_alone(0.0))
@@ -98,15 +98,15 @@ def test_a_number_comes_back_after_a_while(between: int, rejected: int) -> None:
         ([0], True),
         ([2**31 * 1000 - 0.001], True),
         ([2**31 * 1000], False),
-        # Columns of a packet lie within 1 s.
+        # Columns of a packet span at most 1 s.
         ([5000, 6000], True),
         ([5000, 6000.000001], False),
     ],
 )
-def test_stamps_that_no_packet_has(stamps: Stamps, good: bool) -> None:
+def test_impossible_stamps(stamps: Stamps, good: bool) -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival(stamps))
-    assert len(delivery.packets.key) == good
+    accepted = intake.accept(_arrival(stamps))
+    assert len(accepted.packets.key) == good
     assert intake.rejected == ({} if good else {"bad_stamp": 1})
 
 
@@ -119,19 +119,19 @@ def test_a_wild_stamp_that_the_next_packet_does_not_confirm_is_rejected() -> Non
 
 
 @pytest.mark.parametrize(("step_ms", "held"), [(1000, False), (1000.000001, True)])
-def test_a_step_of_just_a_second_is_believed(step_ms: float, held: bool) -> None:
+def test_a_step_of_one_second_needs_no_confirmation(step_ms: float, held: bool) -> None:
     intake = Intake("left")
-    delivery = intake.accept(_alone(10, 10 + step_ms))
-    assert len(delivery.packets.key) == (1 if held else 2)
+    accepted = intake.accept(_alone(10, 10 + step_ms))
+    assert len(accepted.packets.key) == (1 if held else 2)
     assert (intake.held_place is not None) == held
 
 
-def test_a_gap_is_believed_when_the_next_packet_goes_on_from_there() -> None:
+def test_a_gap_is_confirmed_by_the_next_packet() -> None:
     """Both are delivered with the packet that confirms."""
     intake = Intake("left")
-    delivery = intake.accept(_alone(10, 20, 5000, 5010, 5020))
-    assert _stamps_ms(delivery) == [[10], [20], [5000], [5010], [5020]]
-    assert delivery.packets.position.tolist() == [0, 1, 3, 3, 4]
+    accepted = intake.accept(_alone(10, 20, 5000, 5010, 5020))
+    assert _stamps_ms(accepted) == [[10], [20], [5000], [5010], [5020]]
+    assert accepted.packets.position.tolist() == [0, 1, 3, 3, 4]
     assert intake.rejected == {}
 
 
@@ -166,8 +166,8 @@ def test_a_reset_clock_is_an_error_that_names_both_times() -> None:
     with pytest.raises(ClockError) as err:
         intake.accept(_alone(100_000, 100_010, 3, 13))
     assert str(err.value) == (
-        "sensor left: clock reset within the recording: stamps went back from 100.010000 s to "
-        "0.003000 s; wanted one running clock; use --on-jump split, or --clock host"
+        "sensor left: clock reset within the recording: expected stamps of one continuous clock, "
+        "found a step back from 100.010000 s to 0.003000 s; use --on-jump split, or --clock host"
     )
 
 
@@ -178,18 +178,18 @@ def test_a_single_step_back_is_rejected() -> None:
 
 
 def test_invalid_columns_are_no_stamps() -> None:
-    """What a masked column calls its stamp neither holds a packet nor counts as newest."""
+    """The stamp of a masked column neither holds a packet nor counts as newest."""
     intake = Intake("left")
     arrival = _arrival([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
-    delivery = intake.accept(arrival)
-    assert delivery.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
+    accepted = intake.accept(arrival)
+    assert accepted.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
     assert intake.rejected == {}
 
 
-def test_a_packet_without_a_valid_column_passes_and_says_nothing() -> None:
+def test_a_packet_without_a_valid_column_is_accepted() -> None:
     intake = Intake("left")
-    delivery = intake.accept(_arrival([10], [9e6], [20], valid=[[1], [0], [1]]))
-    assert delivery.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
+    accepted = intake.accept(_arrival([10], [9e6], [20], valid=[[1], [0], [1]]))
+    assert accepted.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
 
 
 # -- clocks ---------------------------------------------------------------------------------------
@@ -201,13 +201,13 @@ def test_an_offset_is_added_to_the_stamps() -> None:
 
 
 def test_the_host_clock_keeps_the_age_of_columns_within_their_packet() -> None:
-    """The newest column is stamped with the arrival of its packet."""
+    """The newest column gets the receive time of its packet."""
     intake = Intake("left", host_clock=True)
     arrival = _arrival([10, 12], [20, 22])
     arrival.host_ns = np.array([1_000_000 * MS, 1_000_011 * MS])
-    delivery = intake.accept(arrival)
-    assert _stamps_ms(delivery) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
-    assert delivery.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
+    accepted = intake.accept(arrival)
+    assert _stamps_ms(accepted) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
+    assert accepted.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
 
 
 def test_loss_is_counted_of_accepted_packets_only() -> None:

@@ -1,10 +1,10 @@
-"""The benchmark's packets in other containers, and one pass of reading over any of them.
+"""A standard recording in other containers, and the CPU time of reading any of them.
 
-    python -m tests.bench.containers write RECORDING.pcap RECORDING.mcap
-    python -m tests.bench.containers read RECORDING.mcap
+    python -m tests.bench.containers write FOLDER/capture.pcap FOLDER/capture.mcap
+    python -m tests.bench.containers read FOLDER/capture.mcap
 
-Forms as recorders write them by default: MCAP in chunks without compression (facts/messages.md,
-section 5), db3 with schema 3.
+The forms are the defaults of recorders: MCAP in chunks without compression, db3 with schema 3
+(docs/sources/messages.md section 5).
 """
 
 from __future__ import annotations
@@ -21,30 +21,26 @@ from mcap.writer import CompressionType, Writer
 
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
-from tests.bench.capture import LIDAR_BYTES
 
-PLACES: Final = {"192.168.7.11": "a", "192.168.7.12": "b"}
 TYPE: Final = "ouster_sensor_msgs/msg/PacketMsg"
 CHUNK_BYTES: Final = 786_432
-CDR_HEAD: Final = b"\x00\x01\x00\x00"
-Sent = Iterator[tuple[str, int, bytes]]
+CDR_HEADER: Final = b"\x00\x01\x00\x00"
+Messages = Iterator[tuple[str, int, bytes]]
 
 
-def messages(pcap: Path) -> Sent:
-    """(topic, log time, message) of every packet."""
+def messages(pcap: Path) -> Messages:
+    """(topic, log time in ns, message) of every packet."""
     table = StreamTable()
     for batch in open_recording(pcap, table).packets():
         columns = (batch.start, batch.size, batch.stream, batch.host_ns)
         for start, size, number, host_ns in zip(*(c.tolist() for c in columns), strict=True):
-            stream = table.streams[number]
+            topic = f"/port_{table.streams[number].port}/lidar_packets"
             payload = batch.data[start : start + size].tobytes()
-            tail = "lidar_packets" if size == LIDAR_BYTES else "imu_packets"
-            topic = f"/{PLACES[stream.source_ip]}/ouster/{tail}"
-            yield topic, host_ns, CDR_HEAD + size.to_bytes(4, "little") + payload
+            yield topic, host_ns, CDR_HEADER + size.to_bytes(4, "little") + payload
 
 
-def write_mcap(path: Path, sent: Sent) -> None:
-    """Chunks without compression."""
+def write_mcap(path: Path, sent: Messages) -> None:
+    """Write chunks without compression."""
     with path.open("wb") as file:
         writer = Writer(file, CHUNK_BYTES, compression=CompressionType.NONE, enable_crcs=False)
         writer.start("ros2")
@@ -58,8 +54,8 @@ def write_mcap(path: Path, sent: Sent) -> None:
         finish()
 
 
-def write_db3(path: Path, sent: Sent) -> None:
-    """Tables of schema 3."""
+def write_db3(path: Path, sent: Messages) -> None:
+    """Write the tables of schema 3."""
     with sqlite3.connect(path) as connection:
         connection.execute("PRAGMA journal_mode = OFF")
         connection.execute(
@@ -84,14 +80,14 @@ def write_db3(path: Path, sent: Sent) -> None:
     connection.close()
 
 
-WRITERS: Final[Mapping[str, Callable[[Path, Sent], None]]] = {
+WRITERS: Final[Mapping[str, Callable[[Path, Messages], None]]] = {
     ".mcap": write_mcap,
     ".db3": write_db3,
 }
 
 
 def write(pcap: Path, target: Path) -> None:
-    """Write the packets to a target, by its suffix; it appears when it is whole."""
+    """Write the packets to a container chosen by the suffix; it appears when complete."""
     partial = target.with_name(target.name + ".partial")
     partial.unlink(missing_ok=True)
     WRITERS[target.suffix](partial, messages(pcap))
@@ -99,10 +95,11 @@ def write(pcap: Path, target: Path) -> None:
 
 
 def read(path: Path) -> dict[str, float]:
-    """Packets, their bytes, and the CPU time of one pass over them, after opening."""
+    """Number of packets, their bytes, and the CPU time of one pass over them, after opening."""
     recording = open_recording(path, StreamTable())
     began_s = time.process_time()
-    packets = size = 0
+    packets = 0
+    size = 0
     for batch in recording.packets():
         packets += len(batch)
         size += int(batch.size.sum())

@@ -7,18 +7,18 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "clouds only": (
         "clouds.db3",
         1,
-        "clouds.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
-        " the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
+        "clouds.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
+        "the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
         "read; the first: wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; "
         "convert the recording to that encoding)",
     ),
     "clouds without times": (
         "timeless.db3",
         1,
-        "timeless.db3: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got /points (sensor_msgs/PointCloud2); record the topic on which"
-        " the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
+        "timeless.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
+        "the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
         "read; the first: wanted the time of each point in a field t, time, timestamp, "
         "time_stamp, timestamps, offset_time or ts, got x, y, z; record the raw packets, or "
         "clouds with times)",
@@ -26,22 +26,22 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "one of two lidars": (
         "drive.mcap --rig one.yaml",
         1,
-        "one.yaml: sensor left: wanted packets of one lidar, got those of several (OS-0-32-U1, "
-        "OS-1-32-U1) on /left/ouster/lidar_packets, /right/ouster/lidar_packets; name its stream "
-        "(source_ip, port, topic or serial)",
+        "one.yaml: sensor left: expected packets of one lidar, found those of several "
+        "(OS-0-32-U1, OS-1-32-U1) on /left/ouster/lidar_packets, /right/ouster/lidar_packets; "
+        "name its stream (source_ip, port, topic or serial)",
     ),
     "topic of the rig": (
         "drive.mcap --rig topic.yaml",
         1,
-        "topic.yaml: sensor left: wanted a packet of it (topic /left/ouster/lidar) in the "
-        "first 10 seconds, got none to tell which of /left/ouster/metadata, "
-        "/right/ouster/metadata is its metadata; correct its stream, or give `metadata:`",
+        "topic.yaml: sensor left: expected a packet of it (topic /left/ouster/lidar) in the first "
+        "10 seconds, found none to decide which of /left/ouster/metadata, /right/ouster/metadata "
+        "is its metadata; correct its stream, or give `metadata:`",
     ),
     "topic of no packets": (
         "drive.mcap --rig points.yaml",
         1,
-        "points.yaml: sensor imu: wanted a packet of it (topic /imu/data) in the first 10 "
-        "seconds, got none to tell which of /left/ouster/metadata, /right/ouster/metadata is "
+        "points.yaml: sensor imu: expected a packet of it (topic /imu/data) in the first 10 "
+        "seconds, found none to decide which of /left/ouster/metadata, /right/ouster/metadata is "
         "its metadata; correct its stream, or give `metadata:`",
     ),
     "topic and port": (
@@ -60,53 +60,53 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "folder without a bag": (
         "papers",
         1,
-        "papers: wanted a recording, got a folder without .db3 or .mcap files; name the files"
+        "papers: expected a recording, found a folder without .db3 or .mcap files; name the files"
         " inside it",
     ),
     "two kinds in a folder": (
         "mixed",
         1,
-        "mixed: wanted a folder with the files of one bag, got several kinds (MCAP, ROS 2 bag"
+        "mixed: expected a folder with the files of one bag, found several kinds (MCAP, ROS 2 bag"
         " (sqlite3)); name the files of one kind",
     ),
     "text": (
         "text.db3",
         1,
-        "text.db3: wanted a recording ({*}; also gzip or zstd of them), got a file that "
+        "text.db3: expected a recording ({*}; also gzip or zstd of them), found a file that "
         "begins with 68 65 6c 6c 6f 0a; check that it is the right file",
     ),
     "empty database": (
         "empty.db3",
         1,
-        "empty.db3: wanted a recording, got 0 bytes; record or copy it again",
+        "empty.db3: expected a recording, found 0 bytes; record or copy it again",
     ),
     "another database": (
         "other.db3",
         1,
-        "other.db3: wanted a ROS 2 bag (tables topics and messages), got a database that "
+        "other.db3: expected a ROS 2 bag (tables topics and messages), found a database that "
         "cannot be read ({*}); record or copy it again, or try `sqlite3 "
         ".recover`",
     ),
     "cut MCAP": (
         "head.mcap",
         1,
-        "head.mcap: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got no UDP packet at all; check that the recording holds the "
-        "sensor's data port (head.mcap: byte 20: the file ends within a record: wanted its "
-        "footer; the rest was read)",
+        "head.mcap: no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch "
+        "sensors`), found no UDP packet at all; check that the recording contains the sensor's "
+        "data port (head.mcap: byte 20: the file ends within a record: wanted its footer; the rest "
+        "was read)",
     ),
     "cut ROS 1 bag": (
         "head.bag",
         1,
-        "head.bag: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got no UDP packet at all; check that the recording holds the "
-        "sensor's data port (head.bag: the bag ends within its header, head.bag: byte 13: the"
-        " bag ends within a record; it was cut off)",
+        "head.bag: no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch "
+        "sensors`), found no UDP packet at all; check that the recording contains the sensor's "
+        "data port (head.bag: the bag ends within its header, head.bag: byte 13: the bag ends "
+        "within a record; it was cut off)",
     ),
     "cut database": (
         "head.db3",
         1,
-        "head.db3: wanted a ROS 2 bag (tables topics and messages), got a database that "
+        "head.db3: expected a ROS 2 bag (tables topics and messages), found a database that "
         "cannot be read ({*}); record or copy it again, or try "
         "`sqlite3 .recover`",
     ),
@@ -135,24 +135,24 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "strange metadata": (
         "stranger.db3",
         1,
-        "stranger.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 "
-        "bytes: needs its metadata; wanted metadata that fits, got only "
-        "/roof/ouster/metadata; give the sensor's with --metadata FILE",
+        "stranger.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found only /roof/ouster/metadata; give "
+        "the sensor's with --metadata FILE",
     ),
     "garbage metadata": (
         "garbage.db3",
         1,
-        "garbage.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 "
-        "bytes: needs its metadata; wanted metadata that fits, got none beside the recording;"
-        " give the sensor's with --metadata FILE (/roof/ouster/metadata: wanted the metadata "
-        "of a lidar, got another text)",
+        "garbage.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found none in the recording's "
+        "directory; give the sensor's with --metadata FILE (/roof/ouster/metadata: expected the "
+        "metadata of a lidar, found another text)",
     ),
     "no metadata": (
         "bare.db3",
         1,
-        "bare.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: "
-        "needs its metadata; wanted metadata that fits, got none beside the recording; give "
-        "the sensor's with --metadata FILE",
+        "bare.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: needs "
+        "its metadata; expected metadata that match, found none in the recording's directory; "
+        "give the sensor's with --metadata FILE",
     ),
     "unknown topic to pass": (
         "drive.mcap --pass /imu/dat -o scans.mcap",
@@ -191,24 +191,24 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "no extrinsics": (
         "unmounted.db3",
         1,
-        "extrinsics unknown for left, right; wanted for every sensor when there are two or "
+        "extrinsics unknown for left, right; required for every sensor when there are two or "
         "more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or "
         "accept the body origin with --identity-extrinsics",
     ),
     "moving tf": (
         "moving.mcap",
         1,
-        "extrinsics unknown for left; wanted for every sensor when there are two or more; "
-        "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept"
-        " the body origin with --identity-extrinsics (left: nothing connects frame "
-        "left/os_sensor with base_link: /tf changes base_link -> mast during the recording)",
+        "extrinsics unknown for left; required for every sensor when there are two or more; give "
+        "them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept the "
+        "body origin with --identity-extrinsics (left: nothing connects frame left/os_sensor with "
+        "base_link: /tf changes base_link -> mast during the recording)",
     ),
     "host clock": (
         "frames.db3 --clock host",
         2,
-        "--clock host: sensor roof: wanted the arrival time of each packet, got only that of "
-        "whole messages on /roof/ouster/frames; use --clock sensor (in the rig: "
-        "clock.source) without --align-clocks, or record the packets with tcpdump",
+        "--clock host: sensor roof: expected the receive time of each packet, found only that of "
+        "whole messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source) "
+        "without --align-clocks, or record the packets with tcpdump",
     ),
     "strict contradiction": (
         "contrary.mcap --strict",
@@ -220,12 +220,12 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "only part": (
         "drive.mcap --only front",
         2,
-        "--only: wanted the name or serial number of a sensor, one of left, right, got "
+        "--only: expected the name or serial number of a sensor, one of left, right, found "
         "'front'; choose one",
     ),
     "file of a bag that is gone": (
         "bag/bag_2.db3",
         1,
-        "bag/bag_2.db3: wanted a recording, got no such file; check the path",
+        "bag/bag_2.db3: expected a recording, found no such file; check the path",
     ),
 }

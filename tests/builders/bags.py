@@ -1,6 +1,6 @@
 """Messages of bags from values: raw packets, metadata, transforms, IMU samples; CDR and ROS 1.
 
-Layouts: facts/messages.md, sections 1 and 4; written here once more, apart from the package.
+Layouts: docs/sources/messages.md, sections 1 and 4; written here once more, apart from the package.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Clocks of sensors and recorders, simulated: stamps and arrivals whose truth is known."""
+"""Clocks of sensors and recorders, simulated: stamps and receive times whose truth is known."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # 2024-05-01 12:34:56 UTC; TAI - UTC was 37 s, GPS - UTC 18 s.
 BEGIN_NS = 1_714_566_896 * NS_PER_S
-TAI_NS, GPS_NS = 37 * NS_PER_S, 18 * NS_PER_S
+TAI_NS = 37 * NS_PER_S
+GPS_NS = 18 * NS_PER_S
 GPS_1980_NS = (18 - 315_964_800) * NS_PER_S
 
 
@@ -24,7 +25,7 @@ class Clock:
 
     wander: (ppm, period s) of a drift that comes and goes, with the temperature; quantum_ns: its
     stamps are multiples of that; wrap_ns: it counts on from 0 there, 0: never; past_hour: its
-    stamps leave out the hour, which the decoder takes from the first arrival.
+    stamps leave out the hour, which the decoder takes from the first receive time.
     """
 
     offset_ns: int = 0
@@ -57,10 +58,10 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """From a sensor to the recorder: shortest delay, mean of the exponential rest, bursts.
+    """From a sensor to the capture host: shortest delay, mean of the exponential rest, bursts.
 
     bursts_hz: how often a queue holds everything back for up to `burst_ms`; lost: share of packets;
-    pauses: (after s, for s) while the recorder stands still.
+    pauses: (after s, for s) while the capture host stands still.
     """
 
     least_us: float = 60.0
@@ -73,7 +74,7 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Packets of one sensor in order of arrival: true times, stamps, arrivals; ns, (P,)."""
+    """Packets of one sensor in order of receive time: true, stamp and receive times; ns, (P,)."""
 
     true_ns: I64Array
     stamp_ns: I64Array
@@ -95,7 +96,7 @@ def hear(
     begin_s: float = 0.0,
     silent: tuple[tuple[float, float], ...] = (),
 ) -> Heard:
-    """A sensor that sends at a steady rate, and what a recorder hears of it.
+    """A sensor that sends at a steady rate, and what a capture host hears of it.
 
     silent: (from s, to s) in which it sends nothing.
     """
@@ -106,7 +107,8 @@ def hear(
     kept = rng.random(count) >= way.lost
     for from_s, to_s in silent:
         kept &= (since_s < from_s) | (since_s >= to_s)
-    true_ns, since_s = true_ns[kept], since_s[kept]
+    true_ns = true_ns[kept]
+    since_s = since_s[kept]
     arrival_ns = true_ns + np.rint(_way_ns(rng, way, since_s)).astype(np.int64)
     host_ns = host.read(np.maximum.accumulate(arrival_ns))
     stamp_ns = clock.read(true_ns)
@@ -118,7 +120,8 @@ def hear(
 def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
     """How long each packet takes; nothing overtakes, and what was held back comes at once."""
     delay_ns = way.least_us * NS_PER_US + rng.exponential(way.mean_us * NS_PER_US, len(since_s))
-    first_s, last_s = float(since_s[0]), float(since_s[-1])
+    first_s = float(since_s[0])
+    last_s = float(since_s[-1])
     number = rng.poisson(way.bursts_hz * (last_s - first_s))
     holds = [
         (float(begin), float(length))
@@ -136,7 +139,7 @@ def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
 
 
 def _hours_from_arrival(past_hour_ns: I64Array, host_ns: I64Array) -> I64Array:
-    """Stamps whose hour is guessed once, from the first arrival, and kept."""
+    """Stamps whose hour is guessed once, from the first receive time, and kept."""
     first_ns = int(past_hour_ns[0]) - int(host_ns[0])
     offset_ns = (first_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     near_ns = host_ns + offset_ns

@@ -93,7 +93,7 @@ def damaged_heads(rng: random.Random, sent: Sequence[Datagram]) -> Records:
 
 
 def _odd_columns(rng: random.Random, one: Datagram, kind: int) -> Datagram:
-    """Column heads are 12 bytes: stamp u64, measurement id u16, status u16 (facts/ouster.md)."""
+    """Column headers (docs/sources/ouster.md): stamp u64, measurement id u16, status u16."""
     data = bytearray(one.payload)
     record = (len(data) - 64) // COLUMNS_PER_PACKET
     for _ in range(rng.choice([1, 1, COLUMNS_PER_PACKET])):

@@ -8,7 +8,7 @@ import numpy as np
 
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import Arrival, Delivery, Intake
+from mlbatch.batching.intake import Accepted, Arrival, Intake
 from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
 from mlbatch.batching.windows import Limit, Policy
 from mlbatch.batching.windows import Window as FastWindow
@@ -22,10 +22,10 @@ class _Watched(Intake):
         super().__init__(name, host_clock=host_clock)
         self.accepted: list[int] = []
 
-    def accept(self, arrival: Arrival) -> Delivery:
-        delivery = super().accept(arrival)
-        self.accepted += delivery.packets.place.tolist()
-        return delivery
+    def accept(self, arrival: Arrival) -> Accepted:
+        accepted = super().accept(arrival)
+        self.accepted += accepted.packets.place.tolist()
+        return accepted
 
 
 def run_fast(feed: Sequence[FeedPacket], settings: Settings, group_sizes: Sequence[int]) -> Outcome:

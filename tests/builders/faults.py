@@ -21,7 +21,9 @@ def spoiled(rng: random.Random, packets: Sequence[FeedPacket], chance: float) ->
     Gaps put off all that follows, host times too; resets change only its stamps.
     """
     out: list[FeedPacket] = []
-    shift, lag, begun = 0, 0, False
+    shift = 0
+    lag = 0
+    begun = False
     for packet in packets:
         packet = _shifted(packet, shift)
         fault = rng.choices(FAULTS, FAULT_WEIGHTS)[0] if rng.random() < chance else ""
@@ -79,7 +81,8 @@ def _with_fault(
 
 def _on_the_edge(rng: random.Random, packet: FeedPacket, previous: FeedPacket) -> list[FeedPacket]:
     """Steps and spans of 1 s to the nanosecond, where packets begin to be held or rejected."""
-    past, edge_ns = rng.choice([-1, 0, 0, 1]), NS_PER_S + rng.choice([-1, 0, 0, 1])
+    past = rng.choice([-1, 0, 0, 1])
+    edge_ns = NS_PER_S + rng.choice([-1, 0, 0, 1])
     newest = max(previous.valid_stamps(), default=max(previous.stamps))
     forth = _shifted(packet, newest + edge_ns - max(packet.stamps))
     back = _shifted(packet, newest - edge_ns - min(packet.stamps))

@@ -1,6 +1,6 @@
 """Feeds of packets as rigs produce them, and worse: for the laws of batching.
 
-One maker draws everything from a `random.Random`: seeded it is fast (`random_feed`), and driven by
+One vendor draws everything from a `random.Random`: seeded it is fast (`random_feed`), and driven by
 hypothesis it shrinks (`feeds`). Column rates are low, so that a few packets cross many windows.
 """
 
@@ -71,7 +71,7 @@ def groups(rng: random.Random, total: int) -> list[int]:
 
 
 def make_feed(rng: random.Random, *, quiet: bool = False) -> Case:
-    """Draw a scene, the packets of each sensor, and their order of arrival."""
+    """Draw a scene, the packets of each sensor, and their order of receive time."""
     scene = _scene(rng, quiet)
     arrivals: list[tuple[int, int, FeedPacket]] = []
     for sensor in range(scene.settings.sensors):
@@ -125,7 +125,8 @@ def _sensor_packets(rng: random.Random, scene: Scene, sensor: int) -> list[FeedP
     stamps = [begin + i * step_ns + rng.randint(0, jitter_ns) for i in range(columns)]
     if rng.random() < 0.4:
         stamps = [_snapped(rng, stamp, settings) for stamp in stamps]
-    leap_at, leap_ns = scene.epoch_ns + scene.jump[0], scene.jump[1]
+    leap_at = scene.epoch_ns + scene.jump[0]
+    leap_ns = scene.jump[1]
     stamps = [stamp + leap_ns if stamp >= leap_at else stamp for stamp in stamps]
     first_key = rng.choice([0, 65_530, -1])
     packets = []
@@ -166,7 +167,9 @@ def _arrivals(
     # More than 1 s apart clocks cannot be compared.
     offset_ns = rng.choice([0] * 120 + [-600, 600] * 3 + [-3000, 3000]) * NS_PER_MS
     burst = 0.0 if scene.quiet else rng.choice([0, 0, 0.1])
-    arrivals, at, begun = [], 0, False
+    arrivals = []
+    at = 0
+    begun = False
     for number, packet in enumerate(packets):
         at = max(at, packet.host_ns + latency_ns + offset_ns)
         if begun and rng.random() < burst:
@@ -235,7 +238,8 @@ def _merged(
     lag = _Lag(settings.max_wait_ns, [None] * settings.sensors, [None] * settings.sensors)
     taken = [0] * settings.sensors
     merged: list[FeedPacket] = []
-    stay, current = rng.choice([0.0, 0.5, 0.95]), 0
+    stay = rng.choice([0.0, 0.5, 0.95])
+    current = 0
     while True:
         left = [s for s, queue in enumerate(queues) if taken[s] < len(queue)]
         if not left:
@@ -244,7 +248,8 @@ def _merged(
         if current in left and rng.random() < stay:
             tries.insert(0, current)
         for current in tries:
-            step, trial = queues[current][taken[current]], lag.copied()
+            step = queues[current][taken[current]]
+            trial = lag.copied()
             if trial.follow(step):
                 break
         else:

@@ -166,7 +166,7 @@ def main(folder: Path) -> None:
 
 
 def rig_text() -> str:
-    """The rig (CONTRACT.md section 5)."""
+    """The rig (docs/rig.md)."""
     text = RIG
     for place in PLACES:
         text += RIG_SENSOR.format(

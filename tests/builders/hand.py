@@ -34,7 +34,7 @@ def every(sensor: int, begin_ms: int, end_ms: int, step_ms: int = 50) -> list[Fe
 
 
 def by_host(packets: Iterable[FeedPacket]) -> list[FeedPacket]:
-    """The packets in order of arrival."""
+    """The packets in order of receive time."""
     return sorted(packets, key=lambda one: one.host_ns)
 
 

@@ -1,6 +1,6 @@
 """Encoder of HESAI packets and angle files: what a lidar would send, from plain values.
 
-Source: facts/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
+Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
 (JT16); rows of the models: `hesai_models.py`, angles: `hesai_angles.py`. Column k is the k-th group
 of blocks that share an azimuth; the rotor turns evenly.
 """

@@ -1,7 +1,7 @@
 """Layouts of HESAI packets by model, for the encoder.
 
-Source: facts/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times), laid out here once
-more, apart from the decoder; only the firing tables of section 12 are shared. Pandar20:
+Source: docs/sources/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times), laid out here
+once more, apart from the decoder; only the firing tables of section 12 are shared. Pandar20:
 HesaiTechnology/HesaiLidar_General_SDK.
 """
 
@@ -14,7 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.sensors import _hesai_firing as firing
+from mlbatch.sensors.hesai import firing
 
 SEQUENCE, IMU, SAFETY, SIGNATURE, CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10
 # Each adds a byte to the channels of protocol 1.4: confidence, weight factor, ambient light.

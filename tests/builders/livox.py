@@ -1,6 +1,6 @@
 """Encoder of Livox SDK2 packets: what a lidar would send, from plain raw values.
 
-Source: facts/others.md (Livox SDK2); what the CRC-32 covers, and frames: Livox communication
+Source: docs/sources/others.md (Livox SDK2); what the CRC-32 covers, and frames: Livox communication
 protocol of the Avia2, v1.0. Nothing here is shared with the decoder.
 """
 

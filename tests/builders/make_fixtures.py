@@ -111,7 +111,7 @@ def foreign_frames() -> Records:
 
 
 def rig_text() -> str:
-    """The rig (CONTRACT.md section 5)."""
+    """The rig (docs/rig.md)."""
     sensors = [
         RIG_SENSOR.format(
             name=lidar.name,

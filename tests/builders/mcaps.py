@@ -1,6 +1,6 @@
 """MCAP files from values, by the reference library: ROS 2 and ROS 1, chunks of every kind.
 
-Source: MCAP specification (mcap.dev/spec); message types of facts/messages.md, section 1.
+Source: MCAP specification (mcap.dev/spec); message types of docs/sources/messages.md, section 1.
 """
 
 from __future__ import annotations

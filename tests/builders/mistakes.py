@@ -7,9 +7,10 @@ DIGEST = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10_digest.json"
 ONE_UNIT = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10"
 PAIR = "R/ouster/two-sensors_same-ports_nonlegacy/same_ports_nonlegacy.pcap"
 NO_LIDAR = (
-    "no lidar packets; wanted raw UDP packets of a supported lidar (see `mlbatch sensors`), got "
+    "no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch sensors`), "
+    "found "
 )
-DATA_PORT = "; check that the recording holds the sensor's data port"
+DATA_PORT = "; check that the recording contains the sensor's data port"
 
 # (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} stands
 # for words of the parser, which differ between its versions, and for lists that grow.
@@ -28,23 +29,23 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "missing recording": (
         "none.pcap",
         1,
-        "none.pcap: wanted a recording, got no such file; check the path",
+        "none.pcap: expected a recording, found no such file; check the path",
     ),
     "folder": (
         "fix",
         1,
-        "fix: wanted a recording, got a folder without .db3 or .mcap files; "
+        "fix: expected a recording, found a folder without .db3 or .mcap files; "
         "name the files inside it",
     ),
     "empty file": (
         "empty.pcap",
         1,
-        "empty.pcap: wanted a recording, got 0 bytes; record or copy it again",
+        "empty.pcap: expected a recording, found 0 bytes; record or copy it again",
     ),
     "text": (
         "text.txt",
         1,
-        "text.txt: wanted a recording ({*}; also gzip or zstd of them), got a file that "
+        "text.txt: expected a recording ({*}; also gzip or zstd of them), found a file that "
         "begins with 68 65 6c 6c 6f 0a; check that it is the right file",
     ),
     "no output": (
@@ -278,14 +279,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown sensor": (
         f"{FIX} --only front",
         2,
-        "--only: wanted the name or serial number of a sensor, one of left, right, got 'front'; "
-        "choose one",
+        "--only: expected the name or serial number of a sensor, one of left, right, found "
+        "'front'; choose one",
     ),
     "no sensor left": (
         f"{FIX} --ignore left --ignore 122648000456",
         2,
-        "--only/--ignore: wanted at least one sensor to convert, got none that is left; leave one "
-        "of them out",
+        "--only/--ignore: expected at least one sensor to convert, found none that is left; leave "
+        "one of them out",
     ),
     "rig missing": (
         "fix/two_lidars.pcap --rig none.yaml",
@@ -308,14 +309,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "rig sensor of no stream": (
         "fix/two_lidars.pcap --rig fix/astray.yaml",
         1,
-        "fix/astray.yaml: sensor rear: wanted a packet of it (source_ip 10.5.5.99) in the first "
-        "10 seconds, got none to tell its model; correct its stream, or give `metadata:` or "
+        "fix/astray.yaml: sensor rear: expected a packet of it (source_ip 10.5.5.99) in the first "
+        "10 seconds, found none to decide its model; correct its stream, or give `metadata:` or "
         "`model:`",
     ),
     "rig sensor that is silent": (
         "fix/two_lidars.pcap --rig fix/silent.yaml",
         1,
-        "fix/silent.yaml: sensor rear: wanted its packets, got none from source_ip 10.5.5.99; "
+        "fix/silent.yaml: sensor rear: expected its packets, found none from source_ip 10.5.5.99; "
         "correct its stream or serial, or set `optional: true`",
     ),
     "rig sensor without metadata": (
@@ -333,43 +334,42 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata missing": (
         "fix/two_lidars.pcap --metadata none.json",
         1,
-        "none.json: wanted a calibration file, got no such file; check the path",
+        "none.json: expected a calibration file, found no such file; check the path",
     ),
     "metadata is something else": (
         "fix/two_lidars.pcap --metadata fix/rig.yaml",
         1,
-        "fix/rig.yaml: wanted the metadata or calibration of a lidar, got another kind of file; "
-        "give the file that the sensor's driver or recorder saved",
+        "fix/rig.yaml: expected the metadata or calibration of a lidar, found another kind of "
+        "file; give the file that the sensor's driver or recorder saved",
     ),
     "metadata of another lidar": (
         "bare/drive.pcap --metadata pair/222.json",
         1,
-        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
-        "its metadata; wanted metadata that fits, got only 222.json; give the sensor's with "
-        "--metadata FILE",
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found only 222.json; give the sensor's "
+        "with --metadata FILE",
     ),
     "no metadata": (
         "bare/drive.pcap",
         1,
-        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: needs "
-        "its metadata; wanted metadata that fits, got none beside the recording; give the sensor's "
-        "with --metadata FILE",
+        "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
+        "needs its metadata; expected metadata that match, found none in the recording's "
+        "directory; give the sensor's with --metadata FILE",
     ),
     "two lidars without extrinsics": (
         "pair/drive.pcap",
         1,
-        "extrinsics unknown for ouster_111, ouster_222; wanted for every sensor when there are two "
-        "or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), "
-        "or "
-        "accept the body origin with --identity-extrinsics",
+        "extrinsics unknown for ouster_111, ouster_222; required for every sensor when there are "
+        "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
+        "extrinsic), or accept the body origin with --identity-extrinsics",
     ),
     "incomparable clocks": (
         "apart/drive.pcap --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
-        "ouster_111 and -3600.004 s for ouster_222, 3600.000 s apart (1 whole hour(s): a time "
-        "zone, or the wrong hour); wanted at most 1 s; use --align-clocks or --clock host, or give "
-        "clock.offset_s or clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "3600.000 s (1 whole hour(s): a time zone, or the wrong hour): stamp minus receive time is "
+        "-0.004 s for ouster_111 and -3600.004 s for ouster_222; use --align-clocks or --clock "
+        "host, or give clock.offset_s or clock.epoch in the rig",
     ),
     "strict with a duplicate": (
         "twice/drive.pcap --strict",
@@ -380,7 +380,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with a warning": (
         "cut/drive.pcap --strict",
         1,
-        "drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1000 "
+        "drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, found 1000 "
         "(recording, an error because of --strict)",
     ),
     "only partial scans": (
@@ -404,7 +404,7 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata is a digest": (
         f"{ONE_UNIT}.pcap --metadata {DIGEST}",
         1,
-        f"{DIGEST}: wanted the metadata or calibration of a lidar, got another kind of file; "
+        f"{DIGEST}: expected the metadata or calibration of a lidar, found another kind of file; "
         "give the file that the sensor's driver or recorder saved",
     ),
     "TCP only": (
@@ -434,10 +434,10 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
     "two uptime clocks": (
         f"{PAIR} --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -1718733565.192 s for "
-        "ouster_122239000672 and -1718728642.002 s for ouster_122247000785, 4923.190 s apart; "
-        "wanted at most 1 s; use --align-clocks or --clock host, or give clock.offset_s or "
-        "clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "4923.190 s: stamp minus receive time is -1718733565.192 s for ouster_122239000672 and "
+        "-1718728642.002 s for ouster_122247000785; use --align-clocks or --clock host, or give "
+        "clock.offset_s or clock.epoch in the rig",
     ),
     "one turn is never a whole window": (
         f"{ONE_UNIT}.pcap",

@@ -1,7 +1,8 @@
 """Encoder of Ouster packets and metadata: what a sensor would send, from plain values.
 
-Source: facts/ouster.md sections 1-3 and 8. Encoding is the inverse of decoding; where fields lie is
-taken from the tables of the decoder, which the tests check bit by bit and on real recordings.
+Source: docs/sources/ouster.md sections 1-3 and 8. Encoding is the inverse of decoding; where fields
+lie is taken from the tables of the decoder, which the tests check bit by bit and on real
+recordings.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, U8Array
-from mlbatch.sensors._crc import crc64
-from mlbatch.sensors._ouster_imu import (
+from mlbatch.sensors.crc import crc64
+from mlbatch.sensors.ouster.imu import (
     ACCEL32,
     LEGACY_IMU,
     SAMPLE,
     SAMPLES_START,
     imu_size,
 )
-from mlbatch.sensors._ouster_profiles import (
+from mlbatch.sensors.ouster.profiles import (
     COLUMN,
     ENCODER_TICKS,
     FUSA,

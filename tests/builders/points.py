@@ -1,6 +1,7 @@
 """Messages of decoded clouds from values: PointCloud2 of any fields, Livox CustomMsg.
 
-Layouts: facts/messages.md, sections 1, 4 and 8; written here once more, apart from the package.
+Layouts: docs/sources/messages.md, sections 1, 4 and 8; written here once more, apart from the
+package.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Encoder of ROBOSENSE packets: what a turning lidar would send, from plain raw values.
 
-Source: facts/robosense.md sections 1 to 7. A rotor that turns evenly fires a round of all channels
-again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + what the rotor
-turns meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a decoder.
+Source: docs/sources/robosense.md sections 1 to 7. A rotor that turns evenly fires a round of all
+channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + what the
+rotor turns meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a
+decoder.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """ROBOSENSE models as rows: where their bytes lie, when their channels fire.
 
-Source: facts/robosense.md sections 1 to 6; the firing times of 80- and 48-line models, for which it
-names the files of the maker's driver: `decoder_RS80`, `RS48`, `RSP80`, `RSP48.hpp` of rs_driver.
+Source: docs/sources/robosense.md sections 1 to 6; the firing times of 80- and 48-line models, for
+which it names the files of the maker's driver: `decoder_RS80`, `RS48`, `RSP80`, `RSP48.hpp` of
+rs_driver.
 """
 
 from __future__ import annotations

@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.cli import main
-from mlbatch.discovery.discover import Wishes
-from mlbatch.pipeline import conversion
+from mlbatch.discovery.discover import SensorSelection
+from mlbatch.pipeline import session
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import open_recording
-from mlbatch.readers._capture import CaptureRecording
-from mlbatch.report.report import ReportInputs
+from mlbatch.readers.capture.recording import CaptureRecording
+from mlbatch.report.report import RunReport
 from mlbatch.types import (
     EXTRAS,
     IMU,
@@ -47,10 +47,10 @@ Arrays = dict[str, npt.NDArray[np.generic]]
 # The two lidars of the fixture, head and tail included.
 FIXTURE = Job(
     recordings=(TWO_LIDARS / "two_lidars.pcap",),
-    wishes=Wishes(rig=TWO_LIDARS / "rig.yaml"),
+    selection=SensorSelection(rig=TWO_LIDARS / "rig.yaml"),
     keep_partial=True,
 )
-BY_HOST = replace(FIXTURE, wishes=replace(FIXTURE.wishes, host_clock=True))
+BY_HOST = replace(FIXTURE, selection=replace(FIXTURE.selection, host_clock=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Result:
     """A conversion that ended well; `memory` is None where the output went to a file."""
 
     run: Conversion
-    report: ReportInputs
+    report: RunReport
     memory: Memory | None = None
 
     @property
@@ -187,7 +187,7 @@ def print_of(scan: Scan) -> Values:
 
 
 def prints(result: Result) -> list[Values]:
-    """All that identity covers (CONTRACT.md section 1), of a run in memory."""
+    """All that identity covers, of a run in memory."""
     assert result.memory is not None
     assert result.memory.summary is not None
     table = csv_without_arrival(result.memory.summary.scans_csv)
@@ -216,7 +216,7 @@ def buffers_of(size: int) -> Iterator[None]:
             recording.buffer_bytes = size
         return recording
 
-    with patch.object(conversion, "open_recording", opened):
+    with patch.object(session, "open_recording", opened):
         yield
 
 

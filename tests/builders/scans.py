@@ -1,4 +1,4 @@
-"""Scans for tests of writers: seeded random arrays, or single points with chosen values."""
+"""Scans for tests: seeded random arrays, or single points with chosen values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHANNELS = 4
 
 
 def pose(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> F64Array:
-    """(4, 4) rotation about z and translation."""
+    """Return a (4, 4) rotation about z with a translation."""
     cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array(
         [[cosine, -sine, 0, x_m], [sine, cosine, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], float
@@ -25,7 +25,7 @@ def pose(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> F64Array:
 
 
 def run_info(layout: str = "dense", slices: int = 1) -> RunInfo:
-    """Two sensors, the second one turned by a quarter to the left and 2 m above the body."""
+    """Return a run of two sensors, the second rotated by 90 degrees and 2 m above the body."""
     sensors = (
         SensorInfo("left", "OS1-4", CHANNELS, 1, 0, np.eye(4)),
         SensorInfo("right", "OS1-4", CHANNELS, 1, CHANNELS, pose(math.pi / 2, 1.0, 0.0, 2.0)),
@@ -34,7 +34,7 @@ def run_info(layout: str = "dense", slices: int = 1) -> RunInfo:
 
 
 def dense_scan(index: int = 0, points: int = 1000, columns: int = 50, seed: int = 1) -> Scan:
-    """A scan with coordinates in a buffer of four floats a point, as the pipeline gives them."""
+    """Return a scan with xyz in a buffer of four floats a point, as decoders give them."""
     rng = np.random.default_rng(seed + index)
     column = np.sort(rng.integers(0, columns, points)).astype(np.uint32)
     start_ns = START_NS + index * PERIOD_NS
@@ -67,7 +67,7 @@ def dense_scan(index: int = 0, points: int = 1000, columns: int = 50, seed: int 
 
 
 def point_scan() -> Scan:
-    """One point with values that are exact in every type, of the second sensor."""
+    """Return one point of the second sensor with values that are exact in every type."""
     return replace(
         dense_scan(points=1, columns=1),
         xyz=np.array([[1.0, 2.0, 3.0, 9.0]], np.float32)[:, :3],
@@ -82,7 +82,7 @@ def point_scan() -> Scan:
 
 
 def organized_scan(columns: int = 5) -> Scan:
-    """An organized scan; the first slot of every column is empty."""
+    """Return an organized scan; the first slot of every column is empty."""
     rng = np.random.default_rng(3)
     shape = (columns, CHANNELS)
     xyz = rng.normal(0, 20, (*shape, 4)).astype(np.float32)[..., :3]
@@ -110,7 +110,7 @@ def organized_scan(columns: int = 5) -> Scan:
 
 
 def imu_samples(sensor: int = 0, first_ns: int = START_NS - 5, count: int = 2) -> ImuSamples:
-    """Samples whose numbers tell where they belong: 1, 2, 3 m/s2 and 4, 5, 6 rad/s, + 10 each."""
+    """Return samples with distinct values: 1, 2, 3 m/s2 and 4, 5, 6 rad/s, + 10 each."""
     step = 10.0 * np.arange(count)[:, None]
     return ImuSamples(
         sensor,

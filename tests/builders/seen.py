@@ -113,7 +113,7 @@ class Eye:
 def pose(
     translation_m: tuple[float, float, float], rpy_deg: tuple[float, float, float]
 ) -> F64Array:
-    """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (CONTRACT.md section 5)."""
+    """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (docs/rig.md)."""
     matrix = np.eye(4)
     for (one, other), angle in zip(((1, 2), (2, 0), (0, 1)), np.radians(rpy_deg), strict=True):
         turn = np.eye(4)
@@ -139,7 +139,7 @@ def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     off_ns = said_us * 1000 - round(table.stamp_after_us * 1000) - first_ns
     off_ns = (off_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
     fires_ns += off_ns.repeat(spec.columns_per_packet)[:, None]
-    # Channel 0 is the lowest beam (CONTRACT.md section 3).
+    # Channel 0 is the lowest beam (docs/formats.md).
     order = np.argsort(np.array(table.elevation_deg), kind="stable")
     xyz_m = eye.points(origin, direction, np.asarray(counts * table.unit_m + reach_m))
     return Seen(

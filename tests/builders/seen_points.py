@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.seen import Seen
 
-# facts/outputs.md section 3.
+# docs/sources/outputs.md section 3.
 STRONGEST_FIRST, STRONGEST_LAST, WEAK_FIRST, WEAK_LAST, ONLY = 3, 4, 5, 6, 7
 
 
@@ -103,7 +103,7 @@ def pair_types(counts: I64Array, level: I64Array) -> npt.NDArray[np.uint8]:
 
 
 def _sorted(sight: Seen, ring_base: int, keep_repeated: bool) -> _Sorted:
-    """By firing, then channel, then return (CONTRACT.md section 3)."""
+    """By firing, then channel, then return (docs/formats.md)."""
     keep = sight.counts > 0
     if not keep_repeated:
         keep &= ~repeated(sight.counts)

@@ -1,6 +1,7 @@
 """Sessions as they are recorded: the two lidars of the fixture in every container, or in several.
 
-Messages: bags.py; what the drivers publish beside packets: facts/messages.md, sections 2 and 6.
+Messages: bags.py; what the drivers publish beside packets: docs/sources/messages.md, sections 2 and
+6.
 """
 
 from __future__ import annotations

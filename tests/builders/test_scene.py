@@ -159,7 +159,7 @@ def test_capture_holds_what_its_source_file_says() -> None:
     for host, port, payload in datagrams():
         seen[host, port, len(payload)] += 1
     # 0.85 s hold 272 packets of 3.125 ms; the one that both ends cut into is not sent.
-    # Sizes by facts/ouster.md section 2: 32 beams x 12 or 4 bytes.
+    # Sizes by docs/sources/ouster.md section 2: 32 beams x 12 or 4 bytes.
     assert dict(seen) == {
         (87, 7502, 32 + 16 * (12 + 32 * 12) + 32): 271,
         (88, 7502, 32 + 16 * (12 + 32 * 4) + 32): 271,
@@ -220,7 +220,7 @@ def test_points_lie_on_the_scene(
 def sensor_point(
     document: dict[str, dict[str, list[float]]], r: int, mid: int, beam: int
 ) -> Vector:
-    """One point by the formula of facts/ouster.md section 6, number by number; metres."""
+    """One point by the formula of docs/sources/ouster.md section 6, number by number; metres."""
     beams = document["beam_intrinsics"]
     n = beams["beam_to_lidar_transform"][3]
     theta = 2 * math.pi * (1 - mid / 512)

@@ -1,7 +1,7 @@
 """The two lidars of `fixtures/two_lidars`: geometry, metadata and packet bytes.
 
-Source: facts/ouster.md sections 1 (metadata), 2 and 3 (packets), 6 (range to xyz), 8 (IMU). The
-bytes are laid out here once more, apart from the package, so that the fixture can judge it.
+Source: docs/sources/ouster.md sections 1 (metadata), 2 and 3 (packets), 6 (range to xyz), 8 (IMU).
+The bytes are laid out here once more, apart from the package, so that the fixture can judge it.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def azimuth_deg(lidar: FixtureLidar) -> list[float]:
 
 
 def body_from_sensor(lidar: FixtureLidar) -> F64Array:
-    """Extrinsics (4, 4): rotations about the fixed axes x, y, z; metres (CONTRACT.md section 5)."""
+    """Extrinsics (4, 4): rotations about the fixed axes x, y, z; metres (docs/rig.md)."""
     (cr, cp, cy), (sr, sp, sy) = (f(np.radians(lidar.rpy_deg)) for f in (np.cos, np.sin))
     pose = np.eye(4)
     pose[:3, :3] = [

@@ -1,8 +1,8 @@
 """Encoder of Velodyne packets: what a sensor would send, from ranges or from what it would see.
 
-Source: facts/velodyne.md sections 1-3 and 5-9, and nothing of the decoder. A *column* is one firing
-sequence (all lasers once); column n is the n-th that is sent, so a blind sector leaves no number
-out. Returns are in the order of the wire: last, strongest (HDL-64E: strongest, last).
+Source: docs/sources/velodyne.md sections 1-3 and 5-9, and nothing of the decoder. A *column* is one
+firing sequence (all lasers once); column n is the n-th that is sent, so a blind sector leaves no
+number out. Returns are in the order of the wire: last, strongest (HDL-64E: strongest, last).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _READING = np.dtype([("distance", "<u2"), ("level", "u1")])
 _BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("reading", _READING, 32)])
 _PACKET = np.dtype([("block", _BLOCK, 12), ("stamp_us", "<u4"), ("factory", "u1", 2)])
-# Characters of the HDL-64E's status, facts/velodyne.md section 9.
+# Characters of the HDL-64E's status, docs/sources/velodyne.md section 9.
 _STATUS = b"HMSDNYGTV1234567"
 
 

@@ -43,232 +43,231 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "xt16_bare/drive.pcap",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
-        "return; wanted metadata that fits, got none beside the recording; give the sensor's "
-        "with --metadata FILE",
+        "return; expected metadata that match, found none in the recording's directory; give the "
+        "sensor's with --metadata FILE",
     ),
     "angles of another HESAI beside the recording": (
         "xt16_other/drive.pcap",
         1,
         "xt16_other/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
-        "return; wanted metadata that fits, got only 32.csv; give the sensor's with --metadata "
-        "FILE",
+        "return; expected metadata that match, found only 32.csv; give the sensor's with "
+        "--metadata FILE",
     ),
     "angles of another HESAI": (
         "xt16_bare/drive.pcap --metadata xt16_other/32.csv",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
-        "return; wanted metadata that fits, got only 32.csv; give the sensor's with --metadata "
-        "FILE",
+        "return; expected metadata that match, found only 32.csv; give the sensor's with "
+        "--metadata FILE",
     ),
     "angles of another maker": (
         "xt16_bare/drive.pcap --metadata files/rs16.csv",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
-        "return; wanted metadata that fits, got only rs16.csv; give the sensor's with "
+        "return; expected metadata that match, found only rs16.csv; give the sensor's with "
         "--metadata FILE",
     ),
     "angles of another maker in the rig": (
         "xt16_bare/drive.pcap --rig rs16_csv.yaml",
         1,
-        "rs16_csv.yaml: sensor top: wanted packets that fit files/rs16.csv, got HESAI lidar "
-        "PandarXT-16, strongest return (10.0.0.8 > port 2368); correct model, stream or "
-        "metadata",
+        "rs16_csv.yaml: sensor top: expected packets that match files/rs16.csv, found HESAI lidar "
+        "PandarXT-16, strongest return (10.0.0.8 > port 2368); correct model, stream or metadata",
     ),
     "angles of two units that fit alike": (
         "xt16_alike/drive.pcap",
         1,
-        "packets of 10.0.0.8 > port 2368 (568 bytes) carry no serial number and fit 2 metadata "
-        "files: xt16_alike/a.csv, xt16_alike/b.csv; wanted one; name the sensor of each source "
+        "packets of 10.0.0.8 > port 2368 (568 bytes) carry no serial number and match 2 metadata "
+        "files: xt16_alike/a.csv, xt16_alike/b.csv; expected one; name the sensor of each source "
         "with stream.source_ip in a rig file (--rig), or give only its --metadata",
     ),
     "broken angles beside the recording": (
         "xt16_broken/drive.pcap",
         1,
-        "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, "
-        "strongest return; wanted metadata that fits, got only 16.csv; give the sensor's with "
+        "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
+        "return; expected metadata that match, found only 16.csv; give the sensor's with "
         "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to "
         "360 deg, got zero; read the correction file from the lidar again)",
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",
         1,
-        "xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to 360 deg, got "
+        "xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to 360 deg, found "
         "zero; read the correction file from the lidar again",
     ),
     "angles of one for two lidars": (
         "xt16_twins/drive.pcap",
         1,
-        "metadata xt16_twins/16.csv fits the packets of 2 streams (10.0.0.8 > port 2368; "
-        "10.0.0.9 > port 2368), which carry no serial number; wanted a metadata file each; name "
+        "metadata xt16_twins/16.csv matches the packets of 2 streams (10.0.0.8 > port 2368; "
+        "10.0.0.9 > port 2368), which carry no serial number; expected a metadata file each; name "
         "them in a rig file (--rig) with stream.source_ip",
     ),
     "angles of one for two lidars in the rig": (
         "xt16_twins/drive.pcap --rig xt16_csv.yaml",
         1,
-        "xt16_csv.yaml: sensor top: wanted packets of one lidar, got those of several "
-        "(PandarXT-16) on 10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream "
-        "(source_ip, port, topic or serial)",
+        "xt16_csv.yaml: sensor top: expected packets of one lidar, found those of several "
+        "(PandarXT-16) on 10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream (source_ip, "
+        "port, topic or serial)",
     ),
     "model of the rig without its angles": (
         "xt16_bare/drive.pcap --rig xt16.yaml",
         1,
-        "xt16.yaml: sensor top: wanted metadata that fit HESAI lidar PandarXT-16, strongest "
-        "return (10.0.0.8 > port 2368), got none; give them as `metadata:` of the sensor, or "
+        "xt16.yaml: sensor top: expected metadata that match HESAI lidar PandarXT-16, strongest "
+        "return (10.0.0.8 > port 2368), found none; give them as `metadata:` of the sensor, or "
         "with --metadata",
     ),
     "ROBOSENSE without device packets": (
         "helios_bare/drive.pcap",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles "
-        "of its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: expected the angles of "
+        "its channels, found no DIFOP packets; record its device port (7788) as well, or give a "
+        "csv of `elevation,azimuth` lines with --metadata",
     ),
     "ROBOSENSE angles of too few lines": (
         "helios_bare/drive.pcap --metadata files/rs15.csv",
         1,
-        "files/rs15.csv: ROBOSENSE angles: wanted 16, 32, 48, 80, 96 or 128 lines "
-        "`elevation,azimuth`, got 15; give a line for each channel of the sensor",
+        "files/rs15.csv: ROBOSENSE angles: expected 16, 32, 48, 80, 96 or 128 lines "
+        "`elevation,azimuth`, found 15; give a line for each channel of the sensor",
     ),
     "ROBOSENSE angles of another model": (
         "helios_bare/drive.pcap --metadata files/rs32.csv",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles "
-        "of its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata (does not "
-        "fit: rs32.csv)",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles of "
+        "its channels, got no DIFOP packet beside its point packets; record its device port "
+        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata (without a "
+        "match: rs32.csv)",
     ),
     "serial number of another ROBOSENSE": (
         "helios/drive.pcap --rig serial.yaml",
         1,
-        "serial.yaml: sensor top: wanted packets of serial number 77, got those of "
+        "serial.yaml: sensor top: expected packets of serial number 77, found those of "
         "0a1b2c3d4e5f; correct the serial",
     ),
     "serial number of a ROBOSENSE without device packets": (
         "helios_bare/drive.pcap --rig serial.yaml",
         1,
-        "serial.yaml: sensor top: ROBOSENSE Helios 16: wanted the angles of its channels, got "
-        "no DIFOP packet beside its point packets; record its device port (7788) as well, or "
-        "give a csv of `elevation,azimuth` lines with --metadata",
+        "serial.yaml: sensor top: ROBOSENSE Helios 16: expected the angles of its channels, found "
+        "no DIFOP packets; record its device port (7788) as well, or give a csv of "
+        "`elevation,azimuth` lines with --metadata",
     ),
     "another model of ROBOSENSE": (
         "helios/drive.pcap --rig helios32.yaml",
         1,
-        "helios32.yaml: sensor top: its packets are ROBOSENSE lidar Helios 16, single return, "
-        "not Helios 32, as which they were read: ROBOSENSE Helios 32: wanted the angles of its "
-        "channels, got DIFOP packets without angles beside its point packets; record its device "
-        "port (7788) as well, or give a csv of `elevation,azimuth` lines with --metadata",
+        "helios32.yaml: sensor top: its packets are ROBOSENSE lidar Helios 16, single return, not "
+        "Helios 32, as which they were read: ROBOSENSE Helios 32: expected the angles of its "
+        "channels, found DIFOP packets without angles; record its device port (7788) as well, or "
+        "give a csv of `elevation,azimuth` lines with --metadata",
     ),
     "HDL-64E without its file": (
         "hdl64/drive.pcap",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; "
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: expected its calibration, found none; "
         "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig",
     ),
     "HDL-64E of a rig without its file": (
         "hdl64/drive.pcap --rig any.yaml",
         1,
-        "any.yaml: sensor top: HDL-64E: wanted its calibration, got none; give the unit's YAML "
+        "any.yaml: sensor top: HDL-64E: expected its calibration, found none; give the unit's YAML "
         "or db.xml with --metadata or as `metadata:` in the rig",
     ),
     "HDL-64E with another file": (
         "hdl64/drive.pcap --metadata files/vlp16.yml",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; "
-        "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (does not "
-        "fit: vlp16.yml)",
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; give "
+        "the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (without a match: "
+        "vlp16.yml)",
     ),
     "strict with the file of another Velodyne": (
         "vlp32c/drive.pcap --metadata files/vlp16.yml --strict",
         1,
-        "files/vlp16.yml: wanted a sensor that it fits, got none; it is not used; leave it out, "
-        "or name its sensor in a rig file (--rig) (calibration, an error because of --strict)",
+        "files/vlp16.yml: expected a sensor that it matches, found none; it is not used; leave it "
+        "out, or name its sensor in a rig file (--rig) (calibration, an error because of --strict)",
     ),
     "file of another Velodyne in the rig": (
         "vlp16/drive.pcap --rig vlp32c_yml.yaml",
         1,
-        "vlp32c_yml.yaml: sensor top: wanted packets that fit files/vlp32c.yml, got Velodyne "
-        "lidar VLP-16, strongest return (10.0.0.8 > port 2368); correct model, stream or "
+        "vlp32c_yml.yaml: sensor top: expected packets that match files/vlp32c.yml, found "
+        "Velodyne lidar VLP-16, strongest return (10.0.0.8 > port 2368); correct model, stream or "
         "metadata",
     ),
     "file of a Velodyne that is cut off": (
         "vlp16/drive.pcap --metadata files/cut.yml",
         1,
-        "files/cut.yml: lasers: wanted 16, 32, 64, 128 lasers, got 3 (Velodyne calibration); "
-        "take the maker's file of this sensor",
+        "files/cut.yml: lasers: expected 16, 32, 64, 128 lasers, found 3 (Velodyne calibration); "
+        "use the vendor's file of this sensor",
     ),
     "model in small letters": (
         "vlp16/drive.pcap --rig small.yaml",
         1,
-        "small.yaml: sensor top: wanted a supported model, got 'vls-128'; did you mean VLS-128?",
+        "small.yaml: sensor top: expected a supported model, found 'vls-128'; did you mean "
+        "VLS-128?",
     ),
     "misspelt model": (
         "vlp16/drive.pcap --rig vlp61.yaml",
         1,
-        "vlp61.yaml: sensor top: wanted a supported model, got 'VLP-61'; did you mean VLP-16?",
+        "vlp61.yaml: sensor top: expected a supported model, found 'VLP-61'; did you mean VLP-16?",
     ),
     "another model of Velodyne": (
         "vlp16/drive.pcap --rig vlp32c.yaml",
         1,
-        "vlp32c.yaml: sensor top: wanted packets of the model VLP-32C, got those of VLP-16; "
+        "vlp32c.yaml: sensor top: expected packets of the model VLP-32C, found those of VLP-16; "
         "correct model, stream or metadata",
     ),
     "model of another maker": (
         "vlp16/drive.pcap --rig xt16.yaml",
         1,
-        "xt16.yaml: sensor top: wanted packets of the model PandarXT-16, got those of VLP-16; "
+        "xt16.yaml: sensor top: expected packets of the model PandarXT-16, found those of VLP-16; "
         "correct model, stream or metadata",
     ),
     "model of yet another maker": (
         "vlp16/drive.pcap --rig os1.yaml",
         1,
-        "os1.yaml: sensor top: wanted packets of the model OS1-32, got those of VLP-16; correct "
-        "model, stream or metadata",
+        "os1.yaml: sensor top: expected packets of the model OS1-32, found those of VLP-16; "
+        "correct model, stream or metadata",
     ),
     "model of Livox": (
         "vlp16/drive.pcap --rig livox.yaml",
         1,
-        "livox.yaml: sensor top: wanted packets of the model Livox SDK2, got those of VLP-16; "
+        "livox.yaml: sensor top: expected packets of the model Livox SDK2, found those of VLP-16; "
         "correct model, stream or metadata",
     ),
     "model of a lidar that needs no file": (
         "xt16_bare/drive.pcap --rig vlp16.yaml",
         1,
-        "vlp16.yaml: sensor top: wanted packets of the model VLP-16, got HESAI lidar "
-        "PandarXT-16, strongest return (10.0.0.8 > port 2368); correct model, stream or "
-        "metadata",
+        "vlp16.yaml: sensor top: expected packets of the model VLP-16, found HESAI lidar "
+        "PandarXT-16, strongest return (10.0.0.8 > port 2368); correct model, stream or metadata",
     ),
     "file of another maker in the rig": (
         "vlp16/drive.pcap --rig xt16_csv.yaml",
         1,
-        "xt16_csv.yaml: sensor top: wanted packets that fit files/xt16.csv, got Velodyne lidar "
-        "VLP-16, strongest return (10.0.0.8 > port 2368); correct model, stream or metadata",
+        "xt16_csv.yaml: sensor top: expected packets that match files/xt16.csv, found Velodyne "
+        "lidar VLP-16, strongest return (10.0.0.8 > port 2368); correct model, stream or metadata",
     ),
     "silent lidar of unknown model": (
         "silent/drive.pcap --rig silent.yaml",
         1,
-        "silent.yaml: sensor top: wanted a packet of it (source_ip 10.0.0.8) in the first 10 "
-        "seconds, got none to tell its model; correct its stream, or give `metadata:` or "
+        "silent.yaml: sensor top: expected a packet of it (source_ip 10.0.0.8) in the first 10 "
+        "seconds, found none to decide its model; correct its stream, or give `metadata:` or "
         "`model:`",
     ),
     "silent HESAI": (
         "silent/drive.pcap --rig silent_csv.yaml",
         1,
-        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: wanted packets of the lidar "
-        "in the first 10 seconds, to tell its model and mode, got none; check its stream in the "
-        "rig file, or leave it out",
+        "silent_csv.yaml: sensor top: files/xt16.csv: HESAI angles: expected packets of the lidar "
+        "in the first 10 seconds, which define its model and mode, found none; check its stream in "
+        "the rig file, or leave it out",
     ),
     "silent ROBOSENSE": (
         "silent/drive.pcap --rig silent_helios.yaml",
         1,
-        "silent_helios.yaml: sensor top: ROBOSENSE Helios 16: wanted a packet of it in the "
-        "first 10 seconds to tell its return mode, got none; correct its stream, or leave it "
-        "out of the rig",
+        "silent_helios.yaml: sensor top: ROBOSENSE Helios 16: expected packets in the first 10 "
+        "seconds, which define its return mode, found none; correct its stream, or leave it out of "
+        "the rig",
     ),
     "silent Livox": (
         "silent/drive.pcap --rig silent_livox.yaml",
         1,
-        "silent_livox.yaml: sensor top: Livox SDK2: wanted packets of points in the first 10 "
-        "seconds, to tell their kind, got none; check the sensor's stream in the rig file, or "
+        "silent_livox.yaml: sensor top: Livox SDK2: expected packets of points in the first 10 "
+        "seconds, which define the kind, found none; check the sensor's stream in the rig file, or "
         "leave it out",
     ),
     "decoder option with another value": (
@@ -285,91 +284,93 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",
         1,
-        "firing.yaml: --decode firing_azimuth=maybe: wanted firing_azimuth=on or "
-        "firing_azimuth=off, got maybe",
+        "firing.yaml: --decode firing_azimuth=maybe: expected firing_azimuth=on or "
+        "firing_azimuth=off, found maybe",
     ),
     "counters 20 minutes apart": (
         "apart/drive.pcap",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -0.001 s for "
-        "velodyne_1 and +1199.999 s for velodyne_2, 1200.000 s apart; wanted at most 1 s; use "
-        "--align-clocks or --clock host, or give clock.offset_s or clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "1200.000 s: stamp minus receive time is -0.001 s for velodyne_1 and +1199.999 s for "
+        "velodyne_2; use --align-clocks or --clock host, or give clock.offset_s or clock.epoch in "
+        "the rig",
     ),
     "counter since power-on beside a clock": (
         "livox/drive.pcap --identity-extrinsics",
         1,
-        "clocks of the sensors cannot be compared: stamp minus arrival is -0.004 s for "
-        "ouster_111 and -1699999000.001 s for livox_1, 1699998999.996 s apart; wanted at most 1 "
-        "s; use --align-clocks or --clock host, or give clock.offset_s or clock.epoch in the rig",
+        "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
+        "1699998999.996 s: stamp minus receive time is -0.004 s for ouster_111 and "
+        "-1699999000.001 s for livox_1; use --align-clocks or --clock host, or give clock.offset_s "
+        "or clock.epoch in the rig",
     ),
     "two Velodynes without extrinsics": (
         "twins/drive.pcap",
         1,
-        "extrinsics unknown for velodyne_1, velodyne_2; wanted for every sensor when there are "
+        "extrinsics unknown for velodyne_1, velodyne_2; required for every sensor when there are "
         "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
         "extrinsic), or accept the body origin with --identity-extrinsics",
     ),
     "lidars of two makers without extrinsics": (
         "pair/drive.pcap",
         1,
-        "extrinsics unknown for ouster_111, velodyne_1; wanted for every sensor when there are "
+        "extrinsics unknown for ouster_111, velodyne_1; required for every sensor when there are "
         "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
         "extrinsic), or accept the body origin with --identity-extrinsics",
     ),
     "one of two Velodynes": (
         "twins/drive.pcap --rig any.yaml",
         1,
-        "any.yaml: sensor top: wanted packets of one lidar, got those of several (VLP-16) on "
+        "any.yaml: sensor top: expected packets of one lidar, found those of several (VLP-16) on "
         "10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream (source_ip, port, topic or "
         "serial)",
     ),
     "one of two makers": (
         "pair/drive.pcap --rig any.yaml",
         1,
-        "any.yaml: sensor top: wanted packets of one lidar, got those of several (OS-1-16, "
-        "VLP-16) on 10.0.0.1 > port 7502, 10.0.0.8 > port 2368; name its stream (source_ip, "
-        "port, topic or serial)",
+        "any.yaml: sensor top: expected packets of one lidar, found those of several (OS-1-16, "
+        "VLP-16) on 10.0.0.1 > port 7502, 10.0.0.8 > port 2368; name its stream (source_ip, port, "
+        "topic or serial)",
     ),
     "two of a rig that name no streams": (
         "twins/drive.pcap --rig two.yaml",
         1,
-        "two.yaml: sensor front: wanted packets of one lidar, got those of several (VLP-16) on "
-        "10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream (source_ip, port, topic or "
-        "serial)",
+        "two.yaml: sensor front: expected packets of one lidar, found those of several (VLP-16) "
+        "on 10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream (source_ip, port, topic "
+        "or serial)",
     ),
     "two of a rig on one stream": (
         "vlp16/drive.pcap --rig same.yaml",
         1,
-        "same.yaml: sensors front and rear: wanted a stream each, got 10.0.0.8 > port 2368 for "
-        "both; name the stream of each (source_ip, port, topic or serial)",
+        "same.yaml: sensors front and rear: expected a stream each, found 10.0.0.8 > port 2368 "
+        "for both; name the stream of each (source_ip, port, topic or serial)",
     ),
     "look-alike": (
         "alike/drive.pcap",
         1,
-        "alike/drive.pcap: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got 10.0.0.8 > port 2368 (1212 bytes: LSLIDAR-like, 1212 bytes: "
-        "not supported); check that the recording holds the sensor's data port",
+        "alike/drive.pcap: no lidar packets; expected raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), found 10.0.0.8 > port 2368 (1212 bytes: LSLIDAR-like, 1212 bytes: "
+        "not supported); check that the recording contains the sensor's data port",
     ),
     "position packets only": (
         "positions/drive.pcap",
         1,
-        "positions/drive.pcap: no lidar packets; wanted raw UDP packets of a supported lidar "
-        "(see `mlbatch sensors`), got 10.0.0.8 > port 8308 (512 bytes: Velodyne position "
-        "packet); check that the recording holds the sensor's data port",
+        "positions/drive.pcap: no lidar packets; expected raw UDP packets of a supported lidar "
+        "(see `mlbatch sensors`), found 10.0.0.8 > port 8308 (512 bytes: Velodyne position "
+        "packet); check that the recording contains the sensor's data port",
     ),
     "device packets only": (
         "difop/drive.pcap",
         1,
-        "difop/drive.pcap: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got 10.0.0.8 > port 7788 (1248 bytes: ROBOSENSE DIFOP packet); "
-        "check that the recording holds the sensor's data port",
+        "difop/drive.pcap: no lidar packets; expected raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), found 10.0.0.8 > port 7788 (1248 bytes: ROBOSENSE DIFOP packet); "
+        "check that the recording contains the sensor's data port",
     ),
     "GPS packets only": (
         "gps/drive.pcap",
         1,
-        "gps/drive.pcap: no lidar packets; wanted raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), got 10.0.0.8 > port 10110 (512 bytes: HESAI GPS packet); check "
-        "that the recording holds the sensor's data port",
+        "gps/drive.pcap: no lidar packets; expected raw UDP packets of a supported lidar (see "
+        "`mlbatch sensors`), found 10.0.0.8 > port 10110 (512 bytes: HESAI GPS packet); check "
+        "that the recording contains the sensor's data port",
     ),
     "strict with a change of the return mode": (
         "changed/drive.pcap --strict",
@@ -380,25 +381,26 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with packets of two sizes": (
         "p40/drive.pcap --strict",
         1,
-        "10.0.0.8 > port 2368: wanted packets of 1262 bytes as at first, got 1266 bytes as "
+        "10.0.0.8 > port 2368: expected packets of 1262 bytes as at first, found 1266 bytes as "
         "well, which are rejected as bad_size; split the recording where the settings of the "
         "lidar change (calibration, an error because of --strict)",
     ),
     "metadata is a folder": (
         "vlp16/drive.pcap --metadata files",
         1,
-        "files: wanted a calibration file, got a directory; check the path",
+        "files: expected a calibration file, found a directory; check the path",
     ),
     "metadata of clouds": (
         "clouds.db3 --rig cloud_csv.yaml",
         1,
-        "cloud_csv.yaml: sensor top: wanted packets that fit files/xt16.csv, got lidar points "
-        "of a PointCloud2, every point is a column (/points); correct model, stream or metadata",
+        "cloud_csv.yaml: sensor top: expected packets that match files/xt16.csv, found lidar "
+        "points of a PointCloud2, every point is a column (/points); correct model, stream or "
+        "metadata",
     ),
     "strict with metadata of clouds": (
         "clouds.db3 --metadata files/xt16.csv --strict",
         1,
-        "files/xt16.csv: wanted a sensor that it fits, got none; it is not used; leave it out, "
-        "or name its sensor in a rig file (--rig) (calibration, an error because of --strict)",
+        "files/xt16.csv: expected a sensor that it matches, found none; it is not used; leave it "
+        "out, or name its sensor in a rig file (--rig) (calibration, an error because of --strict)",
     ),
 }

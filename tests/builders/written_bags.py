@@ -1,13 +1,15 @@
-"""Bags for tests: recorded messages to pass on, and bags read back by rosbags."""
+"""Outputs with messages for tests: recorded messages, written outputs, and their readers."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 from mlbatch.types import Message, Scan, Topic
 from mlbatch.writers import WriterOptions, open_writer
@@ -40,7 +42,7 @@ ROS2_NOTE = Topic(
     "/note", "std_msgs/String", "cdr", "string data\n", "ros2msg", QOS_WORDS, latched=True
 )
 ROS1_NOTE = Topic("/note", "std_msgs/String", "ros1", "string data\n", "ros1msg", latched=True)
-# A type that nobody knows, of a type that nobody knows.
+# A type that is in no table, with a field of another such type.
 ODD_TEXT = (
     "# Ours.\nuint8 FULL=3\nmy_msgs/Part[] parts\n" + "=" * 80 + "\nMSG: my_msgs/Part\nint8 x\n"
 )
@@ -49,7 +51,7 @@ ROS2_ODD = Topic("/odd", "my_msgs/Odd", "cdr", ODD_TEXT, "ros2msg")
 
 
 def note(topic: Topic, text: str, after_ns: int) -> Message:
-    """A std_msgs/String as its encoding has it."""
+    """Return a std_msgs/String in the encoding of its topic."""
     data = text.encode()
     if topic.encoding == "ros1":
         body = struct.pack("<I", len(data)) + data
@@ -59,21 +61,32 @@ def note(topic: Topic, text: str, after_ns: int) -> Message:
 
 
 def odd(topic: Topic, *values: int, after_ns: int) -> Message:
-    """A message of the type that nobody knows."""
+    """Return a message of the type that is in no table."""
     body = struct.pack(f"<I{len(values)}b", len(values), *values)
     return Message(
         topic, START_NS + after_ns, body if topic.encoding == "ros1" else b"\0\1\0\0" + body
     )
 
 
-def written(name: str, target: Path, scans: list[Scan], messages: list[Message]) -> Path:
-    """Write IMU samples, the first message, scans, the other messages and more samples."""
-    writer = open_writer(name, target, scans[0].info, WriterOptions())
+def written(
+    name: str,
+    target: Path,
+    scans: Sequence[Scan],
+    messages: Sequence[Message] = (),
+    *,
+    layout: str = "standard",
+    split: bool = False,
+) -> Path:
+    """Write IMU samples, the first message, scans, the other messages and more samples.
+
+    split: scans are of sensor 0, 1, ...
+    """
+    writer = open_writer(name, target, scans[0].info, WriterOptions(layout, split=split))
     writer.write_imu(imu_samples())
     for message in messages[:1]:
         writer.write_message(message)
-    for scan in scans:
-        run_job(writer.write(scan))
+    for number, scan in enumerate(scans):
+        run_job(writer.write(scan, number if split else None))
     for message in messages[1:]:
         writer.write_message(message)
     writer.write_imu(imu_samples(1, START_NS + PERIOD_NS // 2, 1))
@@ -83,7 +96,7 @@ def written(name: str, target: Path, scans: list[Scan], messages: list[Message])
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A message as rosbags reads and decodes it."""
+    """A message as a library decodes it."""
 
     topic: str
     type: str
@@ -93,7 +106,16 @@ class Read:
 
 
 def read_back(path: Path) -> list[Read]:
-    """All messages of a bag by rosbags, in the order of log times."""
+    """Return all messages by log time: bags by rosbags, MCAP by mcap and mcap-ros2-support."""
+    if path.suffix == ".mcap":
+        decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[decoder])
+            return [
+                Read(c.topic, schema.name, m.log_time, m.data, value)
+                for schema, c, m, value in reader.iter_decoded_messages()
+                if schema is not None
+            ]
     highlevel = pytest.importorskip("rosbags.highlevel")
     with highlevel.AnyReader([path]) as reader:
         return [

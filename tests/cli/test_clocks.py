@@ -58,7 +58,7 @@ def test_clocks_apart_are_told_with_the_remedy(shell: Shell) -> None:
 def test_whole_seconds_have_names(shell: Shell) -> None:
     outcome = shell(f"convert {RECORDING} --dry-run --fault jump:right:37s@0s")
     assert outcome.code == 1
-    assert "37.000 s apart (37 s: TAI - UTC)" in outcome.err
+    assert "found 37.000 s (37 s: TAI - UTC)" in outcome.err
     assert "--align-clocks" in outcome.err
 
 

@@ -51,14 +51,15 @@ FORWARD, BACK = 37 * NS_PER_S, -20 * NS_PER_S
     [
         (
             FORWARD,
-            "clock jump within the recording: stamps went forward from 1800000000.619805 s to "
-            "1800000037.622930 s while only 0.003125 s passed at the recorder; wanted one running "
-            "clock; use --on-jump split, or --clock host",
+            "clock jump within the recording: expected stamps of one continuous clock, found a "
+            "step forward from 1800000000.619805 s to 1800000037.622930 s within 0.003125 s at the "
+            "capture host; use --on-jump split, or --clock host",
         ),
         (
             BACK,
-            "clock reset within the recording: stamps went back from 1800000000.619805 s to "
-            "1799999980.620000 s; wanted one running clock; use --on-jump split, or --clock host",
+            "clock reset within the recording: expected stamps of one continuous clock, found a "
+            "step back from 1800000000.619805 s to 1799999980.620000 s; use --on-jump split, or "
+            "--clock host",
         ),
     ],
 )

@@ -120,8 +120,8 @@ def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:
     assert outcome.code == 1
     assert outcome.err == (
         "mlbatch: error: packets of 10.0.0.1 > port 7502 (3392 bytes) carry no serial number and "
-        "fit 2 metadata files: legacy/111.json, legacy/222.json; wanted one; name the sensor of "
-        "each source with stream.source_ip in a rig file (--rig), or give only its --metadata\n"
+        "match 2 metadata files: legacy/111.json, legacy/222.json; expected one; name the sensor "
+        "of each source with stream.source_ip in a rig file (--rig), or give only its --metadata\n"
     )
 
 

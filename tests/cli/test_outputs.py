@@ -206,7 +206,7 @@ def test_another_file_of_json_keeps_its_folder(shell: Shell) -> None:
         Path("out/notes.json").write_text(text)
         outcome = shell(f"convert {FIX} -o out --overwrite")
         assert outcome.code == 1
-        assert "got notes.json in it as well" in outcome.err
+        assert "found notes.json in it" in outcome.err
 
 
 def test_strict_is_silent_on_a_clean_recording(shell: Shell) -> None:

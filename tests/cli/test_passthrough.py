@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.types import MESSAGE_ENCODINGS
@@ -85,8 +85,10 @@ def test_windows_that_are_left_out_hold_no_message_back(
 
 def test_what_passes_by_can_be_taken_at_every_window(tmp_path: Path) -> None:
     recording = write_mcap(tmp_path / "drive.mcap", _never_whole())
-    wishes = Wishes(identity_extrinsics=True)
-    job = Job((recording,), wishes, drop_incomplete=95, passed=("/note",), extras=MESSAGE_ENCODINGS)
+    selection = SensorSelection(identity_extrinsics=True)
+    job = Job(
+        (recording,), selection, drop_incomplete=95, passed=("/note",), extras=MESSAGE_ENCODINGS
+    )
     run = Conversion(job)
     waiting = []
     for item in run.tasks():
@@ -116,8 +118,8 @@ def test_a_recording_of_messages_alone_is_read_along_with_the_packets(tmp_path: 
         for one in _messages()
     ]
     paths = _in_two(tmp_path, messages)
-    wishes = Wishes(identity_extrinsics=True)
-    run = Conversion(Job(tuple(paths), wishes, passed=("/note",), extras=MESSAGE_ENCODINGS))
+    selection = SensorSelection(identity_extrinsics=True)
+    run = Conversion(Job(tuple(paths), selection, passed=("/note",), extras=MESSAGE_ENCODINGS))
     most = taken = 0
     for item in run.tasks():
         most = max(most, run.passthrough.messages.waiting)

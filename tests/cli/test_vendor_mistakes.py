@@ -220,8 +220,9 @@ def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Pa
     assert name == same == "hesai_1"
     assert counted == f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size)"
     assert told == (
-        f"{IP} > port {PORT}: wanted packets of 1262 bytes as at first, got 1266 bytes as well, "
-        "which are rejected as bad_size; split the recording where the settings of the lidar change"
+        f"{IP} > port {PORT}: expected packets of 1262 bytes as at first, found 1266 bytes as "
+        "well, which are rejected as bad_size; split the recording where the settings of the lidar "
+        "change"
     )
 
 
@@ -242,7 +243,10 @@ def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> Non
         folder.mkdir()
         told = _told(_converted(shell, f"{session} --metadata files/{path}", folder))
         unused = "it is not used; leave it out, or name its sensor in a rig file (--rig)"
-        assert ("", f"files/{path}: wanted a sensor that it fits, got none; {unused}") in told
+        assert (
+            "",
+            f"files/{path}: expected a sensor that it matches, found none; {unused}",
+        ) in told
 
 
 def test_clouds_beside_raw_packets_are_left_alone(shell: Shell, tmp_path: Path) -> None:

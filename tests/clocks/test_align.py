@@ -1,4 +1,4 @@
-"""Clocks mapped onto others: errors against the truth, order, exactness, what cannot be done."""
+"""Maps of clocks: error against the truth, order, exactness, targets that are refused."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fitted(one: Heard) -> ClockMap:
 
 
 def error_ns(one: Heard, host: Clock = TRUE) -> I64Array:
-    """Aligned stamps minus true times by the recorder's clock, as if that had never stepped."""
+    """Aligned stamps minus true times by the capture host's clock, as if that had never stepped."""
     aligned_ns = fitted(one).apply(one.stamp_ns, one.host_ns)
     assert (np.diff(aligned_ns) >= 0).all()
     return aligned_ns - replace(host, steps=()).read(one.true_ns)
@@ -66,14 +66,14 @@ def test_drift_jitter_and_bursts(drift_ppm: float, mean_us: float) -> None:
 
 
 @pytest.mark.parametrize("by_ms", [-500, -20, -3, 3, 20, 128, 2000])
-def test_steps_of_the_recorder_are_taken_out(by_ms: int) -> None:
+def test_host_steps_are_removed(by_ms: int) -> None:
     host = Clock(drift_ppm=15, steps=((25, by_ms * NS_PER_MS), (40, -by_ms * NS_PER_MS)))
     errors = error_ns(heard(replace(UPTIME, drift_ppm=-30), host=host), host)
     assert np.abs(errors).max() < 150 * NS_PER_US
 
 
 @pytest.mark.parametrize("by_ns", [-1020 * NS_PER_S, -37 * NS_PER_S, -4_000_000, 4_000_000, TAI_NS])
-def test_steps_of_the_sensor_are_taken_out(by_ns: int) -> None:
+def test_steps_of_the_sensor_are_removed(by_ns: int) -> None:
     one = heard(replace(UPTIME, drift_ppm=8, steps=((30, by_ns),)))
     assert np.abs(error_ns(one)).max() < 150 * NS_PER_US
 
@@ -85,7 +85,7 @@ def test_drift_that_comes_and_goes() -> None:
     assert np.abs(error_ns(one)).max() < 150 * NS_PER_US
     made = fitted(one)
     assert made.knots == 119
-    assert "119 knot(s)" in made.in_words()
+    assert "119 knot(s)" in made.describe()
 
 
 def test_stamps_are_mapped_exactly() -> None:
@@ -101,7 +101,8 @@ def test_stamps_are_mapped_exactly() -> None:
 def test_stamps_between_and_beyond_those_seen_keep_their_order() -> None:
     rng = np.random.default_rng(0)
     one = heard(replace(UPTIME, drift_ppm=-45, steps=((20, 3 * NS_PER_S),)))
-    low, high = int(one.stamp_ns.min()), int(one.stamp_ns.max())
+    low = int(one.stamp_ns.min())
+    high = int(one.stamp_ns.max())
     stamp_ns = np.sort(rng.integers(low - 10 * NS_PER_S, high + 10 * NS_PER_S, 100_000))
     assert (np.diff(fitted(one).apply(stamp_ns)) >= 0).all()
 
@@ -117,7 +118,7 @@ def test_any_shape() -> None:
 
 
 def test_damaged_stamps_stay_damaged() -> None:
-    """Bits flipped at the top, or u64 beyond int64: never mapped into the range of good ones."""
+    """High bits flipped, or u64 beyond int64: never mapped into the range of good stamps."""
     made = fitted(heard(Clock(TAI_NS)))
     stamp_ns = np.array([-1, -(2**63), 2**63 - 1, 2**62, 2**31 * NS_PER_S], np.int64)
     np.testing.assert_array_equal(made.apply(stamp_ns), stamp_ns)
@@ -152,10 +153,12 @@ def test_residuals() -> None:
 
 
 def test_onto_the_first_sensor() -> None:
-    """Drift of the recorder, and its steps, drop out; what differs is the way of the packets."""
+    """Drift and steps of the capture host cancel; transport delays remain."""
     host = Clock(drift_ppm=18, steps=((22, 70 * NS_PER_MS), (41, -1200 * NS_PER_MS)))
-    target, other = Clock(TAI_NS, drift_ppm=3), replace(UPTIME, drift_ppm=-40)
-    first, second = heard(target, USUAL, host), heard(other, ETHERNET, host, seed=9)
+    target = Clock(TAI_NS, drift_ppm=3)
+    other = replace(UPTIME, drift_ppm=-40)
+    first = heard(target, USUAL, host)
+    second = heard(other, ETHERNET, host, seed=9)
     one, two = fit([watched(first), watched(second)], TO_FIRST)
     assert one is not None
     assert two is not None
@@ -163,11 +166,12 @@ def test_onto_the_first_sensor() -> None:
     aligned_ns = two.apply(second.stamp_ns, second.host_ns)
     assert (np.diff(aligned_ns) >= 0).all()
     assert np.abs(aligned_ns - target.read(second.true_ns)).max() < 100 * NS_PER_US
-    assert two.in_words().startswith("aligned to the first sensor's clock: ")
+    assert two.describe().startswith("aligned to the first sensor's clock: ")
 
 
-def test_a_sensor_that_is_longer_there_than_the_first() -> None:
-    first, second = heard(UPTIME, EXACT, seconds=10), heard(Clock(drift_ppm=20), EXACT)
+def test_a_sensor_that_lasts_longer_than_the_first() -> None:
+    first = heard(UPTIME, EXACT, seconds=10)
+    second = heard(Clock(drift_ppm=20), EXACT)
     _, two = fit([watched(first), watched(second)], TO_FIRST)
     assert two is not None
     errors = two.apply(second.stamp_ns) - UPTIME.read(second.true_ns)
@@ -177,9 +181,9 @@ def test_a_sensor_that_is_longer_there_than_the_first() -> None:
 def test_a_target_must_run_without_jumps() -> None:
     jumping = watched(heard(replace(UPTIME, steps=((20, -5 * NS_PER_S),))))
     good = watched(heard(TRUE))
-    with pytest.raises(ClockError, match=r"runs without a jump, got 1 jump\(s\); use --align-cl"):
+    with pytest.raises(ClockError, match=r"does not jump, found 1 jump\(s\); use --align-cl"):
         fit([jumping, good], TO_FIRST)
-    with pytest.raises(ClockError, match="wanted packets of the first sensor, got none"):
+    with pytest.raises(ClockError, match="expected packets of the first sensor, found none"):
         fit([ClockWatch(), good], TO_FIRST)
     maps = fit([good, ClockWatch(), jumping], TO_FIRST)
     assert [one is None for one in maps] == [False, True, False]

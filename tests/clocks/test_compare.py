@@ -1,4 +1,4 @@
-"""Clocks against each other: verdicts, corrections and the words on them, by hand."""
+"""Comparisons of clocks: verdicts, corrections and their texts, worked by hand."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def compared(
     begins_s: Sequence[float] = (0, 0, 0),
     rate_hz: float = 200,
 ) -> Comparison:
-    findings = []
+    estimates = []
     for number, clock in enumerate(clocks):
         one = hear(
             np.random.default_rng(number),
@@ -49,10 +49,10 @@ def compared(
         )
         watch = ClockWatch(period_ns=HOUR_NS if clock.past_hour else 0)
         watch.add(one.stamp_ns, one.host_ns)
-        finding = watch.finding()
-        assert finding is not None
-        findings.append((NAMES[number], finding))
-    return compare(findings)
+        estimate = watch.estimate()
+        assert estimate is not None
+        estimates.append((NAMES[number], estimate))
+    return compare(estimates)
 
 
 def test_synchronised_sensors() -> None:
@@ -61,10 +61,9 @@ def test_synchronised_sensors() -> None:
     # 2 ms, and for both 1 ms of the way and 20 ms of a burst, 1500 times less.
     assert comparison.bound_ns == pytest.approx(4.03 * NS_PER_MS, rel=0.02)
     assert comparison.corrections == ()
-    assert [(pair.one, pair.two) for pair in comparison.pairs] == [
-        *(("a", "b"), ("a", "c"), ("b", "c"))
-    ]
-    assert comparison.in_words()[0].startswith("clocks: synchronised within 4.0")
+    pairs = [(pair.one, pair.two) for pair in comparison.pairs]
+    assert pairs == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert comparison.describe()[0].startswith("clocks: synchronised within 4.0")
 
 
 @pytest.mark.parametrize(
@@ -86,12 +85,12 @@ def test_whole_differences_are_named(clocks: tuple[Clock, Clock], text: str, who
     assert correction.rig_text() == text
     (pair,) = comparison.pairs
     assert pair.whole.startswith(whole)
-    assert f"b: correctable: {whole}" in comparison.in_words()[-1]
+    assert f"b: correctable: {whole}" in comparison.describe()[-1]
     assert comparison.bound_ns is not None
     assert comparison.bound_ns < 5 * NS_PER_MS
 
 
-def test_corrections_lead_to_utc_wherever_it_stands() -> None:
+def test_corrections_refer_to_the_sensor_on_utc() -> None:
     comparison = compared(Clock(TAI_NS), TRUE, Clock(-368 * NS_PER_MS))
     assert comparison.reference == "b"
     texts = {one.sensor: one.rig_text() for one in comparison.corrections}
@@ -114,13 +113,13 @@ def test_clocks_that_run_apart_are_never_synchronised() -> None:
     """20 ppm: 0.6 ms in 30 s, which an offset may correct; 200 ppm over 120 s: 24 ms, not."""
     slowly = compared(TRUE, Clock(drift_ppm=20))
     assert slowly.verdict == CORRECTABLE
-    told_ppm = float(slowly.pairs[0].why.removesuffix(" ppm").split()[-1])
-    assert told_ppm == pytest.approx(20, abs=0.1)
+    apart_ppm = float(slowly.pairs[0].why.removesuffix(" ppm").split()[-1])
+    assert apart_ppm == pytest.approx(20, abs=0.1)
     fast = compared(TRUE, Clock(drift_ppm=200), seconds=120, rate_hz=100)
     assert (fast.verdict, fast.bound_ns, fast.corrections) == (UNSYNCHRONISED, None, ())
-    told_ms = float(fast.pairs[0].why.removesuffix(" ms").split()[-1])
+    apart_ms = float(fast.pairs[0].why.removesuffix(" ms").split()[-1])
     assert fast.pairs[0].why.startswith("they run apart by ")
-    assert told_ms == pytest.approx(24, abs=0.05)
+    assert apart_ms == pytest.approx(24, abs=0.05)
 
 
 def test_clocks_that_jump_are_unsynchronised() -> None:
@@ -134,16 +133,16 @@ def test_clocks_that_jump_are_unsynchronised() -> None:
 def test_one_sensor_has_nothing_to_be_compared_with() -> None:
     comparison = compared(UPTIME)
     assert (comparison.verdict, comparison.pairs, comparison.bound_ns) == (SYNCHRONISED, (), 0)
-    assert len(comparison.in_words()) == 1
-    assert compare([]).in_words() == []
+    assert len(comparison.describe()) == 1
+    assert compare([]).describe() == []
 
 
 def _host_steps(comparison: Comparison) -> list[Jump]:
-    return [jump for jump in comparison.findings[0][1].jumps if jump.kind == "host"]
+    return [jump for jump in comparison.estimates[0][1].jumps if jump.kind == "host"]
 
 
 @pytest.mark.parametrize("by_ms", [-1500, -40, 40, 1500])
-def test_a_step_of_the_recorder_moves_nobody(by_ms: int) -> None:
+def test_a_host_step_changes_no_verdict(by_ms: int) -> None:
     comparison = compared(TRUE, TRUE, host=Clock(steps=((14.2, by_ms * NS_PER_MS),)))
     assert comparison.verdict == SYNCHRONISED
     (step,) = _host_steps(comparison)
@@ -152,7 +151,7 @@ def test_a_step_of_the_recorder_moves_nobody(by_ms: int) -> None:
     assert comparison.bound_ns < 3 * NS_PER_MS
 
 
-def test_a_time_master_that_steps_is_no_step_of_the_recorder() -> None:
+def test_a_time_master_that_steps_is_no_host_step() -> None:
     """All sensors jump together, but it is their stamps that do."""
     clock = Clock(steps=((14.2, 50 * NS_PER_MS),))
     comparison = compared(clock, clock)
@@ -160,28 +159,28 @@ def test_a_time_master_that_steps_is_no_step_of_the_recorder() -> None:
     assert comparison.verdict == UNSYNCHRONISED
 
 
-def test_packets_of_one_sensor_that_take_longer_are_no_step_of_the_recorder() -> None:
-    """Nor is it proven what their delay was before."""
+def test_a_longer_transport_delay_of_one_sensor_is_no_host_step() -> None:
+    """Nor is their delay before known."""
     late = replace(WAY, pauses=())
     one = hear(np.random.default_rng(1), TRUE, seconds=30, rate_hz=200, way=late)
     delayed_ns = one.host_ns + np.where(one.true_ns > BEGIN_NS + 15 * NS_PER_S, 60 * NS_PER_MS, 0)
-    findings = []
+    estimates = []
     for name, host_ns in (("a", one.host_ns), ("b", delayed_ns)):
         watch = ClockWatch()
         watch.add(one.stamp_ns, host_ns)
-        finding = watch.finding()
-        assert finding is not None
-        findings.append((name, finding))
-    comparison = compare(findings)
+        estimate = watch.estimate()
+        assert estimate is not None
+        estimates.append((name, estimate))
+    comparison = compare(estimates)
     assert _host_steps(comparison) == []
-    (jump,) = comparison.findings[1][1].jumps
+    (jump,) = comparison.estimates[1][1].jumps
     assert jump.kind == "delay"
-    assert jump.in_words().startswith("packets took 60.000 ms longer from 1714566911.0")
+    assert jump.describe().startswith("the transport delay became 60.000 ms longer at 1714566911.0")
     assert comparison.verdict == UNSYNCHRONISED
     assert comparison.pairs[0].why == "their difference changes by +60.000 ms"
 
 
-def test_too_few_packets_prove_nothing() -> None:
+def test_too_few_packets_give_no_verdict() -> None:
     """A packet each: either may have been held back by 20 ms."""
     near = compared(TRUE, TRUE, seconds=0.005)
     assert near.verdict == UNSYNCHRONISED
@@ -193,7 +192,7 @@ def test_too_few_packets_prove_nothing() -> None:
 
 
 def test_sensors_that_were_never_seen_together() -> None:
-    """The recorder's clock goes on between them; what it may drift in 30 s is in the bound."""
+    """The bound includes the drift of the capture host's clock in the 30 s between them."""
     comparison = compared(TRUE, TRUE, begins_s=(0, 60))
     assert comparison.verdict == SYNCHRONISED
     # 30 s at 100 ppm.

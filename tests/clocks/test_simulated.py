@@ -1,7 +1,7 @@
-"""The clock doctor and the fit on 600 simulated recordings whose truth is known.
+"""Clock estimates and maps of 600 simulated recordings whose truth is known.
 
-Each has one to three sensors; what their clocks count, how they drift and jump, how packets travel
-and what the recorder's clock does are drawn with a fixed seed.
+Each has one to three sensors; domains, drift, jumps, transport delays and the capture host's clock
+are drawn with a fixed seed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import pytest
 
 from mlbatch.clocks.align import ClockMap, fit
 from mlbatch.clocks.compare import CORRECTABLE, SYNCHRONISED, Comparison, compare
-from mlbatch.clocks.watch import ClockFinding, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from tests.builders.clocks import (
     BEGIN_NS,
     GPS_1980_NS,
@@ -42,13 +42,13 @@ class Sensor:
     domain: str
     heard: Heard
     watch: ClockWatch
-    finding: ClockFinding
+    estimate: ClockEstimate
     map: ClockMap
 
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """A simulated recording; host: the recorder's clock."""
+    """A simulated recording; host: the capture host's clock."""
 
     seconds: float
     host: Clock
@@ -57,16 +57,17 @@ class Simulated:
 
     @property
     def is_long(self) -> bool:
-        """Whether drift must be told."""
+        """True if there must be a drift."""
         return self.seconds >= MINUTE_S
 
     def error_ns(self, sensor: Sensor) -> int:
         """Offset found, minus the true one at that time (modulo the hour that was left out)."""
-        finding, heard = sensor.finding, sensor.heard
-        near = int(np.abs(heard.host_ns - finding.at_host_ns).argmin())
+        estimate = sensor.estimate
+        heard = sensor.heard
+        near = int(np.abs(heard.host_ns - estimate.at_host_ns).argmin())
         true_ns = heard.true_ns[near : near + 1]
         truth_ns = int((sensor.clock.error_ns(true_ns) - self.host.error_ns(true_ns))[0])
-        error_ns = finding.offset_ns - truth_ns
+        error_ns = estimate.offset_ns - truth_ns
         if sensor.clock.past_hour:
             error_ns = (error_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
         return error_ns
@@ -86,7 +87,7 @@ def _clock(rng: np.random.Generator, domain: str) -> Clock:
         "wrong_year": -int(rng.integers(200, 4000)) * DAY_NS + int(rng.integers(DAY_NS)),
         "unknown": int(rng.integers(100, 10_000)) * NS_PER_S + small_ns,
     }
-    # Clocks that follow a source drift with it: what is left is the recorder's own drift.
+    # Clocks that follow a source drift with it: what is left is the capture host's own drift.
     follows = domain in ("utc", "tai", "gps")
     return Clock(
         offsets_ns[domain],
@@ -100,7 +101,7 @@ DOMAINS = ("utc", "utc", "tai", "gps", "uptime", "uptime", "top_of_hour", "wrong
 
 
 def _jumps(rng: np.random.Generator, clock: Clock, domain: str, seconds: float) -> Clock:
-    """One clock in eight steps once, well before the recorder's."""
+    """One clock in eight steps once, well before the capture host's."""
     if seconds < 10 or rng.random() > 0.125 or domain == "top_of_hour":
         return clock
     after_s = float(rng.uniform(0.25, 0.45) * seconds)
@@ -121,7 +122,9 @@ def _simulate(seed: int) -> Simulated:
     same = rng.random() < 0.3
     domain = str(rng.choice(DOMAINS))
     shared = _clock(rng, domain)
-    sensors, watches, heards = [], [], []
+    sensors = []
+    watches = []
+    heards = []
     for _ in range(number):
         clock = shared if same else _clock(rng, domain := str(rng.choice(DOMAINS)))
         clock = _jumps(rng, clock, domain, seconds)
@@ -140,16 +143,16 @@ def _simulate(seed: int) -> Simulated:
         sensors.append((clock, domain))
         watches.append(watch)
         heards.append(heard)
-    findings = [watch.finding() for watch in watches]
+    estimates = [watch.estimate() for watch in watches]
     maps = fit(watches)
-    known = [finding for finding in findings if finding is not None]
-    comparison = compare([(f"s{at}", finding) for at, finding in enumerate(known)])
+    known = [estimate for estimate in estimates if estimate is not None]
+    comparison = compare([(f"s{at}", estimate) for at, estimate in enumerate(known)])
     return Simulated(
         seconds,
         host,
         tuple(
-            Sensor(*sensor, heard, watch, finding, one)
-            for sensor, heard, watch, finding, one in zip(
+            Sensor(*sensor, heard, watch, estimate, one)
+            for sensor, heard, watch, estimate, one in zip(
                 sensors, heards, watches, known, maps, strict=True
             )
             if one is not None
@@ -168,15 +171,15 @@ def _sensors(recordings: list[Simulated]) -> list[tuple[Simulated, Sensor]]:
 
 
 def test_the_domain_is_right(recordings: list[Simulated]) -> None:
-    """Of the longest stretch; a jump of 37 s makes TAI of UTC, so there another one may be told."""
-    told = [
-        sensor.domain in {stretch.domain for stretch in sensor.finding.stretches}
+    """Of the longest segment; with a jump of 37 s (from UTC to TAI), that of any segment."""
+    right = [
+        sensor.domain in {segment.domain for segment in sensor.estimate.segments}
         if sensor.clock.steps
-        else sensor.domain == sensor.finding.domain
+        else sensor.domain == sensor.estimate.domain
         for _, sensor in _sensors(recordings)
     ]
-    assert len(told) > 1000
-    assert np.mean(told) >= 0.99
+    assert len(right) > 1000
+    assert np.mean(right) >= 0.99
 
 
 def test_offsets_are_exact_to_the_second_and_within_a_millisecond(
@@ -185,29 +188,29 @@ def test_offsets_are_exact_to_the_second_and_within_a_millisecond(
     for one, sensor in _sensors(recordings):
         error_ns = abs(one.error_ns(sensor))
         assert error_ns < NS_PER_MS
-        assert error_ns < sensor.finding.uncertainty_ns
+        assert error_ns < sensor.estimate.uncertainty_ns
 
 
 def test_drift_is_within_one_ppm(recordings: list[Simulated]) -> None:
     pairs = [
-        (sensor.finding, sensor.clock.drift_ppm - one.host.drift_ppm)
+        (sensor.estimate, sensor.clock.drift_ppm - one.host.drift_ppm)
         for one, sensor in _sensors(recordings)
         if one.is_long
     ]
     assert len(pairs) > 400
     missed = 0
-    for finding, truth_ppm in pairs:
-        assert finding.drift_ppm is not None
-        assert finding.drift_uncertainty_ppm is not None
-        error_ppm = abs(finding.drift_ppm - truth_ppm)
+    for estimate, truth_ppm in pairs:
+        assert estimate.drift_ppm is not None
+        assert estimate.drift_uncertainty_ppm is not None
+        error_ppm = abs(estimate.drift_ppm - truth_ppm)
         assert error_ppm < 1
-        missed += error_ppm > finding.drift_uncertainty_ppm
+        missed += error_ppm > estimate.drift_uncertainty_ppm
     # The uncertainty is three standard errors.
     assert missed < 0.02 * len(pairs)
 
 
 def test_never_synchronised_beyond_the_bound(recordings: list[Simulated]) -> None:
-    """And clocks that are synchronised are told so."""
+    """And clocks within the bound are."""
     verdicts: dict[tuple[bool, bool, str], int] = {}
     for one in recordings:
         comparison = one.comparison
@@ -232,7 +235,7 @@ def test_corrections_bring_clocks_together(recordings: list[Simulated]) -> None:
         comparison = one.comparison
         if comparison.verdict != CORRECTABLE:
             continue
-        names = [name for name, _ in comparison.findings]
+        names = [name for name, _ in comparison.estimates]
         by_name = dict(zip(names, one.sensors, strict=True))
         reference = by_name[comparison.reference]
         for correction in comparison.corrections:
@@ -248,19 +251,19 @@ def test_corrections_bring_clocks_together(recordings: list[Simulated]) -> None:
     assert checked > 400
 
 
-def test_jumps_are_found_and_told_from_steps_of_the_recorder(recordings: list[Simulated]) -> None:
-    """Where a packet was lost right at a step, only the other sensors tell whose step it was."""
+def test_jumps_are_found_and_separated_from_host_steps(recordings: list[Simulated]) -> None:
+    """Where a packet was lost right at a step, only the other sensors show whose step it was."""
     wrong = 0
     steps = 0
     for one in recordings:
-        for (_, finding), sensor in zip(one.comparison.findings, one.sensors, strict=True):
+        for (_, estimate), sensor in zip(one.comparison.estimates, one.sensors, strict=True):
             truth = sorted(by_ns for _, by_ns in (*sensor.clock.steps, *_seen(one.host)))
-            sizes = sorted(jump.size_ns for jump in finding.jumps)
+            sizes = sorted(jump.size_ns for jump in estimate.jumps)
             assert len(sizes) == len(truth)
             assert np.abs(np.subtract(sizes, truth)).max(initial=0) < NS_PER_MS // 4
             steps += len(truth)
-            wrong += len(finding.sensor_jumps) != len(sensor.clock.steps)
-            for jump in finding.jumps:
+            wrong += len(estimate.sensor_jumps) != len(sensor.clock.steps)
+            for jump in estimate.jumps:
                 since_s = (jump.host_ns - BEGIN_NS) / NS_PER_S
                 after_s = [after_s for after_s, _ in (*sensor.clock.steps, *one.host.steps)]
                 assert np.abs(np.subtract(after_s, since_s)).min() < 4
@@ -269,12 +272,12 @@ def test_jumps_are_found_and_told_from_steps_of_the_recorder(recordings: list[Si
 
 
 def _seen(host: Clock) -> list[tuple[float, int]]:
-    """Steps of the recorder's clock as those of the sensors' clocks against it."""
+    """Steps of the capture host's clock as those of the sensors' clocks against it."""
     return [(after_s, -by_ns) for after_s, by_ns in host.steps]
 
 
 def test_aligned_stamps_are_right_within_half_a_millisecond(recordings: list[Simulated]) -> None:
-    """By the recorder's clock as it was at first: its steps are not in the stamps."""
+    """By the capture host's clock as it was at first: its steps are not in the stamps."""
     errors_ns = []
     for one, sensor in _sensors(recordings):
         heard = sensor.heard

@@ -1,4 +1,4 @@
-"""The clock doctor on single clocks: what it says of values that are known by hand."""
+"""Estimates of single clocks, with values worked by hand."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.clocks.watch import ClockFinding, ClockWatch, stretch_of
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch, segment_of
 from tests.builders.clocks import (
     BEGIN_NS,
     GPS_1980_NS,
@@ -49,27 +49,27 @@ def heard(
     )
 
 
-def found(one: Heard, period_ns: int = 0) -> ClockFinding:
+def found(one: Heard, period_ns: int = 0) -> ClockEstimate:
     watch = ClockWatch(period_ns=period_ns)
     watch.add(one.stamp_ns, one.host_ns)
-    finding = watch.finding()
-    assert finding is not None
-    return finding
+    estimate = watch.estimate()
+    assert estimate is not None
+    return estimate
 
 
 def test_an_exact_clock() -> None:
-    finding = found(heard())
-    assert (finding.domain, finding.packets, finding.damaged) == ("utc", 4000, 0)
-    assert finding.offset_ns == -100 * NS_PER_US
+    estimate = found(heard())
+    assert (estimate.domain, estimate.packets, estimate.damaged) == ("utc", 4000, 0)
+    assert estimate.offset_ns == -100 * NS_PER_US
     # 1 ms for the way; 20 ms of a burst, less for the 1000 times as long that was seen.
-    assert finding.uncertainty_ns == pytest.approx(1_020_000, abs=100)
-    assert finding.drift_ppm == pytest.approx(0, abs=1e-6)
-    assert finding.jumps == ()
+    assert estimate.uncertainty_ns == pytest.approx(1_020_000, abs=100)
+    assert estimate.drift_ppm == pytest.approx(0, abs=1e-6)
+    assert estimate.jumps == ()
     # One packet each 5 ms.
-    assert finding.resolution_ns == 5 * NS_PER_MS
-    assert (finding.jitter_p50_ns, finding.jitter_p99_ns) == (0, 0)
-    assert finding.in_words() == (
-        "clock: UTC, -0.100 ms to the recorder (+-1.020 ms), drift +0.00 +-0.00 ppm"
+    assert estimate.resolution_ns == 5 * NS_PER_MS
+    assert (estimate.jitter_p50_ns, estimate.jitter_p99_ns) == (0, 0)
+    assert estimate.describe() == (
+        "clock: UTC, -0.100 ms to the capture host (+-1.020 ms), drift +0.00 +-0.00 ppm"
     )
 
 
@@ -91,12 +91,12 @@ def test_an_exact_clock() -> None:
         (Clock(8 * HOUR_NS), "unknown"),
     ],
 )
-def test_domains_are_told_by_value(clock: Clock, domain: str) -> None:
+def test_domains_follow_from_values(clock: Clock, domain: str) -> None:
     assert found(heard(clock, seconds=2)).domain == domain
 
 
 def test_a_counter_past_the_hour() -> None:
-    """What a decoder takes from arrivals proves nothing: only a small offset does."""
+    """The decoder completes stamps from receive times: only a small offset means UTC."""
     away = found(heard(Clock(-1531 * NS_PER_S, past_hour=True)), HOUR_NS)
     assert (away.domain, away.offset_ns) == ("top_of_hour", -1531 * NS_PER_S - 100 * NS_PER_US)
     near = found(heard(Clock(-300 * NS_PER_MS, past_hour=True)), HOUR_NS)
@@ -104,11 +104,11 @@ def test_a_counter_past_the_hour() -> None:
 
 
 def test_local_time_is_named() -> None:
-    assert "about 8 whole hour(s): a time zone" in found(heard(Clock(8 * HOUR_NS))).in_words()
-    assert "about 37 s" not in found(heard(Clock(36 * NS_PER_S))).in_words()
+    assert "about 8 whole hour(s): a time zone" in found(heard(Clock(8 * HOUR_NS))).describe()
+    assert "about 37 s" not in found(heard(Clock(36 * NS_PER_S))).describe()
 
 
-def test_the_recorder_before_2017_had_another_tai() -> None:
+def test_tai_before_2017_had_another_offset() -> None:
     """In 2016 TAI - UTC was 36 s, and 37 s ahead is no TAI."""
     one = heard(seconds=2)
     back_ns = 8 * 365 * DAY_NS
@@ -119,32 +119,32 @@ def test_the_recorder_before_2017_had_another_tai() -> None:
 
 def test_drift_with_bursts_and_lost_packets() -> None:
     way = Way(60, 150, bursts_hz=2, lost=0.05)
-    finding = found(heard(Clock(drift_ppm=-37.5), way, seconds=60))
-    assert finding.drift_ppm == pytest.approx(-37.5, abs=0.3)
-    assert finding.drift_uncertainty_ppm is not None
-    assert finding.drift_uncertainty_ppm < 1
+    estimate = found(heard(Clock(drift_ppm=-37.5), way, seconds=60))
+    assert estimate.drift_ppm == pytest.approx(-37.5, abs=0.3)
+    assert estimate.drift_uncertainty_ppm is not None
+    assert estimate.drift_uncertainty_ppm < 1
     # Of an exponential of 0.15 ms: half are below 0.104 ms.
-    assert finding.jitter_p50_ns == pytest.approx(104_000, rel=0.2)
+    assert estimate.jitter_p50_ns == pytest.approx(104_000, rel=0.2)
 
 
-def test_a_short_recording_tells_no_drift() -> None:
-    finding = found(heard(seconds=0.5))
-    assert finding.drift_ppm is None
-    assert finding.drift_uncertainty_ppm is None
+def test_a_short_recording_gives_no_drift() -> None:
+    estimate = found(heard(seconds=0.5))
+    assert estimate.drift_ppm is None
+    assert estimate.drift_uncertainty_ppm is None
     # 0.02 s of 0.495 s.
-    assert finding.uncertainty_ns == pytest.approx(1_000_000 + 20_000_000 * 0.02 / 0.495, rel=0.01)
+    assert estimate.uncertainty_ns == pytest.approx(1_000_000 + 20_000_000 * 0.02 / 0.495, rel=0.01)
 
 
 def test_one_packet() -> None:
     one = heard(UPTIME, seconds=0.005)
-    finding = found(one)
-    assert (finding.packets, finding.domain, finding.damaged) == (1, "uptime", 0)
-    assert finding.uncertainty_ns == 21 * NS_PER_MS
-    assert finding.resolution_ns == 0
+    estimate = found(one)
+    assert (estimate.packets, estimate.domain, estimate.damaged) == (1, "uptime", 0)
+    assert estimate.uncertainty_ns == 21 * NS_PER_MS
+    assert estimate.resolution_ns == 0
 
 
-def test_nothing_was_heard() -> None:
-    assert ClockWatch().finding() is None
+def test_no_packet() -> None:
+    assert ClockWatch().estimate() is None
 
 
 def test_resolution() -> None:
@@ -158,23 +158,23 @@ def test_resolution() -> None:
 
 def jumps(one: Heard, period_ns: int = 0) -> list[tuple[str, float]]:
     """Kinds and sizes in s."""
-    finding = found(one, period_ns)
-    return [(jump.kind, round(jump.size_ns / NS_PER_S, 6)) for jump in finding.jumps]
+    estimate = found(one, period_ns)
+    return [(jump.kind, round(jump.size_ns / NS_PER_S, 6)) for jump in estimate.jumps]
 
 
 def test_ptp_lock_gained() -> None:
-    """From power-on to TAI after 5 s: both are told, and where it happened."""
+    """From power-on to TAI after 5 s: both domains, and the packets around the jump."""
     by_ns = TAI_NS - UPTIME.offset_ns
-    finding = found(heard(replace(UPTIME, steps=((5, by_ns),))))
-    assert [one.domain for one in finding.stretches] == ["uptime", "tai"]
-    assert finding.domain == "tai"
-    (jump,) = finding.jumps
+    estimate = found(heard(replace(UPTIME, steps=((5, by_ns),))))
+    assert [one.domain for one in estimate.segments] == ["uptime", "tai"]
+    assert estimate.domain == "tai"
+    (jump,) = estimate.jumps
     assert (jump.kind, jump.size_ns) == ("forward", by_ns)
     # Packets each 5 ms; the first after the jump was sent at 5 s.
     assert jump.stamp_before_ns == 1004_995 * NS_PER_MS
     assert jump.stamp_after_ns == BEGIN_NS + 5 * NS_PER_S + TAI_NS
     assert jump.host_ns == BEGIN_NS + 5 * NS_PER_S + 100 * NS_PER_US
-    assert "forward by +1714565933.000000 s: from 1004.995000 s to" in finding.in_words()
+    assert "forward by +1714565933.000000 s: from 1004.995000 s to" in estimate.describe()
 
 
 @pytest.mark.parametrize("by_ms", [37_000, -37_000, 1500, -1500, 250, -250, 5, -5, 2, -2])
@@ -202,25 +202,25 @@ def test_an_hour_that_is_found_anew_is_a_wrap() -> None:
 
 
 @pytest.mark.parametrize("by_ms", [1500, -1500, 40, -40, 3, -3])
-def test_the_recorder_steps(by_ms: int) -> None:
-    """Arrivals step, stamps go on: no jump of the sensor."""
-    finding = found(heard(host=Clock(steps=((10, by_ms * NS_PER_MS),))))
-    assert [(jump.kind, jump.size_ns) for jump in finding.jumps] == [("host", -by_ms * NS_PER_MS)]
-    assert finding.sensor_jumps == ()
+def test_the_capture_host_steps(by_ms: int) -> None:
+    """Receive times step, stamps do not: no jump of the sensor."""
+    estimate = found(heard(host=Clock(steps=((10, by_ms * NS_PER_MS),))))
+    assert [(jump.kind, jump.size_ns) for jump in estimate.jumps] == [("host", -by_ms * NS_PER_MS)]
+    assert estimate.sensor_jumps == ()
 
 
-def test_steps_of_the_recorder_in_words() -> None:
-    finding = found(heard(host=Clock(steps=((10, -40 * NS_PER_MS),))))
+def test_host_steps_as_text() -> None:
+    estimate = found(heard(host=Clock(steps=((10, -40 * NS_PER_MS),))))
     # 1714566896 s, 10 s later, 0.1 ms on the way, set back by 40 ms.
-    words = "; the recorder's clock stepped by -40.000 ms at 1714566905.960 s"
-    assert finding.in_words().endswith(words)
+    words = "; the capture host's clock stepped by -40.000 ms at 1714566905.960 s"
+    assert estimate.describe().endswith(words)
 
 
 def test_silence_is_no_jump() -> None:
     assert jumps(heard(silent=((3, 9), (12, 12.5)))) == []
 
 
-def test_a_recorder_that_stands_still_is_no_jump() -> None:
+def test_a_capture_host_that_pauses_is_no_jump() -> None:
     """All packets of 3 s come at once, then of 0.8 s."""
     assert jumps(heard(way=replace(EXACT, pauses=((4, 3), (12, 0.8))))) == []
 
@@ -240,21 +240,21 @@ def test_damaged_stamps_are_no_jumps() -> None:
     damage = {500: 1 << 40, 1001: 1 << 29, 1500: 1 << 62, 2222: 1 << 35, 3999: 1 << 45}
     for at, bit in damage.items():
         stamp_ns[at] ^= bit
-    finding = found(replace(one, stamp_ns=stamp_ns))
-    assert finding.jumps == ()
-    assert finding.offset_ns == -100 * NS_PER_US
-    # 2^29 ns is half a second, which is not told from a late or early packet.
-    assert (finding.packets, finding.damaged) == (3996, 4)
+    estimate = found(replace(one, stamp_ns=stamp_ns))
+    assert estimate.jumps == ()
+    assert estimate.offset_ns == -100 * NS_PER_US
+    # 2^29 ns is half a second, as for a delayed packet.
+    assert (estimate.packets, estimate.damaged) == (3996, 4)
 
 
 def test_a_clock_that_jumps_without_end() -> None:
     """Stretches are kept up to a number; what comes then is only known to be bad."""
     at = np.arange(3000)
     stamp_ns = BEGIN_NS + at * NS_PER_MS + at // 10 % 2 * 100 * NS_PER_S
-    finding = found(Heard(at, stamp_ns, BEGIN_NS + at * NS_PER_MS))
-    assert finding.unsteady
-    assert len(finding.stretches) == 64
-    assert "again and again" in finding.in_words()
+    estimate = found(Heard(at, stamp_ns, BEGIN_NS + at * NS_PER_MS))
+    assert estimate.unsteady
+    assert len(estimate.segments) == 64
+    assert "more than 63 jumps" in estimate.describe()
 
 
 # -- laws -----------------------------------------------------------------------------------------
@@ -278,57 +278,58 @@ def test_pieces_do_not_matter(case: str, size: int) -> None:
     watch = ClockWatch()
     for at in range(0, len(stamp_ns), size):
         watch.add(stamp_ns[at : at + size], one.host_ns[at : at + size])
-    pieces = watch.finding()
+    pieces = watch.estimate()
     assert pieces is not None
     assert _plain(pieces) == _plain(whole)
 
 
-def _plain(finding: ClockFinding) -> str:
-    """A finding with all its digits."""
+def _plain(estimate: ClockEstimate) -> str:
+    """A estimate with all its digits."""
     with np.printoptions(floatmode="unique", threshold=10**6):
-        return repr(finding)
+        return repr(estimate)
 
 
-def test_asking_changes_nothing() -> None:
+def test_an_estimate_changes_nothing() -> None:
     one = heard(CASES["small"][0], Way())
     watch = ClockWatch()
     for at in range(0, len(one.stamp_ns), 100):
         watch.add(one.stamp_ns[at : at + 100], one.host_ns[at : at + 100])
-        watch.finding()
-    finding = watch.finding()
-    assert finding is not None
-    assert _plain(finding) == _plain(found(one))
+        watch.estimate()
+    estimate = watch.estimate()
+    assert estimate is not None
+    assert _plain(estimate) == _plain(found(one))
 
 
 def test_memory_does_not_grow_with_the_recording() -> None:
     """An hour at 500 packets a second: a tenth and the whole of it."""
-    watch, sizes = ClockWatch(), []
+    watch = ClockWatch()
+    sizes = []
     step = np.arange(180_000) * 2 * NS_PER_MS
     for tenth in range(10):
         true_ns = BEGIN_NS + tenth * 360 * NS_PER_S + step
         watch.add(true_ns, true_ns + 70 * NS_PER_US)
         sizes.append(_rows(watch))
     assert max(sizes) <= 4096
-    finding = watch.finding()
-    assert finding is not None
-    assert (finding.packets, finding.offset_ns) == (1_800_000, -70 * NS_PER_US)
+    estimate = watch.estimate()
+    assert estimate is not None
+    assert (estimate.packets, estimate.offset_ns) == (1_800_000, -70 * NS_PER_US)
 
 
 def _rows(watch: ClockWatch) -> int:
-    course = watch.course()
-    assert course is not None
-    return sum(len(part.track.rows) for part in course.parts)
+    track = watch.track()
+    assert track is not None
+    return sum(len(part.table.rows) for part in track.parts)
 
 
 def test_which_stretch_a_packet_is_of() -> None:
-    """Stamps of a clock that was set back 5 s repeat: arrivals tell; others tell by themselves."""
+    """Stamps of a clock that was set back 5 s repeat: receive times separate them."""
     one = heard(Clock(steps=((10, -5 * NS_PER_S),)))
-    finding = found(one)
+    estimate = found(one)
     truth = (one.true_ns - BEGIN_NS >= 10 * NS_PER_S).astype(np.int64)
-    np.testing.assert_array_equal(stretch_of(finding.stretches, one.stamp_ns, one.host_ns), truth)
+    np.testing.assert_array_equal(segment_of(estimate.segments, one.stamp_ns, one.host_ns), truth)
     early = heard(Clock(steps=((10, 5 * NS_PER_S),)))
-    alone = stretch_of(found(early).stretches, early.stamp_ns)
+    alone = segment_of(found(early).segments, early.stamp_ns)
     np.testing.assert_array_equal(alone, truth)
     columns = np.repeat(early.stamp_ns[:, None], 3, axis=1)
-    both = stretch_of(found(early).stretches, columns, early.host_ns[:, None])
+    both = segment_of(found(early).segments, columns, early.host_ns[:, None])
     np.testing.assert_array_equal(both, np.repeat(truth[:, None], 3, axis=1))

@@ -15,7 +15,7 @@ MODULES = modules()
 SPEAKERS = ("print", "exit", "quit", "sys.exit", "os._exit", "typer.echo", "typer.Exit")
 STREAMS = ("sys.stdout", "sys.stderr")
 # What a plug-in's docstring names: a specification, a manual, or the page of facts.
-SOURCE = re.compile(r"facts/\w+\.md|RFC \d+|draft-[\w-]+|APPNOTE|Source: ")
+SOURCE = re.compile(r"docs/sources/\w+\.md|RFC \d+|draft-[\w-]+|APPNOTE|Source: ")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -63,20 +63,36 @@ def test_a_plugin_names_its_source(plugin: Module) -> None:
 
 @pytest.mark.parametrize("plugin", plugins(), ids=_by_name)
 def test_a_plugin_has_tests_and_something_to_test_with(plugin: Module) -> None:
-    package, name = plugin.name.split(".")
-    tests = sorted((ROOT / "tests" / "unit" / package).glob(f"test_{name}*.py"))
-    assert tests, f"{plugin.path}: wanted tests/unit/{package}/test_{name}.py"
-    assert _material(package, name), f"{plugin.path}: wanted a builder or a fixture"
+    tests = _tests_of(plugin)
+    assert tests, f"{plugin.path}: expected tests of it, found none"
+    assert _material(plugin), f"{plugin.path}: expected a builder or a fixture, found none"
 
 
-def _material(package: str, name: str) -> bool:
-    """Whether there is something that makes or holds inputs for the tests of a plug-in."""
-    builders, fixtures = ROOT / "tests" / "builders", ROOT / "fixtures"
+def _tests_of(plugin: Module) -> list[Path]:
+    """Test files of a format, or of a vendor; formats may share the files of their package."""
+    package, *_, name = plugin.name.split(".")
+    if package == "sensors":
+        return sorted((ROOT / "tests" / Path(*plugin.name.split(".")[:2])).glob("test_*.py"))
+    return [
+        path
+        for path in sorted((ROOT / "tests" / package).rglob("test_*.py"))
+        if path.stem.startswith(f"test_{name}") or f".formats.{name}" in _text(path)
+    ]
+
+
+def _material(plugin: Module) -> bool:
+    """True if a builder or a fixture makes inputs for the tests of a plug-in."""
+    package, *_, name = plugin.name.split(".")
+    builders = ROOT / "tests" / "builders"
     if package == "writers":  # Their input is a Scan, made by one builder for all.
-        return (ROOT / "tests" / "unit" / "writers" / "scans.py").is_file()
+        return (builders / "scans.py").is_file()
+    if package == "sensors":
+        name = plugin.name.split(".")[1]
+        # Clouds are messages, not packets.
+        name = "points" if name == "pointcloud" else name
     if any(f"def write_{name}(" in _text(path) for path in builders.glob("*.py")):
         return True
-    return (builders / f"{name}.py").is_file() or (fixtures / name / "SOURCE.md").is_file()
+    return (builders / f"{name}.py").is_file()
 
 
 def _text(path: Path) -> str:

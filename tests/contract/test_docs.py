@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers
@@ -135,7 +135,7 @@ def test_the_table_of_sensors_names_every_model() -> None:
     table = README.partition("<!-- sensors:")[2].partition("<!-- end of sensors")[0]
     for model in models():
         row = next(row for row in _rows(table) if model.name in re.split(r", | \(", row[1]))
-        assert (row[0], row[-1]) == (model.maker, model.verified)
+        assert (row[0], row[-1]) == (model.vendor, model.verified)
         assert f"| {model.verified} | " in README, "say what the word means"
 
 
@@ -183,8 +183,8 @@ def test_every_reason_is_described(kind: str) -> None:
 
 
 def test_every_key_of_the_report_is_described() -> None:
-    wishes = Wishes(rig=ROOT / RIG)
-    _, inputs = convert(Job((ROOT / FIXTURE,), wishes), None)
+    selection = SensorSelection(rig=ROOT / RIG)
+    _, inputs = convert(Job((ROOT / FIXTURE,), selection), None)
     page = _page("report.md")
     words = set(re.findall(r"\w+", " ".join(re.findall(r"`[^`]+`", page))))
     assert set(_keys(build_report(inputs))) <= words

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from mlbatch.cli.app import COMMANDS, command_line
 from tests.contract.tree import run_python
 
-# The options of this version (CONTRACT.md, section 2), and what their help has to say.
+# The options of this version, and a pattern of their help.
 OPTIONS: dict[str, dict[str, str]] = {
     "convert": {
         "--output": r"\.mcap.*folder",
@@ -44,7 +44,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--ignore": "repeatable",
         "--fault": "repeatable",
         "--fault-seed": "random",
-        "--dry-run": "report.*split.*line.*part",
+        "--dry-run": "report.*split.*line.*segment",
         "--report": "JSON",
         "--jobs": "same time",
         "--compression": "none, lz4, zstd.*LEVEL",
@@ -71,7 +71,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--json": "JSON",
     },
     "sensors": {"--json": "JSON"},
-    "verify": {"--report": "JSON.*beside", "--json": "JSON"},
+    "verify": {"--report": "JSON.*next to", "--json": "JSON"},
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from tests.contract.tree import PLUGIN_PACKAGES, Module, imports, modules, plugins
+from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 
 # From top to bottom: a package imports from its own modules and from lower floors.
 FLOORS: tuple[tuple[str, ...], ...] = (
-    ("cli", "__main__"),
-    ("api",),
-    ("compare", "bench"),
+    ("__main__",),
+    ("cli",),
+    ("api", "compare", "bench"),
     ("pipeline",),
     ("discovery",),
     ("readers", "sensors", "writers", "verify", "faults"),
     ("decode", "batching"),
     ("report", "rig", "clocks"),
-    ("lidar", "frames", "ros", "clouds", "_cloud_messages", "_cloud_packets", "_cloud_times"),
+    ("lidar", "frames", "ros"),
     ("types",),
     ("arrays", "units"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", ""),
 )
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
+# A module in the folder of a vendor.
+VENDOR = re.compile(r"sensors\.\w+\.(?=\w)")
 MODULES = modules()
 NAMES = frozenset(module.name for module in MODULES)
 
@@ -69,10 +73,25 @@ def test_nobody_names_a_plugin(module: Module) -> None:
         assert found.target not in found_by_name, f"{module.path}:{found.line}: {found.target}"
 
 
-def test_helpers_of_a_plugin_package_stay_inside() -> None:
-    """`_private` modules of a plug-in package are imported by that package alone."""
-    for module in MODULES:
-        for found in imports(module, NAMES):
-            top, _, rest = found.target.partition(".")
-            if top in PLUGIN_PACKAGES and rest:
-                assert module.top == top, f"{module.path}:{found.line}: {found.target}"
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
+def test_vendors_know_nothing_of_each_other(module: Module) -> None:
+    """Modules of a vendor's folder are imported by that folder alone."""
+    for found in imports(module, NAMES):
+        vendor = VENDOR.match(found.target)
+        if vendor is not None:
+            assert module.name.startswith(vendor[0]), f"{module.path}:{found.line}: {found.target}"
+
+
+def test_no_module_is_private() -> None:
+    """A module that only one other imports is a part of that one.
+
+    The kernels keep their names: a native engine is to replace them.
+    """
+    private = re.compile(r"(?:^|\.)_(?!_main__)")
+    found = [name for name in NAMES if private.search(name) and "kernels" not in name]
+    assert sorted(found) == []
+
+
+def test_the_root_has_seven_modules() -> None:
+    found = {path.stem for path in PACKAGE.glob("*.py")}
+    assert found == {"__init__", "__main__", "api", "types", "arrays", "units", "errors"}

@@ -128,12 +128,12 @@ def cases() -> Mapping[str, Callable[[], Stand]]:
 
 
 def _is_ouster(model: SensorModel) -> bool:
-    return model.maker == "Ouster"
+    return model.vendor == "Ouster"
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=lambda plugin: plugin.__name__)
 def test_a_plugin_offers_all_that_is_asked_of_it(plugin: Plugin) -> None:
-    assert plugin.MAKER
+    assert plugin.VENDOR
     assert plugin.MODELS
     for model in plugin.MODELS:
         assert model.verified in WORDS, f"{model.name}: wanted one of {WORDS}"
@@ -145,7 +145,7 @@ def test_a_plugin_offers_all_that_is_asked_of_it(plugin: Plugin) -> None:
     for calibration in plugin.BUILT_IN:
         assert (calibration.path, calibration.is_shared) == (None, True)
         assert calibration.model in names
-    assert {model.like for model in plugin.MODELS} <= {"", *names}
+    assert {model.same_packets_as for model in plugin.MODELS} <= {"", *names}
 
 
 def test_no_two_models_have_one_name() -> None:
@@ -159,7 +159,7 @@ def test_every_model_has_an_encoder_and_a_case(model: SensorModel) -> None:
         return  # Their encoders have no rows: any number of beams, or none at all.
     # Models whose packets look like those of another one are encoded as that one.
     twins = {words[2]: words[0] for _, words in CASES if len(words) > 2}
-    row = twins.get(model.name, model.like or model.name)
+    row = twins.get(model.name, model.same_packets_as or model.name)
     assert row in encoded(), f"{model.name}: no row in tests/builders; {ADVICE}"
     named = {VARIANTS.get(words[0], words[0]) for _, words in CASES}
     missing = f"{model.name}: no case in tests/golden/test_every_model.py; {ADVICE}"
@@ -239,7 +239,7 @@ def test_a_packet_says_the_same_in_any_company(name: str) -> None:
 def _check_table(lidar: Lidar) -> None:
     """What a lidar says of its columns before any packet."""
     model = next(m for m in models() if _is_named(lidar, m))
-    assert (lidar.maker, lidar.channels) == (model.maker, model.channels)
+    assert (lidar.vendor, lidar.channels) == (model.vendor, model.channels)
     assert lidar.firing_ns.ndim == 2
     assert lidar.firing_ns.shape[1] == lidar.channels
     assert lidar.firing_ns.min() >= -1

@@ -35,17 +35,20 @@ def test_the_library_leaves_the_collector_alone() -> None:
     assert printed.strip() == "True"
 
 
-# Makers that are asked after Ouster, containers and messages that are not there, outputs and
-# commands that were not wanted.
+# Vendors that are asked after Ouster, containers and messages that are not there, outputs and
+# commands that were not requested.
 NEEDLESS = (
-    *("mlbatch.sensors.points", "mlbatch.sensors.robosense", "mlbatch.sensors.velodyne"),
-    *("mlbatch.sensors._recognise_robosense", "mlbatch.sensors._recognise_velodyne"),
-    *("mlbatch.readers.mcap", "mlbatch.readers.pcapng", "mlbatch.readers.rosbag1"),
-    *("mlbatch.readers._bag", "mlbatch.readers._envelopes", "mlbatch.readers._folder"),
-    *("mlbatch.clouds", "mlbatch.faults", "mlbatch.frames.urdf", "mlbatch.discovery.inspect"),
-    *("mlbatch.compare", "mlbatch.verify", "mlbatch.bench", "mlbatch.api"),
-    *("mlbatch.writers.npz", "mlbatch.writers.ply", "mlbatch.writers.rosbag1"),
-    *("mlbatch.cli.bench", "mlbatch.cli.compare", "mlbatch.cli.inspect", "mlbatch.cli.verify"),
+    *("mlbatch.sensors.pointcloud.sensor", "mlbatch.sensors.robosense.sensor"),
+    *("mlbatch.sensors.velodyne.sensor", "mlbatch.sensors.robosense.identify"),
+    *("mlbatch.sensors.velodyne.identify", "mlbatch.readers.formats.mcap"),
+    *("mlbatch.readers.formats.pcapng", "mlbatch.readers.formats.rosbag1"),
+    *("mlbatch.readers.bag.recording", "mlbatch.readers.bag.packet_messages"),
+    *("mlbatch.readers.bag.folder", "mlbatch.readers.bag.clouds", "mlbatch.faults.replay"),
+    *("mlbatch.frames.urdf", "mlbatch.discovery.inspect", "mlbatch.compare.compare"),
+    *("mlbatch.verify.verdict", "mlbatch.bench.runner", "mlbatch.api"),
+    *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
+    *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
+    *("mlbatch.cli.inspect", "mlbatch.cli.verify"),
     *("numpy.ma", "rosbags", "rich", "numba"),
 )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,7 +14,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "mlbatch"
-PLUGIN_PACKAGES = ("readers", "sensors", "writers")
+# Formats of readers and writers, sensors of vendors.
+PLUGIN = re.compile(r"(?:readers|writers)\.formats\.\w+|sensors\.\w+\.sensor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +50,8 @@ def modules() -> tuple[Module, ...]:
 
 @lru_cache(maxsize=1)
 def plugins() -> tuple[Module, ...]:
-    """Modules that are found by their name."""
-    return tuple(
-        module
-        for module in modules()
-        if module.top in PLUGIN_PACKAGES and "." in module.name and "._" not in module.name
-    )
+    """Modules that are found by their place, and named by no other."""
+    return tuple(module for module in modules() if PLUGIN.fullmatch(module.name))
 
 
 def _module(path: Path) -> Module:

@@ -14,7 +14,7 @@ from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.types import RunInfo, Scan, SensorInfo
 from tests.builders.velodyne import VelodyneSpec
-from tests.unit.sensors.velodyne_streams import Seen, made_of
+from tests.builders.velodyne_streams import Seen, made_of
 
 _POSES = (np.eye(4), from_rpy_deg((0, 0.8, 1.6), (0, 0, 60)), from_rpy_deg((-1, 0, 2), (3, 9, 180)))
 _NONE = np.empty((0, 6))

@@ -1,4 +1,4 @@
-"""What is found out about a session before it is converted."""
+"""Sensors of a session: names, poses, metadata, choice, warnings."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Setup, Wishes, describe, discover
-from mlbatch.discovery.probe import calibrations_for, first_seconds, look
+from mlbatch.discovery.discover import Discovery, SensorSelection, discover
+from mlbatch.discovery.match import describe
+from mlbatch.discovery.probe import find_calibrations, first_seconds, probe
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
@@ -26,9 +27,9 @@ from tests.builders.sessions import (
 POSE = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -0.25, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def _discover(capture: Path, wishes: Wishes | None = None) -> Setup:
+def _discover(capture: Path, selection: SensorSelection | None = None) -> Discovery:
     table = StreamTable()
-    return discover([open_recording(capture, table)], table, wishes or Wishes())
+    return discover([open_recording(capture, table)], table, selection or SensorSelection())
 
 
 def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
@@ -41,15 +42,15 @@ def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
     host_ns = np.concatenate([batch.host_ns for batch in first_seconds(recordings)])
     assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
     # 32 packets a turn of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
-    sampler, _ = look(recordings, table)
-    assert list(sampler.packets.values()) == [60 * 32, 50 * 32 + 1]
+    sampler, _ = probe(recordings, table)
+    assert [samples.packets for samples in sampler.kinds.values()] == [60 * 32, 50 * 32 + 1]
 
 
 def test_sensors_without_a_rig_are_named_after_their_serial_number(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
     (sensor,) = _discover(capture).sensors
-    assert (sensor.name, sensor.extrinsics_source) == ("ouster_111", "metadata")
-    np.testing.assert_array_equal(sensor.body_from_sensor, np.reshape(POSE, (4, 4)))
+    assert (sensor.name, sensor.pose.source) == ("ouster_111", "metadata")
+    np.testing.assert_array_equal(sensor.pose.body_from_sensor, np.reshape(POSE, (4, 4)))
 
 
 def test_sensors_without_a_serial_number_are_numbered(tmp_path: Path) -> None:
@@ -65,36 +66,38 @@ def test_the_frame_of_a_single_lidar(tmp_path: Path, posed: bool, frame: str) ->
     assert _discover(write_session(tmp_path, Unit(spec=spec))).frame_id == frame
 
 
-def test_two_lidars_need_extrinsics_or_a_word_that_they_do_not(tmp_path: Path) -> None:
+def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> None:
     known = Unit(spec=replace(SMALL, extrinsic_m=POSE))
     capture = write_session(tmp_path, known, twin(Unit(), 222))
-    with pytest.raises(RigError, match="extrinsics unknown for ouster_222; wanted for every"):
+    with pytest.raises(RigError, match="extrinsics unknown for ouster_222; required for every"):
         _discover(capture)
-    setup = _discover(capture, Wishes(identity_extrinsics=True))
-    assert [s.extrinsics_source for s in setup.sensors] == ["metadata", "identity"]
-    assert setup.frame_id == "base_link"
+    found = _discover(capture, SensorSelection(identity_extrinsics=True))
+    assert [s.pose.source for s in found.sensors] == ["metadata", "identity"]
+    assert found.frame_id == "base_link"
     # A single one may do without.
-    assert [s.name for s in _discover(capture, Wishes(only=("222",))).sensors] == ["ouster_222"]
+    assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
+        "ouster_222"
+    ]
 
 
 def test_the_rig_gives_names_order_frame_and_extrinsics(tmp_path: Path) -> None:
-    setup = _discover(FIXTURE / "two_lidars.pcap", Wishes(rig=FIXTURE / "rig.yaml"))
-    assert [sensor.name for sensor in setup.sensors] == ["left", "right"]
-    assert [sensor.extrinsics_source for sensor in setup.sensors] == ["rig", "rig"]
-    assert setup.sensors[0].body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
-    assert setup.frame_id == "base_link"
-    assert setup.notes == []
+    found = _discover(FIXTURE / "two_lidars.pcap", SensorSelection(rig=FIXTURE / "rig.yaml"))
+    assert [sensor.name for sensor in found.sensors] == ["left", "right"]
+    assert [sensor.pose.source for sensor in found.sensors] == ["rig", "rig"]
+    assert found.sensors[0].pose.body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
+    assert found.frame_id == "base_link"
+    assert found.notes == []
 
 
 def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
     rig = tmp_path / "rig.yaml"
     rig.write_text("sensors:\n- {name: top, extrinsics: {translation_m: [1, 2, 3]}}\n")
-    (sensor,) = _discover(capture, Wishes(rig=rig)).sensors
-    assert (sensor.extrinsics_source, sensor.body_from_sensor[:3, 3].tolist()) == ("rig", [1, 2, 3])
+    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
+    assert (sensor.pose.source, sensor.pose.body_from_sensor[:3, 3].tolist()) == ("rig", [1, 2, 3])
     rig.write_text("sensors:\n- {name: top}\n")
-    (sensor,) = _discover(capture, Wishes(rig=rig)).sensors
-    assert sensor.extrinsics_source == "metadata"
+    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
+    assert sensor.pose.source == "metadata"
 
 
 def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) -> None:
@@ -104,51 +107,51 @@ def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) 
         write_metadata(folder / "any name.JSON", replace(SMALL, serial=serial))
         (folder / "notes.txt").write_text("not looked at")
         (folder / "other.json").write_text("[1, 2]")
-    found, looked = calibrations_for([first / "a.pcap", second / "b.pcap", first / "c.pcap"], [])
+    found, examined = find_calibrations([first / "a.pcap", second / "b.pcap", first / "c.pcap"], [])
     assert [calibration.serial for calibration in found] == ["1", "2"]
-    assert len(looked) == 4
+    assert len(examined) == 4
 
 
 def test_given_metadata_must_be_such(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     other.write_text("[1, 2]")
-    with pytest.raises(RigError, match=r"other\.json: wanted the metadata or calibration"):
-        calibrations_for([tmp_path / "a.pcap"], [other])
+    with pytest.raises(RigError, match=r"other\.json: expected the metadata or calibration"):
+        find_calibrations([tmp_path / "a.pcap"], [other])
 
 
-def test_an_unusable_file_beside_the_recording_is_passed_over(tmp_path: Path) -> None:
+def test_an_unusable_file_in_the_directory_is_skipped(tmp_path: Path) -> None:
     """It was never named by the user; where it is named it is an error."""
     broken = write_metadata(tmp_path / "broken.json", replace(SMALL, altitude_deg=(1.0, 2.0)))
-    assert calibrations_for([tmp_path / "a.pcap"], []) == ([], [broken])
+    assert find_calibrations([tmp_path / "a.pcap"], []) == ([], [broken])
     with pytest.raises(RigError, match=r"broken\.json"):
-        calibrations_for([tmp_path / "a.pcap"], [broken])
+        find_calibrations([tmp_path / "a.pcap"], [broken])
 
 
 def test_unknown_packets_are_described(tmp_path: Path) -> None:
     one = Unit()
     capture = write_session(tmp_path, one, more=one.imu_records(2), metadata=False)
     table = StreamTable()
-    sampler, _ = look([open_recording(capture, table)], table)
-    words = {size: describe(sampler, (stream, size)) for stream, size in sampler.samples}
+    sampler, _ = probe([open_recording(capture, table)], table)
+    words = {kind.size: describe(sampler, kind) for kind in sampler.kinds}
     assert words == {
         1280: "Ouster lidar, serial 111, 1280 bytes: needs its metadata",
         48: "Ouster IMU",
     }
-    with pytest.raises(RecordingError, match="wanted metadata that fits, got none beside"):
+    with pytest.raises(RecordingError, match="expected metadata that match, found none in"):
         _discover(capture)
 
 
 def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), twin(Unit(), 222))
-    for wishes in (Wishes(only=("222",)), Wishes(ignore=("ouster_111",))):
-        setup = _discover(capture, wishes)
-        assert [sensor.name for sensor in setup.sensors] == ["ouster_222"]
-        assert len(setup.ignored) == 1
-    with pytest.raises(UsageError, match="one of ouster_111, ouster_222, got 'front'"):
-        _discover(capture, Wishes(only=("front",)))
+    for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
+        found = _discover(capture, selection)
+        assert [sensor.name for sensor in found.sensors] == ["ouster_222"]
+        assert len(found.ignored) == 1
+    with pytest.raises(UsageError, match="one of ouster_111, ouster_222, found 'front'"):
+        _discover(capture, SensorSelection(only=("front",)))
 
 
-def test_what_a_lidar_says_of_itself_becomes_a_note(tmp_path: Path) -> None:
+def test_warnings_of_a_decoder_become_notes(tmp_path: Path) -> None:
     """Here that its output was off, by the metadata, though packets came."""
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, lidar_port=0)))
     (note,) = _discover(capture).notes
@@ -164,5 +167,5 @@ def test_a_sensor_of_the_rig_that_is_silent_at_first_is_noted(tmp_path: Path) ->
         "\n- {name: rear, stream: {source_ip: 10.0.0.2}, metadata: 111.json, "
         "extrinsics: {translation_m: [0, 0, 0]}}\n"
     )
-    (note,) = _discover(capture, Wishes(rig=rig)).notes
+    (note,) = _discover(capture, SensorSelection(rig=rig)).notes
     assert (note.code, note.sensor) == ("not_seen_yet", "rear")

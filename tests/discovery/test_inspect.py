@@ -1,4 +1,4 @@
-"""`mlbatch inspect`: what it says of recordings, and the rig file it writes."""
+"""`mlbatch inspect`: table, JSON, notes, and the rig file it writes."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ LEFT, RIGHT = "ouster_122647000123", "ouster_122648000456"
 def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
     outcome = shell(f"inspect {arguments} --json")
     assert (outcome.code, outcome.err) == (0, "")
-    told = json.loads(outcome.out)
-    assert told["schema"] == "mlbatch.inspect/1"
-    streams: list[dict[str, Any]] = told["streams"]
+    document = json.loads(outcome.out)
+    assert document["schema"] == "mlbatch.inspect/1"
+    streams: list[dict[str, Any]] = document["streams"]
     return streams
 
 
@@ -48,20 +48,18 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     starts = [head.index(word) for word in head.split()]
     ends = [*starts[1:], None]
     cells = [[row[a:b].strip() for a, b in zip(starts, ends, strict=True)] for row in [head, *rows]]
-    assert cells[0] == [
-        *("stream", "what", "sensor", "packets", "Hz", "lost", "seconds"),
-        *("clock", "calibration", "extrinsics", "missing"),
-    ]
+    assert " ".join(cells[0]) == (
+        "stream what sensor packets Hz lost seconds clock calibration extrinsics missing"
+    )
     table = {row[0]: row[1:] for row in cells[1:]}
     # Packets, rates and spans by fixtures/two_lidars/SOURCE.md.
-    assert table["10.5.5.87 > port 7502"][:6] == [
-        *("OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16", LEFT, "271", "320.0", "0", "0.844")
-    ]
-    assert table["10.5.5.87 > port 7502"][6].startswith("utc -")
-    assert table["10.5.5.87 > port 7502"][7:] == ["left.json", "", ""]
-    assert table["10.5.5.87 > port 7503"] == [
-        *("Ouster IMU", LEFT, "85", "100.0", "", "0.840", "", "", "", "")
-    ]
+    model = "OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16"
+    lidar = table["10.5.5.87 > port 7502"]
+    assert lidar[:6] == [model, LEFT, "271", "320.0", "0", "0.844"]
+    assert lidar[6].startswith("utc -")
+    assert lidar[7:] == ["left.json", "", ""]
+    imu = table["10.5.5.87 > port 7503"]
+    assert imu == ["Ouster IMU", LEFT, "85", "100.0", "", "0.840", "", "", "", ""]
     assert table["10.5.5.88 > port 7503"][1] == RIGHT
     assert table["10.5.5.20 > port 5353"][:3] == ["unknown", "", "2"]
     assert len(table) == 5
@@ -69,7 +67,7 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     assert clocks.count("clock: UTC, -") == 2
 
 
-def test_json_tells_the_same_with_all_digits(shell: Shell) -> None:
+def test_json_has_the_same_values_with_all_digits(shell: Shell) -> None:
     (left,) = [s for s in _streams(shell, str(CAPTURE)) if s["serial"] == "122647000123"]
     assert (left["model"], left["mode"]) == ("OS-0-32-U1", "512x10 RNG19_RFL8_SIG16_NIR16")
     assert (left["bytes"], left["packets"], left["lost"]) == (6400, 271, 0)
@@ -85,20 +83,20 @@ def test_loss_and_clock_of_an_unsynchronised_lidar(shell: Shell, tmp_path: Path)
     gone = slice(24 + 10 * 1338, 24 + 13 * 1338)
     capture.write_bytes(raw[: gone.start] + raw[gone.stop :])
     outcome = shell(f"inspect {capture}")
-    # 16 columns of a 512x10 turn last 3.125 ms.
+    # 16 columns of a 512x10 revolution last 3.125 ms.
     assert "uptime -1700000000.003 s" in outcome.out
     (stream,) = _streams(shell, str(capture))
     assert (stream["packets"], stream["lost"], stream["timescale"]) == (93, 3, "uptime")
 
 
-def test_a_stream_without_metadata_says_what_is_missing(shell: Shell, tmp_path: Path) -> None:
+def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), metadata=False)
     (stream,) = _streams(shell, str(capture))
     assert (stream["sensor"], stream["missing"]) == ("", "metadata")
     assert stream["what"] == "Ouster lidar, serial 111, 1280 bytes: needs its metadata"
     outcome = shell(f"inspect {capture}")
     assert outcome.out.splitlines()[-1] == (
-        "note: no lidar with its metadata; files looked at: none"
+        "note: no lidar with its metadata; files examined: none"
     )
 
 
@@ -107,18 +105,19 @@ def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     capture.write_bytes(capture.read_bytes()[:-100])
     outcome = shell(f"inspect {capture}")
     assert outcome.out.splitlines()[-1] == (
-        "note: drive.pcap: byte 127134: the file ends within a record; wanted 1338 bytes, got 1238"
+        "note: drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, "
+        "found 1238"
     )
 
 
-def test_only_the_first_ten_seconds_are_looked_at(shell: Shell, tmp_path: Path) -> None:
+def test_only_the_first_ten_seconds_are_read(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(turns=110))
     (stream,) = _streams(shell, str(capture))
     # Packets come every 3.125 ms; one of them just 10 s after the first.
     assert stream["packets"] == 10_000 * 1000 // 3125 + 1
 
 
-def test_extrinsics_of_the_metadata_are_told_and_written(shell: Shell, tmp_path: Path) -> None:
+def test_extrinsics_of_the_metadata_are_shown_and_written(shell: Shell, tmp_path: Path) -> None:
     pose = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -0.25, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=pose)))
     (stream,) = _streams(shell, str(capture))
@@ -163,7 +162,7 @@ def test_no_rig_is_written_of_nothing(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"inspect {capture} --write-rig rig.yaml")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: --write-rig: wanted at least one lidar with its metadata, got none; "
+        "mlbatch: error: --write-rig: expected at least one lidar with its metadata, found none; "
         "give --metadata FILE\n"
     )
     assert not Path("rig.yaml").exists()
@@ -235,16 +234,11 @@ def test_two_real_sensors_on_one_port(shell: Shell, kind: str) -> None:
     case = OUSTER / f"two-sensors_same-ports_{kind}" / f"same_ports_{kind}.pcap"
     streams = _streams(shell, str(case))
     found = {(s["stream"].split()[0], s["sensor"], s["bytes"]) for s in streams}
-    first, second = (
-        ("169.254.92.158", "ouster_122247000785"),
-        (
-            "169.254.238.111",
-            "ouster_122239000672",
-        ),
-    )
+    first = ("169.254.92.158", "ouster_122247000785")
+    second = ("169.254.238.111", "ouster_122239000672")
     sizes = {"legacy": (24896, 12608), "nonlegacy": (16640, 16640)}[kind]
-    wanted = {(*first, sizes[0]), (*second, sizes[1])}
+    expected = {(*first, sizes[0]), (*second, sizes[1])}
     if kind == "nonlegacy":
-        wanted |= {(*first, 48), (*second, 48)}
-    assert found == wanted
+        expected |= {(*first, 48), (*second, 48)}
+    assert found == expected
     assert all("same_ports" in s["calibration"] for s in streams if s["bytes"] > 48)

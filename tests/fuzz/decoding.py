@@ -59,7 +59,7 @@ def decode_samples(
     options = rng.choice(_DECODE)
     every = [*calibrations, *sensors.built_in()]
     model, is_rigged = rng.choice(sensors.models()).name, rng.random() < 0.4
-    for kind in sampler.samples:
+    for kind in sampler.kinds:
         evidence = sampler.evidence(kind)
         text = sensors.describe(evidence.size, evidence.sample)
         if text is not None and (not text.isprintable() or len(text) > 500):

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.discovery.probe import look, with_clouds
+from mlbatch.discovery.probe import probe, with_clouds
 from mlbatch.frames.naming import Candidate
-from mlbatch.readers._bag import BagRecording, Portion
-from mlbatch.readers._definitions import definition_text
-from mlbatch.readers._packet_types import PACKET_TYPES
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+from mlbatch.readers.bag.recording import BagRecording, Portion
+from mlbatch.ros.definitions import definition_text
 from mlbatch.types import StreamTable, Topic
 from tests.builders import points
 from tests.builders.bags import Body, Recorded, definition, packet_message, transforms_message
@@ -26,7 +26,7 @@ from tests.fuzz.framing import Part, joined, parts_of
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.fuzz.readers import check_batch
-from tests.unit.readers.test_envelopes import serialised
+from tests.readers.bag.test_packet_messages import serialised
 
 # Parts of an input: the topic (type, encoding and format as a line), its definition, messages.
 _TOPIC, _DEFINITION, _MESSAGE = range(3)
@@ -142,15 +142,15 @@ def _read(data: bytes, folder: Path) -> None:
         log_ns = 10**18 + np.arange(len(size)) * 10**8
         yield Portion(whole, end - size, end, log_ns, np.zeros(len(size), np.int64))
 
-    bag = BagRecording(folder, "bag", 0, (topic,), table, portions)
+    bag = BagRecording(folder, "bag", 0, table, portions, topics=(topic,))
     recordings = with_clouds([bag], table, {topic.name})
-    sampler, learner = look(recordings, table)
+    sampler, collector = probe(recordings, table)
     for recording in recordings:
         for batch in recording.packets():
             check_batch(batch, table)
-    calibrations = learner.calibrations()
+    calibrations = collector.calibrations()
     frames = [Candidate("left/os_sensor")]
-    learner.knowledge.mount({"left": frames}, {}, {}, None)
+    collector.extrinsics.resolve({"left": frames}, {}, {}, None)
     decode_samples(sampler, calibrations, random.Random(zlib.crc32(data)))
 
 

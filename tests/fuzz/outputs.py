@@ -1,4 +1,4 @@
-"""Targets: outputs of mlbatch that others changed; `verify` has to judge, and readers to read."""
+"""Targets: changed outputs of mlbatch, for `verify` and for the readers."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ def _whole() -> tempfile.TemporaryDirectory[str]:
         "--exclude-box=-9,-9,0,9,9,9",
     )
     for form, target, compression in _FORMS.values():
-        told = command(
+        run = command(
             *("convert", *words, *limits, "--format", form, "--compression", compression),
             *("-o", Path(place.name) / target),
         )
-        if told.code:
-            raise RuntimeError(told.err)
+        if run.code:
+            raise RuntimeError(run.err)
     return place
 
 
 def _files(form: str) -> list[Path]:
-    """Files of an output, those of a folder from its front on; and what lies beside it."""
+    """The first and last files of an output, report and table included."""
     place = Path(_whole().name)
     target = place / _FORMS[form][1]
     inner = sorted(target.iterdir()) if target.is_dir() else sorted(place.glob(f"{target.name}*"))
@@ -78,7 +78,7 @@ def _mutated(rng: random.Random, seeds: Seeds) -> bytes:
     (part,) = parts_of(rng.choice(seeds))
     if part.data.startswith(_MAGIC) and rng.random() < 0.6:
         return joined([Part(part.kind, 0, mutated_mcap(rng, [part.data]))])
-    # Texts are told by their first byte: report, table, metadata.
+    # Report, table and metadata.yaml, by their first byte.
     change = mutated_text if part.data[:1] in b"{ir" and rng.random() < 0.9 else mutated
     return joined([Part(part.kind, 0, change(rng, [part.data]))])
 

@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch import sensors
 from mlbatch.errors import MlbatchError
 from mlbatch.lidar.interface import Calibration, Evidence, ModelFile
-from mlbatch.sensors._ouster_profiles import PROFILES
+from mlbatch.sensors.ouster.profiles import PROFILES
 from tests.builders import ouster, robosense, velodyne
 from tests.builders.livox import (
     CARTESIAN16,
@@ -28,13 +28,13 @@ from tests.builders.livox import (
 )
 from tests.builders.others import livox1_packets
 from tests.builders.velodyne_tables import calibration_yaml
+from tests.builders.velodyne_xml import entries, xml_of
 from tests.contract.tree import ROOT
 from tests.fuzz.decoding import check_lidar, decode_samples, sampled, try_all
 from tests.fuzz.framing import Part, joined, mutated_parts, parts_of
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.golden.test_every_model import CASES
-from tests.unit.sensors.test_velodyne_calibration_xml import points, xml_of
 
 # Parts of an input that are no datagrams: a calibration, its name.
 CALIBRATION, _LIDAR_PORT, _DEVICE_PORT = 0, 2368, 7788
@@ -138,7 +138,10 @@ def _files() -> dict[str, Seeds]:
     flat = ouster.OusterSpec("LEGACY", beams=16)
     found[".json"].append(json.dumps(ouster.flat_json(flat)).encode())
     found[".yaml"] += [calibration_yaml(model).encode() for model in ("VLP-16", "HDL-64E S2")]
-    found[".xml"] += [xml_of(points(64), [1] * 64).encode(), xml_of(points(16)).encode()]
+    found[".xml"] += [
+        xml_of(entries(64), [1] * 64).encode(),
+        xml_of(entries(16)).encode(),
+    ]
     fan = robosense.fan(robosense.RobosenseSpec("Helios 32-31"))
     found[".csv"].append(robosense.angles_csv(fan).encode())
     return {name: tuple(dict.fromkeys(seeds)) for name, seeds in found.items()}
@@ -157,7 +160,7 @@ def _seen() -> Sequence[Part]:
 @lru_cache(maxsize=1)
 def _evidence() -> Sequence[Evidence]:
     sampler = sampled(_seen())
-    return [sampler.evidence(kind) for kind in sampler.samples]
+    return [sampler.evidence(kind) for kind in sampler.kinds]
 
 
 def _calibrate(suffix: str, data: bytes, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import importlib
+import itertools
 import os
 import random
 import struct
@@ -19,8 +20,8 @@ import zstandard
 
 from mlbatch.decode.kernels import is_installed
 from mlbatch.errors import MlbatchError
-from mlbatch.readers import open_recording, use_engine
-from mlbatch.readers._capture import CaptureRecording
+from mlbatch.readers import open_recording
+from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from tests.builders import mcaps, rosbag1
 from tests.builders.bags import Recorded, fixture_messages
@@ -51,11 +52,12 @@ _lz4 = importlib.import_module("lz4.frame")
 
 
 def read_all(recording: Recording, streams: StreamTable) -> None:
-    """Read a recording twice, with the messages of all topics; the second time only its begin."""
+    """Read a recording twice, with the messages of all topics; then only its first batch."""
     recording.keep = frozenset(topic.name for topic in recording.topics)
-    for until_ns in (None, 1_000_000):
-        for batch in recording.packets(until_ns):
-            check_batch(batch, streams)
+    for most in (None, None, 1):
+        with contextlib.closing(recording.packets()) as packets:
+            for batch in itertools.islice(packets, most):
+                check_batch(batch, streams)
         counts = recording.counts
         if counts.frames != counts.datagrams + sum(counts.skipped.values()):
             raise BrokenLaw(f"frames are forgotten or invented: {counts}")
@@ -98,7 +100,7 @@ def _told(path: Path, engine: str) -> list[object]:
     """All that a reader says of a capture; how it cuts batches is its own affair."""
     streams = StreamTable()
     recording = open_recording(path, streams)
-    use_engine([recording], engine)
+    recording.use_engine(engine)
     if isinstance(recording, CaptureRecording):
         recording.buffer_bytes = _BUFFERS[path.stat().st_size % len(_BUFFERS)]
     told: list[object] = []

@@ -19,7 +19,7 @@ from unittest.mock import patch
 from mlbatch.decode import numba_engine
 from mlbatch.decode.kernels import is_installed
 from mlbatch.decode.kernels.native import Constant, Kernel, load
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
 from tests.builders.captures import udp_frame, write_pcap
@@ -39,7 +39,7 @@ _JOBS = (
     Job((), keep_partial=True, keep_repeated=True, layout="organized"),
     Job((), keep_partial=True, slices=3, min_range_m=1.0),
     Job((), split=True, rate=Fraction(1000)),
-    Job((), Wishes(decode={"firing_azimuth": "off"}), keep_partial=True),
+    Job((), SensorSelection(decode={"firing_azimuth": "off"}), keep_partial=True),
 )
 
 
@@ -63,8 +63,8 @@ def _job(data: bytes, folder: Path) -> Job:
             records += [(min(part.host_ns, _LAST_NS), frame) for frame in frames]
     capture = write_pcap(folder / "lidar.pcap", records)
     job = random.Random(zlib.crc32(data)).choice(_JOBS)
-    wishes = replace(job.wishes, metadata=tuple(metadata))
-    return replace(job, recordings=(capture,), wishes=wishes)
+    selection = replace(job.selection, metadata=tuple(metadata))
+    return replace(job, recordings=(capture,), selection=selection)
 
 
 def _convert(data: bytes, folder: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from mlbatch.discovery.probe import calibrations_for, read_given
+from mlbatch.discovery.probe import find_calibrations, read_given
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.readers import open_recording
 from mlbatch.rig.rig import read_rig
@@ -122,7 +122,7 @@ def test_a_compressed_database_is_unpacked_no_further_than_its_pages(
     assert sum(file.stat().st_size for file in temporary.rglob("*.db3")) == len(whole)
     assert list(recording.packets()) == []
     path.write_bytes(pack(b"no database", 1024))
-    with pytest.raises(MlbatchError, match="wanted a recording"):
+    with pytest.raises(MlbatchError, match="expected a recording"):
         open_recording(path, StreamTable())
 
 
@@ -158,9 +158,9 @@ def test_a_gigabyte_beside_the_recording_is_not_read(
     def run(data: bytes, folder: Path) -> None:
         (folder / "a.pcap").write_bytes(pcap_bytes([]))
         path = _sparse(tmp_path / name, 1 << 30, data)
-        found, looked = calibrations_for([tmp_path / "a.pcap"], [])
+        found, looked = find_calibrations([tmp_path / "a.pcap"], [])
         assert (found, looked) == ([], [])
-        with pytest.raises(RigError, match="wanted the metadata"):
+        with pytest.raises(RigError, match="expected the metadata"):
             read_given(path)
 
     _sound(_examined(begin, run))
@@ -182,7 +182,7 @@ def test_gigabytes_of_bag_metadata_are_not_read(tmp_path: Path) -> None:
     def run(data: bytes, folder: Path) -> None:
         _sparse(bag / "metadata.yaml", 1 << 30, data)
         notes = open_recording(bag, StreamTable()).notes
-        assert notes == ["metadata.yaml: cannot be read; the files in the folder are taken"]
+        assert notes == ["metadata.yaml: cannot be read; the files in the folder are read"]
 
     _sound(_examined(b"rosbag2_bagfile_information:\n", run))
 

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RecordingError, RigError, one_line
-from mlbatch.readers import decode_transforms, open_recording
-from mlbatch.readers._envelopes import Unpacker
+from mlbatch.readers import open_recording
+from mlbatch.readers.bag.packet_messages import Unpacker
 from mlbatch.rig.rig import read_rig
+from mlbatch.ros import decode_transforms
 from mlbatch.types import StreamTable, Topic
 from tests.builders.bags import Recorded, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
@@ -132,7 +133,7 @@ def test_packets_have_one_time_each_whatever_a_definition_says(text: str) -> Non
 def test_transforms_of_another_definition_are_an_error() -> None:
     text = "geometry_msgs/TransformStamped[] transforms\n===\nMSG: geometry_msgs/TransformStamped\n"
     topic = Topic("/tf", "tf2_msgs/TFMessage", "ros1", text + "string child_frame_id\n", "ros1msg")
-    with pytest.raises(RecordingError, match="got a definition without"):
+    with pytest.raises(RecordingError, match="found a definition without"):
         decode_transforms(topic, struct.pack("<II", 1, 1) + b"a")
 
 
@@ -163,7 +164,7 @@ def test_links_that_lead_to_themselves_are_one_line(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
     (bag / "bag_0.db3").symlink_to(bag / "bag_0.db3")
-    with pytest.raises(RecordingError, match="wanted a recording"):
+    with pytest.raises(RecordingError, match="expected a recording"):
         open_recording(bag, StreamTable())
 
 
@@ -214,7 +215,7 @@ def test_tables_without_their_columns_are_no_bag(old: str, new: str, tmp_path: P
     data = path.read_bytes()
     assert old.encode() in data
     path.write_bytes(data.replace(old.encode(), new.encode()))
-    with pytest.raises(RecordingError, match="wanted a ROS 2 bag"):
+    with pytest.raises(RecordingError, match="expected a ROS 2 bag"):
         open_recording(path, StreamTable())
 
 

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from mlbatch import sensors
 from mlbatch.cli import options
-from mlbatch.discovery.match import Wanted, match_rig
+from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import joints
-from mlbatch.rig.rig import Rig, StreamSelector, read_rig
+from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
-from mlbatch.sensors._options import check_options
+from mlbatch.sensors.options import check_options
 from mlbatch.types import StreamTable
 from tests.builders.four_makers import RIG
 from tests.builders.sessions_of_bags import urdf
@@ -68,7 +68,7 @@ def _sampler() -> Sampler:
     from mlbatch.readers import open_recording
 
     recording = open_recording(_FIXTURES[-1].parent / "two_lidars.pcap", table)
-    for batch in recording.packets(100_000_000):
+    for batch in recording.packets():
         sampler.add(batch)
     return sampler
 
@@ -95,17 +95,13 @@ def _rig(data: bytes, folder: Path) -> None:
 
 def _match(rig: Rig, path: Path) -> None:
     every = sensors.built_in()
-    wanted = [
-        Wanted(
-            one.name,
-            one.stream or StreamSelector(),
-            [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
-            one.decode,
-            one.model,
+    expected = [
+        ExpectedSensor(
+            one, [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every
         )
         for one in rig.sensors
     ]
-    match_rig(_sampler(), wanted, path)
+    match_rig(_sampler(), expected, path)
 
 
 def _urdfs() -> Seeds:

@@ -24,7 +24,7 @@ from tests.builders.sessions_of_bags import packets_only, told, write_mcap
 from tests.golden.maker_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
 from tests.matrix.containers import rig_text
-from tests.matrix.lidars import MAKERS, Spell, write_metadata
+from tests.matrix.lidars import VENDORS, Spell, write_metadata
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 CAPTURES = ("pcap", "pcapng")
@@ -62,7 +62,7 @@ def write_recordings(folder: Path) -> None:
         (folder / name).mkdir(parents=True)
     _two_lidars(folder / "two_lidars")
     _four_makers(folder / "four_makers")
-    for vendor in MAKERS:
+    for vendor in VENDORS:
         _vendor(folder / vendor, vendor)
     _livox(folder / "livox")
     _clouds(folder / "clouds")
@@ -206,10 +206,10 @@ def _robosense(topic: str, sent: _Datagram, encoding: str) -> Recorded:
 
 
 def _vendor(folder: Path, vendor: str) -> None:
-    session = [MAKERS[vendor].send(_SPELL)]
+    session = [VENDORS[vendor].send(_SPELL)]
     write_metadata(folder)
     for path in folder.iterdir():
-        if path.name != MAKERS[vendor].metadata:
+        if path.name != VENDORS[vendor].metadata:
             path.unlink()
     for container in CONTAINERS:
         MATRIX_CONTAINERS[_MATRIX_NAMES.get(container, container)](folder, session)

@@ -1,6 +1,7 @@
 """Velodyne and HESAI packets in captures and bags, in the messages that their drivers record.
 
-Messages: facts/messages.md section 1, facts/hesai.md section 10, facts/velodyne.md section 12.
+Messages: docs/sources/messages.md section 1, docs/sources/hesai.md section 10,
+docs/sources/velodyne.md section 12.
 """
 
 from __future__ import annotations

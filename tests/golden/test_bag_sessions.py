@@ -148,10 +148,9 @@ def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> Non
 def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "drive.mcap", told(without="tf_static"))
     assert refused(bag) == (
-        "extrinsics unknown for left, right; wanted for every sensor when there are two or more; "
-        "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept "
-        "the "
-        "body origin with --identity-extrinsics"
+        "extrinsics unknown for left, right; required for every sensor when there are two or "
+        "more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or "
+        "accept the body origin with --identity-extrinsics"
     )
     assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == []
 
@@ -235,8 +234,8 @@ def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Pat
         rig.write_text("sensors: [{name: roof, clock: {source: host}}]\n", encoding="utf-8")
         options = ["--rig", rig]
     assert refused(bag, *options) == (
-        "--clock host: sensor roof: wanted the arrival time of each packet, got only that of whole "
-        "messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source) "
+        "--clock host: sensor roof: expected the receive time of each packet, found only that of "
+        "whole messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source) "
         "without --align-clocks, or record the packets with tcpdump"
     )
     assert convert(tmp_path / "scans", bag).report["sensors"][0]["packets"]["read"] == 96

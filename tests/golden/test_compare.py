@@ -1,7 +1,7 @@
-"""Joined turns against windows on recordings whose phases are known; figures worked out by hand.
+"""Frame-level fusion against windows on recordings of known phases; figures worked out by hand.
 
-Turns of `left` begin 20 ms after a line of the grid. A set's span counts from its first column to
-its last one, so it misses the last column's own time: 100 ms / 512.
+Sweeps of `left` begin 20 ms after a bound of the grid. The span of a set is from its first column
+to its last, without the duration of the last: 100 ms / 512.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 
 from mlbatch.compare.compare import WINDOWS, Comparison, compare
-from mlbatch.compare.statistics import WayReport
+from mlbatch.compare.statistics import SetReport
 from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, slug, write_case
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "compare.md"
-WAYS = ("newest turns", "nearest turns", "collected turns", WINDOWS)
+POLICIES = ("latest sweeps", "approximate time", "timeout collate", WINDOWS)
 IN_PHASE, BY_37, BY_63, DOUBLE, DRIFTING, SILENT = CASES
 # 511 / 512 of 100 ms, rounded down to ns as the encoder does.
-TURN_MS = 99.804687
+SWEEP_MS = 99.804687
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +32,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Comparison]:
     }
 
 
-def _way(found: dict[str, Comparison], case: str, way: str) -> WayReport:
-    return next(one for one in found[case].ways if one.way == way)
+def _policy(found: dict[str, Comparison], case: str, policy: str) -> SetReport:
+    return next(one for one in found[case].reports if one.policy == policy)
 
 
-def _spans_ms(report: WayReport) -> tuple[float, float]:
+def _spans_ms(report: SetReport) -> tuple[float, float]:
     low, high = report.span_ms.min, report.span_ms.max
     assert low is not None
     assert high is not None
@@ -47,7 +47,7 @@ def _spans_ms(report: WayReport) -> tuple[float, float]:
 def test_windows_span_one_period_and_use_each_column_once(
     found: dict[str, Comparison], case: str
 ) -> None:
-    ours = _way(found, case, WINDOWS)
+    ours = _policy(found, case, WINDOWS)
     assert _spans_ms(ours)[1] < 100
     assert (ours.stale, ours.used_twice, ours.never_used) == (0, 0, 0)
     # From t_init at 100 ms; the last window holds the last stamp, and is left out.
@@ -57,11 +57,11 @@ def test_windows_span_one_period_and_use_each_column_once(
 @pytest.mark.parametrize(
     ("case", "spans_ms"),
     [
-        # Turns that begin together end together.
+        # Sweeps that begin together end together.
         (IN_PHASE, (0, 0, 0)),
-        # Right's turn that ended by then began 63 ms before left's; the nearest, 37 ms after it.
+        # Right's sweep that ended by then began 63 ms before left's; the nearest, 37 ms after it.
         (BY_37, (63, 37, 37)),
-        # Turns are collected from left's first on: right's follows 63 ms later, though one that
+        # Sweeps are collected from left's first on: right's follows 63 ms later, though one that
         # began 37 ms before left's would have been nearer.
         (BY_63, (37, 37, 63)),
     ],
@@ -69,43 +69,43 @@ def test_windows_span_one_period_and_use_each_column_once(
 def test_phases_add_to_the_span(
     found: dict[str, Comparison], case: str, spans_ms: tuple[float, ...]
 ) -> None:
-    for way, more_ms in zip(WAYS, spans_ms, strict=False):
-        report = _way(found, case, way)
-        assert _spans_ms(report) == pytest.approx((TURN_MS + more_ms,) * 2, abs=1e-9)
+    for policy, more_ms in zip(POLICIES, spans_ms, strict=False):
+        report = _policy(found, case, policy)
+        assert _spans_ms(report) == pytest.approx((SWEEP_MS + more_ms,) * 2, abs=1e-9)
         assert (report.apart_ms.min, report.apart_ms.max) == (more_ms, more_ms)
         assert (report.without_a_sensor, report.stale, report.used_twice) == (0, 0, 0)
-        # 99 turns: the first has no known begin, the last no end; and some have no partner.
+        # 99 sweeps: the first has no known begin, the last no end; and some have no partner.
         assert 96 <= report.sets <= 97
     for sensor in found[case].sensors:
-        assert (sensor.turns, sensor.turn_ms) == (97, 100.0)
+        assert (sensor.sweeps, sensor.sweep_ms) == (97, 100.0)
 
 
 def test_half_of_the_faster_turns_is_lost(found: dict[str, Comparison]) -> None:
-    # The right turn of the same end has its last column nearer to it; the one of the same begin
-    # ends before; that which came first began 50 ms before left's turn.
-    spans_ms = (100 - 50 / 512, TURN_MS, 50 + TURN_MS)
-    for way, span_ms in zip(WAYS, spans_ms, strict=False):
-        report = _way(found, DOUBLE, way)
+    # The right sweep of the same end has its last column nearer to it; the one of the same begin
+    # ends before; that which came first began 50 ms before left's sweep.
+    spans_ms = (100 - 50 / 512, SWEEP_MS, 50 + SWEEP_MS)
+    for policy, span_ms in zip(POLICIES, spans_ms, strict=False):
+        report = _policy(found, DOUBLE, policy)
         assert _spans_ms(report) == pytest.approx((span_ms, span_ms), abs=2e-6)
         # Two of three columns are right's; half of them are in no set.
         assert report.never_used / report.columns == pytest.approx(1 / 3, abs=0.01)
-    assert _way(found, DOUBLE, WINDOWS).columns == 98 * 3 * 512
+    assert _policy(found, DOUBLE, WINDOWS).columns == 98 * 3 * 512
 
 
 def test_drifting_rotors_pass_through_all_phases(found: dict[str, Comparison]) -> None:
-    """In 60 s the rotors of 10.00 and 9.95 Hz drift by three turns."""
-    newest, nearest, collected = (_way(found, DRIFTING, way) for way in WAYS[:3])
-    # Right's newest turn ended up to 100.5 ms ago, and took 100.5 ms.
+    """In 60 s the rotors of 10.00 and 9.95 Hz drift by three sweeps."""
+    newest, nearest, collected = (_policy(found, DRIFTING, policy) for policy in POLICIES[:3])
+    # Right's newest sweep ended up to 100.5 ms ago, and took 100.5 ms.
     low, high = _spans_ms(newest)
     assert 100 < low < 102
     assert 198 < high < 201.01
-    # Begins at most 50 ms apart; where turns stand in opposition some find no partner.
+    # Begins at most 50 ms apart; where sweeps stand in opposition some find no partner.
     low, high = _spans_ms(nearest)
     assert low < 101
     assert 148 < high <= 150.51
     assert 590 <= nearest.sets < 597
     assert nearest.never_used > 0
-    # Right's turn is awaited for 100 ms; when it comes later still, the set goes without.
+    # Right's sweep is awaited for 100 ms; when it comes later still, the set goes without.
     low, high = _spans_ms(collected)
     assert low < 101
     assert 198 < high <= 200.51
@@ -113,16 +113,16 @@ def test_drifting_rotors_pass_through_all_phases(found: dict[str, Comparison]) -
 
 
 def test_a_silent_lidar_pollutes_joined_turns(found: dict[str, Comparison]) -> None:
-    newest, nearest, collected, ours = (_way(found, SILENT, way) for way in WAYS)
-    # Right's last whole turn began at 4.82 s; left's turn that ends at 7.92 s still meets it.
-    assert _spans_ms(newest) == pytest.approx((TURN_MS, 3000 + TURN_MS), abs=2e-6)
+    newest, nearest, collected, ours = (_policy(found, SILENT, policy) for policy in POLICIES)
+    # Right's last whole sweep began at 4.82 s; left's sweep that ends at 7.92 s still meets it.
+    assert _spans_ms(newest) == pytest.approx((SWEEP_MS, 3000 + SWEEP_MS), abs=2e-6)
     # Those that end from 5.22 s to 7.92 s: more than 200 ms after it.
     assert newest.stale == 28
-    # Left's turns that begin from 4.92 s to 7.92 s find none.
+    # Left's sweeps that begin from 4.92 s to 7.92 s find none.
     assert nearest.sets == newest.sets - 31
-    assert _spans_ms(nearest) == pytest.approx((TURN_MS, TURN_MS), abs=2e-6)
-    # Right's broken turn from 4.92 s is published at 8 s, and meets left's that ended at 7.92 s.
-    assert _spans_ms(collected) == pytest.approx((TURN_MS, 2900 + TURN_MS), abs=2e-6)
+    assert _spans_ms(nearest) == pytest.approx((SWEEP_MS, SWEEP_MS), abs=2e-6)
+    # Right's broken sweep from 4.92 s is published at 8 s, and meets left's that ended at 7.92 s.
+    assert _spans_ms(collected) == pytest.approx((SWEEP_MS, 2900 + SWEEP_MS), abs=2e-6)
     assert (collected.without_a_sensor, collected.stale) == (29, 1)
     # The windows from 5.1 s to 8.0 s.
     assert ours.without_a_sensor == 29
@@ -143,23 +143,23 @@ def _losses_table(found: dict[str, Comparison]) -> str:
     return _table("what else", found, _losses)
 
 
-def _table(title: str, found: dict[str, Comparison], tell: Callable[[WayReport], str]) -> str:
-    rows = [[title, *WAYS], ["---"] * (1 + len(WAYS))]
-    rows += [[case, *map(tell, one.ways)] for case, one in found.items()]
+def _table(title: str, found: dict[str, Comparison], cell: Callable[[SetReport], str]) -> str:
+    rows = [[title, *POLICIES], ["---"] * (1 + len(POLICIES))]
+    rows += [[case, *map(cell, one.reports)] for case, one in found.items()]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def _span(report: WayReport) -> str:
+def _span(report: SetReport) -> str:
     low, high = (f"{value:.0f}" for value in _spans_ms(report))
     return low if low == high else f"{low} to {high}"
 
 
-def _losses(report: WayReport) -> str:
+def _losses(report: SetReport) -> str:
     share = 100 * report.never_used / report.columns
-    said = [
+    parts = [
         f"{report.without_a_sensor} sets of one lidar" if report.without_a_sensor else "",
         f"{report.stale} stale" if report.stale else "",
-        # Less than a turn or two: the ends of the recording.
+        # Less than a sweep or two: the ends of the recording.
         f"{share:.0f} % of the columns unused" if share > 1 else "",
     ]
-    return ", ".join(filter(None, said)) or "-"
+    return ", ".join(filter(None, parts)) or "-"

@@ -11,7 +11,7 @@ import pytest
 
 from mlbatch.frames.naming import NAMINGS
 from mlbatch.readers import open_recording
-from mlbatch.readers._packet_types import PACKET_TYPES
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.types import StreamTable
 from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy

@@ -12,34 +12,20 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.report.report import report_text
 from tests.builders import four_makers
 from tests.builders.engines import WANTED, check_conversion, few_kernels, needs_numba
-from tests.builders.run import FIXTURE, RECORDINGS, command, in_memory, prints
+from tests.builders.run import FIXTURE, command, in_memory, prints
 from tests.golden.test_every_model import CASES, Sent, job_of
 
 pytestmark = needs_numba
 
 MAKERS = Job(
     (four_makers.FOLDER / "four_makers.pcap",),
-    Wishes(rig=four_makers.FOLDER / "rig.yaml"),
+    SensorSelection(rig=four_makers.FOLDER / "rig.yaml"),
     keep_partial=True,
-)
-REAL = (
-    "velodyne/vlp16_gps/sample_velodyne_vlp16_gps.pcap",
-    "velodyne/vlp16_ros2_dual/1673400471837873222",
-    "velodyne/vlp32c_ros2/1713492677464078412",
-    "ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10.pcap",
-    "ouster/os0-32_v2.2.0_rng19-dual/OS-0-32-U1_v2.2.0_1024x10.pcap",
-    "ouster/os1-32-g_v2.1.1_legacy/OS-1-32-G_v2.1.1_1024x10.pcap",
-    "ouster/os0-128_windowed",
-    "hesai/pandar40p",
-    "hesai/pandar64",
-    "hesai/pandarqt64",
-    "hesai/pandarxt16",
-    "hesai/pandarxt32",
 )
 
 
@@ -62,7 +48,7 @@ def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path
     assert cut.box > 0
     assert near.written > 0
     still = {"firing_azimuth": "off"}
-    check_conversion(replace(job, wishes=replace(job.wishes, decode=still)), WANTED[:1])
+    check_conversion(replace(job, selection=replace(job.selection, decode=still)), WANTED[:1])
 
 
 @pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
@@ -98,7 +84,7 @@ def test_outputs_do_not_tell_the_engine(suffix: str, tmp_path: Path) -> None:
     for engine in ("numpy", "numba"):
         target: list[str | Path] = ["-o", tmp_path / f"{engine}.{suffix}"]
         words = [*target, "--engine", engine, "--quiet"]
-        told = command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words)
+        told = command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words)
         assert (told.code, told.err) == (0, "")
     one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "numba"))
     assert one == other
@@ -115,16 +101,5 @@ def test_the_report_tells_the_engine(tmp_path: Path) -> None:
     (recording,) = FIXTURE.recordings
     report = tmp_path / "report.json"
     words: list[str | Path] = ["--dry-run", "--engine", "numba", "--report", report]
-    assert command("convert", recording, "--rig", FIXTURE.wishes.rig or "", *words).code == 0
+    assert command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words).code == 0
     assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "numba"
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_recordings(name: str) -> None:
-    path = RECORDINGS / name
-    if not path.exists():
-        pytest.skip(f"no recordings: wanted ../shared/recordings/{name}")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        found = [*path.glob("*.pcap"), *(one.parent for one in path.glob("*/metadata.yaml"))]
-        (path,) = found
-    check_conversion(Job((path,), Wishes(identity_extrinsics=True), keep_partial=True))

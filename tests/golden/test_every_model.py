@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.types import Scan
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
@@ -178,16 +178,16 @@ def job_of(sent: Sent, folder: Path) -> Job:
         for host_ns, payload in payloads
     ]
     path = write_pcap(folder / "lidar.pcap", sorted(records))
-    wishes = Wishes()
+    selection = SensorSelection()
     if sent.file:
         (folder / sent.file).write_bytes(sent.content)
-        wishes = Wishes(metadata=(folder / sent.file,))
+        selection = SensorSelection(metadata=(folder / sent.file,))
     if sent.is_named:
         rig = folder / "rig.yaml"
         more = RIG_METADATA.format(metadata=sent.file) if sent.file else ""
         rig.write_text(RIG.format(model=sent.model, ip=SOURCE) + more, encoding="utf-8")
-        wishes = Wishes(rig=rig)
-    return Job((path,), wishes, rate=Fraction(20), keep_partial=True)
+        selection = SensorSelection(rig=rig)
+    return Job((path,), selection, rate=Fraction(20), keep_partial=True)
 
 
 def convert(sent: Sent, folder: Path) -> tuple[Result, Result]:

@@ -49,7 +49,7 @@ POINT_KEYS = {
     "return_type": 0,
 }
 
-# facts/outputs.md section 2.
+# docs/sources/outputs.md section 2.
 POINT_CLOUD = np.dtype(
     [
         ("xyz", "<f4", 3),
@@ -156,7 +156,7 @@ def test_slices_sum_to_the_whole(slices: int, folder: Path, tmp_path: Path) -> N
     for path in scan_files(tmp_path / "slices"):
         scan, stamps = load(path), Cloud.of(path).column_stamp_ns
         start_ns = T_INIT_NS + int(scan["index"]) * PERIOD_NS
-        # Rounded up, as CONTRACT.md section 2 says.
+        # Rounded up, see docs/batching.md.
         bounds = [start_ns - -part * PERIOD_NS // slices for part in range(slices + 1)]
         part = int(scan["slice"])
         assert [int(scan["start_ns"]), int(scan["end_ns"])] == bounds[part : part + 2]

@@ -21,12 +21,12 @@ from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.hesai_angles import MirrorAngles, angles_csv
+from tests.builders.loss import Came
 from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes
-from tests.golden.test_loss_recordings import Came
 
 # Ten turns a second, and a dark sector is known by a dozen of them.
 LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000
@@ -131,7 +131,7 @@ def found(spoken: Spoken) -> Came:
         (sensor,) = match(sampler, calibrations, {}).sensors
         lidar = sensor.lidar
     else:
-        (kind,) = sampler.samples
+        (kind,) = sampler.kinds
         (fit,), _ = best_fits(
             sampler.evidence(kind), [*calibrations, *sensors.built_in()], {}, spoken.model
         )
@@ -151,13 +151,13 @@ def test_what_is_taken_out_is_what_is_lost(case: Case) -> None:
     count = len(packets.host_ns)
     assert packets.counted() == (0, 0)
     rng = np.random.default_rng(count)
-    # Whether a column at the edge of a dark sector was in the light may hide behind 0.01 degrees.
-    unsure = 3 if "dark" in words[2] and packets.lidar.columns_per_packet <= 3 else 0
+    is_unsure = "dark" in words[2] and packets.lidar.columns_per_packet <= 3
     for share in (0.01, 0.2):
         came = rng.random(count) >= share
         came[[0, -1]] = True
         lost, crossed = packets.counted(came, 2000)
-        assert abs(lost - missing(came)) <= unsure
+        # Packets of few columns: the edges of a dark sector are uncertain by a column.
+        assert abs(lost - missing(came)) <= (max(3, missing(came) // 100) if is_unsure else 0)
         assert crossed == 0
     came = np.ones(count, bool)
     for begin in rng.integers(1, count - 50, 3).tolist():

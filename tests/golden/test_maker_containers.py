@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
-from mlbatch.readers import open_recording
-from mlbatch.types import StreamTable
 from tests.builders import hesai, velodyne
 from tests.builders.hesai_angles import angles_csv
-from tests.builders.run import RECORDINGS, Values, buffers_of, in_memory, prints
+from tests.builders.run import Values, buffers_of, in_memory, prints
 from tests.golden.maker_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
 
 LENGTH_NS = 250 * NS_PER_MS
@@ -54,8 +52,8 @@ def angles(folder: Path) -> Path:
 
 def job(metadata: Path, *recordings: Path) -> Job:
     """Everything in a session, at 20 Hz."""
-    wishes = Wishes(metadata=(metadata,), identity_extrinsics=True)
-    return Job(recordings, wishes, Fraction(20), keep_partial=True)
+    selection = SensorSelection(metadata=(metadata,), identity_extrinsics=True)
+    return Job(recordings, selection, Fraction(20), keep_partial=True)
 
 
 @pytest.fixture(scope="module")
@@ -106,34 +104,3 @@ def test_scans_do_not_depend_on_the_files_of_a_session(
     paths.append(CONTAINERS["pcapng"](tmp_path, (velodyne_unit,)))
     found = in_memory(job(angles(tmp_path), paths[first], paths[1 - first]))
     assert prints(found) == plain
-
-
-REAL = {
-    "velodyne": ("velodyne/vlp16_ros2_dual", "1673400471837873222", "VLP16.yaml"),
-    "hesai": ("hesai/pandarxt16", "1732848127890747768", "PandarXT16.csv"),
-}
-
-
-def packets_of(path: Path) -> tuple[tuple[int, bytes], ...]:
-    """Arrival and payload of all packets of a recording."""
-    found = []
-    for batch in open_recording(path, StreamTable()).packets():
-        places = (batch.host_ns, batch.start, batch.size)
-        for host_ns, start, size in zip(*(values.tolist() for values in places), strict=True):
-            found.append((host_ns, batch.data[start : start + size].tobytes()))
-    return tuple(found)
-
-
-@pytest.mark.parametrize("maker", REAL)
-def test_packets_of_a_real_bag_in_other_containers(maker: str, tmp_path: Path) -> None:
-    folder, bag, file = REAL[maker]
-    if not (RECORDINGS / folder).is_dir():
-        pytest.skip(f"no recording: wanted ../shared/recordings/{folder}")
-    metadata, source = RECORDINGS / folder / file, RECORDINGS / folder / bag
-    whole = prints(in_memory(job(metadata, source)))
-    assert len(whole) > 6
-    unit = unit_of(maker, packets_of(source))
-    for number, write in enumerate(CONTAINERS.values()):
-        (tmp_path / str(number)).mkdir()
-        path = write(tmp_path / str(number), (unit,))
-        assert prints(in_memory(job(metadata, path))) == whole

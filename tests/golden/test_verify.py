@@ -1,7 +1,7 @@
-"""Whatever the tool writes is proven clean, and what a format shows is judged.
+"""Outputs of the tool have no violation, and what a format shows is checked.
 
-Both fixtures in every format, layout and preset; lidars that look odd to a proof: ranges of an
-HDL-64E begin elsewhere, a Ruby gives each return a column of its own, a PandarQT64 fires longest.
+Both fixtures in every format, layout and preset; unusual lidars: ranges of an HDL-64E begin
+elsewhere, a Ruby gives each return its own column, a PandarQT64 has the longest columns.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ FORMS: dict[str, tuple[str, ...]] = {
 }
 PRESETS = ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal")
 SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
-# What is judged in each format, of merged scans at the standard layout; the rest stays open.
+# Checks with values in each format, of merged scans at the standard layout.
 MESSAGES = set(CHECKS) - {"names", "geometry", "duplicates", "messages"}
-JUDGED = {
+CHECKED = {
     "npz": set(CHECKS) - {"stamps", "tf_static", "imu", "messages"},
     "ply": set(CHECKS) - {"stamps", "tf_static", "imu", "messages", "geometry", "duplicates"},
     "mcap": MESSAGES,
@@ -62,12 +62,12 @@ JUDGED = {
 
 
 def converted(folder: Path, fixture: str, name: str, *words: str) -> Verdict:
-    """What is said of a conversion of a fixture."""
+    """The verdict on a conversion of a fixture."""
     source = ROOT / "fixtures" / fixture
     target = folder / f"out{SUFFIX.get(name, '')}"
     rig = ("--rig", source / "rig.yaml", "--quiet", "--overwrite")
-    told = command("convert", source / f"{fixture}.pcap", "-o", target, *rig, *words)
-    assert (told.code, told.err) == (0, "")
+    run = command("convert", source / f"{fixture}.pcap", "-o", target, *rig, *words)
+    assert (run.code, run.err) == (0, "")
     return verify(target)
 
 
@@ -80,8 +80,8 @@ def test_fixtures_are_clean(form: str, fixture: str, tmp_path: Path) -> None:
         assert verdict.ok, (words, verdict.violations)
         # The Velodyne, the HESAI and the ROBOSENSE of the other fixture have no IMU packets.
         if not words and fixture == "two_lidars":
-            judged = {check.name for check in verdict.checks if check.judged}
-            assert judged == JUDGED[name]
+            checked = {check.name for check in verdict.checks if check.checked}
+            assert checked == CHECKED[name]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -114,8 +114,8 @@ def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
     for layout in ("dense", "organized"):
         target = tmp_path / layout
         more = ("--rate", "20", "--keep-partial", "--layout", layout)
-        told = command("convert", path, "-o", target, *words, *more)
-        assert told.code == 0, told.err
+        run = command("convert", path, "-o", target, *words, *more)
+        assert run.code == 0, run.err
         verdict = verify(target)
         assert verdict.ok, verdict.violations
         assert verdict.points > 0
@@ -125,13 +125,13 @@ def test_recorded_messages_are_counted(tmp_path: Path) -> None:
     session = SESSIONS["MCAP"](tmp_path)
     for name in ("scans.mcap", "scans.bag"):
         words = ("--pass", "*metadata", "--quiet")
-        told = command("convert", session, "-o", tmp_path / name, *words)
-        assert told.code == 0, told.err
+        run = command("convert", session, "-o", tmp_path / name, *words)
+        assert run.code == 0, run.err
         verdict = verify(tmp_path / name)
         assert verdict.ok, verdict.violations
-        judged = {check.name: check.judged for check in verdict.checks}
-        assert judged["messages"] > 0
-        assert judged["imu"] > 0
+        checked = {check.name: check.checked for check in verdict.checks}
+        assert checked["messages"] > 0
+        assert checked["imu"] > 0
 
 
 def test_clouds_are_clean(tmp_path: Path) -> None:
@@ -148,8 +148,8 @@ def test_clouds_are_clean(tmp_path: Path) -> None:
     bag = write_rosbag2(tmp_path / "clouds.db3", write_points("/points_raw", messages))
     for layout in ("dense", "organized"):
         target = tmp_path / layout
-        told = command("convert", bag, "-o", target, "--keep-partial", "--layout", layout)
-        assert told.code == 0, told.err
+        run = command("convert", bag, "-o", target, "--keep-partial", "--layout", layout)
+        assert run.code == 0, run.err
         verdict = verify(target)
         assert verdict.ok, verdict.violations
         assert verdict.points == 4 * len(firings)

@@ -1,4 +1,4 @@
-"""What each fault must lead to: a table of declarations, by CONTRACT.md and docs/faults.md.
+"""Expected result of each fault: a table of declarations, by docs/faults.md.
 
 A declaration names the fault as a user writes it ({v}: the victim), what it leaves of the packets
 before the batching sees them, and which counts must stand in the report. `touched` is the number of
@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.matrix.lidars import HOUR_NS, MAKERS, NS_PER_MS, NS_PER_S, Sent, Spell
+from tests.matrix.lidars import HOUR_NS, NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell
 
 Session = tuple[Sent, ...]
 Change = Callable[[Session, int], Session]
 # What a sensor's `packets` must say: from its packets sent, and those touched.
 Counts = Mapping[str, Callable[[int, int], tuple[int, int]]]
 
-# The recorder runs so long; things happen at times that lie well inside windows.
+# Length of the capture; events are at times well inside windows.
 LENGTH_NS = 500 * NS_PER_MS
 NOON_NS = 1_700_000_000 * NS_PER_S // HOUR_NS * HOUR_NS + 1000 * NS_PER_S
 HALF_NS = 250 * NS_PER_MS
@@ -30,8 +30,8 @@ SHORT_WAIT = ("--max-wait", "0.1")
 class Kind:
     """A row of the table; only one of `change`, `pieces`, `subset`, or none for identity.
 
-    fault: "" none; send: the session of some makers; change: what is left for the batching (the
-    session, first arrival); subset: chance decides which packets are gone, any of them may be;
+    fault: "" none; send: the session of some vendors; change: what is left for the batching (the
+    session, first receive time); subset: chance decides which packets are gone, any of them may be;
     pieces: outputs of `--on-jump split`, each a session; error: what the run says without it;
     counts: of the victim's packets, lowest and highest; wait_ns: of `words`.
     """
@@ -50,30 +50,30 @@ class Kind:
     warnings: tuple[str, ...] = ()
 
 
-def plain(maker: str) -> Sent:
+def plain(vendor: str) -> Sent:
     """Half a second around noon."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     return row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS))
 
 
-def ahead(maker: str) -> Sent:
+def ahead(vendor: str) -> Sent:
     """The same half second by a clock that counts TAI."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     ahead_ns = 37 * NS_PER_S
     return row.send(Spell(NOON_NS + row.begin_ns + ahead_ns, LENGTH_NS, ahead_ns=-ahead_ns))
 
 
-def wrapping(maker: str) -> Sent:
+def wrapping(vendor: str) -> Sent:
     """Half a second over the full hour, in which every count begins anew."""
-    row = MAKERS[maker]
+    row = VENDORS[vendor]
     return row.send(
         Spell(NOON_NS // HOUR_NS * HOUR_NS - HALF_NS + row.begin_ns, LENGTH_NS, row.wrap)
     )
 
 
-def restarting(maker: str) -> Sent:
-    """Up for 100 s at first; then all counts and clocks begin anew, and the recorder goes on."""
-    row = MAKERS[maker]
+def restarting(vendor: str) -> Sent:
+    """Up for 100 s at first; then all counts and clocks begin anew, but not the capture host's."""
+    row = VENDORS[vendor]
     up_ns = 100 * NS_PER_S
     before = row.send(Spell(up_ns + row.begin_ns, HALF_NS - 20 * NS_PER_MS, 5000))
     again = Spell(row.begin_ns + 20 * NS_PER_MS, HALF_NS, 0, up_ns + HALF_NS)
@@ -85,7 +85,7 @@ def _victim(session: Session, change: Callable[[Sent], Sent]) -> Session:
 
 
 def silent(from_ns: int, until_ns: int) -> Change:
-    """The victim's packets of a time after the first arrival are lost."""
+    """The victim's packets of an interval after the first receive time are lost."""
 
     def change(session: Session, begin_ns: int) -> Session:
         def remaining(sent: Sent) -> Sent:
@@ -105,7 +105,7 @@ def shifted(by_ns: int) -> Change:
 
 
 def drifting(ppm: int) -> Change:
-    """The victim's clock gains from the first arrival on."""
+    """The victim's clock gains from the first receive time on."""
 
     def change(session: Session, begin_ns: int) -> Session:
         def gaining(sent: Sent) -> Sent:
@@ -120,10 +120,11 @@ def drifting(ppm: int) -> Change:
 
 
 def cut_at(at_ns: int, by_ns: int) -> Callable[[Session, int], tuple[Session, ...]]:
-    """Two stretches, by arrival; in the second all clocks are off."""
+    """Two pieces, by receive time; in the second all clocks are off."""
 
     def pieces(session: Session, begin_ns: int) -> tuple[Session, ...]:
-        first, second = [], []
+        first = []
+        second = []
         for sent in session:
             late = sent.host_ns - begin_ns >= at_ns
             first.append(sent.where(np.flatnonzero(~late)))
@@ -136,7 +137,8 @@ def cut_at(at_ns: int, by_ns: int) -> Callable[[Session, int], tuple[Session, ..
 
 def restarted(session: Session, begin_ns: int) -> tuple[Session, ...]:
     """Before and after the stamps step back."""
-    first, second = [], []
+    first = []
+    second = []
     for sent in session:
         again = int(np.argmax(np.diff(sent.stamp_ns[:, 0]) < 0)) + 1
         first.append(sent.where(np.arange(again)))
@@ -165,7 +167,7 @@ def _with(sent: int, touched: int) -> tuple[int, int]:
 
 
 def _between_others(sent: int, touched: int) -> tuple[int, int]:
-    """Nobody can tell what is missing at the very ends."""
+    """Loss at the ends cannot be known."""
     return touched - 3, touched
 
 
@@ -249,12 +251,12 @@ KINDS: Mapping[str, Kind] = {
     "jump forward": Kind(
         "jump:*:37s@0.25s",
         pieces=cut_at(HALF_NS, 37 * NS_PER_S),
-        error=("clock jump within the recording", "went forward", "--on-jump split"),
+        error=("clock jump within the recording", "a step forward", "--on-jump split"),
     ),
     "jump back": Kind(
         "jump:*:-20s@0.25s",
         pieces=cut_at(HALF_NS, -20 * NS_PER_S),
-        error=("clock reset within the recording", "went back", "--on-jump split"),
+        error=("clock reset within the recording", "a step back", "--on-jump split"),
     ),
     "wrap": Kind(
         "reorder:{v}:10%",
@@ -264,7 +266,7 @@ KINDS: Mapping[str, Kind] = {
     "restart": Kind(
         pieces=restarted,
         session=restarting,
-        error=("clock reset within the recording", "went back", "--on-jump split"),
+        error=("clock reset within the recording", "a step back", "--on-jump split"),
     ),
     "bit flips": Kind(
         "bitflip:{v}:2%",

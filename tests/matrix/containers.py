@@ -1,7 +1,7 @@
 """Sessions of the matrix in every container, with the rig that names their lidars.
 
-Messages: facts/messages.md section 1; the bag for ROS 2 holds scans of HESAI and Velodyne, many
-packets a message, all others a message a packet.
+Messages: docs/sources/messages.md section 1; the bag for ROS 2 has scans of HESAI and Velodyne, of
+many packets a message, all others a message a packet.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import write_mcap
 from tests.golden.maker_messages import Unit, merged, nebula, scans, singles
-from tests.matrix.lidars import MAKERS, Sent
+from tests.matrix.lidars import VENDORS, Sent
 
-# Scans hold what came in so many ns: less than the slack of the shortest wait of the matrix.
+# Scan messages contain the packets of so many ns, less than the shortest wait of the matrix.
 SCAN_NS = 20_000_000
 Session = Sequence[Sent]
 
 
 def packets_of(sent: Sent) -> tuple[tuple[int, bytes], ...]:
-    """(arrival, payload)."""
+    """(receive time, payload)."""
     return tuple(zip(sent.host_ns.tolist(), sent.payloads, strict=True))
 
 
 def unit(sent: Sent) -> Unit:
     """As the builders of messages want it."""
-    maker = MAKERS[sent.maker]
-    return Unit(sent.maker, maker.ip, maker.topic, packets_of(sent))
+    vendor = VENDORS[sent.vendor]
+    return Unit(sent.vendor, vendor.ip, vendor.topic, packets_of(sent))
 
 
 def _frames(session: Session) -> list[tuple[int, bytes]]:
     records = [
-        (host_ns, udp_frame(payload, maker.ip, dport=maker.port)[0])
+        (host_ns, udp_frame(payload, vendor.ip, dport=vendor.port)[0])
         for sent in session
-        for maker in [MAKERS[sent.maker]]
+        for vendor in [VENDORS[sent.vendor]]
         for host_ns, payload in packets_of(sent)
     ]
-    # By arrival; what came at the same time stays in the order of the lidars.
+    # By receive time, then in the order of the lidars.
     return sorted(records, key=lambda record: record[0])
 
 
 def _ouster(sent: Sent, encoding: str) -> list[Recorded]:
     kind = {"cdr": "ouster_sensor_msgs/PacketMsg", "ros1": "ouster_ros/PacketMsg"}[encoding]
-    topic = MAKERS[sent.maker].topic
+    topic = VENDORS[sent.vendor].topic
     return [
         Recorded(topic, kind, host_ns, packet_message(encoding, payload))
         for host_ns, payload in packets_of(sent)
@@ -57,7 +57,8 @@ def _ouster(sent: Sent, encoding: str) -> list[Recorded]:
 
 def _robosense(sent: Sent, encoding: str) -> list[Recorded]:
     """Header, is_difop, is_frame_begin, data."""
-    topic, kind = MAKERS[sent.maker].topic, "rslidar_msg/RslidarPacket"
+    topic = VENDORS[sent.vendor].topic
+    kind = "rslidar_msg/RslidarPacket"
     return [
         Recorded(
             topic,
@@ -72,9 +73,9 @@ def _robosense(sent: Sent, encoding: str) -> list[Recorded]:
 def _messages(session: Session, encoding: str, *, in_scans: bool = False) -> list[Recorded]:
     parts = []
     for sent in session:
-        if sent.maker == "ouster":
+        if sent.vendor == "ouster":
             parts.append(_ouster(sent, encoding))
-        elif sent.maker == "robosense":
+        elif sent.vendor == "robosense":
             parts.append(_robosense(sent, encoding))
         elif in_scans:
             parts.append(scans(unit(sent), encoding, SCAN_NS))
@@ -117,32 +118,32 @@ CAPTURES = ("pcap", "pcapng")
 
 
 def names(session: Session) -> list[str]:
-    """Of the sensors, in the order of the rig: its makers."""
-    return [sent.maker for sent in session]
+    """Names of the sensors in the order of the rig: their vendors."""
+    return [sent.vendor for sent in session]
 
 
 def rig_text(session: Session, container: str, clocks: Mapping[str, str] | None = None) -> str:
     """A rig; clocks: of some sensors, the text of their `clock`."""
     lines = ["rate_hz: 20", "sensors:"]
     for number, sent in enumerate(session):
-        maker = MAKERS[sent.maker]
-        stream = f"topic: {maker.topic}"
+        vendor = VENDORS[sent.vendor]
+        stream = f"topic: {vendor.topic}"
         if container in CAPTURES:
-            stream = f"source_ip: {maker.ip}, port: {maker.port}"
+            stream = f"source_ip: {vendor.ip}, port: {vendor.port}"
         pose = f"translation_m: [0, 0, {number}], rotation_rpy_deg: [0, 0, {90 * number}]"
         lines += [
-            f"  - name: {sent.maker}",
+            f"  - name: {sent.vendor}",
             f"    stream: {{{stream}}}",
             f"    extrinsics: {{{pose}}}",
         ]
-        if maker.metadata:
-            lines.append(f"    metadata: {maker.metadata}")
-        if clocks and sent.maker in clocks:
-            lines.append(f"    clock: {clocks[sent.maker]}")
+        if vendor.metadata:
+            lines.append(f"    metadata: {vendor.metadata}")
+        if clocks and sent.vendor in clocks:
+            lines.append(f"    clock: {clocks[sent.vendor]}")
     return "\n".join(lines) + "\n"
 
 
 def span_ns(session: Session) -> tuple[int, int]:
-    """First and last arrival."""
+    """First and last receive time."""
     hosts = np.concatenate([sent.host_ns for sent in session])
     return int(hosts.min()), int(hosts.max())

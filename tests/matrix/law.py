@@ -1,7 +1,7 @@
-"""CONTRACT.md section 1 for packets that arrive in the order of their stamps, in a few array steps.
+"""Expected scans of packets received in the order of their stamps (docs/batching.md), by arrays.
 
-Only for sessions in which no column is late: what faults do to packets is done to them before. The
-grid is that of 20 Hz, whose lines are whole ns.
+Only for sessions in which no column is late; faults are applied to packets before. The grid is that
+of 20 Hz, whose bounds are whole ns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PERIOD_NS = 50 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A scan that must be there: its columns (n,) in order, and how many points they hold."""
+    """An expected scan: its columns (n,) in order, and the number of their points."""
 
     start_ns: int
     complete: bool
@@ -30,7 +30,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """What must come of a session; dropped: columns of each sensor by reason."""
+    """Expected result of a session; dropped: columns of each sensor by reason."""
 
     t_init_ns: int
     windows: Mapping[int, Window]
@@ -54,7 +54,9 @@ def law(session: Sequence[Sent], max_wait_ns: int = NS_PER_S) -> Law:
     points = np.concatenate([sent.points.reshape(-1) for sent in session])
     sensor = np.repeat(np.arange(len(session)), [sent.stamp_ns.size for sent in session])
     order = np.lexsort((np.arange(len(sensor)), sensor, stamp_ns))
-    stamp_ns, sensor, points = stamp_ns[order], sensor[order], points[order]
+    stamp_ns = stamp_ns[order]
+    sensor = sensor[order]
+    points = points[order]
     index = stamp_ns // PERIOD_NS - k0
     tail = int(max(lasts)) // PERIOD_NS - k0
     reasons = {"before_start": index < -1, "head": index == -1, "tail": index == max(tail, 0)}

@@ -1,7 +1,7 @@
-"""What small lidars of four makers send, from the encoders: bytes, arrivals and true stamps.
+"""Packets of small lidars of four vendors, by the encoders: bytes, receive times, true stamps.
 
 Stamps are what packets say, whole us for Velodyne, HESAI and ROBOSENSE (the encoders' sheets);
-arrivals are whole steps of 10 us, so that drifts by whole ppm of 100 add whole ns.
+receive times are whole steps of 10 us, so that drifts by whole ppm of 100 add whole ns.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from tests.builders import hesai, robosense, velodyne
 from tests.builders.hesai_angles import angles_csv
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
-NS_PER_S, NS_PER_MS, NS_PER_US = 10**9, 10**6, 10**3
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
+NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # One reading in so many has a return.
 SPARSE = 16
@@ -32,10 +34,10 @@ OUSTER_STEP_NS = 100 * NS_PER_MS // OUSTER.columns_per_frame
 class Sent:
     """Packets of one lidar, in their order.
 
-    host_ns: (P,) arrival; stamp_ns: (P, C) of the columns; points: (P, C) their returns.
+    host_ns: (P,) receive time; stamp_ns: (P, C) of the columns; points: (P, C) their returns.
     """
 
-    maker: str
+    vendor: str
     payloads: tuple[bytes, ...]
     host_ns: I64Array
     stamp_ns: I64Array
@@ -67,7 +69,7 @@ class Sent:
 class Spell:
     """When a lidar measures, ns by its clock; count: its packet number (Ouster: frame) at first.
 
-    ahead_ns: what the recorder's clock adds to the lidar's.
+    ahead_ns: what the capture host's clock adds to the lidar's.
     """
 
     begin_ns: int
@@ -77,7 +79,7 @@ class Spell:
 
 
 def _readings(seed: int, *shape: int) -> tuple[I64Array, I64Array]:
-    """Counts of range (0: nothing came back) and levels."""
+    """Counts of range (0: no return) and signal."""
     rng = np.random.default_rng(seed)
     hit = rng.integers(0, SPARSE, shape) == 0
     ranges = np.where(hit, rng.integers(1000, 4000, shape) // 8 * 8, 0)
@@ -85,19 +87,19 @@ def _readings(seed: int, *shape: int) -> tuple[I64Array, I64Array]:
 
 
 def _sent(
-    maker: str, spell: Spell, payloads: list[bytes], stamp_ns: I64Array, ranges: I64Array
+    vendor: str, spell: Spell, payloads: list[bytes], stamp_ns: I64Array, ranges: I64Array
 ) -> Sent:
-    """A packet arrives 0.3 ms after its last column."""
+    """A packet is received 0.3 ms after its last column."""
     shape = len(payloads), -1
     stamps = stamp_ns.reshape(shape)
     arrival = stamps[:, -1] + 300_000 + spell.ahead_ns
     host_ns = -(-arrival // ARRIVAL_STEP_NS) * ARRIVAL_STEP_NS
     points = np.count_nonzero(ranges.reshape(len(stamp_ns), -1), axis=1).reshape(shape)
-    return Sent(maker, tuple(payloads), host_ns, stamps, points)
+    return Sent(vendor, tuple(payloads), host_ns, stamps, points)
 
 
 def ouster(spell: Spell) -> Sent:
-    """320 packets a second of 16 columns; turns begin with the spell."""
+    """320 packets a second of 16 columns; revolutions begin with the spell."""
     count = spell.length_ns // OUSTER_STEP_NS // 16 * 16
     number = np.arange(count)
     stamps = spell.begin_ns + number * OUSTER_STEP_NS
@@ -122,7 +124,7 @@ def velodyne_vlp16(spell: Spell) -> Sent:
     ranges, levels = _readings(2, len(columns), 16, 1)
     sent = velodyne.encode(spec, ranges, levels)
     true_ns = velodyne.firing_times_ns(spec, columns).min(axis=1)
-    # Packets tell the time of their first firing, in whole us.
+    # Packets contain the time of their first firing, in whole us.
     first_ns = true_ns[:: spec.columns_per_packet]
     said_ns = sent.payloads[:, 1200:1204].copy().view("<u4")[:, 0].astype(np.int64) * 1000
     off_ns = (said_ns - first_ns % HOUR_NS + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
@@ -158,7 +160,7 @@ def robosense_helios16(spell: Spell) -> Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class Maker:
+class Vendor:
     """A lidar of the matrix.
 
     begin_ns: its first turn after the others'; wrap: its own count of packets at the begin of a
@@ -174,17 +176,17 @@ class Maker:
     wrap: int = 0
 
 
-MAKERS: Mapping[str, Maker] = {
-    "ouster": Maker(
+VENDORS: Mapping[str, Vendor] = {
+    "ouster": Vendor(
         *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
         *(0, 2**16 - 1),
     ),
-    "velodyne": Maker(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
-    "hesai": Maker(
+    "velodyne": Vendor(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
+    "hesai": Vendor(
         *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
         *(5_700_000, 2**32 - 100),
     ),
-    "robosense": Maker(
+    "robosense": Vendor(
         *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
         7_300_000,
     ),

@@ -1,7 +1,7 @@
-"""Every fault in rigs of one to four makers, in every container: the declared result, and proof.
+"""Every fault in rigs of one to four vendors, in every container: the declared result, and checks.
 
-The rows of the table stand in `cells.py`, the law of windows in `law.py`. Every maker is once the
-victim of every fault, since the rigs of one to four lidars begin with another maker each.
+The rows of the table are in `cells.py`, the law of windows in `law.py`. Every vendor is once the
+victim of every fault, since the rigs of one to four lidars begin with another vendor each.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.builders.run import (
 from tests.matrix.cells import KINDS, Kind, Session, plain
 from tests.matrix.containers import CONTAINERS, rig_text, span_ns
 from tests.matrix.law import PERIOD_NS, law
-from tests.matrix.lidars import MAKERS, Sent, write_metadata
+from tests.matrix.lidars import VENDORS, Sent, write_metadata
 
 SIZES = (1, 2, 3, 4)
 WARNING = "mlbatch: warning: "
@@ -41,8 +41,8 @@ Print = tuple[object, ...]
 def session_of(name: str, size: int) -> Session:
     """The rig of a kind; the last lidar is the victim."""
     first = list(KINDS).index(name)
-    makers = [list(MAKERS)[(first + number) % len(MAKERS)] for number in range(size)]
-    return tuple((KINDS[name].session or plain)(maker) for maker in makers)
+    vendors = [list(VENDORS)[(first + number) % len(VENDORS)] for number in range(size)]
+    return tuple((KINDS[name].session or plain)(vendor) for vendor in vendors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +67,11 @@ class Cell:
     @property
     def victim(self) -> str:
         """Whom the fault befalls."""
-        return self.session[-1].maker
+        return self.session[-1].vendor
 
     @property
     def begin_ns(self) -> int:
-        """Arrival of the first packet."""
+        """Receive time of the first packet."""
         return span_ns(self.session)[0]
 
     def prepare(self, session: Session, clock: str = "") -> None:
@@ -87,7 +87,8 @@ class Cell:
     def convert(self, *words: str, faulty: bool = True, output: str = "out") -> Told:
         """Run the command."""
         (recording,) = self.folder.glob("drive.*")
-        rig, target = self.folder / "rig.yaml", self.folder / output
+        rig = self.folder / "rig.yaml"
+        target = self.folder / output
         fault = self.kind.fault.format(v=self.victim)
         faults = ["--fault", fault] if fault and faulty else []
         return command(
@@ -95,7 +96,7 @@ class Cell:
         )
 
 
-# -- what holds for every output ------------------------------------------------------------------
+# -- checks of every output -----------------------------------------------------------------------
 
 
 def report_of(folder: Path) -> Report:
@@ -104,7 +105,7 @@ def report_of(folder: Path) -> Report:
 
 
 def check_proof(folder: Path) -> Report:
-    """`verify` finds nothing, ledgers balance, and no scan holds what is older than its period."""
+    """`verify` finds nothing, ledgers balance, and no scan has a column before its period."""
     verdict = verify(folder)
     assert verdict.violations == ()
     assert verdict.scans
@@ -112,7 +113,9 @@ def check_proof(folder: Path) -> Report:
     capture = report["capture"]
     assert capture["frames"] == capture["datagrams"] + sum(capture["skipped"].values())
     for sensor in report["sensors"]:
-        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        packets = sensor["packets"]
+        columns = sensor["columns"]
+        points = sensor["points"]
         assert packets["read"] == packets["accepted"] + sum(packets["rejected"].values())
         assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
         assert points.pop("slots") == sum(points.values())
@@ -154,10 +157,11 @@ def check_counts(cell: Cell, report: Report) -> None:
     (fault,) = report["faults"]
     assert fault["packets"] > 0
     for sent, sensor in zip(cell.session, report["sensors"], strict=True):
-        packets, total = sensor["packets"], len(sent.payloads)
+        packets = sensor["packets"]
+        total = len(sent.payloads)
         found = {"lost": packets["lost"], "reordered": packets["reordered"], "duplicate": 0}
         found |= {"read": packets["read"], "accepted": packets["accepted"], **packets["rejected"]}
-        if sent.maker != cell.victim:
+        if sent.vendor != cell.victim:
             assert (found["read"], found["accepted"]) == (total, total)
             assert (found["lost"], found["reordered"]) == (0, 0)
             continue
@@ -170,7 +174,7 @@ def check_counts(cell: Cell, report: Report) -> None:
 
 
 def prints(folder: Path) -> Print:
-    """All that identity covers (CONTRACT.md section 1), and all ledgers."""
+    """Everything that must be identical, and all ledgers."""
     report = report_of(folder)
     files = tuple((path.name, sha256(path.read_bytes()).digest()) for path in scan_files(folder))
     table = csv_without_arrival((folder / "scans.csv").read_text(encoding="utf-8"))
@@ -229,7 +233,8 @@ def test_cell(name: str, size: int, container: str, tmp_path: Path) -> None:
 
 def check_merged(cell: Cell) -> None:
     """One output of all sensors."""
-    kind, out = cell.kind, cell.folder / "out"
+    kind = cell.kind
+    out = cell.folder / "out"
     told = cell.convert(*kind.words)
     assert told.code == 0, told.err
     for line in told.err.splitlines():
@@ -253,9 +258,11 @@ def check_subset(cell: Cell, report: Report) -> None:
     assert [int(path.stem) for path in files] == list(wanted.windows)
     astray = 0
     for path, window in zip(files, wanted.windows.values(), strict=True):
-        scan, last = load(path), cell.size - 1
+        scan = load(path)
+        last = cell.size - 1
         assert bool(scan["complete"]) == window.complete
-        hurt, was_hurt = scan["column_lidar_id"] == last, window.sensor == last
+        hurt = scan["column_lidar_id"] == last
+        was_hurt = window.sensor == last
         assert np.array_equal(scan["column_stamp_ns"][~hurt], window.stamp_ns[~was_hurt])
         astray += len(np.setxor1d(scan["column_stamp_ns"][hurt], window.stamp_ns[was_hurt]))
     columns = cell.session[-1].stamp_ns.shape[1]
@@ -274,7 +281,7 @@ def check_refused(cell: Cell, words: Sequence[str], *, faulty: bool = True) -> N
 
 
 def check_remedied(cell: Cell, send: Callable[[str], Sent], clock: str) -> None:
-    """A sensor that really is off: refused, until its rig tells by how much."""
+    """A sensor whose clock is off: refused, until its rig has the offset."""
     session = (*cell.session[:-1], send(cell.victim))
     cell.prepare(session)
     if cell.size > 1:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import mlbatch
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.run import convert
-from mlbatch.report.report import ReportInputs
+from mlbatch.report.report import RunReport
 from mlbatch.types import RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
@@ -25,8 +25,8 @@ CAPTURE = TWO_LIDARS / "two_lidars.pcap"
 RIG = TWO_LIDARS / "rig.yaml"
 
 
-def _job(capture: Path, **wishes: bool) -> Job:
-    return Job((capture,), Wishes(identity_extrinsics=wishes.get("identity", False)))
+def _job(capture: Path, **selection: bool) -> Job:
+    return Job((capture,), SensorSelection(identity_extrinsics=selection.get("identity", False)))
 
 
 def _rig(folder: Path, *clocks: str) -> Path:
@@ -53,7 +53,7 @@ def test_an_offset_of_the_rig_brings_clocks_together(tmp_path: Path) -> None:
     with pytest.raises(ClockError, match=r"37\.000 s apart"):
         in_memory(_job(capture, identity=True))
     rig = _rig(tmp_path, "{source: sensor}", "{offset_s: -37}")
-    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     for scan in result.scans:
         assert scan.columns_per_sensor == (512, 512)
@@ -70,7 +70,7 @@ def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
     )
     capture = write_session(tmp_path, one, uptime)
     rig = _rig(tmp_path, "{source: sensor}", "{source: host}")
-    result = in_memory(Job((capture,), Wishes(rig=rig)))
+    result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     assert [sensor.clock.source for sensor in result.report.sensors] == ["sensor", "host"]
     # The last column of a packet counts as its arrival: 1 ms and a column's 0.195 ms after it was.
@@ -120,7 +120,7 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
 
 
 def test_a_dry_run_reports_the_same() -> None:
-    def sums(report: ReportInputs) -> list[object]:
+    def sums(report: RunReport) -> list[object]:
         return [report.scans, report.t_init_ns, *(sensor.ledger for sensor in report.sensors)]
 
     job = replace(FIXTURE, extras=frozenset())
@@ -195,7 +195,7 @@ def test_scans_in_python_may_be_kept() -> None:
 def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
     with pytest.raises(UsageError, match="clock: wanted sensor or host, got 'gps'"):
         next(iter(mlbatch.scans(CAPTURE, clock="gps")))
-    with pytest.raises(RecordingError, match=r"none\.pcap: wanted a recording, got no such file"):
+    with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
         next(iter(mlbatch.scans("none.pcap")))
     for seconds in (math.nan, 0.0, -1.0, -math.inf):
         with pytest.raises(UsageError, match="max_wait: wanted seconds above 0, or inf, got "):

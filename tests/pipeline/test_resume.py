@@ -16,9 +16,10 @@ from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.pipeline import resume
 from mlbatch.pipeline import resume as _resume_state
-from mlbatch.readers import _source
+from mlbatch.readers import source
 from mlbatch.types import Scan
 from mlbatch.writers.formats import npz
+from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
 from tests.resume_storm import contents
 
@@ -41,16 +42,16 @@ def shell(
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
     """Have the writing of a scan fail, once."""
-    save, calls = npz.NpzSaver.save, 0
+    encode, calls = npz.NpzEncoder.encode, 0
 
-    def failing(saver: npz.NpzSaver, file: object, found: Scan) -> None:
+    def failing(encoder: npz.NpzEncoder, found: Scan) -> list[Bytes]:
         nonlocal calls
         calls += 1
         if calls == scan + 1:
             raise error
-        save(saver, file, found)  # type: ignore[arg-type]
+        return encode(encoder, found)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", failing)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", failing)
 
 
 def _interrupt(shell: Shell, words: str = f"{CAPTURE} -o out") -> None:
@@ -74,13 +75,13 @@ def test_it_goes_on_after_the_scans_that_are_safe(
     _interrupt(shell)
     first = Path("out.partial/000000.npz").stat().st_mtime_ns
     saved = []
-    save = npz.NpzSaver.save
+    encode = npz.NpzEncoder.encode
 
-    def counting(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
+    def counting(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
         saved.append(scan.index)
-        save(saver, file, scan)  # type: ignore[arg-type]
+        return encode(encoder, scan)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", counting)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", counting)
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 0
     assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
@@ -100,14 +101,14 @@ def test_an_interrupt_tells_of_it(shell: Shell, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_request_to_end_is_an_interrupt(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGTERM)
-    save = npz.NpzSaver.save
+    encode = npz.NpzEncoder.encode
 
-    def ending(saver: npz.NpzSaver, file: object, scan: Scan) -> None:
-        save(saver, file, scan)  # type: ignore[arg-type]
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
         if scan.index == 1:
             signal.raise_signal(signal.SIGTERM)
+        return encode(encoder, scan)
 
-    monkeypatch.setattr(npz.NpzSaver, "save", ending)
+    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 130
     assert signal.getsignal(signal.SIGTERM) is before
     assert '"synced":true' in STATE.read_text().splitlines()[-1]
@@ -315,7 +316,7 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     assert outcome.code == 1
     assert outcome.err == (
         "mlbatch: error: out.partial/000004.npz: expected to write it, found 'No space left on "
-        "device'; free space on this disk or choose another output; then --resume goes on after "
+        "device'; free space on this disk or choose another output; then --resume continues after "
         "the 4 scans that are safe\n"
     )
     assert shell(f"convert {CAPTURE} -o out --resume").code == 0
@@ -329,21 +330,21 @@ def test_an_unreadable_disk_names_the_way_on(
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=60))
     whole = _whole(shell, str(capture))
-    fill = _source.Source.fill
+    fill = source.Source.fill
 
-    def failing(source: _source.Source, target: memoryview) -> int:
-        if source.position_bytes > 0.9 * source.size_bytes and Path("out.partial").exists():
-            raise RecordingError(
-                _source._unreadable(source.path, OSError(5, "Input/output error"))
-            ) from OSError(5, "Input/output error")
-        return fill(source, target)
+    def failing(opened: source.Source, target: memoryview) -> int:
+        if opened.position_bytes > 0.9 * opened.size_bytes and Path("out.partial").exists():
+            broken = OSError(5, "Input/output error")
+            text = f"{opened.path}: could not read it (Input/output error); check the disk"
+            raise RecordingError(text) from broken
+        return fill(opened, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(_source.Source, "fill", failing)
+        patch.setattr(source.Source, "fill", failing)
         outcome = shell(f"convert {capture} -o out")
     assert outcome.code == 1
     assert (
-        "could not read it (Input/output error); check the disk; then --resume goes on after"
+        "could not read it (Input/output error); check the disk; then --resume continues after"
         in (outcome.err)
     )
     assert shell(f"convert {capture} -o out --resume").code == 0

@@ -1,4 +1,4 @@
-"""The laws of batching: the fast batcher is the paper, and neither grouping nor arrival matters."""
+"""The laws of batching: equal to the reference, for every grouping and order between sensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INTERLEAVED_BLOCKS = range(100, 104)
 
 
 def by_reference(feed: list[FeedPacket], options: Settings) -> Outcome | None:
-    """What the paper makes of a feed; None for clocks that cannot be used."""
+    """Outcome of the reference; None for clocks that cannot be used."""
     try:
         return reference_scans(feed, options)
     except ClockError:
@@ -28,31 +28,33 @@ def by_reference(feed: list[FeedPacket], options: Settings) -> Outcome | None:
 
 
 def by_fast(feed: list[FeedPacket], options: Settings, sizes: list[int]) -> Outcome | None:
-    """What the fast batcher makes of a feed in batches of these sizes."""
+    """Outcome of the fast batcher for batches of these sizes."""
     try:
         return run_fast(feed, options, sizes)
     except ClockError:
         return None
 
 
-def differences(wanted: Outcome | None, got: Outcome | None) -> list[str]:
+def differences(expected: Outcome | None, found: Outcome | None) -> list[str]:
     """Names and values of all fields in which two outcomes differ; for windows the first pair."""
-    if wanted is None or got is None:
-        return [] if wanted is got else [f"clock error: wanted {wanted is None}, got {got is None}"]
-    found = []
+    if expected is None or found is None:
+        same = expected is found
+        return [] if same else [f"clock error: expected {expected is None}, found {found is None}"]
+    different = []
     for name in Outcome.__slots__:
-        one, two = getattr(wanted, name), getattr(got, name)
+        one = getattr(expected, name)
+        two = getattr(found, name)
         if one == two:
             continue
         if name == "windows":
             pairs = [pair for pair in zip(one, two, strict=False) if pair[0] != pair[1]]
             one, two = pairs[0] if pairs else (len(one), len(two))
-        found.append(f"{name}: wanted {one}, got {two}")
-    return found
+        different.append(f"{name}: expected {one}, found {two}")
+    return different
 
 
-def apart_from_arrival(outcome: Outcome | None) -> Outcome | None:
-    """The outcome without what depends on the order of arrival between sensors."""
+def without_receive_times(outcome: Outcome | None) -> Outcome | None:
+    """The outcome without fields that depend on the order between sensors."""
     if outcome is None:
         return None
     windows = [replace(window, ready_host_ns=0) for window in outcome.windows]
@@ -64,8 +66,8 @@ def test_fast_batcher_equals_the_reference(block: int) -> None:
     for seed in range(block * SEEDS_A_BLOCK, (block + 1) * SEEDS_A_BLOCK):
         feed, options = random_feed(seed)
         sizes = groups(random.Random(seed), len(feed))
-        wanted = by_reference(feed, options)
-        found = differences(wanted, by_fast(feed, options, sizes))
+        expected = by_reference(feed, options)
+        found = differences(expected, by_fast(feed, options, sizes))
         assert not found, f"random_feed({seed}), {options}, groups {sizes}: {found}"
 
 
@@ -73,27 +75,28 @@ def test_fast_batcher_equals_the_reference(block: int) -> None:
 @given(feeds(), st.randoms(use_true_random=False))
 def test_grouping_does_not_matter(case: Case, rng: random.Random) -> None:
     feed, options = case
-    wanted = by_reference(feed, options)
+    expected = by_reference(feed, options)
     for sizes in ([1] * len(feed), [len(feed)], groups(rng, len(feed))):
-        assert not differences(wanted, by_fast(feed, options, sizes))
+        assert not differences(expected, by_fast(feed, options, sizes))
 
 
 @pytest.mark.parametrize("block", INTERLEAVED_BLOCKS)
-def test_arrival_between_sensors_does_not_matter(block: int) -> None:
+def test_order_between_sensors_does_not_matter(block: int) -> None:
     compared = 0
     for seed in range(block * SEEDS_A_BLOCK, (block + 1) * SEEDS_A_BLOCK):
         case = random_feed(seed)
-        options, rng = case[1], random.Random(seed)
+        options = case[1]
+        rng = random.Random(seed)
         if options.sensors == 1:
             continue
-        wanted = apart_from_arrival(by_reference(*case))
+        expected = without_receive_times(by_reference(*case))
         for feed in interleavings(case, rng, count=2):
             compared += 1
-            for got in (
+            for outcome in (
                 by_reference(feed, options),
                 by_fast(feed, options, groups(rng, len(feed))),
             ):
-                found = differences(wanted, apart_from_arrival(got))
+                found = differences(expected, without_receive_times(outcome))
                 assert not found, f"random_feed({seed}), interleaved: {found}"
     # Too many stalls in the feeds would leave the law untested.
     assert compared > SEEDS_A_BLOCK // 4

@@ -16,10 +16,10 @@ from types import FrameType
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
-from mlbatch.report.report import ReportInputs, build_report
+from mlbatch.report.report import RunReport, build_report
 from mlbatch.types import Scan
 from tests.builders.captures import pcap_bytes
 from tests.builders.damage import (
@@ -46,7 +46,7 @@ from tests.builders.run import (
 from tests.builders.traffic import Records, datagrams, frames
 from tests.builders.two_lidars import LEFT, RIGHT
 
-# Whoever converts damaged data must not be told of the arithmetic inside.
+# Damaged data must cause no numpy warnings.
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 LENGTH_NS = 220_000_000
@@ -54,7 +54,8 @@ LONGEST_S = 300
 BUFFERS = (9_000, 50_000)
 # Source IP in an Ethernet frame.
 SENDER = slice(26, 30)
-RIG, LIDARS = "rig.yaml", ("left.json", "right.json")
+RIG = "rig.yaml"
+LIDARS = ("left.json", "right.json")
 
 JOBS = (
     FIXTURE,
@@ -66,7 +67,7 @@ JOBS = (
     replace(FIXTURE, rate=Fraction(100, 3), max_wait_ns=None),
     replace(
         FIXTURE,
-        wishes=Wishes(
+        selection=SensorSelection(
             metadata=tuple(TWO_LIDARS / name for name in LIDARS),
             identity_extrinsics=True,
             decode={"crc": "check"},
@@ -97,7 +98,7 @@ Damage = Callable[[random.Random, str], str]
 
 
 def outcome(job: Job, frames_given: int | None = None) -> Outcome:
-    """Convert and judge; ledgers and scans as one can compare them, or the line of the error."""
+    """Convert and check; ledgers and scans in comparable form, or the line of the error."""
     try:
         with within(LONGEST_S):
             result = in_memory(job)
@@ -117,15 +118,18 @@ def outcome(job: Job, frames_given: int | None = None) -> Outcome:
     return json.dumps(ledgers), prints(result)
 
 
-def check_ledgers(report: ReportInputs) -> None:
-    """The equations of CONTRACT.md section 4, and that no datagram is forgotten."""
-    capture, unassigned = report.capture, sum(row.packets for row in report.unassigned)
+def check_ledgers(report: RunReport) -> None:
+    """Ledgers balance (docs/report.md), and every datagram is counted."""
+    capture = report.capture
+    unassigned = sum(row.packets for row in report.unassigned)
     assert capture.frames == capture.datagrams + sum(capture.skipped.values())
     ledgers = [sensor.ledger for sensor in report.sensors]
     own = sum(ledger.packets.read + ledger.imu_packets for ledger in ledgers)
     assert capture.datagrams == own + unassigned
     for ledger in ledgers:
-        packets, columns, points = ledger.packets, ledger.columns, ledger.points
+        packets = ledger.packets
+        columns = ledger.columns
+        points = ledger.points
         assert packets.read == packets.accepted + sum(packets.rejected.values())
         assert columns.decoded == columns.written + sum(columns.dropped.values())
         kept_out = points.no_return + points.range + points.box + points.repeated
@@ -137,11 +141,12 @@ def check_ledgers(report: ReportInputs) -> None:
 
 
 def check_output(result: Result) -> None:
-    """What the ledgers call written is there, and sound."""
+    """What the ledgers count as written is in the output, and valid."""
     assert result.memory is not None
     assert not result.memory.abandoned
     ledgers = [sensor.ledger for sensor in result.report.sensors]
-    columns, points = np.zeros(len(ledgers), np.int64), np.zeros(len(ledgers), np.int64)
+    columns = np.zeros(len(ledgers), np.int64)
+    points = np.zeros(len(ledgers), np.int64)
     for scan in result.scans:
         check_scan(scan)
         columns += np.bincount(scan.column_lidar_id, minlength=len(ledgers))
@@ -232,7 +237,8 @@ def test_damaged_columns(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["removed", "duplicated", "truncated"])
 def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
-    rng, sent = random.Random(f"exact {name}"), datagrams(LENGTH_NS)
+    rng = random.Random(f"exact {name}")
+    sent = datagrams(LENGTH_NS)
     parts = damaged(rng, [one.payload for one in sent], name)
     records = [
         replace(one, payload=payload).frame()
@@ -249,7 +255,8 @@ def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
             if (one.source, one.port) == (lidar.ip, 7502)
         ]
         whole = [sizes.count(size) for size, sizes in own]
-        packets, there = sensor.ledger.packets, np.flatnonzero(whole)
+        packets = sensor.ledger.packets
+        there = np.flatnonzero(whole)
         assert packets.read == sum(len(sizes) for _, sizes in own)
         assert packets.accepted == len(there)
         rejected = {
@@ -257,7 +264,7 @@ def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
             "duplicate": sum(whole) - len(there),
         }
         assert packets.rejected == {reason: n for reason, n in rejected.items() if n}
-        # What is missing at the ends nobody can know.
+        # Loss at the ends cannot be known.
         assert packets.lost == there[-1] - there[0] + 1 - len(there)
         assert len(there) < len(own) or rejected["duplicate"]
 
@@ -292,9 +299,11 @@ def test_damaged_metadata(kind: Damage, seed: int, short: Path, tmp_path: Path) 
     rng = random.Random(f"metadata {kind.__name__} {seed}")
     name = rng.choice(LIDARS)
     rig = set_up(tmp_path, name, kind(rng, (TWO_LIDARS / name).read_text(encoding="utf-8")))
-    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
-    given = Wishes(metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True)
-    outcome(replace(FIXTURE, recordings=(short,), wishes=given))
+    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))
+    given = SensorSelection(
+        metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True
+    )
+    outcome(replace(FIXTURE, recordings=(short,), selection=given))
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -302,4 +311,4 @@ def test_damaged_rigs(seed: int, short: Path, tmp_path: Path) -> None:
     rng = random.Random(f"rig {seed}")
     text = (TWO_LIDARS / RIG).read_text(encoding="utf-8")
     rig = set_up(tmp_path, RIG, damaged_text(rng, text))
-    outcome(replace(FIXTURE, recordings=(short,), wishes=Wishes(rig=rig)))
+    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))

@@ -1,16 +1,16 @@
-"""The result depends on stamps alone: whole conversions over 1000 random arrivals, and delays.
+"""The result depends on stamps alone: whole conversions over 1000 random receive times, and delays.
 
-CONTRACT.md section 1, Laws: scans, scans.csv without `ready_host_ns` and all ledgers are the same
+docs/batching.md: scans, scans.csv without `ready_host_ns` and all ledgers are the same
 for every interleaving between sensors in which none lags by more than `--max-wait` in stamps.
-Thousands of other feeds cross the batching alone in `test_batching.py`; here packets of five makers
-go all the way, their arrivals drawn anew each time and cut into batches anywhere.
+`test_batching.py` tests the batching alone with thousands of other feeds; here packets of five
+vendors are converted, with random receive times and batches.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from unittest.mock import patch
@@ -18,45 +18,40 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from mlbatch.discovery.discover import Wishes
-from mlbatch.faults.replay import Fault, parse_fault
-from mlbatch.pipeline import conversion
+from mlbatch.discovery.discover import SensorSelection
+from mlbatch.faults import Fault, parse_fault
+from mlbatch.pipeline import session as session_module
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
-from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable, Topic
+from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable
 from tests.builders import livox
 from tests.builders.run import Values, csv_without_arrival, print_of
 from tests.matrix.cells import NOON_NS
 from tests.matrix.containers import rig_text
-from tests.matrix.lidars import MAKERS, NS_PER_MS, Sent, Spell, write_metadata
+from tests.matrix.lidars import NS_PER_MS, VENDORS, Sent, Spell, write_metadata
 
-BLOCKS, PERMUTATIONS_A_BLOCK = range(20), 50
+BLOCKS = range(20)
+PERMUTATIONS_A_BLOCK = 50
 LENGTH_NS = 80 * NS_PER_MS
-# Shorter than the session, so that an arrival could break the law.
+# Shorter than the session, so that receive times could break the law.
 WAIT_NS = 40 * NS_PER_MS
 RATE = Fraction(50)
-LIVOX_IP, LIVOX_PORT = "10.0.0.5", 57000
+LIVOX_IP = "10.0.0.5"
+LIVOX_PORT = 57000
 
 # Scans, scans.csv, ledgers, and what is the same for all scans.
 Print = tuple[list[Values], str, list[str], str]
 
 
-@dataclass(slots=True)
-class Memory:
-    """A recording of packets in memory; `Recording`. cuts: where its batches end."""
+class Memory(Recording):
+    """A recording of packets in memory; cuts: where its batches end."""
 
-    batch: PacketBatch
-    cuts: Sequence[int]
-    topics: tuple[Topic, ...] = ()
-    keep: frozenset[str] = frozenset()
-    notes: list[str] = field(default_factory=list)
-    path: Path = Path("memory.pcap")
-    container: str = "pcap"
-    counts: CaptureCounts = field(default_factory=CaptureCounts)
-    size_bytes: int = 0
-    position_bytes: int = 0
+    def __init__(self, batch: PacketBatch, cuts: Sequence[int]) -> None:
+        super().__init__(Path("memory.pcap"), "pcap", 0)
+        self.batch = batch
+        self.cuts = cuts
 
-    def packets(self, until_ns: int | None = None) -> Iterator[PacketBatch]:
+    def packets(self) -> Generator[PacketBatch, None, None]:
         """All batches, again from the start."""
         self.counts = CaptureCounts()
         ends = [*self.cuts, len(self.batch)]
@@ -105,14 +100,14 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(conversion, "open_recording", opened):
+        with patch.object(session_module, "open_recording", opened):
             return printed(replace(self.job, faults=faults))
 
     @property
     def job(self) -> Job:
         """A conversion of it."""
-        wishes = Wishes(rig=self.rig)
-        return Job((Path("memory.pcap"),), wishes, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
+        selection = SensorSelection(rig=self.rig)
+        return Job((Path("memory.pcap"),), selection, RATE, keep_partial=True, max_wait_ns=WAIT_NS)
 
 
 def printed(job: Job) -> Print:
@@ -141,10 +136,10 @@ def livox_sent() -> Sent:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """Lidars of five makers at the same time."""
+    """Lidars of five vendors at the same time."""
     folder = tmp_path_factory.mktemp("permutations")
     write_metadata(folder)
-    four = [row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS)) for row in MAKERS.values()]
+    four = [row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS)) for row in VENDORS.values()]
     text = rig_text(four, "pcap")
     text += f"  - name: livox\n    stream: {{source_ip: {LIVOX_IP}, port: {LIVOX_PORT}}}\n"
     text += "    extrinsics: {translation_m: [0, 0, 5], rotation_rpy_deg: [0, 0, 0]}\n"
@@ -161,7 +156,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
         np.repeat(np.arange(len(sents)), counts),
         np.concatenate([sent.host_ns for sent in sents]),
     )
-    streams = [Stream(row.ip, row.port) for row in MAKERS.values()]
+    streams = [Stream(row.ip, row.port) for row in VENDORS.values()]
     return Session(
         batch,
         tuple(range(a, a + n) for a, n in zip(firsts, counts, strict=False)),
@@ -181,13 +176,14 @@ def permutation(session: Session, rng: random.Random) -> list[int]:
     places = [rows.start for rows in session.rows]
     newest = [min(session.low_ns)] * len(places)
     order: list[int] = []
-    stays, current = rng.choice([0.0, 0.5, 0.9, 0.99]), 0
+    stays = rng.choice([0.0, 0.5, 0.9, 0.99])
+    current = 0
     left = list(range(len(places)))
     while left:
         tries = rng.sample(left, len(left))
         if current in left and rng.random() < stays:
             tries.insert(0, current)
-        # The slowest may always go on, so that one is found.
+        # The slowest may always continue, so that one is found.
         current = next(one for one in tries if _may_go_on(session, places, newest, one))
         order.append(places[current])
         newest[current] = max(newest[current], session.high_ns[places[current]])

@@ -1,4 +1,4 @@
-"""Laws of whole conversions: scans depend only on the packets (CONTRACT.md section 1)."""
+"""Laws of whole conversions: scans depend only on the packets (docs/batching.md)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Wanted:
     whole_messages: list[Message]
 
     def check(self, paths: Sequence[Path], folder: Path, buffer_bytes: int = LARGE) -> None:
-        """Convert recordings that hold the same packets, and compare."""
+        """Convert recordings of the same packets, and compare."""
         job = replace(FIXTURE, recordings=tuple(paths))
         whole = replace(job, keep_partial=False)
         with buffers_of(buffer_bytes):
@@ -130,7 +130,7 @@ def by_sensor() -> tuple[Records, Records]:
 
 
 def by_turns() -> tuple[Records, Records]:
-    """Datagrams cut in time, as a recorder that begins a new file does."""
+    """Datagrams divided by time, as by a capture tool that begins a new file."""
     records = [one.frame() for one in datagrams(LENGTH_NS)]
     return records[: len(records) // 2], records[len(records) // 2 :]
 
@@ -184,7 +184,9 @@ def test_a_late_network_does_not_matter(lag_ms: int, wanted: Wanted, tmp_path: P
 
 
 @pytest.mark.parametrize("size", [*BUFFERS, LARGE])
-def test_a_pause_of_the_recorder_does_not_matter(size: int, wanted: Wanted, tmp_path: Path) -> None:
+def test_a_pause_of_the_capture_host_does_not_matter(
+    size: int, wanted: Wanted, tmp_path: Path
+) -> None:
     """Sensors are looked for in the first 10 s; a buffer may end exactly there."""
     records = [one.frame() for one in datagrams(LENGTH_NS)]
     late = [(host_ns + 11 * 10**9, frame) for host_ns, frame in records[100:]]
@@ -200,7 +202,7 @@ def test_a_damaged_first_packet_does_not_silence_a_late_lidar(size: int, tmp_pat
     early = next(one for one in sent if one.source == LEFT.ip and one.port == 7502)
     late = [number for number, one in enumerate(sent) if (one.source, one.port) == (RIGHT.ip, 7502)]
     payload = bytearray(sent[late[0]].payload)
-    payload[7] ^= 1  # in the serial number, facts/ouster.md section 2
+    payload[7] ^= 1  # in the serial number, docs/sources/ouster.md section 2
     sent[late[0]] = replace(sent[late[0]], payload=bytes(payload))
     records = [replace(early, host_ns=START_NS - 15 * 10**9).frame()]
     path = tmp_path / "recording.pcap"
@@ -224,7 +226,7 @@ def test_the_report_names_streams_in_one_order(step: int, tmp_path: Path) -> Non
     assert streams == ["10.5.5.20", *sorted(strangers)]
 
 
-def test_imu_on_the_clock_of_the_recorder_has_arrivals_as_stamps(tmp_path: Path) -> None:
+def test_imu_on_the_host_clock_has_receive_times_as_stamps(tmp_path: Path) -> None:
     """Also samples whose own stamps are damaged beyond all arithmetic."""
     sent = [
         replace(one, payload=one.payload[:16] + LEAST + one.payload[24:])

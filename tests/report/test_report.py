@@ -14,10 +14,9 @@ import pytest
 from mlbatch.report.ledger import SensorLedger, check_capture
 from mlbatch.report.report import (
     ClockReport,
+    ForwardedMessages,
     InputReport,
-    Passed,
-    ReportInputs,
-    ScanTable,
+    RunReport,
     SensorReport,
     Timing,
     Unassigned,
@@ -26,6 +25,7 @@ from mlbatch.report.report import (
     report_text,
     summary_lines,
 )
+from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import CaptureCounts
 from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 
@@ -48,7 +48,7 @@ def ledger() -> SensorLedger:
     return counts
 
 
-def run() -> ReportInputs:
+def run() -> RunReport:
     """A whole run, with timings."""
     table = ScanTable(run_info())
     table.add(dense_scan(0))
@@ -61,7 +61,7 @@ def run() -> ReportInputs:
         *("left", "OS1-4", 0, "10.0.0.1 > port 7502", "1024x10"),
         *(ledger(), clock, "rig", np.eye(4), "left.json"),
     )
-    return ReportInputs(
+    return RunReport(
         inputs=(InputReport("/data/a.pcap", 1000, "pcap"),),
         timescale="utc",
         rate_hz="10",
@@ -102,7 +102,7 @@ def test_every_counter_tips_its_ledger(part: str, name: str) -> None:
 
 
 def test_messages_that_nobody_accounts_for_are_found() -> None:
-    passed = Passed("/imu", 10, 6, {"no_place": 4})
+    passed = ForwardedMessages("/imu", 10, 6, {"no_place": 4})
     assert imbalances(replace(run(), messages=(passed,))) == []
     assert imbalances(replace(run(), messages=(passed, replace(passed, written=5)))) == [
         "messages of /imu: wanted 10 accounted for, got 5 + 4"

@@ -1,4 +1,4 @@
-"""Which format an output gets, and what is refused."""
+"""Which format an output gets, what is refused, and where the side files are."""
 
 from __future__ import annotations
 
@@ -8,30 +8,36 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import UsageError
 from mlbatch.writers import (
     WriterOptions,
+    check_compression,
     check_target,
     choose_format,
+    extras,
     format_names,
-    open_writer,
-    plugin,
     report_paths,
 )
-from tests.builders.scans import run_info
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_formats_are_the_modules_of_the_package() -> None:
-    assert format_names() == ("mcap", "npz", "ply", "rosbag1", "rosbag2")
+def test_formats_are_found_by_their_place() -> None:
+    modules = (ROOT / "mlbatch" / "writers" / "formats").glob("[!_]*.py")
+    assert format_names() == tuple(sorted(path.stem for path in modules))
+    assert set(format_names()) >= {"mcap", "npz", "ply", "rosbag1", "rosbag2"}
 
 
-@pytest.mark.parametrize("name", format_names())
-def test_a_plug_in_is_called_as_its_format(name: str) -> None:
-    assert name == plugin(name).FORMAT
+def test_listing_formats_loads_no_heavy_package() -> None:
+    code = (
+        "import sys; from mlbatch.writers import format_names; format_names(); "
+        "sys.exit(any(name in sys.modules for name in ('numpy', 'mcap')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
 @pytest.mark.parametrize(
-    ("target", "asked", "wanted"),
+    ("target", "asked", "expected"),
     [
         ("out.mcap", None, "mcap"),
         ("OUT.MCAP", None, "mcap"),
@@ -46,8 +52,8 @@ def test_a_plug_in_is_called_as_its_format(name: str) -> None:
         ("out", "rosbag2", "rosbag2"),
     ],
 )
-def test_suffix_and_option_choose(target: str, asked: str | None, wanted: str) -> None:
-    assert choose_format(Path(target), asked) == wanted
+def test_suffix_and_option_choose(target: str, asked: str | None, expected: str) -> None:
+    assert choose_format(Path(target), asked) == expected
 
 
 @pytest.mark.parametrize(
@@ -60,47 +66,20 @@ def test_suffix_and_option_choose(target: str, asked: str | None, wanted: str) -
         ("x.pcd", None, "pcd, not in this version"),
         ("x.db3", None, "-o x --format rosbag2"),
         ("x.bag", "rosbag2", "leave out .bag"),
-        ("x.bag", "mcap", "the name of a .mcap file for --format mcap, got that of a rosbag1"),
+        ("x.bag", "mcap", "the name of a .mcap file for --format mcap, found that of a rosbag1"),
         ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
         ("x", "las", "'las' (not in this version)"),
-        ("x", "stl", "one of mcap, npz, ply, rosbag1, rosbag2"),
+        ("x", "stl", "one of mcap, npz, ply"),
     ],
 )
-def test_refusals_say_what_to_do(target: str, asked: str | None, hint: str) -> None:
+def test_refusals_name_a_remedy(target: str, asked: str | None, hint: str) -> None:
     with pytest.raises(UsageError) as caught:
         choose_format(Path(target), asked)
     assert hint in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["npz", "ply"])
-def test_point_layouts_belong_to_mcap(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="point-layout"):
-        open_writer(name, tmp_path / "out", run_info(), WriterOptions("velodyne"))
-    assert not list(tmp_path.iterdir())
-
-
-def test_unknown_point_layout_names_the_known(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="standard, velodyne, ouster"):
-        open_writer("mcap", tmp_path / "out.mcap", run_info(), WriterOptions("velodine"))
-    assert not list(tmp_path.iterdir())
-
-
-def test_ply_has_no_organized_form(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="organized"):
-        open_writer("ply", tmp_path / "out", run_info("organized"), WriterOptions())
-
-
-def test_listing_formats_loads_no_heavy_package() -> None:
-    code = (
-        "import sys; from mlbatch.writers import format_names; format_names(); "
-        "sys.exit(any(name in sys.modules for name in ('numpy', 'mcap')))"
-    )
-    root = Path(__file__).resolve().parents[2]
-    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
-
-
-def test_places_of_side_files() -> None:
+def test_paths_of_side_files() -> None:
     folder = report_paths(Path("a/out"), "npz")
     assert (folder.report, folder.scans_csv) == (Path("a/out/report.json"), Path("a/out/scans.csv"))
     file = report_paths(Path("a/x.mcap"), "mcap")
@@ -108,19 +87,30 @@ def test_places_of_side_files() -> None:
     assert file.scans_csv == Path("a/x.mcap.scans.csv")
 
 
-@pytest.mark.parametrize(
-    ("name", "file"),
-    [("mcap", "x.mcap"), ("npz", "x"), ("ply", "x"), ("rosbag1", "x.bag"), ("rosbag2", "x")],
-)
-def test_checking_a_target_leaves_nothing(name: str, file: str, tmp_path: Path) -> None:
-    check_target(name, tmp_path / file, WriterOptions(split=True), "dense")
-    assert not list(tmp_path.iterdir())
+def test_contents_of_the_formats() -> None:
+    for name, encodings in (("mcap", {"cdr", "ros1"}), ("rosbag1", {"ros1"}), ("rosbag2", {"cdr"})):
+        assert extras(name, WriterOptions()) == {"imu", *encodings}
+        assert extras(name, WriterOptions("ouster")) == {
+            *("imu", "range_m", "reflectivity", *encodings)
+        }
+    for name in ("npz", "ply"):
+        assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
 
 
-def test_checking_a_target_refuses_as_opening_does(tmp_path: Path) -> None:
-    (tmp_path / "x.mcap").write_text("old")
-    with pytest.raises(ExportError, match="existing"):
-        check_target("mcap", tmp_path / "x.mcap", WriterOptions(), "dense")
-    assert (tmp_path / "x.mcap").read_text() == "old"
+@pytest.mark.parametrize("name", ["npz", "ply", "rosbag1"])
+def test_formats_without_compression_refuse_it(name: str) -> None:
+    check_compression(name, WriterOptions())
+    with pytest.raises(UsageError) as caught:
+        check_compression(name, WriterOptions(compression="zstd"))
+    assert str(caught.value) == (
+        f"--compression: expected none for {name}, found 'zstd'; leave it out, or write a .mcap "
+        "or rosbag2 output"
+    )
+    with pytest.raises(UsageError, match="zstd:1 to zstd:22, found 'gzip'"):
+        check_compression(name, WriterOptions(compression="gzip"))
+
+
+def test_ply_is_never_organized(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="organized"):
         check_target("ply", tmp_path / "x", WriterOptions(), "organized")
+    assert not list(tmp_path.iterdir())

@@ -1,35 +1,204 @@
-"""Rotations as quaternions."""
+"""Messages of all containers: topics, order, contents; read back by other libraries."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mlbatch.errors import ExportError
+from mlbatch.types import IMU, Message, Summary
+from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
 from mlbatch.writers.message_writer import quaternion
+from tests.builders.scans import (
+    PERIOD_NS,
+    START_NS,
+    SUMMARY,
+    dense_scan,
+    imu_samples,
+    organized_scan,
+    run_info,
+    run_job,
+)
+from tests.builders.written_bags import (
+    ROS1_NOTE,
+    ROS1_ODD,
+    ROS2_NOTE,
+    ROS2_ODD,
+    note,
+    odd,
+    read_back,
+    written,
+)
 
+OUTPUTS = {
+    name: f"out{plugin(name).SUFFIX or ''}"
+    for name in format_names()
+    if IMU in extras(name, WriterOptions())
+}
+each_container = pytest.mark.parametrize("name", OUTPUTS)
+# The first one has more points than a block of the packing, and not a multiple of it.
+SCANS = [dense_scan(0, 20_001), dense_scan(1, 30)]
+POINT = np.dtype("<f4,<f4,<f4,<f4,<f4,<u2,u1,u1")
 HALF = 0.5**0.5
 
 
+def recorded(name: str) -> list[Message]:
+    """Return messages that a container can forward."""
+    topic, other = (ROS1_NOTE, ROS1_ODD) if name == "rosbag1" else (ROS2_NOTE, ROS2_ODD)
+    return [
+        note(topic, "first", -7),
+        odd(other, 1, -2, after_ns=3),
+        note(topic, "last", 3 * PERIOD_NS),
+    ]
+
+
+@each_container
+def test_other_libraries_read_every_message(name: str, tmp_path: Path) -> None:
+    messages = recorded(name)
+    found = read_back(written(name, tmp_path / OUTPUTS[name], SCANS, messages))
+    assert found[0].topic == "/tf_static"
+    assert [(r.topic, r.log_ns - START_NS) for r in found] == [
+        ("/tf_static", -7),
+        ("/note", -7),
+        ("/left/imu", -5),
+        ("/points", 0),
+        ("/odd", 3),
+        ("/left/imu", 10_000_000 - 5),
+        ("/right/imu", PERIOD_NS // 2),
+        ("/points", PERIOD_NS),
+        ("/note", 3 * PERIOD_NS),
+    ]
+    for cloud, scan in zip([r.value for r in found if r.topic == "/points"], SCANS, strict=True):
+        assert (cloud.height, cloud.width, cloud.row_step) == (1, scan.points, 24 * scan.points)
+        assert (cloud.is_dense, cloud.is_bigendian) == (True, False)
+        points = np.frombuffer(cloud.data, POINT)
+        x, y, z = scan.xyz.T
+        fields = {"f0": x, "f1": y, "f2": z, "f3": scan.intensity, "f5": scan.ring}
+        fields |= {"f6": scan.return_type, "f7": scan.lidar_id}
+        for field, values in fields.items():
+            np.testing.assert_array_equal(points[field], values)
+        assert cloud.header.frame_id == "base_link"
+        assert cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec == scan.start_ns
+    assert [r.raw for r in found if r.topic in ("/note", "/odd")] == [m.data for m in messages]
+    assert [r.value.data for r in found if r.topic == "/note"] == ["first", "last"]
+    [strange] = [r for r in found if r.topic == "/odd"]
+    assert (strange.type, [part.x for part in strange.value.parts]) == ("my_msgs/msg/Odd", [1, -2])
+
+
+@each_container
+def test_static_transforms_are_the_poses(name: str, tmp_path: Path) -> None:
+    [message] = [
+        r.value
+        for r in read_back(written(name, tmp_path / OUTPUTS[name], SCANS))
+        if r.topic == "/tf_static"
+    ]
+    frames = [(item.header.frame_id, item.child_frame_id) for item in message.transforms]
+    assert frames == [("base_link", "left"), ("base_link", "right")]
+    right = message.transforms[1].transform
+    assert (right.translation.x, right.translation.y, right.translation.z) == (1.0, 0.0, 2.0)
+    found = (right.rotation.x, right.rotation.y, right.rotation.z, right.rotation.w)
+    # 90 degrees about z.
+    assert found == pytest.approx((0, 0, HALF, HALF))
+
+
+@each_container
+def test_imu_messages_have_the_samples(name: str, tmp_path: Path) -> None:
+    found = read_back(written(name, tmp_path / OUTPUTS[name], SCANS))
+    first, second = (r.value for r in found if r.topic == "/left/imu")
+    assert first.header.frame_id == "left_imu"
+    stamp = first.header.stamp
+    assert (stamp.sec, stamp.nanosec) == (1_700_000_000, 99_999_995)
+    assert first.orientation_covariance[0] == -1.0
+    acceleration = second.linear_acceleration
+    assert (acceleration.x, acceleration.y, acceleration.z) == (11.0, 12.0, 13.0)
+    velocity = second.angular_velocity
+    assert (velocity.x, velocity.y, velocity.z) == (14.0, 15.0, 16.0)
+    [right] = [r.value for r in found if r.topic == "/right/imu"]
+    assert (right.angular_velocity.z, right.linear_acceleration.x) == (6.0, 1.0)
+
+
+@each_container
+def test_organized_clouds(name: str, tmp_path: Path) -> None:
+    scan = organized_scan(5)
+    found = read_back(written(name, tmp_path / OUTPUTS[name], [scan]))
+    [cloud] = [r.value for r in found if r.topic == "/points"]
+    assert (cloud.height, cloud.width, cloud.row_step, cloud.is_dense) == (4, 5, 120, False)
+    floats = np.frombuffer(cloud.data, "<f4").reshape(4, 5, 6)
+    shorts = np.frombuffer(cloud.data, "<u2").reshape(4, 5, 12)
+    assert np.isnan(floats[0, :, :4]).all()
+    np.testing.assert_array_equal(floats[..., :3], scan.xyz.transpose(1, 0, 2))
+    np.testing.assert_array_equal(shorts[..., 10], scan.ring.T)
+
+
+@each_container
+def test_split_gives_a_topic_a_sensor(name: str, tmp_path: Path) -> None:
+    scans = [dense_scan(0), dense_scan(0)]
+    path = written(name, tmp_path / OUTPUTS[name], scans, split=True)
+    topics = {message.topic for message in read_back(path)}
+    assert {"/left/points", "/right/points"} < topics
+    assert "/points" not in topics
+
+
+@each_container
+def test_a_run_without_scans(name: str, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
+    writer.write_imu(imu_samples(count=0))
+    writer.finish(Summary(None, "{}", "index\n"))
+    assert [(r.topic, r.log_ns) for r in read_back(tmp_path / OUTPUTS[name])] == [("/tf_static", 0)]
+
+
+@each_container
+@pytest.mark.parametrize("topic", ["/points", "/left/imu", "/tf_static"])
+def test_topics_of_the_scans_are_not_shared(name: str, topic: str, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path / "out", run_info(), WriterOptions())
+    with pytest.raises(ExportError, match=f"than those of the scans, found {topic}; do not pass"):
+        writer.write_message(note(replace(ROS2_NOTE, name=topic), "x", 0))
+    writer.abandon()
+
+
+@each_container
+def test_messages_that_fill_the_memory_do_not_wait(name: str, tmp_path: Path) -> None:
+    topic = ROS1_NOTE if name == "rosbag1" else ROS2_NOTE
+    writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
+    for number in range(20):
+        writer.write_message(note(topic, "x" * 1_000_000, number))
+    run_job(writer.flush())
+    assert writer.checkpoint().kept_bytes > 10_000_000
+    run_job(writer.write(dense_scan()))
+    writer.finish(SUMMARY)
+    found = [(r.topic, r.log_ns - START_NS) for r in read_back(tmp_path / OUTPUTS[name])]
+    assert found[0] == ("/tf_static", 0)
+    notes = [log_ns for topic, log_ns in found if topic == "/note"]
+    assert notes == list(range(20))
+
+
+# -- rotations ------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
-    ("rotation", "wanted"),
+    ("rotation", "expected"),
     [
         ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], (0, 0, 0, 1)),
         ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], (HALF, 0, 0, HALF)),
         ([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (0, HALF, 0, HALF)),
         ([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, HALF, HALF)),
-        # Half turns, where w is 0.
+        # 180 degrees, where w is 0.
         ([[1, 0, 0], [0, -1, 0], [0, 0, -1]], (1, 0, 0, 0)),
         ([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], (0, 1, 0, 0)),
         ([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], (0, 0, 1, 0)),
-        # x to y, y to z, z to x: a third of a turn about (1, 1, 1).
+        # x to y, y to z, z to x: 120 degrees about (1, 1, 1).
         ([[0, 0, 1], [1, 0, 0], [0, 1, 0]], (0.5, 0.5, 0.5, 0.5)),
     ],
 )
-def test_known_turns(rotation: list[list[int]], wanted: tuple[float, ...]) -> None:
-    assert quaternion(np.array(rotation, float)) == pytest.approx(wanted)
+def test_known_rotations(rotation: list[list[int]], expected: tuple[float, ...]) -> None:
+    assert quaternion(np.array(rotation, float)) == pytest.approx(expected)
 
 
-def test_it_turns_vectors_as_the_matrix_does() -> None:
+def test_quaternions_rotate_vectors_as_their_matrix() -> None:
     rng = np.random.default_rng(2)
     for _ in range(200):
         rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -38,6 +207,7 @@ def test_it_turns_vectors_as_the_matrix_does() -> None:
         vector = rng.normal(size=3)
         # v + 2 w (q x v) + 2 q x (q x v)
         once = np.cross(axis, vector)
-        turned = vector + 2 * w * once + 2 * np.cross(axis, once)
-        np.testing.assert_allclose(turned, rotation @ vector, atol=1e-12)
+        rotated = vector + 2 * w * once + 2 * np.cross(axis, once)
+        np.testing.assert_allclose(rotated, rotation @ vector, atol=1e-12)
         assert w >= 0
+        assert math.isclose(w * w + sum(part * part for part in axis), 1)

@@ -1,21 +1,20 @@
-"""npz folders: keys, types and bytes of CONTRACT.md, section 3."""
+"""npz files: keys, types, values, and the zip around them."""
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from mlbatch.types import Scan
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers.scan_folder import scan_name
 from tests.builders.scans import (
     SUMMARY,
     dense_scan,
     imu_samples,
     organized_scan,
-    run_info,
     run_job,
 )
 
@@ -41,11 +40,11 @@ TYPES = {
 WORDS = ("sensors", "frame_id", "rate_hz", "timescale", "schema")
 
 
-def written(folder: Path, *scans: Scan, split: bool = False) -> Path:
-    """Write scans into `folder`; one after the other by sensor 0, 1, ... if `split`."""
-    writer = open_writer("npz", folder, scans[0].info, WriterOptions(split=split))
-    for number, scan in enumerate(scans):
-        run_job(writer.write(scan, number if split else None))
+def written(folder: Path, *scans: Scan) -> Path:
+    """Write scans into a folder."""
+    writer = open_writer("npz", folder, scans[0].info, WriterOptions())
+    for scan in scans:
+        run_job(writer.write(scan))
     writer.write_imu(imu_samples())
     writer.finish(SUMMARY)
     return folder
@@ -93,34 +92,11 @@ def test_the_buffer_of_a_large_scan_leaves_nothing_in_a_small_one(tmp_path: Path
         np.testing.assert_array_equal(loaded["xyz"], small.xyz)
 
 
-def test_equal_scans_give_equal_bytes(tmp_path: Path) -> None:
-    first = written(tmp_path / "a", dense_scan()) / "000000.npz"
-    second = written(tmp_path / "b", dense_scan()) / "000000.npz"
-    assert first.read_bytes() == second.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("index", "slice_", "slices", "name"),
-    [
-        (42, 0, 1, "000042"),
-        (42, 3, 4, "000042-3"),
-        (1_234_567, 0, 1, "1234567"),
-        (-1, 0, 1, "head"),
-        (-1, 3, 4, "head-3"),
-    ],
-)
-def test_names(index: int, slice_: int, slices: int, name: str) -> None:
-    assert scan_name(index, slice_, slices) == name
-
-
-def test_split_gives_a_folder_a_sensor(tmp_path: Path) -> None:
-    folder = written(tmp_path / "out", dense_scan(), dense_scan(seed=5), split=True)
-    found = sorted(str(path.relative_to(folder)) for path in folder.rglob("*.npz"))
-    assert found == ["left/000000.npz", "right/000000.npz"]
-
-
-def test_nothing_stands_under_the_final_name_before_finish(tmp_path: Path) -> None:
-    writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
-    run_job(writer.write(dense_scan()))
-    writer.abandon()
-    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+def test_the_zip_is_that_of_zipfile(tmp_path: Path) -> None:
+    path = written(tmp_path / "out", dense_scan()) / "000000.npz"
+    again = io.BytesIO()
+    with zipfile.ZipFile(path) as found, zipfile.ZipFile(again, "w") as expected:
+        assert found.testzip() is None
+        for name in found.namelist():
+            expected.writestr(zipfile.ZipInfo(name), found.read(name))
+    assert path.read_bytes() == again.getvalue()

@@ -1,4 +1,4 @@
-"""PLY folders: properties of facts/outputs.md, section 5."""
+"""PLY folders: properties of docs/sources/outputs.md, section 5."""
 
 from __future__ import annotations
 

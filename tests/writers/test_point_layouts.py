@@ -1,7 +1,9 @@
-"""Fields that move together land where they do one by one, with the values that they have."""
+"""Point records: presets by hand, times, and fields that are copied as one word."""
 
 from __future__ import annotations
 
+import math
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,16 +12,75 @@ import pytest
 
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import Scan
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
-from tests.builders.scans import dense_scan, organized_scan
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, Records, points_of
+from tests.builders.scans import dense_scan, organized_scan, point_scan
 
 SCANS: dict[str, Callable[[], Scan]] = {"dense": dense_scan, "organized": organized_scan}
 LAYOUTS = {layout.name: layout for layout in (*CLOUD_LAYOUTS.values(), PLY_LAYOUT)}
 SPARE = 7
 
 
+def packed(scan: Scan, name: str) -> Records:
+    """Return the records of a scan."""
+    records = np.zeros(scan.time_ns.T.shape, LAYOUTS[name].dtype)
+    LAYOUTS[name].pack(points_of(scan), records)
+    return records
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values"),
+    [
+        ("standard", "<fffffHBB", (1, 2, 3, 7, 0.0625, 258, 2, 1)),
+        ("velodyne", "<ffffHf", (1, 2, 3, 7, 258, 0.0625)),
+        ("ouster", "<fff4xfIHHH2xI12x", (1, 2, 3, 7, 62_500_000, 300, 258, 0, 1500)),
+        ("hesai", "<ffffHd", (1, 2, 3, 7, 258, 1_700_000_000.1625)),
+        ("kiss-icp", "<ffff", (1, 2, 3, 0.0625)),
+        ("minimal", "<fff", (1, 2, 3)),
+        ("ply", "<ffffdiBB", (1, 2, 3, 7, 0.0625, 258, 2, 1)),
+    ],
+)
+def test_presets_by_hand(name: str, form: str, values: tuple[float, ...]) -> None:
+    assert LAYOUTS[name].step == struct.calcsize(form)
+    assert packed(point_scan(), name).tobytes() == struct.pack(form, *values)
+
+
+def test_autoware_angles_are_in_the_sensor_frame() -> None:
+    # The sensor is at (1, 0, 2) and its x axis is body y: the point (1, 3, 6) is 3 m ahead of it
+    # and 4 m up.
+    scan = replace(point_scan(), xyz=np.array([[1, 3, 6]], np.float32))
+    scan = replace(scan, intensity=np.array([999], np.float32), ring=np.array([6], np.uint16))
+    records = packed(scan, "autoware")
+    x, y, z, intensity, kind, channel, azimuth, elevation, distance, time = struct.unpack(
+        "<fffBBHfffI", records.tobytes()
+    )
+    assert (x, y, z, intensity, kind, channel, time) == (1, 3, 6, 255, 2, 2, 62_500_000)
+    assert azimuth == pytest.approx(0, abs=1e-6)
+    assert elevation == pytest.approx(math.atan2(4, 3))
+    assert distance == pytest.approx(5)
+    assert records.dtype.names == (
+        *("x", "y", "z", "intensity", "return_type", "channel"),
+        *("azimuth", "elevation", "distance", "time_stamp"),
+    )
+
+
+def test_float32_times_never_exceed_the_true_time() -> None:
+    # The float32 nearest to 99 999 999 ns is 0.1 s, above the truth; the next below, 2^-27 s less,
+    # is 0.0999999940395355224609375 s. Those of 500 000 000 ns and 0 are exact.
+    time_ns = np.array([0, 1, 99_999_999, 500_000_000, 4_000_000_001], np.uint32)
+    found = packed(replace(dense_scan(points=len(time_ns)), time_ns=time_ns), "standard")["time"]
+    assert found[2] == 0.0999999940395355224609375
+    assert found[[0, 3, 4]].tolist() == [0.0, 0.5, 4.0]
+    for value, truth_ns in zip(found, time_ns.tolist(), strict=True):
+        # Exact rationals: m / 2^k <= ns / 10^9 < next(m / 2^k).
+        above = np.nextafter(value, np.float32(5))
+        numerator, denominator = float(value).as_integer_ratio()
+        assert numerator * 10**9 <= truth_ns * denominator
+        numerator, denominator = float(above).as_integer_ratio()
+        assert numerator * 10**9 > truth_ns * denominator
+
+
 def side_by_side(scan: Scan) -> Scan:
-    """The same scan in the arrays of a decoder, which are longer than what is in them."""
+    """Return the same scan in the arrays of a decoder, which are longer than their content."""
     rows, *slots = scan.time_ns.shape
     buffer = ScanBuffer(rows + SPARE, *slots or (None,))
     buffer.point[:rows, ..., :3] = scan.xyz
@@ -40,10 +101,12 @@ def side_by_side(scan: Scan) -> Scan:
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("kind", SCANS)
 @pytest.mark.parametrize("begin", [0, 3])
-def test_wide_moves_change_nothing(kind: str, name: str, begin: int) -> None:
-    """Whatever the place of the first record in memory."""
-    scan, layout = SCANS[kind](), LAYOUTS[name]
-    apart, together = points_of(scan), points_of(side_by_side(scan))
+def test_wide_copies_change_nothing(kind: str, name: str, begin: int) -> None:
+    """For any alignment of the first record."""
+    scan = SCANS[kind]()
+    layout = LAYOUTS[name]
+    apart = points_of(scan)
+    together = points_of(side_by_side(scan))
     assert (apart.reals is None, apart.labels is None) == (True, True)
     assert together.reals is not None
     assert together.labels is not None
@@ -57,13 +120,11 @@ def test_wide_moves_change_nothing(kind: str, name: str, begin: int) -> None:
     for axis, letter in enumerate("xyz"):
         np.testing.assert_array_equal(records[letter], apart.xyz[..., axis])
     if "lidar_id" in (layout.dtype.names or ()):
-        np.testing.assert_array_equal(records["intensity"], apart.intensity)
-        np.testing.assert_array_equal(records["ring"], apart.ring)
-        np.testing.assert_array_equal(records["return_type"], apart.return_type)
-        np.testing.assert_array_equal(records["lidar_id"], apart.lidar_id)
+        for field in ("intensity", "ring", "return_type", "lidar_id"):
+            np.testing.assert_array_equal(records[field], getattr(apart, field))
 
 
-def test_a_part_that_lies_elsewhere_is_seen() -> None:
+def test_arrays_that_are_not_side_by_side() -> None:
     scan = side_by_side(dense_scan())
     assert points_of(replace(scan, intensity=scan.intensity.copy())).reals is None
     assert points_of(replace(scan, xyz=scan.xyz.copy())).reals is None
@@ -76,7 +137,5 @@ def test_a_part_that_lies_elsewhere_is_seen() -> None:
     assert points_of(swapped).labels is None
 
 
-def test_no_points_are_no_words() -> None:
-    scan = side_by_side(dense_scan(points=0, columns=1))
-    records = np.zeros(0, LAYOUTS["standard"].dtype)
-    LAYOUTS["standard"].pack(points_of(scan), records)
+def test_no_points() -> None:
+    assert len(packed(side_by_side(dense_scan(points=0, columns=1)), "standard")) == 0

@@ -1,7 +1,7 @@
 """Pieces of the decoding kernel: which slots of a column are wanted, and what returns are.
 
-Source: facts/outputs.md section 3 for the types of returns; `decode.projector` does the same in
-numpy. Elements are `return * pad + beam`; those beyond the beams hold no return.
+Source: docs/sources/outputs.md section 3 for the types of returns; `decode.projector` does the same
+in numpy. Elements are `return * pad + beam`; those beyond the beams hold no return.
 """
 
 from __future__ import annotations

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RunInfo
-from mlbatch.writers._wire import Cdr
-from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, layout_of
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
@@ -25,7 +24,6 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
-    layout_of(options)
 
     def open_file(path: Path, kept_bytes: int | None) -> MessageFile:
         # Imported here, so that naming the format does not load the library.
@@ -33,5 +31,4 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
         return McapContainer(path, kept_bytes, options.compression)
 
-    output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
-    return MessageWriter(output, info, options, Cdr, open_file)
+    return MessageWriter(target, info, options, Cdr, open_file)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mlbatch.errors import ExportError
 from mlbatch.types import EXTRAS, RunInfo, Scan
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.output_file import Bytes, crc32, write_all
+from mlbatch.writers.output_file import Bytes, crc32
 from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "npz"
@@ -55,10 +55,10 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of npz files."""
-    return FolderWriter(target, info, options, ".npz", lambda: NpzSaver(info))
+    return FolderWriter(target, info, options, FORMAT, lambda: NpzEncoder(info))
 
 
-class NpzSaver:
+class NpzEncoder:
     """Encodes scans of one run; owns the buffers that make arrays contiguous."""
 
     def __init__(self, info: RunInfo) -> None:
@@ -72,11 +72,11 @@ class NpzSaver:
             "schema": np.array(SCHEMA, dtype=np.str_),
         }
 
-    def save(self, file: io.FileIO, scan: Scan) -> None:
-        """Write the scan as a zip of npy files."""
+    def encode(self, scan: Scan) -> list[Bytes]:
+        """Return the scan as a zip of npy files."""
         arrays = self._arrays(scan) | self._constant
         members = ((f"{key}.npy", self._npy(key, array)) for key, array in arrays.items())
-        write_all(file, stored_zip(members))
+        return stored_zip(members)
 
     def _arrays(self, scan: Scan) -> dict[str, Array]:
         """Return the arrays that change from scan to scan, in the order of the file."""

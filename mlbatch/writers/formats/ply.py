@@ -6,7 +6,6 @@ Source: G. Turk, "The PLY Polygon File Format", 1994, and docs/sources/outputs.m
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import mlbatch
 from mlbatch.errors import UsageError, one_line
 from mlbatch.types import RunInfo, Scan
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.output_file import write_all
+from mlbatch.writers.output_file import Bytes
 from mlbatch.writers.point_layouts import PLY_LAYOUT, points_of
 from mlbatch.writers.scan_folder import FolderWriter
 
@@ -38,23 +37,23 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         raise UsageError(
             "--layout organized: expected dense for ply, found organized; write npz or mcap"
         )
-    return FolderWriter(target, info, options, ".ply", PlySaver)
+    return FolderWriter(target, info, options, FORMAT, PlyEncoder)
 
 
-class PlySaver:
+class PlyEncoder:
     """Encodes scans in a buffer of vertices that is reused."""
 
     def __init__(self) -> None:
         self._vertices = np.zeros(0, dtype=PLY_LAYOUT.dtype)
 
-    def save(self, file: io.FileIO, scan: Scan) -> None:
-        """Write the header and all points as vertices."""
+    def encode(self, scan: Scan) -> list[Bytes]:
+        """Return the header and all points as vertices."""
         count = len(scan.time_ns)
         if len(self._vertices) < count:
             self._vertices = np.zeros(count * 5 // 4, dtype=PLY_LAYOUT.dtype)
         vertices = self._vertices[:count]
         PLY_LAYOUT.pack(points_of(scan), vertices)
-        write_all(file, [header(scan, count).encode(), vertices.view(np.uint8).data])
+        return [header(scan, count).encode(), vertices.view(np.uint8).data]
 
 
 def header(scan: Scan, count: int) -> str:

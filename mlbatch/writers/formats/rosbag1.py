@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Ros1
 from mlbatch.types import Message, RunInfo, Summary, Topic
-from mlbatch.writers._wire import Ros1
-from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of, layout_of
+from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of
 from mlbatch.writers.output_file import open_buffered
 
 if TYPE_CHECKING:
@@ -38,9 +37,7 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
-    layout_of(options)
-    output = prepare(target, options.overwrite, folder=False, keep=options.kept_bytes is not None)
-    return MessageWriter(output, info, options, Ros1, _Rosbag1File)
+    return MessageWriter(target, info, options, Ros1, _Rosbag1File)
 
 
 class _OpenPath:

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
+from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RunInfo, Topic
-from mlbatch.writers._wire import Cdr
-from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, layout_of
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
 
 if TYPE_CHECKING:
     from mlbatch.writers.mcap_container import McapContainer
@@ -33,7 +32,6 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
-    layout_of(options)
 
     def open_file(folder: Path, kept_bytes: int | None) -> MessageFile:
         # Imported here, so that naming the format does not load the library.
@@ -47,8 +45,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
         return McapContainer(path, kept_bytes, options.compression, _check_topic, write_metadata)
 
-    output = prepare(target, options.overwrite, folder=True, keep=options.kept_bytes is not None)
-    return MessageWriter(output, info, options, Cdr, open_file)
+    return MessageWriter(target, info, options, Cdr, open_file, folder=True)
 
 
 def _check_topic(topic: Topic) -> None:

@@ -26,8 +26,8 @@ from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
 from mlbatch.pipeline.conversion import Conversion
-from mlbatch.sensors._ouster_profiles import PROFILES
-from mlbatch.sensors.ouster import read_calibration
+from mlbatch.sensors.ouster.profiles import PROFILES
+from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.types import EXTRAS, RunInfo, SensorInfo
 from tests.builders.engines import BOXES_M, Pair, few_kernels, needs_numba
 from tests.builders.ouster import OusterSpec, metadata_json

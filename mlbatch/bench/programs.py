@@ -1,0 +1,233 @@
+"""Programs that are measured for comparison, each in a process of its own: floors and peers.
+
+    python -m mlbatch.bench.programs FLOOR RESULT BYTES MESSAGES
+
+runs a floor: work that no conversion avoids (`copy`, `write`, `start`), or a library (`mcap`). A
+peer is another program that does a part of the same work; peers.py passes this file as text to
+the interpreter that has it installed:
+
+    python -c TEXT ouster-sdk|ouster-sdk-lean|ouster-cli RESULT RECORDING METADATA,X,Y,Z,YAW_DEG...
+    python -c TEXT velodyne-decoder RESULT RECORDING
+
+RESULT is a JSON file: CPU time without start and imports, and what was read. This file imports
+only the standard library at the top, and nothing of mlbatch: imports count in what is measured.
+
+Source: the APIs of ouster-sdk 1.0 and velodyne-decoder 3.1 (both BSD-3-Clause).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+BLOCK_BYTES: Final = 8 << 20
+# Slots of a VLP-16 packet: 12 blocks of 2 firing sequences of 16 channels.
+_VLP16_SLOTS: Final = 384
+# Fields that mlbatch decodes, by profile.
+_LEAN_FIELDS: Final = {
+    "RNG15_RFL8_NIR8": ["RANGE", "REFLECTIVITY"],
+    "RNG19_RFL8_SIG16_NIR16": ["RANGE", "REFLECTIVITY", "SIGNAL"],
+}
+
+# -- floors ---------------------------------------------------------------------------------------
+
+
+def copy(size: int, messages: int) -> None:
+    """Copy `size` bytes, one message at a time, between two warm buffers."""
+    message_bytes = max(1, size // messages)
+    source = memoryview(bytes(message_bytes))
+    target = memoryview(bytearray(message_bytes))
+    for _ in range(messages):
+        target[:] = source
+
+
+def write(size: int, messages: int) -> None:
+    """Write `size` bytes to a new file in large blocks; like mlbatch, without fsync."""
+    block = memoryview(bytes(range(256)) * (BLOCK_BYTES // 256))
+    with Path("floor.bin").open("wb", buffering=0) as file:
+        for at in range(0, size, BLOCK_BYTES):
+            file.write(block[: min(BLOCK_BYTES, size - at)])
+
+
+def mcap_library(size: int, messages: int) -> None:
+    """Write messages of equal size by the `mcap` library, one chunk with a CRC per message."""
+    from mcap.writer import CompressionType, Writer
+
+    message = bytes(range(256)) * max(1, size // messages // 256)
+    with Path("floor.mcap").open("wb") as file:
+        writer = Writer(file, len(message), compression=CompressionType.NONE)
+        writer.start("ros2")
+        schema = writer.register_schema("sensor_msgs/msg/PointCloud2", "ros2msg", b"uint8[] data")
+        channel = writer.register_channel("/points", "cdr", schema)
+        for number in range(messages):
+            writer.add_message(channel, number, message, number)
+        finish: Callable[[], None] = writer.finish
+        finish()
+
+
+def start(size: int, messages: int) -> None:
+    """Import numpy, as every conversion does."""
+    importlib.import_module("numpy")
+
+
+FLOORS: Final[Mapping[str, Callable[[int, int], None]]] = {
+    "copy": copy,
+    "write": write,
+    "mcap": mcap_library,
+    "start": start,
+}
+
+
+def run_floor(name: str, size: str, messages: str) -> dict[str, float]:
+    """CPU and wall time of a floor, in s."""
+    began_wall_s = time.perf_counter()
+    began_cpu_s = time.process_time()
+    FLOORS[name](int(size), max(1, int(messages)))
+    return {
+        "own_cpu_s": time.process_time() - began_cpu_s,
+        "wall_s": time.perf_counter() - began_wall_s,
+    }
+
+
+# -- peers ----------------------------------------------------------------------------------------
+
+
+def _body_from_sensor(x: float, y: float, z: float, yaw_deg: float) -> npt.NDArray[np.float64]:
+    """Pose as (4, 4), metres, from a translation and a yaw angle."""
+    import numpy as np
+
+    cosine = np.cos(np.radians(yaw_deg))
+    sine = np.sin(np.radians(yaw_deg))
+    return np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])
+
+
+def ouster_sdk(recording: str, *sensors: str, lean: bool) -> dict[str, float]:
+    """Collate the frames of all sensors and project them into the body frame.
+
+    By default all fields and `XYZLut` (float64) with extrinsics, as the SDK does; lean: only the
+    fields that mlbatch decodes, and `XYZLutFloat`.
+    """
+    import numpy as np
+
+    # Imported by name: type checks run where the SDK is not installed.
+    sdk = importlib.import_module("ouster.sdk")
+    core = importlib.import_module("ouster.sdk.core")
+    began_s = time.process_time()
+    metadata = [sensor.split(",")[0] for sensor in sensors]
+    poses = [_body_from_sensor(*map(float, sensor.split(",")[1:])) for sensor in sensors]
+    settings: dict[str, object] = {"meta": metadata, "extrinsics": poses}
+    table_type = core.XYZLut
+    if lean:
+        sensor_format = json.loads(Path(metadata[0]).read_text(encoding="utf-8"))
+        profile = sensor_format["lidar_data_format"]["udp_profile_lidar"]
+        settings["field_names"] = _LEAN_FIELDS[profile]
+        table_type = core.XYZLutFloat
+    source = sdk.open_source(recording, **settings)
+    tables = [table_type(info, use_extrinsics=True) for info in source.sensor_info]
+    slots = 0
+    points = 0
+    scans = 0
+    for frames in source:
+        scans += 1
+        for number, frame in enumerate(frames):
+            if frame is not None:
+                slots += tables[number](frame).size // 3
+                points += int(np.count_nonzero(frame.field("RANGE")))
+    own_cpu_s = time.process_time() - began_s
+    return {"slots": slots, "points": points, "scans": scans, "own_cpu_s": own_cpu_s}
+
+
+def ouster_cli(recording: str, *sensors: str) -> dict[str, float]:
+    """Write one PLY file of all points, in sensor frames, by the command line of the SDK."""
+    cli = importlib.import_module("ouster.cli.core")
+    began_s = time.process_time()
+    metadata = [part for sensor in sensors for part in ("--meta", sensor.split(",")[0])]
+    sys.argv = ["ouster-cli", "source", *metadata, recording]
+    sys.argv += ["save", "--decimate", "false", "peer.ply"]
+    # The command line ends with sys.exit().
+    with contextlib.suppress(SystemExit):
+        cli.run()
+    own_cpu_s = time.process_time() - began_s
+    points = 0
+    size = 0
+    for path in Path().glob("peer*.ply"):
+        with path.open("rb") as file:
+            points += next(int(line.split()[2]) for line in file if b"element vertex" in line)
+        size += path.stat().st_size
+        path.unlink()
+    if not points:
+        raise RuntimeError("expected points in the PLY file of ouster-cli, found none")
+    counts = {"slots": points, "points": points, "scans": 1, "written_bytes": size}
+    return {**counts, "own_cpu_s": own_cpu_s}
+
+
+class _SweepDecoder(Protocol):
+    """`velodyne_decoder.StreamDecoder`: decodes one sensor; a sweep is its time and its points."""
+
+    def decode(self, stamp: float, packet: bytes) -> tuple[float, list[object]] | None:
+        """Add a packet; returns the sweep that it completes, if any."""
+        ...
+
+    def finish(self) -> tuple[float, list[object]] | None:
+        """Return the last sweep, if any."""
+        ...
+
+
+def velodyne_decoder(recording: str) -> dict[str, float]:
+    """Decode the sweeps of each sensor in its own frame, without merging sensors.
+
+    Packets come from dpkt, as in the decoder's `read_pcap`, which supports one sensor per file.
+    """
+    decoder = importlib.import_module("velodyne_decoder")
+    pcap = importlib.import_module("dpkt.pcap")
+    ethernet = importlib.import_module("dpkt.ethernet")
+    began_s = time.process_time()
+    streams: dict[bytes, _SweepDecoder] = {}
+    sweeps = []
+    slots = 0
+    with Path(recording).open("rb") as file:
+        for stamp, frame in pcap.Reader(file):
+            packet = ethernet.Ethernet(frame).data
+            if packet.src not in streams:
+                config = decoder.Config(model=decoder.Model.VLP16)
+                streams[packet.src] = decoder.StreamDecoder(config)
+            sweep = streams[packet.src].decode(stamp, packet.data.data)
+            slots += _VLP16_SLOTS
+            if sweep is not None:
+                sweeps.append(len(sweep[1]))
+    for stream in streams.values():
+        sweep = stream.finish()
+        if sweep is not None:
+            sweeps.append(len(sweep[1]))
+    own_cpu_s = time.process_time() - began_s
+    return {"slots": slots, "points": sum(sweeps), "scans": len(sweeps), "own_cpu_s": own_cpu_s}
+
+
+PROGRAMS: Final[Mapping[str, Callable[..., dict[str, float]]]] = {
+    **{name: partial(run_floor, name) for name in FLOORS},
+    "ouster-sdk": partial(ouster_sdk, lean=False),
+    "ouster-sdk-lean": partial(ouster_sdk, lean=True),
+    "ouster-cli": ouster_cli,
+    "velodyne-decoder": velodyne_decoder,
+}
+
+
+def main(name: str, result: str, *arguments: str) -> None:
+    """Run a program and write its times and counts to the file `result` (JSON)."""
+    found = PROGRAMS[name](*arguments)
+    Path(result).write_text(json.dumps(found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

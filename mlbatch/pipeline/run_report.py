@@ -1,0 +1,285 @@
+"""Report of a run: figures of its session, batching and decoding; late warnings; why no scan."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mlbatch import sensors
+from mlbatch.discovery.match import describe
+from mlbatch.discovery.types import Note, PacketKind
+from mlbatch.pipeline.passthrough import PASS_REASONS
+from mlbatch.pipeline.sensor import Sensor
+from mlbatch.pipeline.session import CLOUDS
+from mlbatch.report.ledger import ordered
+from mlbatch.report.report import (
+    ClockReport,
+    FaultReport,
+    ForwardedMessages,
+    InputReport,
+    RunReport,
+    SensorReport,
+    Timing,
+    Unassigned,
+    Warned,
+)
+from mlbatch.report.scan_table import ScanStatistics, Spread
+from mlbatch.types import CaptureCounts
+from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.conversion import Conversion
+
+_KB_PER_MB = 1024
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
+
+
+def run_report(run: Conversion) -> RunReport:
+    """Collect the content of report.json."""
+    table = run.table
+    return RunReport(
+        inputs=tuple(
+            InputReport(str(r.path), r.size_bytes, r.container) for r in run.session.recordings
+        ),
+        timescale="unknown" if run.info is None else run.info.timescale,
+        rate_hz=rate_text(run.grid.rate),
+        t_init_ns=run.batcher.t_init_ns,
+        slices=run.job.slices,
+        capture=_capture(run),
+        sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
+        scans=_NO_SCANS
+        if table is None
+        else table.statistics(run.batcher.empty, run.dropped_incomplete),
+        unassigned=_unassigned(run),
+        timing=_timing(run),
+        messages=tuple(
+            ForwardedMessages(
+                topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS)
+            )
+            for topic, counts in sorted(run.passthrough.messages.counts.items())
+        ),
+        faults=()
+        if run.session.replay is None
+        else tuple(FaultReport(one.fault, one.packets) for one in run.session.replay.counts),
+        repeated=_repeated(run),
+        warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
+    )
+
+
+# Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
+# calibration; one damaged timestamp in the future makes those that follow it late.
+MANY = 0.01
+
+
+def _cloud_notes(run: Conversion) -> Iterator[Note]:
+    """How the times of decoded clouds were read."""
+    if not any(recording.topics for recording in run.session.recordings):
+        return
+    # Captures have no topics, hence no clouds: do not load their reader.
+    from mlbatch.readers.bag.clouds import CloudRecording
+
+    for recording in run.session.recordings:
+        if isinstance(recording, CloudRecording):
+            for text in recording.verdicts:
+                yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
+
+
+def final_notes(run: Conversion) -> list[Note]:
+    """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
+    notes = [
+        Note("recording", "", f"{recording.path.name}: {text}")
+        for recording in run.session.recordings
+        for text in recording.notes
+    ]
+    notes += _cloud_notes(run)
+    for sensor in run.sensors:
+        packets = sensor.ledger.packets
+        # A packet captured twice is no loss.
+        reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
+        rejected = sum(reasons_of.values())
+        if rejected > MANY * packets.read:
+            reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
+            text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
+            notes.append(Note("rejected", sensor.name, text))
+        decoded, late = sensor.ledger.columns.decoded, sensor.ledger.columns.dropped.get("late", 0)
+        if late > MANY * decoded:
+            text = (
+                f"{sensor.name}: {late} of {decoded} columns were late, after a timestamp in the "
+                "future (damaged?) or a stall; see --decode crc=check, --max-wait"
+            )
+            notes.append(Note("late", sensor.name, text))
+    table, seen = run.session.setup.sampler.table, run.session.setup.sampler.kinds
+    for kind in sorted(run.session.ingest.samples):
+        what = _what(run, kind)
+        # A rig lists the sensors to use; others need no warning.
+        if run.session.setup.rig is None and kind not in seen and "lidar" in what:
+            notes.append(
+                Note(
+                    "late_stream",
+                    "",
+                    f"{table.streams[kind[0]]}: {what}; it started after the first 10 s, in "
+                    "which sensors are detected; its packets are counted as unassigned; name the "
+                    "sensor in a rig file (--rig)",
+                )
+            )
+    return notes
+
+
+def message_notes(run: Conversion) -> list[Note]:
+    """Warnings about messages that could not be forwarded."""
+    notes = []
+    for topic, counts in run.passthrough.messages.counts.items():
+        if run.passthrough.messages.has_place and (other := counts.dropped.get("no_place")):
+            text = f"{topic}: {other} message(s) dropped: the output cannot hold its ROS version"
+            notes.append(Note("other_ros", "", text))
+        if other := counts.dropped.get("other_clock"):
+            text = (
+                f"{topic}: {other} message(s) dropped: their clock differs from that of the scans"
+            )
+            notes.append(Note("imu_clock", "", text))
+    return notes
+
+
+def why_no_scan(run: Conversion) -> str:
+    """Error text of a run without a scan: time span of each sensor, and a remedy."""
+    where = ", ".join(str(path) for path in run.job.recordings)
+    spans = []
+    for sensor, span in zip(run.sensors, run.batcher.spans_ns, strict=True):
+        if span is None:
+            spans.append(f"{sensor.name} has no valid column")
+        else:
+            spans.append(
+                f"{sensor.name} from {span[0] / NS_PER_S:.6f} to {span[1] / NS_PER_S:.6f} s"
+            )
+    heads = sum(
+        count
+        for dropped in run.batcher.dropped
+        for reason, count in dropped.items()
+        if reason in ("head", "tail")
+    )
+    if all(span is None for span in run.batcher.spans_ns):
+        return f"{where}: no scan: expected valid columns, found none ({'; '.join(spans)})"
+    period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
+    advice = (
+        "write the partial ones with --keep-partial"
+        if heads
+        else "choose another --start/--end, or a recording where all sensors run together"
+    )
+    return (
+        f"{where}: no scan: expected a whole window of {period_ms:g} ms with all sensors, found "
+        f"{'; '.join(spans)}; {advice}"
+    )
+
+
+def _capture(run: Conversion) -> CaptureCounts:
+    total = CaptureCounts()
+    for recording in run.session.recordings:
+        total.frames += recording.counts.frames
+        total.datagrams += recording.counts.datagrams
+        for reason, count in recording.counts.skipped.items():
+            total.skip(reason, count)
+    if run.batcher.past_end:
+        # Recordings are read ahead of each other; what was not used does not count.
+        ahead = total.datagrams - run.session.delivered
+        total.frames -= ahead
+        total.datagrams -= ahead
+    return total
+
+
+def _repeated(run: Conversion) -> int:
+    """Datagrams that injected faults duplicated, less those that they removed."""
+    if run.session.replay is None or run.batcher.past_end:
+        # With an end, only datagrams after fault injection are counted.
+        return 0
+    return sum(one.repeated - one.removed for one in run.session.replay.ledgers)
+
+
+def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
+    table = run.session.setup.sampler.table
+    kinds = sensor.detected.kinds
+    streams = sorted({str(table.streams[stream]) for stream, _ in kinds})
+    return SensorReport(
+        name=sensor.name,
+        model=sensor.lidar.model,
+        lidar_id=sensor.index,
+        stream="; ".join(streams),
+        mode=sensor.lidar.mode,
+        ledger=sensor.ledger,
+        clock=_clock(run, sensor),
+        extrinsics_source=sensor.detected.pose.describe(),
+        body_from_sensor=sensor.body_from_sensor,
+        calibration=Path(sensor.lidar.calibration).name,
+    )
+
+
+def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
+    first = run.batcher.firsts[sensor.index]
+    source = sensor.clock.source
+    mode = sensor.lidar.timestamp_mode
+    notes: tuple[str, ...] = (f"timestamp mode {mode}",) if mode else ()
+    if first is None:
+        return ClockReport(source, "unknown", notes=notes)
+    epoch = sensor.clock.timescale(*first)
+    offset_ns = first[0] - first[1]
+    finding = dict(run.session.clocks.findings()).get(sensor.name)
+    if finding is None:
+        return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
+    if sensor.clock.map is not None:
+        notes += (sensor.clock.map.describe(),)
+    return ClockReport(
+        source,
+        epoch,
+        offset_to_host_ms=offset_ns / NS_PER_MS,
+        drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
+        notes=(*notes, finding.describe()),
+    )
+
+
+def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
+    setup, rows = run.session.setup, []
+    streams = setup.sampler.table.streams
+    # Not by stream number, which depends on the order of reading.
+    by_name = sorted(
+        run.session.ingest.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
+    )
+    for kind, count in by_name:
+        stream = streams[kind[0]]
+        what = _what(run, kind)
+        if kind not in setup.sampler.kinds:
+            what = f"not seen in the first 10 s: {what}"
+        if kind in setup.ignored:
+            what = f"ignored: {what}"
+        elif kind in setup.not_in_rig:
+            what = f"not_in_rig: {what}"
+        rows.append(Unassigned(str(stream), count, f"{what} ({kind[1]} bytes)"))
+    return tuple(rows)
+
+
+def _what(run: Conversion, kind: PacketKind) -> str:
+    """Description of unassigned packets: by one of them, else by those sampled by discovery."""
+    sample = run.session.ingest.samples.get(kind)
+    if sample is not None and (text := sensors.describe(kind[1], sample)):
+        return text
+    if kind in run.session.setup.sampler.kinds:
+        return describe(run.session.setup.sampler, kind) or "unknown"
+    return "unknown"
+
+
+def _timing(run: Conversion) -> Timing:
+    wall_s, cpu_s = run.stages.elapsed_s
+    stages = run.stages
+    points = sum(sensor.ledger.points.written for sensor in run.sensors)
+    return Timing(
+        wall_s=wall_s,
+        cpu_s=cpu_s,
+        read_s=stages.read_s,
+        decode_s=stages.decode_s,
+        merge_s=stages.merge_s - stages.read_s,
+        write_s=stages.write_s,
+        recorded_s=run.session.recorded_s,
+        points_per_s=points / wall_s if wall_s > 0 else 0.0,
+        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB,
+        engine=run.session.engine,
+    )

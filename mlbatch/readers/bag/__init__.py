@@ -1,0 +1,1 @@
+"""Bags: messages, and the packets in them."""

@@ -1,0 +1,305 @@
+"""Reassembly of fragmented UDP datagrams (RFC 791 section 3.2, RFC 8200 section 4.5).
+
+The rules, in receive order of the fragments:
+- a set is identified by (source, destination, identification); the protocol is always UDP here;
+- a set whose first fragment is more than 1 s before or after any later fragment is dropped:
+  fragments of one datagram arrive within a millisecond, and identifications are used again;
+- a fragment at offset 0 with other bytes than the one already there begins a new datagram: the old
+  set is dropped; a duplicate fragment (same place, same bytes) changes nothing;
+- fragments that overlap otherwise, or are beyond the last one, drop their set;
+- the last missing fragment completes the datagram and gives its receive time;
+- at most MAX_SETS sets are open: a further one drops the oldest.
+Frames of dropped and never completed sets are counted `fragment_lost`; the frames of a completed
+datagram but the completing one are counted `fragment`, so that each datagram is one frame.
+
+`SetTable` applies the rules to one fragment at a time. `Reassembler` treats the usual case many at
+once: all fragments of a datagram are in one buffer, in order, and no set of theirs is open. A chain
+is a run of fragments of one set in which each continues the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.readers.byte_records import copy_runs, records
+from mlbatch.readers.capture.frames import UDP, Datagrams, Fragments, in_order
+from mlbatch.types import CaptureCounts
+from mlbatch.units import NS_PER_S
+
+MAX_SETS = 2048
+MAX_DATAGRAM_BYTES = 65535
+MAX_AGE_NS = NS_PER_S
+_UDP_BYTES = 8
+
+
+@dataclass(slots=True)
+class _Set:
+    """Fragments of one datagram so far; total: its length, known from the last fragment."""
+
+    birth_ns: int
+    parts: dict[int, bytes] = field(default_factory=dict)
+    frames: int = 0
+    received: int = 0
+    total: int | None = None
+
+    def fits(self, offset: int, size: int, more: bool) -> bool:
+        """Whether a fragment neither overlaps the others nor contradicts the datagram's end."""
+        end = offset + size
+        limit = MAX_DATAGRAM_BYTES if self.total is None else self.total
+        if end > limit or (not more and self.total is not None):
+            return False
+        starts = self.parts.items()
+        if any(offset < at + len(part) and at < end for at, part in starts):
+            return False
+        return more or all(at + len(part) <= end for at, part in starts)
+
+    def add(self, offset: int, part: bytes, more: bool) -> bool:
+        """Add a fragment that fits; whether the datagram is complete."""
+        self.parts[offset] = part
+        self.received += len(part)
+        if not more:
+            self.total = offset + len(part)
+        return self.received == self.total
+
+
+@dataclass(slots=True)
+class SetTable:
+    """The open sets; held_bytes: of their fragments."""
+
+    counts: CaptureCounts
+    held_bytes: int = 0
+    _sets: dict[tuple[int, int, int], _Set] = field(default_factory=dict)
+    _oldest_ns: int = 0
+    _newest_ns: int = 0
+
+    def __len__(self) -> int:
+        return len(self._sets)
+
+    def __contains__(self, key: tuple[int, int, int]) -> bool:
+        return key in self._sets
+
+    def expire(self, now_ns: int) -> None:
+        """Drop the sets that are more than a second away from `now_ns`."""
+        if now_ns - self._oldest_ns <= MAX_AGE_NS and self._newest_ns - now_ns <= MAX_AGE_NS:
+            return
+        for key, held in list(self._sets.items()):
+            if abs(now_ns - held.birth_ns) > MAX_AGE_NS:
+                self._drop(key)
+        births = [held.birth_ns for held in self._sets.values()]
+        self._oldest_ns = min(births, default=now_ns)
+        self._newest_ns = max(births, default=now_ns)
+
+    def add(
+        self, key: tuple[int, int, int], offset: int, part: bytes, more: bool, now_ns: int
+    ) -> dict[int, bytes] | None:
+        """Add a fragment; the parts of the datagram by offset if it is complete."""
+        held = self._sets.get(key)
+        known = held.parts.get(offset) if held else None
+        if held and known == part and more == (offset + len(part) != held.total):
+            held.frames += 1
+            return None
+        if held and known is not None and offset == 0:
+            self._drop(key)
+            held = None
+        held = held or self._open(key, now_ns)
+        held.frames += 1
+        if not held.fits(offset, len(part), more):
+            self._drop(key)
+            return None
+        self.held_bytes += len(part)
+        return self._close(key) if held.add(offset, part, more) else None
+
+    def finish(self) -> None:
+        """Count the open sets as lost."""
+        for key in list(self._sets):
+            self._drop(key)
+
+    def _open(self, key: tuple[int, int, int], now_ns: int) -> _Set:
+        if len(self._sets) >= MAX_SETS:
+            self._drop(next(iter(self._sets)))
+        if not self._sets:
+            self._oldest_ns = self._newest_ns = now_ns
+        self._oldest_ns = min(self._oldest_ns, now_ns)
+        self._newest_ns = max(self._newest_ns, now_ns)
+        held = self._sets[key] = _Set(now_ns)
+        return held
+
+    def _close(self, key: tuple[int, int, int]) -> dict[int, bytes] | None:
+        held = self._sets[key]
+        length = int.from_bytes(held.parts[0][4:6], "big")
+        if len(held.parts[0]) < _UDP_BYTES or not _UDP_BYTES <= length <= held.received:
+            self._drop(key)
+            return None
+        del self._sets[key]
+        self.held_bytes -= held.received
+        self.counts.skip("fragment", held.frames - 1)
+        return held.parts
+
+    def _drop(self, key: tuple[int, int, int]) -> None:
+        held = self._sets.pop(key)
+        self.held_bytes -= held.received
+        self.counts.skip("fragment_lost", held.frames)
+
+
+# -- many at once ----------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Chains:
+    """Chains over the fragments sorted by set; chain c is `order[start[c] : stop[c]]`.
+
+    whole: the chain is a complete datagram; new_set: it is the first chain of its set;
+    total: bytes; udp_length, port: of its UDP header.
+    """
+
+    order: I64Array
+    start: I64Array
+    stop: I64Array
+    whole: BoolArray
+    new_set: BoolArray
+    total: I64Array
+    udp_length: I64Array
+    port: I64Array
+
+
+@dataclass(slots=True)
+class Reassembler:
+    """Joins fragments in the front part of a buffer; open sets survive the buffer's end.
+
+    together: False applies the rules to one fragment at a time.
+    """
+
+    counts: CaptureCounts
+    together: bool = True
+    kernel: CaptureKernel | None = None
+    sets: SetTable = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sets = SetTable(self.counts)
+
+    def push(self, data: U8Array, fragments: Fragments, host_ns: I64Array) -> Datagrams:
+        """Datagrams completed by `fragments`, assembled from byte 0 of `data` on.
+
+        host_ns: (n,) int64, receive time of each fragment. The caller leaves enough room: the
+        fragments' bytes and `sets.held_bytes`, or MAX_DATAGRAM_BYTES for each fragment.
+        """
+        every = np.arange(len(fragments))
+        if not self.together or not _independent(fragments, host_ns):
+            return self._one_by_one(data, fragments, host_ns, every, 0)
+        chains = _find_chains(data, fragments, host_ns)
+        if len(self.sets) + len(chains.start) > MAX_SETS:
+            return self._one_by_one(data, fragments, host_ns, every, 0)
+        self.sets.expire(int(host_ns[0]))
+        usable = self._undisturbed(chains, fragments)
+        copy = copy_runs if self.kernel is None else self.kernel.copy_runs
+        done, end = _assemble(data, fragments, chains, usable, copy)
+        lengths = chains.stop - chains.start
+        self.counts.skip("fragment", int((lengths[usable] - 1).sum()))
+        rest = np.sort(chains.order[np.repeat(~usable, lengths)])
+        others = self._one_by_one(data, fragments, host_ns, rest, end)
+        self.sets.expire(int(host_ns[-1]))
+        return in_order(done, others)
+
+    def _undisturbed(self, chains: _Chains, fragments: Fragments) -> BoolArray:
+        """Whole chains of sets that are not open and have no other fragments before them."""
+        broken = ~chains.whole
+        if len(self.sets):
+            head = chains.order[chains.start]
+            columns = fragments.source[head], fragments.destination[head], fragments.ident[head]
+            keys = zip(*(column.tolist() for column in columns), strict=True)
+            broken |= np.array([key in self.sets for key in keys], bool)
+        count = np.cumsum(broken)
+        before_set: I64Array = (count - broken)[chains.new_set][np.cumsum(chains.new_set) - 1]
+        usable: BoolArray = count == before_set
+        return usable
+
+    def _one_by_one(
+        self, data: U8Array, fragments: Fragments, host_ns: I64Array, rows: I64Array, end: int
+    ) -> Datagrams:
+        """Add the fragments `rows` by the rules; assemble from byte `end` on."""
+        view = data.data
+        done = []
+        for row in rows.tolist():
+            start = int(fragments.start[row])
+            size = int(fragments.size[row])
+            source = int(fragments.source[row])
+            key = (source, int(fragments.destination[row]), int(fragments.ident[row]))
+            offset = int(fragments.offset[row])
+            more = bool(fragments.more[row])
+            now_ns = int(host_ns[row])
+            self.sets.expire(now_ns)
+            parts = self.sets.add(key, offset, bytes(view[start : start + size]), more, now_ns)
+            if parts is None:
+                continue
+            for at, part in parts.items():
+                view[end + at : end + at + len(part)] = part
+            port = int.from_bytes(parts[0][2:4], "big")
+            length = int.from_bytes(parts[0][4:6], "big")
+            done.append((int(fragments.frame[row]), end + 8, length - 8, source, port))
+            end += max(at + len(part) for at, part in parts.items())
+        return Datagrams(*np.array(done, np.int64).reshape(-1, 5).T)
+
+
+def _independent(fragments: Fragments, host_ns: I64Array) -> bool:
+    """Whether receive times rise, so that the last one decides on age, and no source is IPv6."""
+    steps_back = host_ns[1:] < host_ns[:-1]
+    return len(fragments) > 0 and not steps_back.any() and bool((fragments.source >= 0).all())
+
+
+def _find_chains(data: U8Array, fragments: Fragments, host_ns: I64Array) -> _Chains:
+    pair = fragments.source << 32 | fragments.destination
+    order = np.lexsort((fragments.ident, pair))
+    pair = pair[order]
+    ident = fragments.ident[order]
+    host_ns = host_ns[order]
+    offset = fragments.offset[order]
+    more = fragments.more[order]
+    end = offset + fragments.size[order]
+    same = np.zeros(len(order), bool)
+    same[1:] = (pair[1:] == pair[:-1]) & (ident[1:] == ident[:-1])
+    follows = same.copy()
+    follows[1:] &= (offset[1:] == end[:-1]) & more[:-1]
+    start = np.flatnonzero(~follows)
+    stop = np.append(start[1:], len(order))
+    last = stop - 1
+    udp = records(data, UDP, fragments.start[order[start]])
+    length = udp["length"].astype(np.int64)
+    total = end[last]
+    whole = (offset[start] == 0) & ~more[last] & (host_ns[last] - host_ns[start] <= MAX_AGE_NS)
+    whole &= (end[start] >= UDP.itemsize) & (total <= MAX_DATAGRAM_BYTES)
+    whole &= (length >= UDP.itemsize) & (length <= total)
+    port = udp["port"].astype(np.int64)
+    return _Chains(order, start, stop, whole, ~same[start], total, length, port)
+
+
+def _assemble(
+    data: U8Array,
+    fragments: Fragments,
+    chains: _Chains,
+    usable: BoolArray,
+    copy: Callable[[U8Array, I64Array, I64Array, U8Array, I64Array], None],
+) -> tuple[Datagrams, int]:
+    """Copy the usable chains to the front of `data`; the datagrams and the first free byte."""
+    lengths = (chains.stop - chains.start)[usable]
+    rows = chains.order[np.repeat(usable, chains.stop - chains.start)]
+    total = chains.total[usable]
+    place = np.cumsum(total) - total
+    target = np.repeat(place, lengths) + fragments.offset[rows]
+    copy(data, fragments.start[rows], fragments.size[rows], data, target)
+    last = chains.order[chains.stop[usable] - 1]
+    datagrams = Datagrams(
+        frame=fragments.frame[last],
+        start=place + UDP.itemsize,
+        size=chains.udp_length[usable] - UDP.itemsize,
+        source=fragments.source[last],
+        port=chains.port[usable],
+    )
+    # File order: sorting by set separated the datagrams of different sensors.
+    by_frame = np.argsort(datagrams.frame, kind="stable")
+    sorted_columns = (getattr(datagrams, name)[by_frame] for name in Datagrams.__slots__)
+    return Datagrams(*sorted_columns), int(total.sum())

@@ -1,0 +1,190 @@
+"""Packet captures, whatever their file format: one reused buffer, batch by batch.
+
+The front of the buffer takes reassembled datagrams, the rest the bytes of the file, so that one
+array contains all payloads of a batch. A format supplies a `Walker` that finds the frames.
+Counts: one frame per record of the file, and one (`truncated`) for a record that the file cuts off
+or that claims an impossible length; reading ends there and `notes` say where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.errors import RecordingError
+from mlbatch.readers.capture import link_types
+from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
+from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
+from mlbatch.readers.source import BUFFER_BYTES, Source, Window
+from mlbatch.types import CaptureCounts, PacketBatch, Recording, StreamTable
+
+# Room for fragments of earlier buffers in addition to those of this one.
+_ARENA_EXTRA_BYTES = 1 << 20
+# The largest snapshot length of libpcap; a longer frame is a damaged record header.
+MAX_FRAME_BYTES = 1 << 18
+# Blocks that must be complete are a little longer than the longest frame.
+MAX_BLOCK_BYTES = 1 << 20
+
+
+@dataclass(slots=True)
+class Walk:
+    """Frames found in a buffer; the bytes before `next` are dealt with.
+
+    next: may be behind the buffer's end, the bytes between are then skipped; need: bytes required
+    from `next` on, 0 if the walk can continue; is_frame: a frame begins at `next`; fault: why
+    nothing from `next` on can be read.
+    """
+
+    next: int
+    need: int = 0
+    is_frame: bool = True
+    fault: str = ""
+    frames: Frames = field(default_factory=Frames.none)
+
+
+class Walker(Protocol):
+    """Finds the frames of a file, in order; keeps what earlier bytes declared."""
+
+    def walk(self, data: U8Array, begin: int, end: int) -> Walk:
+        """The frames in `data[begin:end]`, as far as their records are complete."""
+        ...
+
+
+@dataclass(slots=True)
+class CaptureRecording(Recording):
+    """A capture file.
+
+    walker: makes the Walker of a pass, with compiled loops or None; engine: `numba` for compiled
+    loops. For tests: buffer_bytes, and together (False: fragments one at a time). Results do not
+    depend on engine, buffer_bytes and together.
+    """
+
+    walker: Callable[[CaptureKernel | None], Walker]
+    streams: StreamTable
+    buffer_bytes: int = BUFFER_BYTES
+    together: bool = True
+    engine: str = "numpy"
+
+    def use_engine(self, engine: str) -> None:
+        """Read by `numpy` or `numba` from the next pass on."""
+        self.engine = engine
+
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield all packets from the start, in file order; each call is a new pass."""
+        self.counts = CaptureCounts()
+        self.notes = []
+        self.position_bytes = 0
+        current = _Pass(self)
+        try:
+            with Source(self.path) as source:
+                yield from current.batches(source)
+        finally:
+            current.reassembler.sets.finish()
+        current.check_links()
+
+
+class _Pass:
+    """One pass over a capture."""
+
+    def __init__(self, recording: CaptureRecording) -> None:
+        self.recording = recording
+        self.kernel = CaptureKernel() if recording.engine == "numba" else None
+        self.walker = recording.walker(self.kernel)
+        self.addresses = Addresses()
+        self.numbers = StreamNumbers(self.addresses, recording.streams)
+        self.reassembler = Reassembler(recording.counts, recording.together, self.kernel)
+        self.arena_bytes = recording.buffer_bytes + _ARENA_EXTRA_BYTES
+        self.unknown_link: int | None = None
+        self.has_known_link = False
+
+    def batches(self, source: Source) -> Iterator[PacketBatch]:
+        """All packets of the file."""
+        window = Window(source, self.recording.buffer_bytes, front=self.arena_bytes)
+        window.refill()
+        while True:
+            self.recording.position_bytes = source.position_bytes
+            walk = self.walker.walk(window.data, window.begin, window.end)
+            for frames in self._portions(walk.frames):
+                batch = self._batch(window.data, frames)
+                if len(batch):
+                    yield batch
+            window.begin = walk.next
+            if walk.fault:
+                self._note(window, f"{walk.fault}; the rest of the file was not read")
+                self._count_cut()
+                return
+            can_continue = not walk.need and window.begin < window.end
+            if not can_continue and not window.refill(walk.need):
+                self._end(window, walk, source)
+                return
+
+    def _portions(self, frames: Frames) -> Iterator[Frames]:
+        """Frames in portions whose datagrams fit into the arena, whatever their fragments."""
+        fewest = self.arena_bytes // MAX_DATAGRAM_BYTES
+        end_bytes = np.cumsum(frames.captured)
+        at = 0
+        while at < len(frames):
+            before = int(end_bytes[at - 1]) if at else 0
+            room = self.arena_bytes - self.reassembler.sets.held_bytes + before
+            stop = max(int(np.searchsorted(end_bytes, room, side="right")), at + fewest)
+            yield frames.take(slice(at, stop))
+            at = stop
+
+    def _batch(self, data: U8Array, frames: Frames) -> PacketBatch:
+        """The packets that these frames contain or complete; all other frames are counted."""
+        self._note_links(frames.link)
+        found = dissect(data, frames, self.addresses, self.kernel)
+        counts = self.recording.counts
+        counts.frames += len(frames)
+        for reason, count in found.skipped.items():
+            counts.skip(reason, count)
+        datagrams = found.datagrams
+        if len(found.fragments):
+            receive_ns = frames.host_ns[found.fragments.frame]
+            assembled = self.reassembler.push(data, found.fragments, receive_ns)
+            datagrams = in_order(datagrams, assembled)
+        counts.datagrams += len(datagrams.frame)
+        stream = self.numbers.numbers(datagrams.source, datagrams.port)
+        host_ns = frames.host_ns[datagrams.frame]
+        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns)
+
+    def _note_links(self, link: I64Array) -> None:
+        if not self.has_known_link:
+            numbers = sorted(set(link.tolist()))
+            unknown = [number for number in numbers if number not in link_types.LINKS]
+            self.has_known_link = len(unknown) < len(numbers)
+            self.unknown_link = unknown[0] if unknown else self.unknown_link
+
+    def check_links(self) -> None:
+        """Raise if no frame of the capture was of a known link type."""
+        if not self.has_known_link and self.unknown_link is not None:
+            why = link_types.unknown_link(self.unknown_link)
+            raise RecordingError(f"{self.recording.path}: {why}")
+
+    def _end(self, window: Window, walk: Walk, source: Source) -> None:
+        """Count a record that the end of the file cuts off."""
+        if source.fault:
+            self.recording.notes.append(f"byte {source.position_bytes}: {source.fault}")
+        if window.begin == window.end:
+            return
+        if walk.need:
+            left = max(window.end - window.begin, 0)
+            self._note(
+                window, f"the file ends within a record; expected {walk.need} bytes, found {left}"
+            )
+        else:
+            self._note(window, "expected more of the file, found its end")
+        if walk.is_frame:
+            self._count_cut()
+
+    def _note(self, window: Window, text: str) -> None:
+        self.recording.notes.append(f"byte {window.place}: {text}")
+
+    def _count_cut(self) -> None:
+        self.recording.counts.frames += 1
+        self.recording.counts.skip("truncated")

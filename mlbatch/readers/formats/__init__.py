@@ -1,0 +1,1 @@
+"""Plug-ins: one module a container of recordings."""

@@ -1,0 +1,166 @@
+"""pcap files of libpcap: microseconds or nanoseconds, either byte order.
+
+Layout: draft-ietf-opsawg-pcap, sections 4 (file header) and 5 (packet record).
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import I64Array, U8Array, U32Array
+from mlbatch.decode.kernels.capture import NO_ROOM, TOO_LONG
+from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.errors import RecordingError
+from mlbatch.readers.byte_records import records
+from mlbatch.readers.capture import link_types
+from mlbatch.readers.capture.frames import Frames
+from mlbatch.readers.capture.recording import MAX_FRAME_BYTES, CaptureRecording, Walk
+from mlbatch.readers.source import read_head
+from mlbatch.types import Recording, StreamTable
+from mlbatch.units import NS_PER_S, NS_PER_US
+
+CONTAINER = "pcap"
+
+# First bytes of the file: byte order, and nanoseconds per unit of the fraction.
+_MAGIC = {
+    b"\xd4\xc3\xb2\xa1": ("<", NS_PER_US),
+    b"\xa1\xb2\xc3\xd4": (">", NS_PER_US),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+# Alexey Kuznetzov's variant with longer record headers, written by some old Linux tools.
+_MODIFIED = (b"\x34\xcd\xb2\xa1", b"\xa1\xb2\xcd\x34")
+_FILE_HEADER_BYTES = 24
+_LINK_AT = 20
+_RECORD_BYTES = 16
+_LENGTH_AT = 8
+# After this many frames of one length in a row, more are likely.
+_ALIKE = 16
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a pcap file."""
+    return head[:4] in _MAGIC or head[:4] in _MODIFIED
+
+
+def open_packets(path: Path, streams: StreamTable) -> Recording:
+    """Open a pcap file; its payloads come from streams (source IP, destination port)."""
+    head = read_head(path)
+    if head[:4] in _MODIFIED:
+        raise RecordingError(
+            f"{path}: expected a pcap file, found the modified kind (magic a1b2cd34); "
+            f"convert it: editcap -F pcap {path.name} plain.pcap"
+        )
+    if head[:4] not in _MAGIC or len(head) < _FILE_HEADER_BYTES:
+        raise RecordingError(
+            f"{path}: expected a pcap header of {_FILE_HEADER_BYTES} bytes, found {len(head)} "
+            f"({head[:8].hex(' ')}); record or copy it again"
+        )
+    order, unit_ns = _MAGIC[head[:4]]
+    link = struct.unpack_from(order + "I", head, _LINK_AT)[0] & 0xFFFF
+    if link not in link_types.LINKS:
+        raise RecordingError(f"{path}: {link_types.unknown_link(link)}")
+    walker = partial(_Walker, order, unit_ns, link)
+    return CaptureRecording(path, CONTAINER, path.stat().st_size, walker, streams)
+
+
+class _Walker:
+    """Steps from record to record."""
+
+    def __init__(
+        self, order: str, unit_ns: int, link: int, kernel: CaptureKernel | None = None
+    ) -> None:
+        names = ("seconds", "fraction", "captured", "original")
+        self.layout = np.dtype([(name, order + "u4") for name in names])
+        self.length = struct.Struct(order + "I")
+        self.unit_ns = unit_ns
+        self.link = link
+        self.kernel = kernel
+        self.is_swapped = order == ">"
+        self.skip = _FILE_HEADER_BYTES
+
+    def walk(self, data: U8Array, begin: int, end: int) -> Walk:
+        """The frames in `data[begin:end]`, as far as their records are complete."""
+        begin += self.skip
+        self.skip = 0
+        if self.kernel is not None:
+            return self._walk_by(self.kernel, data, begin, end)
+        starts = self._starts(data, begin, end)
+        record = records(data, self.layout, starts)
+        captured = record["captured"].astype(np.int64)
+        after = starts + _RECORD_BYTES + captured
+        too_long = np.flatnonzero(captured > MAX_FRAME_BYTES)
+        count = (
+            int(too_long[0]) if len(too_long) else int(np.searchsorted(after, end, side="right"))
+        )
+        frames = Frames(
+            start=starts[:count] + _RECORD_BYTES,
+            captured=captured[:count],
+            original=record["original"][:count].astype(np.int64),
+            link=np.full(count, self.link, np.int64),
+            host_ns=record["seconds"][:count].astype(np.int64) * NS_PER_S
+            + record["fraction"][:count].astype(np.int64) * self.unit_ns,
+        )
+        place = int(after[count - 1]) if count else begin
+        if len(too_long):
+            return Walk(place, fault=_too_long(int(captured[count])), frames=frames)
+        more = int(captured[count]) if count < len(starts) else 0
+        return Walk(place, _RECORD_BYTES + more, frames=frames)
+
+    def _walk_by(self, kernel: CaptureKernel, data: U8Array, begin: int, end: int) -> Walk:
+        """The same by compiled loops; at most as many frames as they have room for."""
+        records, place, why = kernel.walk(
+            data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
+        )
+        start, captured, original, host_ns = records
+        link = np.full(len(start), self.link, np.int64)
+        frames = Frames(start, captured, original, link, host_ns)
+        if why == NO_ROOM:
+            return Walk(place, frames=frames)
+        more = 0
+        if place <= end - _RECORD_BYTES:
+            more = self.length.unpack_from(data.data, place + _LENGTH_AT)[0]
+        if why == TOO_LONG:
+            return Walk(place, fault=_too_long(more), frames=frames)
+        return Walk(place, _RECORD_BYTES + more, frames=frames)
+
+    def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
+        """Places of records with complete headers; the last one's frame may be cut off."""
+        view = data.data
+        length_at = self.length.unpack_from
+        parts: list[I64Array] = []
+        starts: list[int] = []
+        at = begin
+        before = -1
+        alike = 0
+        while at <= end - _RECORD_BYTES:
+            starts.append(at)
+            length = length_at(view, at + _LENGTH_AT)[0]
+            alike = alike + 1 if length == before else 0
+            before = length
+            at += _RECORD_BYTES + length
+            if alike >= _ALIKE:
+                run = self._alike(data, at, end, length)
+                parts += [np.array(starts, np.int64), run]
+                at += len(run) * (_RECORD_BYTES + length)
+                starts = []
+                alike = 0
+        return np.concatenate([*parts, np.array(starts, np.int64)])
+
+    def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
+        """Places of the next records as long as their frames have this length; none to many."""
+        step = _RECORD_BYTES + length
+        count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
+        at = begin + _LENGTH_AT
+        lengths: U32Array = np.ndarray(count, self.layout["captured"], data.data, at, (step,))
+        others = (lengths != length).nonzero()[0]
+        run = int(others[0]) if len(others) else count
+        return begin + step * np.arange(run)
+
+
+def _too_long(size: int) -> str:
+    return f"expected a frame of at most {MAX_FRAME_BYTES} bytes, found {size}"

@@ -1,0 +1,156 @@
+"""Several recordings as one session: packets in order of their receive times.
+
+Equal times keep the order of the recordings. Where a recording's own times step back, its packets
+keep their order and count with the largest time so far. A recording of messages alone is read
+first, so that its metadata are known before any packet, or by its log times, so that memory needs
+to contain little of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.readers.byte_records import SLACK, copy_runs
+from mlbatch.types import PacketBatch, Recording
+
+_NONE = np.zeros(0, np.int64)
+_NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)
+
+
+def _never(recording: Recording) -> bool:
+    return False
+
+
+def merge(
+    recordings: Sequence[Recording], by_log_time: Callable[[Recording], bool] = _never
+) -> Generator[PacketBatch, None, None]:
+    """Yield all packets of all recordings; batches of a single recording are passed on as they are.
+
+    Each recording is opened at its first receive time: memory contains those that overlap, not all.
+    by_log_time: whether to order a recording by the log times of its messages; only for recordings
+    without packets, which have times of their own.
+    """
+    if len(recordings) == 1:
+        yield from recordings[0].packets()
+        return
+    feeds = [_Feed.peek(recording, by_log_time(recording)) for recording in recordings]
+    try:
+        yield from _merged(feeds)
+    finally:
+        for feed in feeds:
+            feed.close()
+
+
+def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
+    out: U8Array = np.zeros(0, np.uint8)
+    while waiting := [feed for feed in feeds if not feed.ended]:
+        # The feed that is known up to the earliest time bounds the others; of equals, the first.
+        slowest = min(waiting, key=lambda feed: feed.known_until_ns)
+        bound_ns = slowest.known_until_ns
+        is_before = True
+        ready = []
+        for feed in waiting:
+            is_before = is_before and feed is not slowest
+            ready.append(feed.take(bound_ns, inclusive=is_before or feed is slowest))
+        messages = tuple(message for batch, _ in ready for message in batch.messages)
+        ready = [(batch, key_ns) for batch, key_ns in ready if len(batch)]
+        if len(ready) == 1:
+            yield replace(ready[0][0], messages=messages)
+        elif ready:
+            batch, out = _interleave(ready, out)
+            yield replace(batch, messages=messages)
+        elif messages:
+            yield replace(_NOTHING, messages=messages)
+        slowest.advance()
+
+
+@dataclass(slots=True)
+class _Feed:
+    """Packets of one recording that are known and not yet given out.
+
+    key_ns: (n,) largest receive time up to each packet of `batch`; known_until_ns: no later packet
+    of this recording can come before it.
+    """
+
+    recording: Recording
+    by_log_time: bool
+    known_until_ns: int = 0
+    ended: bool = False
+    batch: PacketBatch | None = None
+    key_ns: I64Array = field(default_factory=lambda: _NONE)
+    _packets: Generator[PacketBatch, None, None] | None = None
+
+    @classmethod
+    def peek(cls, recording: Recording, by_log_time: bool) -> _Feed:
+        """A feed that knows its first packet's time, but has no buffer yet."""
+        packets = recording.packets()
+        first = next((batch for batch in packets if len(batch) or batch.messages), None)
+        # Closing now returns the buffer.
+        packets.close()
+        if first is None:
+            return cls(recording, by_log_time, ended=True)
+        if len(first):
+            known_until_ns = int(first.host_ns[0])
+        else:
+            # Log times of messages are no clock for the packets of others unless `by_log_time`.
+            known_until_ns = first.messages[0].host_ns if by_log_time else 0
+        return cls(recording, by_log_time, known_until_ns)
+
+    def take(self, bound_ns: int, inclusive: bool) -> tuple[PacketBatch, I64Array]:
+        """Give out the packets up to `bound_ns`, with their keys."""
+        if self.batch is None:
+            return _NOTHING, self.key_ns
+        messages = self.batch.messages
+        stop = int(np.searchsorted(self.key_ns, bound_ns, side="right" if inclusive else "left"))
+        given = replace(self.batch.take(slice(0, stop)), messages=messages)
+        key_ns = self.key_ns[:stop]
+        self.batch = self.batch.take(slice(stop, None))
+        self.key_ns = self.key_ns[stop:]
+        return given, key_ns
+
+    def advance(self) -> None:
+        """Get the next batch; its bytes replace those of the one before."""
+        if self._packets is None:
+            self._packets = self.recording.packets()
+        batch = next((batch for batch in self._packets if len(batch) or batch.messages), None)
+        if batch is None:
+            self.ended = True
+            self.batch = None
+            self._packets = None
+            return
+        self.batch = batch
+        self.key_ns = np.maximum(np.maximum.accumulate(batch.host_ns), self.known_until_ns)
+        if len(batch):
+            self.known_until_ns = int(self.key_ns[-1])
+        elif self.by_log_time:
+            last_ns = max(message.host_ns for message in batch.messages)
+            self.known_until_ns = max(self.known_until_ns, last_ns)
+
+    def close(self) -> None:
+        """End the reading in this thread, not when the last reference is dropped."""
+        if self._packets is not None:
+            self._packets.close()
+
+
+def _interleave(
+    ready: list[tuple[PacketBatch, I64Array]], out: U8Array
+) -> tuple[PacketBatch, U8Array]:
+    """One batch in order of keys, its payloads copied to `out` (replaced if too small)."""
+    size = np.concatenate([batch.size for batch, _ in ready])
+    end = np.cumsum(size)
+    start = end - size
+    if len(out) < end[-1] + SLACK:
+        out = np.zeros(int(end[-1]) * 3 // 2 + SLACK, np.uint8)
+    first = 0
+    for batch, _ in ready:
+        rows = slice(first, first + len(batch))
+        copy_runs(batch.data, batch.start, batch.size, out, start[rows])
+        first += len(batch)
+    order = np.argsort(np.concatenate([key_ns for _, key_ns in ready]), kind="stable")
+    stream = np.concatenate([batch.stream for batch, _ in ready])
+    host_ns = np.concatenate([batch.host_ns for batch, _ in ready])
+    return PacketBatch(out, start, size, stream, host_ns).take(order), out

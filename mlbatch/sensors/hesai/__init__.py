@@ -1,0 +1,1 @@
+"""HESAI lidars; `sensor.py` is the plug-in."""

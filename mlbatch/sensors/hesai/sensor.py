@@ -1,0 +1,275 @@
+"""HESAI lidars: Pandar, XT, QT, OT128, AT128, JT, described by an angle file and their packets.
+
+Source: docs/sources/hesai.md (HesaiLidar_SDK_2.0, HesaiLidar_General_SDK, tier4/nebula, user
+manuals). An angle file belongs to one unit and has no model name, so packets identify the model.
+Channels are numbered from 0 in packet order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import F64Array, I64Array, U8Array, median
+from mlbatch.errors import RigError
+from mlbatch.lidar.geometry import BeamTable, Projection, spherical
+from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
+from mlbatch.sensors.base import BaseLidar, content_keys
+from mlbatch.sensors.hesai import models as rows
+from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
+from mlbatch.sensors.hesai.at128 import at128_projection
+from mlbatch.sensors.hesai.identify import describe, identify
+from mlbatch.sensors.hesai.layout import Layout
+from mlbatch.sensors.hesai.models import Model
+from mlbatch.sensors.hesai.optics import OffAxis, off_axis
+from mlbatch.sensors.hesai.packets import PacketReader
+from mlbatch.sensors.options import check_options
+from mlbatch.types import Heads, Pixels
+from mlbatch.units import M_PER_MM, RAD_PER_DEG
+
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
+
+VENDOR = "HESAI"
+BUILT_IN: tuple[Calibration, ...] = ()
+_CSV = "angle csv of the unit, required"
+_DAT = "correction dat of the unit, required"
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=row.name,
+        vendor=VENDOR,
+        channels=row.channels,
+        returns=tuple(range(1, row.most_returns + 1)),
+        clock="free-running, GPS or PTP; date and us in every packet",
+        calibration=_DAT if row is rows.AT128 else _CSV,
+        verified=row.verified,
+        same_packets_as=row.same_packets_as,
+    )
+    for row in rows.ALL
+)
+# A file whose beams fit the model within the unit-to-unit tolerance is preferred.
+_FITS = 200
+_FITS_BEAMS = 300
+_ELEVATION_TOLERANCE_DEG = 4.0
+# Number of consecutive packets at the start of a sample.
+_PACKETS_IN_A_ROW = 16
+
+
+def read_calibration(path: Path, content: bytes) -> Calibration | None:
+    """Parse the angles in a csv or dat file; None if it is something else."""
+    at128 = read_at128(path, content)
+    if at128 is not None:
+        return At128Calibration(at128)
+    angles = read_angles(path, content)
+    return None if angles is None else HesaiCalibration(angles)
+
+
+class HesaiCalibration:
+    """Angle csv, for any model with as many channels; `Calibration` of lidar.py."""
+
+    __slots__ = ("_angles", "is_shared", "model", "path", "serial")
+
+    def __init__(self, angles: HesaiAngles) -> None:
+        self._angles = angles
+        self.path: Path | None = angles.path
+        self.model = f"{VENDOR} of {len(angles.azimuth_rad)} channels"
+        self.serial = ""
+        self.is_shared = False
+
+    def fit(self, evidence: Evidence) -> int:
+        """Match score of packets: by channels, then by the elevations of the outer beams."""
+        layout = _layout(evidence)
+        if layout is None or layout.model.channels != len(self._angles.azimuth_rad):
+            return 0
+        layout = _model_by_beams(layout, self._angles)
+        if layout.model.name == rows.AT128.name:
+            return 1
+        return _FITS if _note_on_beams(self._angles, layout.model) else _FITS_BEAMS
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
+        """Decoder of the sensor; RigError if the file is of another model."""
+        check_options(options)
+        angles = self._angles
+        layout = _model_by_beams(_require_layout(self.path, evidence), angles)
+        model = layout.model
+        if model.name == rows.AT128.name:
+            raise RigError(
+                f"{self.path}: HESAI {model.name}: expected its correction file (.dat), found a "
+                "csv, which has no data of the mirrors; read the file from the lidar"
+            )
+        if len(angles.azimuth_rad) != model.channels:
+            raise RigError(
+                f"{self.path}: HESAI angles: expected {model.channels} channels for the packets "
+                f"of a {model.name}, found {len(angles.azimuth_rad)}; give the file of this lidar"
+            )
+        centre = np.array(model.centre_mm) * M_PER_MM if _is_on(options, "optical_centre") else None
+        lidar = HesaiLidar(layout, options, evidence, angles, centre)
+        note = _note_on_beams(angles, model)
+        lidar.notes = (note,) if note else ()
+        return lidar
+
+
+class At128Calibration:
+    """Correction file of an AT128; `Calibration` of lidar.py."""
+
+    __slots__ = ("_file", "is_shared", "model", "path", "serial")
+
+    def __init__(self, file: At128File) -> None:
+        self._file = file
+        self.path: Path | None = file.path
+        self.model = rows.AT128.name
+        self.serial = ""
+        self.is_shared = False
+
+    def fit(self, evidence: Evidence) -> int:
+        """Match score of packets."""
+        layout = _layout(evidence)
+        return _FITS_BEAMS if layout is not None and layout.model.name == self.model else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> HesaiLidar:
+        """Decoder of the sensor; RigError if the file is of another model."""
+        check_options(options)
+        layout = _require_layout(self.path, evidence)
+        if layout.model.name != self.model:
+            raise RigError(
+                f"{self.path}: HESAI angles: expected the csv of a {layout.model.name} for these "
+                f"packets, found the file of an {self.model}; give the file of this lidar"
+            )
+        return At128Lidar(layout, options, evidence, self._file)
+
+
+class HesaiLidar(BaseLidar):
+    """Decoder of one sensor; `Lidar` of lidar.py. Frame: x right, y forward, z up."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        options: Mapping[str, str],
+        evidence: Evidence | None,
+        angles: HesaiAngles | At128File,
+        centre_m: F64Array | None = None,
+    ) -> None:
+        """centre_m: (3,) optical centre; None: beams leave from the axis."""
+        model = layout.model
+        self._reader = PacketReader(
+            layout,
+            follows_rotor=_is_on(options, "firing_azimuth", "on"),
+            checks_crc="crc" in options,
+        )
+        self._reader.sense = _sense(self._reader, evidence)
+        self.vendor = VENDOR
+        self.model = model.name
+        self.mode = layout.mode.text
+        self.channels = model.channels
+        self.returns = layout.mode.returns
+        self.packet_size = layout.size
+        self.columns_per_packet = layout.columns
+        self.column_period_ns = model.timing.step_ns / model.timing.divisor
+        self.records = self._reader.records
+        self.pixel_layout = (VENDOR, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
+        self.pixels = self._reader.pixels()
+        self.return_types = layout.mode.types
+        self.channel = np.arange(model.channels)
+        self.firing_ns = self._reader.firing_ns
+        self.calibration = str(angles.path)
+        self.sequence_modulus = layout.sequence_modulus
+        direction = spherical(angles.azimuth_rad, angles.elevation_rad, clockwise_from="y")
+        self._on_axis = BeamTable(direction, np.zeros((3, 1, 3)), np.zeros(1))
+        self._from_centre = model.from_centre
+        self._centre_m = centre_m
+        self.beams = self._on_axis
+        if centre_m is not None:
+            self.beams = off_axis(self._on_axis, centre_m, from_centre=model.from_centre)
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """(P,) index into FAULTS."""
+        return self._reader.faults(packets)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """(P,) UDP sequence number; without one, a hash of the content."""
+        found = self._reader.sequence(packets)
+        return content_keys(packets) if found is None else found
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Timestamps and rotor words; packets carry the date, so host_ns is not used."""
+        return self._reader.heads(packets)
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of columns (n, records.size) into `out`."""
+        self._reader.read(records, which, out)
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """Projection of off-axis beams whose ranges count from the axis; else None."""
+        if self._centre_m is None or self._from_centre:
+            return None
+        return OffAxis(self._on_axis, self._centre_m, body_from_sensor, self.firing_ns, columns)
+
+
+class At128Lidar(HesaiLidar):
+    """AT128: each of its mirrors sweeps the beams once through the field of view."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        options: Mapping[str, str],
+        evidence: Evidence | None,
+        file: At128File,
+    ) -> None:
+        super().__init__(layout, options, evidence, file)
+        self._file = file
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """Projection by the mirrors."""
+        return at128_projection(self._file, self.firing_ns, body_from_sensor, columns)
+
+
+def _is_on(options: Mapping[str, str], key: str, default: str = "off") -> bool:
+    return options.get(key, default) == "on"
+
+
+def _layout(evidence: Evidence) -> Layout | None:
+    found = identify(evidence.size, evidence.sample) if len(evidence.sample) else None
+    return None if found is None else found.layout
+
+
+def _require_layout(path: Path | None, evidence: Evidence | None) -> Layout:
+    """Layout of the packets; RigError without packets, since a file has no model name."""
+    layout = None if evidence is None else _layout(evidence)
+    if layout is None:
+        raise RigError(
+            f"{path}: HESAI angles: expected packets of the lidar in the first 10 seconds, which "
+            "define its model and mode, found none; check its stream in the rig file, or leave it "
+            "out"
+        )
+    return layout
+
+
+def _model_by_beams(layout: Layout, angles: HesaiAngles) -> Layout:
+    """Layout with the model of the file's beams, if packets fit several models."""
+    is_b = layout.model is rows.PANDAR20A and not _note_on_beams(angles, rows.PANDAR20B)
+    return replace(layout, model=rows.PANDAR20B) if is_b else layout
+
+
+def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
+    """Note on elevations of a file that do not fit a model, or ""."""
+    if model.elevation_deg is None:
+        return ""
+    got_deg = angles.elevation_rad.min() / RAD_PER_DEG, angles.elevation_rad.max() / RAD_PER_DEG
+    pairs = zip(got_deg, model.elevation_deg, strict=True)
+    if all(abs(found - expected) <= _ELEVATION_TOLERANCE_DEG for found, expected in pairs):
+        return ""
+    return (
+        f"{angles.path}: expected elevations from about {model.elevation_deg[0]:g} to "
+        f"{model.elevation_deg[1]:g} deg for a {model.name}, found {got_deg[0]:.1f} to "
+        f"{got_deg[1]:.1f}; check that the file is of this lidar"
+    )
+
+
+def _sense(reader: PacketReader, evidence: Evidence | None) -> int:
+    """1 for a clockwise rotor, seen from above; -1 for a counter-clockwise one."""
+    if evidence is None or len(evidence.sample) < 2:
+        return 1
+    step = np.diff(reader.azimuth_revolutions(evidence.sample[:_PACKETS_IN_A_ROW]))
+    return -1 if median(step - np.rint(step)) < 0 else 1

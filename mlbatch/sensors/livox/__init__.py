@@ -1,0 +1,1 @@
+"""Livox lidars; `sensor.py` is the plug-in."""

@@ -1,0 +1,182 @@
+"""Livox SDK2 packets: header, points with coordinates, IMU samples.
+
+Source: docs/sources/others.md (Livox SDK2). Coverage of the CRC-32, time and data: Livox
+communication protocol of the Avia2, v1.0.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.lidar.interface import FAULTS
+from mlbatch.types import ImuSamples
+from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
+
+HEADER_SIZE = 36
+IMU = 0
+# 1 + 2 + 2 + 2 + 2 + 1 + 1 + 1 + 12 + 4 + 8 = 36 bytes; interval: 0.1 us.
+HEADER = np.dtype(
+    [
+        ("version", "u1"),
+        ("size", "<u2"),
+        ("interval", "<u2"),
+        ("points", "<u2"),
+        ("counter", "<u2"),
+        ("frame", "u1"),
+        ("data_type", "u1"),
+        ("time_type", "u1"),
+        ("reserved", "V12"),
+        ("crc", "<u4"),
+        ("stamp_ns", "<u8"),
+    ]
+)
+Points: TypeAlias = npt.NDArray[np.void]
+_NS_PER_INTERVAL = 100
+_CRC_FROM = 28
+_BAD_HEADER = FAULTS.index("bad_header")
+_BAD_CRC = FAULTS.index("bad_crc")
+_INTENSITY = [("intensity", "u1"), ("tag", "u1")]
+_CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_INTENSITY])
+_CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_INTENSITY])
+# zenith: from the z axis; azimuth: from x towards y; both in 0.01 degrees.
+_SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), *_INTENSITY])
+_SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
+IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
+_CIRCLE_CDEG = 36000
+_QUARTER_CDEG = 9000
+
+
+@dataclass(frozen=True, slots=True)
+class PointKind:
+    """Points of an SDK2 data type: bytes and returns of a point, and its coordinates."""
+
+    data_type: int
+    size: int
+    returns: int
+    what: str
+
+
+KINDS: Mapping[int, PointKind] = {
+    kind.data_type: kind
+    for kind in (
+        PointKind(IMU, 24, 0, "IMU"),
+        PointKind(1, 14, 1, "Cartesian 32 bit, single return"),
+        PointKind(2, 8, 1, "Cartesian 16 bit, single return"),
+        PointKind(3, 10, 1, "spherical, single return"),
+        PointKind(0x11, 28, 2, "Cartesian 32 bit, dual return"),
+    )
+}
+
+
+def headers(packets: U8Array) -> npt.NDArray[np.void]:
+    """(P,) records of HEADER."""
+    return np.ascontiguousarray(packets[:, :HEADER_SIZE]).view(HEADER)[:, 0]
+
+
+def faults(packets: U8Array, kind: PointKind, *, check_crc: bool) -> U8Array:
+    """(P,) index into FAULTS: `bad_header` for other kinds of points, `bad_crc` for damage."""
+    head = headers(packets)
+    size = packets.shape[1]
+    good = (head["data_type"] == kind.data_type) & (head["size"] == size)
+    good &= head["points"] == (size - HEADER_SIZE) // kind.size
+    found = np.where(good, 0, _BAD_HEADER).astype(np.uint8)
+    if check_crc:
+        # Less than a microsecond each, a fraction of the decoding of their points.
+        crc = [zlib.crc32(packet[_CRC_FROM:].tobytes()) for packet in packets]
+        found[good & (head["crc"] != np.array(crc, np.uint32))] = _BAD_CRC
+    return found
+
+
+def stamps_ns(packets: U8Array, points: int) -> I64Array:
+    """(P, points) timestamps, spread evenly over the interval stated in the packet.
+
+    The interval is divided by the number of points, as in the vendor's driver; the protocol
+    defines it as the time between the first and the last point.
+    """
+    head = headers(packets)
+    interval_ns = head["interval"].astype(np.int64)[:, None] * _NS_PER_INTERVAL
+    # Timestamps of damaged packets may exceed int64: they become negative and are rejected.
+    first_ns = head["stamp_ns"].astype(np.int64)[:, None]
+    stamp_ns: I64Array = first_ns + interval_ns * np.arange(points) // points
+    return stamp_ns
+
+
+def read_points(
+    records: U8Array, which: int, kind: PointKind
+) -> tuple[F64Array, F64Array, U8Array]:
+    """Coordinates (n, 3) and ranges (n,) in metres, and intensities (n,), of one return."""
+    layout, convert = _RETURNS[kind.data_type]
+    begin = which * layout.itemsize
+    point = records[:, begin : begin + layout.itemsize].view(layout)[:, 0]
+    xyz_m, range_m = convert(point)
+    return xyz_m, range_m, point["intensity"]
+
+
+def read_imu(payloads: U8Array, sensor: int) -> ImuSamples:
+    """The sample of each IMU packet; point packets of the same size are skipped."""
+    head = headers(payloads)
+    is_sample = (head["data_type"] == IMU) & (head["points"] == 1)
+    chosen = np.ascontiguousarray(payloads[is_sample, HEADER_SIZE:IMU_SIZE])
+    sample = chosen.view(_SAMPLE)[:, 0]
+    # Damaged packets may contain signaling NaN.
+    with np.errstate(invalid="ignore"):
+        return ImuSamples(
+            sensor,
+            head["stamp_ns"][is_sample].astype(np.int64),
+            sample["acceleration_g"].astype(np.float64) * STANDARD_GRAVITY,
+            sample["angular_velocity"].astype(np.float64),
+        )
+
+
+def _from_millimetres(point: Points) -> tuple[F64Array, F64Array]:
+    return _cartesian(point["xyz"] / 1000.0)
+
+
+def _from_centimetres(point: Points) -> tuple[F64Array, F64Array]:
+    return _cartesian(point["xyz"] / 100.0)
+
+
+def _cartesian(xyz_m: F64Array) -> tuple[F64Array, F64Array]:
+    x, y, z = xyz_m.T
+    return xyz_m, np.sqrt(x * x + y * y + z * z)
+
+
+def _spherical(point: Points) -> tuple[F64Array, F64Array]:
+    zenith = point["zenith"].astype(np.int64)
+    azimuth = point["azimuth"].astype(np.int64)
+    range_m = point["depth"] / 1000.0
+    flat_m = range_m * _sine(zenith)
+    up_m = range_m * _sine(zenith + _QUARTER_CDEG)
+    forward_m = flat_m * _sine(azimuth + _QUARTER_CDEG)
+    left_m = flat_m * _sine(azimuth)
+    return np.stack([forward_m, left_m, up_m], axis=1), range_m
+
+
+def _sine(angle_cdeg: I64Array) -> F32Array:
+    """Sine of whole hundredths of a degree."""
+    sines: F32Array = _sines().take(angle_cdeg % _CIRCLE_CDEG)
+    return sines
+
+
+@lru_cache(maxsize=1)
+def _sines() -> F32Array:
+    """Sines of a full circle; float32, so that the last digit of a library has no effect."""
+    sines: F32Array = np.sin(np.arange(_CIRCLE_CDEG) * (0.01 * RAD_PER_DEG)).astype(np.float32)
+    return sines
+
+
+# By data type: layout of a return, and conversion to coordinates and range.
+_RETURNS: Mapping[int, tuple[np.dtype[np.void], Callable[[Points], tuple[F64Array, F64Array]]]] = {
+    1: (_CARTESIAN32, _from_millimetres),
+    2: (_CARTESIAN16, _from_centimetres),
+    3: (_SPHERICAL, _spherical),
+    0x11: (_CARTESIAN32, _from_millimetres),
+}

@@ -1,0 +1,206 @@
+"""Livox lidars of SDK2 (Mid-360, Mid-360s, HAP, Avia2): points with coordinates.
+
+Source: docs/sources/others.md (Livox SDK2). There is no rotor and no calibration: every point has
+coordinates, and its time follows from its number in the packet. So a point is a column of one
+channel; its laser (point number modulo 4 or 6) is dropped, since the points of a column share one
+timestamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, median
+from mlbatch.errors import RigError
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
+from mlbatch.sensors.base import BaseLidar, content_keys
+from mlbatch.sensors.livox.identify import describe, identify
+from mlbatch.sensors.livox.packets import (
+    HEADER_SIZE,
+    IMU_SIZE,
+    PointKind,
+    faults,
+    headers,
+    read_imu,
+    read_points,
+    stamps_ns,
+)
+from mlbatch.sensors.options import check_options
+from mlbatch.sensors.packet_bytes import most_common
+from mlbatch.types import Heads, ImuSamples, Pixels
+
+__all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
+
+VENDOR = "Livox"
+SDK2 = "Livox SDK2"
+MODELS: tuple[SensorModel, ...] = (
+    SensorModel(
+        name=SDK2,
+        vendor=VENDOR,
+        channels=1,
+        returns=(1, 2),
+        clock="power-on, gPTP, PTP, GPS or NTP; ns in every packet",
+        calibration="none: Mid-360, Mid-360s, HAP and Avia2 send coordinates",
+        verified="two sources",
+    ),
+)
+_FITS_BYTES = 100
+_CLOCKS = {0: "time since power-on", 1: "gPTP or PTP", 2: "GPS", 5: "NTP"}
+# Default IMU port by point port: Mid-360 and HAP.
+_IMU_PORTS = {56301: 56401, 57000: 58000}
+_COUNTER_MODULUS = 1 << 16
+# Tolerance between counter and time: a share of the packets since the first, plus so many.
+_COUNTER_SHARE = 0.1
+_COUNTER_SLACK = 2
+_SHARED_STAMP = (
+    "most packets repeat the timestamp of the one before, as within a frame of the Avia2; the "
+    "times of their points are no more precise than that"
+)
+
+
+class LivoxCalibration:
+    """Livox needs no calibration; `Calibration` of lidar.py."""
+
+    __slots__ = ()
+
+    path: Path | None = None
+    model = SDK2
+    serial = ""
+    is_shared = True
+
+    def fit(self, evidence: Evidence) -> int:
+        """Match packets of points."""
+        kind = identify(evidence.size, evidence.sample)
+        return _FITS_BYTES if kind is not None and kind.returns else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> LivoxLidar:
+        """Decoder of the sensor; its packets define the kind of points."""
+        check_options(options)
+        kind = None if evidence is None else identify(evidence.size, evidence.sample)
+        if evidence is None or kind is None or not kind.returns:
+            raise RigError(
+                f"{SDK2}: expected packets of points in the first 10 seconds, which define the "
+                "kind, found none; check the sensor's stream in the rig file, or leave it out"
+            )
+        return LivoxLidar(kind, evidence, check_crc="crc" in options)
+
+
+BUILT_IN: tuple[Calibration, ...] = (LivoxCalibration(),)
+
+
+def read_calibration(path: Path, content: bytes) -> Calibration | None:
+    """None: there are no calibration files."""
+    return None
+
+
+class LivoxLidar(BaseLidar):
+    """Decoder of one sensor; `Lidar` of lidar.py.
+
+    Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the last points read.
+    """
+
+    def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
+        packets = evidence.sample[faults(evidence.sample, kind, check_crc=False) == 0]
+        self.vendor = VENDOR
+        self.model = SDK2
+        self.mode = kind.what
+        self.channels = 1
+        self.returns = kind.returns
+        self.packet_size = evidence.size
+        self.columns_per_packet = (evidence.size - HEADER_SIZE) // kind.size
+        self.records = Records(HEADER_SIZE, kind.size, kind.size)
+        self.pixel_layout = (VENDOR, kind.data_type)
+        self.return_types = (0,) * kind.returns
+        self.sends_twice = False
+        self.channel = np.zeros(1, np.int64)
+        self.firing_ns = np.zeros((1, 1), np.int64)
+        self.beams = BeamTable(np.zeros((3, 1, 3)), np.zeros((3, 1, 3)), np.zeros(1))
+        self.calibration = ""
+        self.imu_port = _IMU_PORTS.get(evidence.stream.port, 0)
+        self.timestamp_mode = _CLOCKS.get(most_common(headers(packets)["time_type"]), "")
+        self.sequence_modulus = _COUNTER_MODULUS if _is_continuous(packets) else 0
+        self.notes = (_SHARED_STAMP,) if _share_stamps(packets) else ()
+        self.last_xyz_m: F64Array = np.empty((0, 3))
+        self._kind = kind
+        self._check_crc = check_crc
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """(P,) index into FAULTS."""
+        return faults(packets, self._kind, check_crc=self._check_crc)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """(P,) packet counter; without one, a hash of the content."""
+        if self.sequence_modulus:
+            return headers(packets)["counter"].astype(np.int64)
+        return content_keys(packets)
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Timestamps of all points."""
+        stamp_ns = stamps_ns(packets, self.columns_per_packet)
+        return Heads(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of n points; keeps their coordinates for the projection."""
+        self.last_xyz_m, out.range_m[:, 0], out.intensity[:, 0] = read_points(
+            records, which, self._kind
+        )
+
+    def is_imu(self, size: int) -> bool:
+        """Whether a payload of this size is an IMU packet."""
+        return size == IMU_SIZE
+
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """Samples of IMU packets (P, size)."""
+        return read_imu(payloads, sensor)
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
+        """Transform of the last points read into the body frame."""
+        return MovedPoints(self, body_from_sensor)
+
+
+class MovedPoints:
+    """The last points read, moved into the body frame; `Projection` of geometry.py."""
+
+    def __init__(self, lidar: LivoxLidar, body_from_sensor: F64Array) -> None:
+        self._lidar = lidar
+        self._body_from_sensor = body_from_sensor
+
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
+        """No rotor: nothing to prepare."""
+
+    def project(self, range_m: F32Array, out: F32Array) -> None:
+        """Rotate and translate, summed in a fixed order (see geometry.py)."""
+        x, y, z = self._lidar.last_xyz_m.T
+        for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):
+            out[:, 0, axis] = x * by_x + y * by_y + z * by_z + shift
+
+
+def _is_continuous(packets: U8Array) -> bool:
+    """Whether the packet counter counts all packets, rather than those of each frame.
+
+    A continuous counter grows in proportion to time, even if packets are lost. A counter that
+    restarts with every frame would make later packets look like duplicates.
+    """
+    head = headers(packets)
+    counter = head["counter"].astype(np.int64)
+    stamp_ns = head["stamp_ns"].astype(np.int64)
+    steps = np.diff(counter) % _COUNTER_MODULUS
+    steps_ns = np.diff(stamp_ns)
+    next_ns = steps_ns[(steps == 1) & (steps_ns > 0)]
+    if not len(next_ns):
+        return False
+    expected = np.cumsum(steps_ns) / median(next_ns)
+    away = np.abs(np.cumsum(steps) - expected)
+    return bool((away <= _COUNTER_SHARE * np.abs(expected) + _COUNTER_SLACK).all())
+
+
+def _share_stamps(packets: U8Array) -> bool:
+    """Whether most consecutive packets have equal timestamps."""
+    head = headers(packets)
+    is_next = np.diff(head["counter"].astype(np.int64)) == 1
+    is_same = head["stamp_ns"][1:] == head["stamp_ns"][:-1]
+    return 2 * int((is_next & is_same).sum()) > int(is_next.sum())

@@ -1,0 +1,29 @@
+"""Options of `--decode`: keys and values that any vendor accepts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mlbatch.errors import UsageError
+
+_SWITCH = ("on", "off")
+# packet_stamp: whether a Velodyne HDL-32E stamps the start or the end of a packet
+# (docs/sources/velodyne.md section 2).
+DECODE_OPTIONS: Mapping[str, tuple[str, ...]] = {
+    "crc": ("check",),
+    "firing_azimuth": _SWITCH,
+    "optical_centre": _SWITCH,
+    "packet_stamp": ("start", "end"),
+    "vertical_offset": _SWITCH,
+}
+
+
+def check_options(options: Mapping[str, str]) -> None:
+    """Raise UsageError for keys and values that no vendor knows."""
+    for key, value in options.items():
+        if key not in DECODE_OPTIONS:
+            known = ", ".join(DECODE_OPTIONS)
+            raise UsageError(f"--decode {key}={value}: expected one of {known}, found {key}")
+        if value not in DECODE_OPTIONS[key]:
+            expected = " or ".join(f"{key}={choice}" for choice in DECODE_OPTIONS[key])
+            raise UsageError(f"--decode {key}={value}: expected {expected}, found {value}")

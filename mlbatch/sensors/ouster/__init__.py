@@ -1,0 +1,1 @@
+"""Ouster lidars; `sensor.py` is the plug-in."""

@@ -1,0 +1,304 @@
+"""Ouster lidars: OS0, OS1, OS2, OSDome, all firmware since 1.12, described by their metadata JSON.
+
+Source: docs/sources/ouster.md (ouster-sdk 1.0.1; Firmware User Manual, "Lidar Data"). A packet has
+C columns with one timestamp each; the pixels of a column fire together, without firing offsets.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.errors import RigError
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
+from mlbatch.sensors.options import check_options
+from mlbatch.sensors.ouster.identify import describe
+from mlbatch.sensors.ouster.imu import (
+    ACCEL32,
+    LEGACY_SIZE,
+    imu_size,
+    read_accel32,
+    read_legacy,
+    sample_count,
+)
+from mlbatch.sensors.ouster.metadata import Metadata, parse_metadata, read_document
+from mlbatch.sensors.ouster.packets import (
+    Headers,
+    LegacyHeaders,
+    PacketHeaders,
+    first_measurement_ids,
+)
+from mlbatch.sensors.ouster.pixels import PixelReader, pixel_table
+from mlbatch.sensors.ouster.profiles import FUSA, LEGACY
+from mlbatch.types import Heads, ImuSamples, Pixels
+from mlbatch.units import NS_PER_S
+
+__all__ = [
+    "BUILT_IN",
+    "MODELS",
+    "VENDOR",
+    "OusterCalibration",
+    "OusterLidar",
+    "describe",
+    "read_calibration",
+]
+
+VENDOR = "Ouster"
+_REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
+_BEAMS = {
+    "OS0": (32, 64, 128),
+    "OS1": (16, 32, 64, 128),
+    "OS2": (32, 64, 128),
+    "OSDome": (32, 64, 128),
+}
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=f"{line}-{beams}",
+        vendor=VENDOR,
+        channels=beams,
+        returns=(1, 2),
+        clock="internal oscillator, sync pulse or PTP; ns in every column",
+        calibration="metadata JSON of the sensor, required",
+        verified="real recording" if f"{line}-{beams}" in _REAL else "one source",
+    )
+    for line, counts in _BEAMS.items()
+    for beams in counts
+)
+
+BUILT_IN: tuple[Calibration, ...] = ()
+
+# Match scores: the serial number decides, then the configuration, then the ports.
+_FITS_SERIAL = 1000
+_FITS_INIT_ID = 100
+_FITS_LIDAR_PORT = 10
+_FITS_IMU_PORT = 2
+_FITS_SIZE = 1
+_FRAME_IDS = {FUSA: 1 << 32}
+_DEFAULT_FRAME_IDS = 1 << 16
+
+
+def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
+    """Parse a metadata file; None if it is something else."""
+    document = read_document(path, content)
+    return None if document is None else OusterCalibration(parse_metadata(document))
+
+
+class OusterCalibration:
+    """A metadata file; `Calibration` of lidar.py."""
+
+    __slots__ = ("_headers", "is_shared", "metadata", "model", "path", "serial")
+
+    def __init__(self, described: Metadata) -> None:
+        self.metadata = described
+        self.path: Path | None = described.path
+        self.model = described.product or f"Ouster {described.layout.beams}-beam"
+        self.serial = str(described.serial) if described.serial else ""
+        self.is_shared = False
+        self._headers = _headers(described, check_crc=False)
+
+    def fit(self, evidence: Evidence) -> int:
+        """Match score of packets; old ROS drivers append one byte to payloads."""
+        size = self.metadata.layout.packet_size
+        is_off = self.metadata.layout.profile.returns == 0
+        if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
+            return 0
+        packets = evidence.sample[:, :size]
+        good = packets[(self._headers.faults(packets) == 0) & self._headers.owns(packets)]
+        if 2 * len(good) <= len(packets):
+            return 0
+        return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> OusterLidar:
+        """Decoder of the sensor; RigError if its profile has no pixels."""
+        check_options(options)
+        if self.metadata.layout.profile.returns == 0:
+            raise RigError(
+                f"{self.path}: Ouster metadata, udp_profile_lidar: expected a profile with pixels, "
+                f"found {self.metadata.layout.profile.name}; leave the sensor out of the rig"
+            )
+        return OusterLidar(self.metadata, self.model, self.serial, "crc" in options)
+
+    def _ids_fit(self, packets: U8Array) -> int:
+        serial = self.metadata.serial
+        init_id = self.metadata.init_id
+        same_unit = serial != 0 and bool((self._headers.serials(packets) == serial).any())
+        same_init = init_id != 0 and bool((self._headers.init_ids(packets) == init_id).any())
+        return _FITS_SERIAL * same_unit + _FITS_INIT_ID * same_init
+
+    def _ports_fit(self, evidence: Evidence) -> int:
+        on_port = evidence.stream.port != 0 and evidence.stream.port == self.metadata.lidar_port
+        imu_seen = any(
+            port == self.metadata.imu_port and _is_imu(self.metadata, size)
+            for port, size in ((one.stream.port, one.size) for one in evidence.beside)
+        )
+        return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
+
+
+class OusterLidar:
+    """Decoder of one sensor; `Lidar` of lidar.py.
+
+    Beyond the protocol: `lidar_port`, `init_id`. The sequence counts the packets within the column
+    window of the metadata, modulo frames x packets per frame; it is negative for packets outside
+    the window.
+    """
+
+    def __init__(self, described: Metadata, model: str, serial: str, check_crc: bool) -> None:
+        layout = described.layout
+        self.vendor = VENDOR
+        self.model = model
+        self.serial = serial
+        # LEGACY packets have no header, hence no serial number.
+        self.carries_serial = layout.profile.name != LEGACY and bool(serial)
+        self.mode = f"{described.lidar_mode or described.columns_per_frame} {layout.profile.name}"
+        self.channels = layout.beams
+        self.returns = layout.profile.returns
+        self.has_reflectivity = True
+        self.packet_size = layout.packet_size
+        self.columns_per_packet = layout.columns
+        self.column_period_ns = _column_period_ns(described)
+        self.records = Records(layout.record_start, layout.record_size, layout.record_size)
+        self.pixel_layout = (VENDOR, layout.profile.name, layout.beams, described.strongest_first)
+        # The type of dual returns follows from their order, see `typed_by`.
+        self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
+        self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""
+        self.sends_twice = False
+        self.channel = np.arange(self.channels)
+        # The pixels of a column fire together.
+        self.firing_ns = np.zeros((1, self.channels), np.int64)
+        self.beams = beam_table(described)
+        self.extrinsics = described.extrinsics
+        self.sensor_from_lidar: F64Array | None = described.lidar_to_sensor
+        self.timestamp_mode = described.timestamp_mode
+        self.clock_period_ns = 0
+        self.calibration = str(described.path)
+        self.notes = described.notes
+        self.lidar_port = described.lidar_port
+        self.imu_port = described.imu_port
+        self.init_id = described.init_id
+        self._metadata = described
+        self._headers = _headers(described, check_crc)
+        self._pixels = PixelReader(layout)
+        self.pixels = pixel_table(layout)
+        self._rank, in_window = _packet_ranks(described)
+        self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
+        self._packets_per_frame = in_window
+        self.sequence_modulus = self._frame_ids * in_window
+
+    def owns(self, packets: U8Array) -> BoolArray:
+        """(P,) whether packets carry this sensor's serial number, or none."""
+        return self._headers.owns(packets)
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """(P,) index into FAULTS."""
+        return self._headers.faults(packets)
+
+    def sequence(self, packets: U8Array) -> I64Array:
+        """(P,) frame id and rank within the frame as one number."""
+        frame = self._headers.frame_ids(packets) % self._frame_ids
+        first = first_measurement_ids(packets, self._metadata.layout)
+        block = first // self.columns_per_packet
+        rank = self._rank.take(block, mode="clip")
+        inside = frame * self._packets_per_frame + rank
+        is_inside = rank >= 0
+        if is_inside.all():
+            return inside
+        return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Timestamps, measurement ids and validity of all columns."""
+        return self._headers.heads(packets)
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Decode return `which` of columns (n, record_size) into `out`, which may be strided."""
+        self._pixels.read(records, which, out)
+
+    def is_imu(self, size: int) -> bool:
+        """Whether a payload of this size is an IMU packet; old ROS drivers append one byte."""
+        return size != self.packet_size and _is_imu(self._metadata, size)
+
+    def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
+        """Samples of IMU packets (P, size)."""
+        read = read_accel32 if self._metadata.imu_profile == ACCEL32 else read_legacy
+        return read(payloads, sensor)
+
+    def sensor_from_imu(self) -> F64Array:
+        """Pose of the IMU in the sensor frame, metres."""
+        pose: F64Array = self._metadata.imu_to_sensor.copy()
+        return pose
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """None: the beam vectors suffice."""
+        return None
+
+
+def beam_table(described: Metadata) -> BeamTable:
+    """Beam vectors in the sensor frame, metres (section 6).
+
+    The angle of a column decreases with its measurement id: the sensor rotates clockwise.
+    """
+    azimuth = -described.azimuth_rad
+    altitude = described.altitude_rad
+    forward = np.cos(azimuth) * np.cos(altitude)
+    side = np.sin(azimuth) * np.cos(altitude)
+    zero = np.zeros_like(forward)
+    direction = np.stack(
+        [
+            np.stack([forward, side, zero], axis=1),
+            np.stack([-side, forward, zero], axis=1),
+            np.stack([zero, zero, np.sin(altitude)], axis=1),
+        ]
+    )
+    offset_x, offset_z = described.beam_offset_m
+    origin = np.array([[[offset_x, 0.0, 0.0]], [[0.0, offset_x, 0.0]], [[0.0, 0.0, offset_z]]])
+    # Ranges are measured from the front of the rotor, at this distance from its axis.
+    reach_m = -(math.hypot(offset_x, offset_z) if offset_z else offset_x)
+    column = np.arange(described.columns_per_frame)
+    angle_rad = 2 * math.pi * (1 - column / described.columns_per_frame)
+    return BeamTable(direction, origin, np.array([reach_m]), angle_rad).moved(
+        described.lidar_to_sensor
+    )
+
+
+def _headers(described: Metadata, check_crc: bool) -> Headers:
+    layout = described.layout
+    columns = described.columns_per_frame
+    if layout.legacy:
+        return LegacyHeaders(layout, columns)
+    return PacketHeaders(layout, columns, described.header, described.serial, check_crc)
+
+
+def _column_period_ns(described: Metadata) -> float:
+    """Column period by the mode, such as 1024x10; 0 if the metadata have no mode."""
+    revolutions_per_s = described.lidar_mode.rpartition("x")[2]
+    if not revolutions_per_s.isdigit() or not int(revolutions_per_s):
+        return 0.0
+    return NS_PER_S / (described.columns_per_frame * int(revolutions_per_s))
+
+
+def _packet_ranks(described: Metadata) -> tuple[I64Array, int]:
+    """Rank of every packet of a full frame among those sent (-1: not sent), and their number.
+
+    If the window spans encoder zero, a frame begins at column 0 with the second part of the window.
+    """
+    size = described.layout.columns
+    blocks = np.arange(described.columns_per_frame // size)
+    first, last = (column // size for column in described.column_window)
+    wraps = described.column_window[0] > described.column_window[1]
+    sent = (blocks >= first) | (blocks <= last) if wraps else (blocks >= first) & (blocks <= last)
+    rank = np.where(sent, np.cumsum(sent) - 1, -1)
+    return rank.astype(np.int64), int(sent.sum())
+
+
+def _is_imu(described: Metadata, size: int) -> bool:
+    if described.imu_profile == LEGACY:
+        return size in (LEGACY_SIZE, LEGACY_SIZE + 1)
+    if described.imu_profile != ACCEL32:
+        return False
+    if described.imu_samples:
+        return size in (imu_size(described.imu_samples), imu_size(described.imu_samples) + 1)
+    return sample_count(size) > 0

@@ -1,0 +1,1 @@
+"""Decoded point clouds as a lidar; `sensor.py` is the plug-in."""

@@ -1,0 +1,208 @@
+"""Clouds decoded by a driver, whose points are batched again by their own timestamps.
+
+Source: docs/sources/messages.md, section 8. The packets are those of `mlbatch.clouds`, one column
+each: the points of equal timestamp. Points have coordinates, so beams have no angles; a range is
+the distance of a point from the origin of the cloud's frame. The channel of a point is its ring if
+most points of a timestamp are on different rings, or if every point has its own timestamp; else its
+number among the points of its timestamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.errors import RigError
+from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
+from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
+from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
+from mlbatch.sensors.base import BaseLidar
+from mlbatch.sensors.options import check_options
+from mlbatch.types import Heads, Pixels
+
+VENDOR = "any"
+# In the order of KINDS.
+MODELS: tuple[SensorModel, ...] = tuple(
+    SensorModel(
+        name=name,
+        vendor=vendor,
+        channels=MOST_SLOTS,
+        returns=(1,),
+        clock="a time for every point",
+        calibration="none: points have coordinates",
+        verified="two sources",
+    )
+    for name, vendor in zip(KINDS, (VENDOR, "Livox"), strict=True)
+)
+_FITS = 100
+_BAD_HEADER = FAULTS.index("bad_header")
+# Magic, version, kind and slots: the same in all packets of a topic.
+_SHARED_BYTES = 8
+# The table number of a rotor word has room for so many rings.
+_RINGS = 128
+
+
+def _layout(sample: U8Array) -> Layout | None:
+    """Layout named by most of the packets (k, size), else None."""
+    if sample.shape[1] < HEAD.itemsize or not len(sample):
+        return None
+    heads = np.ascontiguousarray(sample[:, : HEAD.itemsize]).view(HEAD)[:, 0]
+    words = np.ascontiguousarray(sample[:, :_SHARED_BYTES]).view("<u8")[:, 0]
+    first = heads[0]
+    if 2 * int(np.count_nonzero(words == words[0])) <= len(words):
+        return None
+    kind = int(first["kind"])
+    slots = int(first["slots"])
+    if (int(first["magic"]), int(first["version"])) != (MAGIC, VERSION):
+        return None
+    layout = Layout(kind, slots, bool(first["by_ring"]))
+    known = kind < len(KINDS) and 0 < slots <= MOST_SLOTS and layout.size == sample.shape[1]
+    return layout if known else None
+
+
+class CloudCalibration:
+    """A topic of clouds, which needs no calibration; `Calibration` of lidar.py."""
+
+    path: Path | None = None
+    serial = ""
+    is_shared = True
+
+    def __init__(self, kind: int) -> None:
+        self.model = KINDS[kind]
+        self._kind = kind
+
+    def fit(self, evidence: Evidence) -> int:
+        """Match cloud packets of this kind; they only come from topics."""
+        layout = _layout(evidence.sample) if evidence.stream.topic else None
+        return _FITS if layout is not None and layout.kind == self._kind else 0
+
+    def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
+        """The sensor; its first cloud defines the size of its columns."""
+        check_options(options)
+        layout = None if evidence is None else _layout(evidence.sample)
+        if evidence is None or layout is None:
+            raise RigError(
+                f"{self.model}: expected a cloud of the topic in the first 10 seconds, which "
+                "defines how points share timestamps, found none; correct the topic, or leave it "
+                "out"
+            )
+        return CloudLidar(layout, evidence.stream.topic)
+
+
+BUILT_IN: tuple[Calibration, ...] = tuple(CloudCalibration(kind) for kind in range(len(KINDS)))
+
+
+def read_calibration(path: Path, content: bytes) -> Calibration | None:
+    """None: clouds need no calibration file."""
+    return None
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """Name packets (k, size); None if they are not cloud packets."""
+    layout = _layout(np.atleast_2d(sample)[:, :size])
+    return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {layout}"
+
+
+class CloudLidar(BaseLidar):
+    """A topic of clouds; `Lidar` of lidar.py."""
+
+    sends_twice = False
+    typed_by = ""
+
+    def __init__(self, layout: Layout, topic: str) -> None:
+        slots = layout.slots
+        self.model = KINDS[layout.kind]
+        # Names the sensor if its topic does not.
+        self.vendor = "Cloud"
+        self.mode = str(layout)
+        self.channels = slots
+        self.returns = 1
+        self.return_types = (0,)
+        self.packet_size = layout.size
+        self.columns_per_packet = 1
+        self.records = Records(0, layout.size, layout.size)
+        # `read` passes coordinates to the projection of the same topic, so layouts differ by topic.
+        self.pixel_layout = ("points", slots, topic)
+        # In columns of one point the rotor word carries the ring.
+        rings = _RINGS if slots == 1 else 1
+        self.channel = (
+            np.arange(slots) + np.arange(rings)[:, None] if slots == 1 else np.arange(slots)
+        )
+        self.firing_ns = np.zeros((rings, slots), np.int64)
+        nowhere = np.zeros((3, slots, 3))
+        self.beams = BeamTable(nowhere, nowhere[:, :1], np.zeros(1))
+        self.calibration = "none"
+        self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
+        self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
+        self._scratch = _LastRead(np.empty((0, REALS, slots), np.float32))
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """`bad_header` for packets of another layout."""
+        head = np.ascontiguousarray(packets[:, :_SHARED_BYTES]).view("<u8")[:, 0]
+        faults = np.zeros(len(packets), np.uint8)
+        faults[head != self._shared] = _BAD_HEADER
+        return faults
+
+    def heads(self, packets: U8Array, host_ns: I64Array) -> Heads:
+        """Timestamp of every column, shared by its points."""
+        head = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)
+        stamp_ns: I64Array = head["stamp_ns"].astype(np.int64)
+        still = np.zeros(stamp_ns.shape)
+        ring: I64Array | int = 0
+        if self.channels == 1:
+            at = HEAD.itemsize + 4 * REALS
+            ring = (
+                np.ascontiguousarray(packets[:, at : at + 2]).view("<u2").astype(np.int64) % _RINGS
+            )
+        return Heads(stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_))
+
+    def read(self, records: U8Array, which: int, out: Pixels) -> None:
+        """Ranges and intensities of columns (n, records.size); keeps coordinates for `points`."""
+        reals: F32Array = records[:, self._reals].view("<f4")
+        reals = reals.reshape(len(records), REALS, self.channels)
+        self._scratch.reals = reals
+        x, y, z, intensity = reals.transpose(1, 0, 2)
+        range_m = np.multiply(x, x, out=out.range_m)
+        range_m += y * y
+        range_m += z * z
+        np.sqrt(range_m, out=range_m)
+        np.copyto(out.intensity, intensity)
+
+    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+        """Transform of the recorded coordinates."""
+        return _MovedPoints(self._scratch, body_from_sensor)
+
+
+@dataclass(slots=True)
+class _LastRead:
+    """Coordinates of the last columns read, (n, REALS, slots), a view of their records."""
+
+    reals: F32Array
+
+
+class _MovedPoints:
+    """The last columns read, moved into the body frame; `Projection` of geometry.py."""
+
+    def __init__(self, last_read: _LastRead, body_from_sensor: F64Array) -> None:
+        self._last_read = last_read
+        self._rotation = body_from_sensor[:3, :3].astype(np.float32)
+        self._translation_m = body_from_sensor[:3, 3].astype(np.float32)
+
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
+        """No rotor: nothing to prepare."""
+
+    def project(self, range_m: F32Array, out: F32Array) -> None:
+        """Rotate and translate, axis by axis in a fixed order; empty slots get any value."""
+        reals = self._last_read.reals
+        x, y, z = (reals[:, axis] for axis in range(3))
+        for axis, (row, shift_m) in enumerate(
+            zip(self._rotation, self._translation_m, strict=True)
+        ):
+            moved = x * row[0]
+            moved += y * row[1]
+            moved += z * row[2]
+            np.add(moved, shift_m, out=out[:, :, axis])

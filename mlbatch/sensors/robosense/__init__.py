@@ -1,0 +1,1 @@
+"""RoboSense lidars; `sensor.py` is the plug-in."""

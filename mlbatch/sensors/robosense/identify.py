@@ -1,0 +1,194 @@
+"""Names of ROBOSENSE packets by content: magic bytes, type bytes, block ids, return modes.
+
+Source: docs/sources/robosense.md sections 1 to 4 and 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.sensors.packet_bytes import (
+    NO_DECODER,
+    block_azimuths,
+    block_time_us,
+    has_bytes,
+    in_pairs,
+    majority,
+    most_common,
+    number,
+    payload_rows,
+)
+from mlbatch.sensors.robosense import models as rows
+from mlbatch.sensors.robosense.models import SECOND_KIND, VENDOR, Layout, Model
+
+_SOLID_STATE = bytes.fromhex("55aa5aa5")
+DIFOP = bytes.fromhex("a5ff005a11115555")
+_IMU = bytes.fromhex("aa555a05")
+_IMU_SIZE = 51
+_OLD_TYPE_AT = 30
+_TYPE_AT = 31
+_MODEL_AT = 32
+_MINUTE_US = 60_000_000
+_PACE_TOLERANCE = 0.1
+_SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812: "EM"}
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Model of point packets.
+
+    name: in words.
+    model: its row, None without a decoder.
+    other: a model that the type bytes may also stand for.
+    """
+
+    name: str
+    model: Model | None
+    other: Model | None = None
+
+
+_OLD_TYPES = {
+    1: Identity("RS-LiDAR-16", rows.RS16),
+    2: Identity("RS-LiDAR-32", rows.RS32),
+    3: Identity("RS-Bpearl v3", rows.BPEARL_V3),
+}
+_BPEARL_V4 = Identity("RS-Bpearl v4", rows.BPEARL_V4)
+_BPEARL_V4_TYPE = 3
+_BPEARL_V4_MODELS = (0, 4)
+# Second kind, by type and model; None: any model.
+_TYPES: Mapping[tuple[int, int | None], Identity] = {
+    (6, 1): Identity("Helios 32, 70 degrees", rows.HELIOS_32),
+    (6, 2): Identity("Helios 32, 31 degrees", rows.HELIOS_32),
+    (6, 3): Identity("Helios 16", rows.HELIOS_16),
+    (6, 4): Identity("Helios 32, 26 degrees", rows.HELIOS_32),
+    (7, None): Identity("Helios 16", rows.HELIOS_16),
+    (0x31, 1): Identity("Airy 48", rows.AIRY_48),
+    (0x31, 2): Identity("Airy 96", rows.AIRY_96),
+    (0x31, 3): Identity("Airy 192", None),
+}
+# Ruby: by readings per block.
+_RUBIES = {
+    128: (rows.RUBY_128, rows.RUBY_PLUS_128),
+    80: (rows.RUBY_80, rows.RUBY_PLUS_80),
+    48: (rows.RUBY_48, rows.RUBY_PLUS_48),
+}
+_RUBY_PLUS_TYPE = 5
+MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
+
+
+def describe(size: int, sample: U8Array) -> str | None:
+    """Name payloads (k, size); None if they are not ROBOSENSE's."""
+    packets = payload_rows(size, sample)
+    if packets is None:
+        return None
+    points = point_packets(packets)
+    found = identify(points)
+    if found is not None and found.model is not None:
+        return _lidar(found.name, MODE_WORDS[returns_of(points, found.model)])
+    if found is not None:
+        return _lidar(found.name) + NO_DECODER
+    if 2 * len(points) < len(packets):
+        return f"{VENDOR} DIFOP packet"
+    if size == _IMU_SIZE and majority(packets, has_bytes(packets, _IMU)) is not None:
+        return f"{VENDOR} IMU packet, Airy"
+    if size in _SOLID_SIZES and majority(packets, has_bytes(packets, _SOLID_STATE)) is not None:
+        return _lidar(_SOLID_SIZES[size]) + NO_DECODER
+    return None
+
+
+def is_difop(packets: U8Array) -> BoolArray:
+    """(P,) whether packets are device packets."""
+    return has_bytes(packets, DIFOP)
+
+
+def point_packets(packets: U8Array) -> U8Array:
+    """Packets without the device packets that share their topic."""
+    return packets[~is_difop(packets)]
+
+
+def fits(packets: U8Array, layout: Layout) -> BoolArray:
+    """(k,) whether packets have the magic bytes and the first two blocks of a layout."""
+    if packets.shape[1] < layout.end:
+        return np.zeros(len(packets), bool)
+    good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
+    return good & has_bytes(packets, layout.block_id, layout.header + layout.stride)
+
+
+def identify(packets: U8Array) -> Identity | None:
+    """Identify point packets (k, size); None if they are not ROBOSENSE's."""
+    for layout in rows.LAYOUTS:
+        chosen = majority(packets, fits(packets, layout))
+        if chosen is not None:
+            return _identity(chosen, layout)
+    return None
+
+
+def _identity(packets: U8Array, layout: Layout) -> Identity:
+    old, kind, model = (
+        most_common(number(packets, at, 1)) for at in (_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT)
+    )
+    rubies = _RUBIES.get(layout.per_block) if layout.block_id == b"\xfe" else None
+    if rubies is not None:
+        name = f"{rubies[0].name} or {rubies[1].name}"
+        own, other = rubies[::-1] if kind == _RUBY_PLUS_TYPE else rubies
+        return Identity(name, own, other)
+    if layout.magic == SECOND_KIND:
+        found = _TYPES.get((kind, model)) or _TYPES.get((kind, None))
+        shown = f"{kind:02X} {model:02X}"
+    else:
+        is_v4 = kind == _BPEARL_V4_TYPE and model in _BPEARL_V4_MODELS
+        found = _BPEARL_V4 if is_v4 else _OLD_TYPES.get(old)
+        shown = f"{old:02X} {kind:02X}"
+    if found is None or (found.model is not None and found.model.layout != layout):
+        return Identity(f"of unknown model (type bytes {shown})", None)
+    return found
+
+
+def returns_of(packets: U8Array, model: Model) -> int:
+    """Returns per shot: by the mode byte, by azimuths, or by pace; 0: unknown."""
+    layout = model.layout
+    chosen = majority(packets, fits(packets, layout))
+    if chosen is None:
+        return 0
+    if layout.modes is not None:
+        code = most_common(number(chosen, layout.mode_at, 1))
+        stated = layout.modes.get(code, layout.other_modes)
+        if stated:
+            return stated
+    azimuth = block_azimuths(chosen, layout.header, layout.stride, layout.blocks, ">")
+    if model.rounds_per_block == 1:
+        is_moving = bool((azimuth[:, 0] != azimuth[:, -1]).all())
+        is_dual = in_pairs(azimuth) if layout.blocks % 2 == 0 else _repeats(azimuth)
+        return 1 + is_dual if is_moving else 0
+    # A block has one round of two returns, or two rounds of one.
+    took_us = block_time_us(_stamp_us(chosen, model), azimuth, _MINUTE_US)
+    for returns in (1, 2):
+        wanted_us = model.rounds_per_block / returns * model.round_ns / 1000
+        if took_us is not None and abs(took_us - wanted_us) < _PACE_TOLERANCE * wanted_us:
+            return returns
+    return 0
+
+
+def _repeats(azimuth: I64Array) -> bool:
+    """Whether most packets have a pair of equal azimuths, with an odd number of blocks."""
+    return float((azimuth[:, 1:] == azimuth[:, :-1]).any(axis=1).mean()) > 0.75
+
+
+def _stamp_us(packets: U8Array, model: Model) -> I64Array:
+    """(k,) time within the minute, us."""
+    at = model.layout.time_at
+    if model.is_calendar:
+        second = number(packets, at + 5, 1)
+        milli, micro = (number(packets, at + offset, 2, ">") for offset in (6, 8))
+        return second * 1_000_000 + milli * 1000 + micro
+    second = number(packets, at, 6, ">")
+    micro = number(packets, at + 6, 4, ">")
+    return np.asarray((second % 60) * 1_000_000 + micro, np.int64)
+
+
+def _lidar(model: str, mode: str = "") -> str:
+    return f"{VENDOR} lidar {model}{', ' if mode else ''}{mode}"

@@ -1,0 +1,1 @@
+"""Velodyne lidars; `sensor.py` is the plug-in."""

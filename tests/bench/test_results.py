@@ -1,0 +1,273 @@
+"""Comparisons by hand, the document, reading an earlier one, and the table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mlbatch.bench.measure import BenchError
+from mlbatch.bench.results import (
+    COPY,
+    CPU,
+    DRY_RUN,
+    FLOOR,
+    LIBRARY,
+    MEMORY,
+    OURS,
+    OWN_CPU,
+    PEER,
+    START,
+    WALL,
+    WRITE,
+    WRITING,
+    Change,
+    Json,
+    Ratio,
+    Result,
+    Row,
+    Run,
+    Workload,
+    aligned,
+    changes,
+    document,
+    lines,
+    ratios,
+    read_document,
+)
+
+STAGES = {"read": 0.1, "decode": 0.4, "merge": 0.2, "write": 0.0}
+READ = Workload(1_000_000, 800_000, 100, 10.0, 4_000_000)
+WRITTEN = replace(READ, written_bytes=20_000_000)
+FLOORED = replace(WRITTEN, read_bytes=0)
+MACHINE: dict[str, Json] = {
+    "cpu": "Abacus",
+    "cores": 2,
+    "memory_mb": 1000,
+    "system": "S",
+    "load": 0.5,
+    "mlbatch": "0.1.0",
+    "python": "3.11.7",
+}
+
+
+def run(
+    cpu_s: float,
+    own_cpu_s: float = 0.5,
+    wall_s: float = 2.0,
+    workload: Workload = READ,
+    stages_s: Mapping[str, float] | None = None,
+) -> Run:
+    """A run of a million slots in 10 s."""
+    return Run(cpu_s, wall_s, 80.0, own_cpu_s, workload, stages_s or {})
+
+
+def row(program: str, runs: Sequence[Run], role: str = OURS, base: str = "") -> Row:
+    """A program of the case `dual-4`."""
+    return Row("dual-4", program, role, base, runs[0].workload, tuple(runs))
+
+
+def result(*rows: Row) -> Result:
+    """A result with these rows."""
+    return Result("2026-01-02T03:04:05Z", MACHINE, 10.0, 3, rows, (), ())
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+def compared(*rows: Row) -> dict[tuple[str, str, str], tuple[float, ...]]:
+    """Ratios by program, the other program, and the figure."""
+    return {(one.program, one.to, one.of): one.values for one in ratios(rows)}
+
+
+def test_runs_are_compared_in_pairs() -> None:
+    ours = row("numpy", [run(1.0, 0.5), run(3.0, 2.0)])
+    theirs = row("sdk", [run(2.0, 2.0), run(3.0, 1.0)], PEER)
+    assert compared(ours, theirs) == {
+        ("numpy", "sdk", CPU): (0.5, 1.0),
+        ("numpy", "sdk", OWN_CPU): (0.25, 2.0),
+    }
+
+
+def test_a_peer_on_another_recording_is_not_compared() -> None:
+    other = replace(READ, read_bytes=5_000_000)
+    ours = row("numpy, fragments", [run(1.0, workload=other)], base="numpy")
+    assert compared(ours, row("sdk", [run(2.0)], PEER)) == {}
+
+
+def test_a_program_is_compared_with_its_base() -> None:
+    plain = row("numpy", [run(2.0, wall_s=4.0)])
+    fragments = row("numpy, fragments", [run(2.5, wall_s=4.0)], base="numpy")
+    assert compared(plain, fragments) == {
+        ("numpy, fragments", "numpy", CPU): (1.25,),
+        ("numpy, fragments", "numpy", WALL): (1.0,),
+    }
+
+
+def test_floors_of_a_dry_run() -> None:
+    ours = row("numpy", [run(1.0, 0.6)])
+    copied = row(COPY, [run(9.0, 0.1, workload=FLOORED)], FLOOR)
+    started = row(START, [run(9.0, 0.1, workload=FLOORED)], FLOOR)
+    values = compared(ours, copied, started)
+    assert values == {
+        ("numpy", COPY, OWN_CPU): (pytest.approx(6.0),),
+        ("numpy", START, MEMORY): (1.0,),
+    }
+
+
+def test_floors_of_an_output() -> None:
+    dry = row(DRY_RUN, [run(1.0, 0.6)])
+    ours = row("mcap", [run(2.0, 1.0, wall_s=3.0, workload=WRITTEN)], base=DRY_RUN)
+    written = row(WRITE, [run(9.0, 0.1, wall_s=2.0, workload=FLOORED)], FLOOR)
+    library = row(LIBRARY, [run(9.0, 1.6, workload=FLOORED)], FLOOR)
+    assert compared(dry, ours, written, library) == {
+        ("mcap", DRY_RUN, CPU): (2.0,),
+        ("mcap", DRY_RUN, WALL): (1.5,),
+        ("mcap", WRITE, WALL): (1.5,),
+        # (1.0 - 0.6) s of 1.6 s.
+        ("mcap", LIBRARY, WRITING): (pytest.approx(0.25),),
+    }
+
+
+def test_changes_are_ratios_of_medians() -> None:
+    rows = [row("numpy", [run(1.0), run(2.0), run(9.0)]), row("numba", [run(1.0)])]
+    lists = {"cpu_s": [8.0, 4.0, 3.0], "own_cpu_s": [0.5], "wall_s": [1.0], "rss_mb": [0.0]}
+    found = {one.of: one for one in changes(rows, {("dual-4", "numpy"): lists})}
+    # The earlier document has no memory.
+    assert set(found) == {CPU, OWN_CPU, WALL}
+    assert (found[CPU].before, found[CPU].now, found[CPU].ratio) == (4.0, 2.0, 0.5)
+    assert found[WALL].ratio == 2.0
+
+
+# -- document -------------------------------------------------------------------------------------
+
+KEYS = ["schema", "date", "machine", "seconds", "repeat"]
+LISTS = ["rows", "ratios", "changes", "notes", "failed"]
+
+
+def test_the_document_contains_every_run() -> None:
+    rows = row("numpy", [run(1.0, stages_s=STAGES), run(2.0)])
+    found = json.loads(json.dumps(document(result(rows))))
+    assert list(found) == [*KEYS, *LISTS]
+    assert found["schema"] == "mlbatch.bench/1"
+    assert found["machine"]["cpu"] == "Abacus"
+    (only,) = found["rows"]
+    assert (only["case"], only["program"], only["cpu_s"]) == ("dual-4", "numpy", [1.0, 2.0])
+    assert (only["slots"], only["recorded_s"], only["read_bytes"]) == (1_000_000, 10.0, 4_000_000)
+    assert only["stages_s"]["decode"] == [0.4, 0.0]
+
+
+def test_the_document_contains_ratios_and_changes() -> None:
+    found = document(
+        replace(
+            result(row("numpy", [run(1.0)])),
+            ratios=(Ratio("dual-4", "numpy", "sdk", CPU, (0.5, 0.75)),),
+            changes=(Change("dual-4", "numpy", CPU, 4.0, 1.0),),
+        )
+    )
+    pair = {"case": "dual-4", "program": "numpy", "to": "sdk", "of": CPU}
+    assert found["ratios"] == [{**pair, "values": (0.5, 0.75), "median": 0.625}]
+    (change,) = json.loads(json.dumps(found["changes"]))
+    assert change["ratio"] == 0.25
+
+
+def test_an_earlier_document_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(document(result(row("numpy", [run(1.0), run(2.0)])))))
+    found = read_document(path)
+    assert list(found) == [("dual-4", "numpy")]
+    assert found["dual-4", "numpy"]["cpu_s"] == [1.0, 2.0]
+    assert found["dual-4", "numpy"]["rss_mb"] == [80.0, 80.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected the output of `mlbatch bench --json`"),
+        ("[]", "expected the output of `mlbatch bench --json`"),
+        ("{}", "KeyError"),
+        ('{"schema": "mlbatch.bench/9", "rows": []}', "expected schema mlbatch.bench/1, found"),
+        ('{"schema": "mlbatch.bench/1", "rows": [1]}', "TypeError"),
+        ('{"schema": "mlbatch.bench/1", "rows": [{"case": "a"}]}', "KeyError"),
+        (None, "expected an earlier result, found No such file"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / "old.json"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(BenchError, match="expected") as caught:
+        read_document(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+
+
+# -- table ----------------------------------------------------------------------------------------
+
+
+def test_a_line_has_medians_in_the_units_of_the_head() -> None:
+    runs = [run(cpu_s, stages_s=STAGES) for cpu_s in (1.0, 5.0, 2.0)]
+    head, line = (one.split("  ") for one in lines(result(row("numpy", runs)))[4:6])
+    cells = dict(zip(filter(None, head), filter(None, line), strict=True))
+    assert {name.strip(): cell.strip() for name, cell in cells.items()} == {
+        "case": "dual-4",
+        "program": "numpy",
+        "CPU s": "2.000",
+        "own s": "0.500",
+        "time s": "2.000",
+        # 2 s for a million slots.
+        "ns/slot": "2000.00",
+        # 10 s recorded in 2 s.
+        "x real": "5.0",
+        "MB": "80",
+        "read": "100.00",
+        "decode": "400.00",
+        "merge": "200.00",
+        "write": "0.00",
+    }
+
+
+def test_the_machine_and_the_date_come_first() -> None:
+    found = lines(result(row("numpy", [run(1.0)])))
+    assert found[0] == "Abacus, 2 cores, 1000 MB, S"
+    assert found[1] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
+    assert found[2].startswith("10 s of recording, medians of 3, ")
+
+
+def test_programs_without_counts_have_empty_cells() -> None:
+    found = lines(result(row("start", [run(1.0, workload=Workload())])))
+    assert found[5].split() == ["dual-4", "start", "1.000", "0.500", "2.000", "0.0", "80"]
+
+
+def test_ratios_changes_and_notes_follow() -> None:
+    found = lines(
+        replace(
+            result(row("numpy", [run(1.0)])),
+            ratios=(Ratio("dual-4", "numpy", "sdk", CPU, (0.5, 0.25, 4.0)),),
+            changes=(
+                Change("dual-4", "numpy", CPU, 4.0, 1.0),
+                Change("dual-4", "numpy", MEMORY, 50.0, 60.0),
+            ),
+            notes=("no peers",),
+        )
+    )
+    assert "dual-4  numpy    sdk  CPU   0.50   0.25  4.00" in found
+    changed = next(line for line in found if "0.25 " in line and "sdk" not in line)
+    assert changed.split() == ["dual-4", "numpy", "0.25", "1.20"]
+    assert found[-1] == "note: no peers"
+
+
+def test_numbers_are_aligned_to_the_right() -> None:
+    assert aligned([("a", "b"), ("long", "1"), ("x", "22")], 1) == [
+        "a      b",
+        "long   1",
+        "x     22",
+    ]
+
+
+def test_escape_sequences_are_not_printed() -> None:
+    found = lines(replace(result(row("numpy", [run(1.0)])), notes=("\x1b[31m",)))
+    assert "\x1b" not in "".join(found)

@@ -1,0 +1,81 @@
+"""What tests of the ROBOSENSE decoder share: evidence from payloads, and points in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.interface import Beside, Evidence, Lidar
+from mlbatch.sensors.robosense import sensor as robosense
+from mlbatch.types import Pixels, Stream
+from tests.builders.others import rows
+
+SOURCE = "192.168.1.200"
+MSOP, DIFOP = Stream(SOURCE, 6699), Stream(SOURCE, 7788)
+
+
+def evidence_of(
+    points: Sequence[bytes], difops: Sequence[bytes] = (), host_ns: I64Array | None = None
+) -> Evidence:
+    """Point packets on port 6699, device packets on port 7788 of one source."""
+    sample = rows(points)
+    receive_ns = np.arange(len(points)) * 1_000_000 if host_ns is None else host_ns
+    beside = tuple(Beside(DIFOP, len(difop), rows([difop]), receive_ns[:1]) for difop in difops[:1])
+    if len(difops) > 1:
+        beside = (Beside(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
+    return Evidence(MSOP, sample.shape[1], sample, receive_ns, beside)
+
+
+def built_in(evidence: Evidence) -> robosense.DifopCalibration:
+    """The calibration that the packets name."""
+    (best,) = [one for one in robosense.BUILT_IN if one.fit(evidence) == 100]
+    assert isinstance(best, robosense.DifopCalibration)
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """Columns of packets: (n, channels) or (n, channels, returns); xyz_m: one more axis of 3."""
+
+    range_m: F32Array
+    intensity: F32Array
+    time_ns: I64Array
+    angle_rad: F64Array
+    xyz_m: F64Array
+
+
+def records_of(lidar: Lidar, packets: U8Array) -> U8Array:
+    """The bytes of all columns, one by one."""
+    at = lidar.records
+    begins = [
+        at.start + column // at.per_row * at.stride + column % at.per_row * at.step
+        for column in range(lidar.columns_per_packet)
+    ]
+    pieces = [packets[:, begin : begin + at.size] for begin in begins]
+    return np.ascontiguousarray(np.stack(pieces, axis=1).reshape(-1, at.size))
+
+
+def decoded(lidar: Lidar, packets: U8Array) -> Decoded:
+    """All columns of packets (P, size), projected in the sensor frame."""
+    heads = lidar.heads(packets, np.zeros(len(packets), np.int64))
+    records = records_of(lidar, packets)
+    shape = (len(records), lidar.channels, lidar.returns)
+    range_m, intensity = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for which in range(lidar.returns):
+        plane = np.zeros(shape[:2], np.float32)
+        lidar.read(records, which, Pixels(plane, intensity[..., which], None))
+        range_m[..., which] = plane
+    rotor_rad, rad_per_ns, _ = read_rotor_words(heads.encoder.reshape(-1))
+    angle_rad = rotor_rad[:, None] + rad_per_ns[:, None] * lidar.firing_ns[0]
+    cosine, sine = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    towards, origin = (
+        cosine * one[0] + sine * one[1] + one[2]
+        for one in (lidar.beams.direction, lidar.beams.origin)
+    )
+    xyz_m = range_m[..., None] * towards[:, :, None] + origin[:, :, None]
+    time_ns = heads.stamp_ns.reshape(-1)[:, None] + lidar.firing_ns[0]
+    return Decoded(range_m, intensity, time_ns, angle_rad, xyz_m)

@@ -1,0 +1,104 @@
+"""`mlbatch compare`: the table, its JSON, and mistakes."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.builders.sessions import FIXTURE, NS_PER_MS, REPOSITORY, Shell, Unit, twin, write_session
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+MAKERS = REPOSITORY / "fixtures" / "four_makers"
+
+
+def test_the_table_of_the_fixture(shell: Shell) -> None:
+    outcome = shell(f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'}")
+    assert (outcome.code, outcome.err) == (0, "")
+    title, head, *rows = outcome.out.splitlines()
+    assert title == (
+        "0.9 s of left (7 sweeps of 100.0 ms), right (8 sweeps of 100.0 ms); windows at 10 Hz; "
+        "times in ms"
+    )
+    assert head.split("  ")[0] == "joined by"
+    # 37 ms apart (fixtures/two_lidars/SOURCE.md): 163 ms or 137 ms, and 100 ms.
+    longest = {re.split("  +", row)[0]: float(re.split("  +", row)[7]) for row in rows}
+    expected = {"latest sweeps": 163, "approximate time": 137, "timeout collate": 163}
+    assert longest == pytest.approx({**expected, "windows (mlbatch)": 100}, abs=0.5)
+
+
+def test_json_and_all_vendors(shell: Shell) -> None:
+    """Sweeps per second: SOURCE.md of the fixture."""
+    words = f"compare {MAKERS / 'four_makers.pcap'} --rig {MAKERS / 'rig.yaml'} --json"
+    outcome = shell(f"{words} --rate 10 --tolerance 0.08 --timeout 0.2")
+    assert (outcome.code, outcome.err) == (0, "")
+    found = json.loads(outcome.out)
+    assert found["schema"] == "mlbatch.compare/1"
+    assert (found["rate_hz"], found["period_ms"]) == ("10", 100)
+    assert (found["tolerance_ms"], found["timeout_ms"]) == (80, 200)
+    sweeps_hz = {one["name"]: 1000 / one["turn_ms"] for one in found["sensors"]}
+    expected_hz = {"left": 9.999, "roof": 10, "right": 12.5, "rear": 9.95}
+    # Sweeps are cut at columns: one column more or less is 0.01 Hz.
+    assert sweeps_hz == pytest.approx(expected_hz, abs=0.015)
+    assert [way["way"] for way in found["ways"]][-1] == "windows (mlbatch)"
+    assert found["ways"][-1]["span_ms"]["max"] < 100
+
+
+def test_host_clock(shell: Shell, tmp_path: Path) -> None:
+    """Clocks one hour apart: refused, then compared by receive time."""
+    left = Unit(turns=6)
+    hour_ns = 3600 * 1000 * NS_PER_MS
+    right = replace(
+        twin(left, 222), begin_ns=left.begin_ns + hour_ns, host_ns=left.host_ns - hour_ns
+    )
+    capture = write_session(tmp_path / "in", left, right)
+    refused = shell(f"compare {capture}")
+    assert (refused.code, refused.out) == (1, "")
+    assert "3600.000 s apart" in refused.err
+    outcome = shell(f"compare {capture} --clock host --json")
+    assert outcome.code == 0
+    assert json.loads(outcome.out)["ways"][0]["span_ms"]["max"] < 100
+
+
+def test_one_lidar_is_refused(shell: Shell, tmp_path: Path) -> None:
+    outcome = shell(f"compare {write_session(tmp_path / 'in', Unit())}")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err == (
+        f"mlbatch: error: {tmp_path / 'in' / 'drive.pcap'}: compare: expected two or more lidars, "
+        "found ouster_111 only; give all recordings of the session\n"
+    )
+
+
+def test_lidars_without_a_common_window_are_refused(shell: Shell, tmp_path: Path) -> None:
+    left = Unit(turns=1)
+    capture = write_session(tmp_path / "in", left, twin(left, 222))
+    outcome = shell(f"compare {capture}")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "no scan: expected a whole window of 100 ms" in outcome.err
+
+
+@pytest.mark.parametrize("option", ["--tolerance", "--timeout"])
+@pytest.mark.parametrize("text", ["0", "-1", "inf", "nan", "soon"])
+def test_times_are_seconds_above_0(shell: Shell, option: str, text: str) -> None:
+    outcome = shell("compare", CAPTURE, f"{option}={text}")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == (
+        f"mlbatch: error: {option}: expected seconds above 0, found {text!r}; write 0.05\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("--clock wall", 2, "--clock: expected"),
+        ("--rate 0", 2, "--rate: "),
+        ("--rig none.yaml", 1, "none.yaml"),
+    ],
+)
+def test_mistakes_are_one_line(shell: Shell, words: str, code: int, message: str) -> None:
+    outcome = shell(f"compare {CAPTURE} {words}")
+    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1)
+    assert message in outcome.err

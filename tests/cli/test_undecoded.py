@@ -1,0 +1,79 @@
+"""What the command line says of sessions with lidars that have no decoder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.builders.captures import udp_frame
+from tests.builders.others import EE, filled
+from tests.builders.sessions import EPOCH_NS, Records, Shell, Unit, write_session
+
+WHAT = "ROBOSENSE lidar M1: no decoder in this version"
+WHERE = "10.0.0.8 > port 6699"
+ADVICE = "expected a supported lidar, found none; see `mlbatch sensors` for those that are"
+
+
+def _m1() -> Records:
+    return [
+        (EPOCH_NS + 1_327_000 * n, frame)
+        for n in range(20)
+        for frame in udp_frame(
+            filled(1210, {0: bytes.fromhex("55aa5aa5"), 4: bytes((0, n))}),
+            src="10.0.0.8",
+            dport=6699,
+        )
+    ]
+
+
+def test_a_recording_of_a_lidar_without_decoder_is_refused(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, more=_m1())
+    told = shell(f"convert {capture} -o out")
+    assert (told.code, told.out) == (1, "")
+    assert told.err == f"mlbatch: error: {capture}: {WHERE} carries {WHAT}; {ADVICE}\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_metadata_that_are_missing_are_asked_for_first(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), more=_m1(), metadata=False)
+    told = shell(f"convert {capture} -o out")
+    assert told.code == 1
+    assert "10.0.0.1 > port 7502 carries Ouster lidar, serial 111" in told.err
+    assert "give the sensor's with --metadata FILE" in told.err
+
+
+def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), more=_m1())
+    told = shell(f"convert {capture} -o out")
+    assert told.code == 0, told.err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    (warning,) = report["warnings"]
+    assert warning["code"] == "no_decoder"
+    unassigned = "its packets are counted as unassigned"
+    assert warning["message"] == f"{WHERE}: {WHAT}; {unassigned}; {ADVICE}"
+    assert [(one["stream"], one["packets"]) for one in report["unassigned"]] == [(WHERE, 20)]
+
+
+@pytest.mark.parametrize("stream", ["{source_ip: 10.0.0.8, port: 6699}", "{port: 6699}"])
+def test_a_sensor_of_the_rig_without_decoder(shell: Shell, tmp_path: Path, stream: str) -> None:
+    capture = write_session(tmp_path, Unit(), more=_m1())
+    (tmp_path / "rig.yaml").write_text(f"sensors:\n  - name: front\n    stream: {stream}\n")
+    told = shell(f"convert {capture} --rig rig.yaml -o out")
+    assert told.code == 1
+    selector = stream[1:-1].replace(":", "")
+    assert told.err == (
+        f"mlbatch: error: rig.yaml: sensor front: {selector} carries {WHAT}; {ADVICE}\n"
+    )
+
+
+def test_inspect_says_what_is_missing(shell: Shell, tmp_path: Path) -> None:
+    position = filled(512, {0: EE + b"712190403180"})
+    beside = [(EPOCH_NS, frame) for frame in udp_frame(position, src="10.0.0.8", dport=10110)]
+    capture = write_session(tmp_path, Unit(), more=_m1() + beside)
+    told = json.loads(shell(f"inspect {capture} --json").out)
+    found = {one["stream"]: (one["what"], one["missing"]) for one in told["streams"]}
+    assert found[WHERE] == (WHAT, "decoder")
+    assert found["10.0.0.8 > port 10110"] == ("HESAI GPS packet", "")
+    assert found["10.0.0.1 > port 7502"][1] == ""

@@ -1,0 +1,40 @@
+"""Statistics of sets, by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from mlbatch.compare.statistics import SetStatistics
+from mlbatch.compare.sweeps import Sweep
+from mlbatch.units import NS_PER_MS
+
+
+def _sweep(sensor: int, first_ms: int) -> Sweep:
+    """A sweep of 100 ms and 100 columns."""
+    end_ns = (first_ms + 100) * NS_PER_MS
+    return Sweep(sensor, first_ms * NS_PER_MS, end_ns - 1, end_ns, 100)
+
+
+def test_figures() -> None:
+    statistics = SetStatistics("some", 2, 100 * NS_PER_MS)
+    first, second, third = _sweep(0, 0), _sweep(0, 100), _sweep(0, 400)
+    late = _sweep(1, 40)
+    for joined in ((first, late), (second, late), (third, late), (third, None)):
+        statistics.add(joined)
+    report = statistics.report(900, [third, _sweep(1, 500)])
+    assert (report.sets, report.without_a_sensor) == (4, 1)
+    # 400 to 500 ms with 40 to 140 ms: 360 ms older, more than two periods.
+    assert report.stale == 1
+    # To the last column, 1 ns before the end.
+    short_ms = 1e-6
+    spans = (100 - short_ms, 140 - short_ms, 460 - short_ms, 460 - short_ms)
+    assert (report.span_ms.min, report.span_ms.p50) == pytest.approx(spans[:2], abs=1e-9)
+    assert (report.span_ms.p99, report.span_ms.max) == pytest.approx(spans[2:], abs=1e-9)
+    assert (report.apart_ms.min, report.apart_ms.p50, report.apart_ms.max) == (40, 60, 360)
+    # 100 of 900 columns wait; `third` and `late` were used more than once.
+    assert (report.columns, report.used_twice, report.never_used) == (800, 200, 400)
+
+
+def test_without_sets_there_are_no_figures() -> None:
+    report = SetStatistics("some", 2, NS_PER_MS).report(0)
+    assert report.row() == ["some", "0", "0", "0", *["-"] * 6, "0", "-", "-"]

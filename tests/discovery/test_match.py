@@ -1,0 +1,108 @@
+"""Several lidars at one address are refused; damage of the packets of one lidar is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.run import command
+from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write_metadata
+
+BEGIN_NS = 1_700_000_000 * NS_PER_S
+LENGTH_NS = 1200 * NS_PER_MS
+# Time of a packet of each lidar of the matrix, ns: the sheets' column periods times columns.
+PACKET_NS = {
+    "ouster": 100 * NS_PER_MS // 512 * 16,
+    "velodyne": 24 * 55_296,
+    "hesai": 8 * 50_000,
+    "robosense": 24 * 55_552,
+}
+FILES = {"ouster": "front.json", "velodyne": "", "hesai": "unit.csv", "robosense": "angles.csv"}
+
+
+def one(maker: str) -> Sent:
+    return VENDORS[maker].send(Spell(BEGIN_NS, LENGTH_NS))
+
+
+def both(maker: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
+    """Packets of two lidars in receive order; of the second, sending and clock are ahead."""
+    spell = Spell(BEGIN_NS + ahead_ns + clock_ahead_ns, LENGTH_NS, ahead_ns=-clock_ahead_ns)
+    mixed = one(maker).then(VENDORS[maker].send(spell))
+    return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
+
+
+def converted(maker: str, sent: Sent, folder: Path) -> tuple[int, str]:
+    """Exit code and error of a conversion of these packets, all from one address."""
+    write_metadata(folder)
+    frames = [
+        (int(host_ns), frame)
+        for host_ns, payload in zip(sent.host_ns, sent.payloads, strict=True)
+        for frame in udp_frame(payload, VENDORS[maker].ip, sport=9000, dport=VENDORS[maker].port)
+    ]
+    capture = write_pcap(folder / "drive.pcap", frames)
+    files: list[str | Path] = ["--metadata", folder / FILES[maker]] if FILES[maker] else []
+    result = command("convert", capture, *files, "--dry-run", "--quiet")
+    return result.code, result.err
+
+
+@pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
+@pytest.mark.parametrize("maker", VENDORS)
+def test_two_lidars_that_alternate_are_refused(maker: str, share: float, tmp_path: Path) -> None:
+    # A third of a revolution apart, so that the rotors differ as well.
+    ahead_ns = 33 * NS_PER_MS // PACKET_NS[maker] * PACKET_NS[maker]
+    code, err = converted(maker, both(maker, ahead_ns + int(share * PACKET_NS[maker])), tmp_path)
+    assert code == 1
+    assert "several lidars share the address" in err
+
+
+@pytest.mark.parametrize("maker", VENDORS)
+def test_two_clocks_are_refused(maker: str, tmp_path: Path) -> None:
+    code, err = converted(maker, both(maker, 5 * NS_PER_MS, 700 * NS_PER_S), tmp_path)
+    assert code == 1
+    assert "several lidars share the address" in err
+
+
+def repeated(sent: Sent) -> Sent:
+    """Captured at two ports of a bridge: every packet again, three packets later."""
+    late = sent.where(np.arange(len(sent.payloads)))
+    late.host_ns[:] += 3 * int(np.median(np.diff(sent.host_ns))) + 10_000
+    mixed = sent.then(late)
+    return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
+
+
+def swapped(sent: Sent) -> Sent:
+    """Neighbours change places; receive times do not."""
+    count = len(sent.payloads) // 2 * 2
+    order = np.arange(count).reshape(-1, 2)[:, ::-1].reshape(-1)
+    mixed = sent.where(order)
+    mixed.host_ns[:] = sent.host_ns[:count]
+    return mixed
+
+
+ONE: Mapping[str, Callable[[Sent], Sent]] = {
+    "as sent": lambda sent: sent,
+    "repeated": repeated,
+    "swapped": swapped,
+    "every other lost": lambda sent: sent.where(np.arange(0, len(sent.payloads), 2)),
+    "half lost": lambda sent: sent.where(
+        np.flatnonzero(np.random.default_rng(5).random(len(sent.payloads)) < 0.5)
+    ),
+}
+
+
+@pytest.mark.parametrize("change", ONE)
+@pytest.mark.parametrize("maker", VENDORS)
+def test_one_lidar_is_not_refused(maker: str, change: str, tmp_path: Path) -> None:
+    code, err = converted(maker, ONE[change](one(maker)), tmp_path)
+    assert code == 0, err
+
+
+def test_inspect_notes_it(tmp_path: Path) -> None:
+    converted("velodyne", both("velodyne", 600_000), tmp_path)
+    result = command("inspect", tmp_path / "drive.pcap")
+    assert result.code == 0
+    assert "several lidars share the address" in result.out

@@ -1,0 +1,260 @@
+"""What each fault does to a few packets, by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from mlbatch.arrays import I64Array
+from mlbatch.errors import UsageError
+from mlbatch.faults import FaultCount, FaultLedger, FaultReplay, parse_fault
+from mlbatch.types import Message, PacketBatch, Topic
+
+MS, S = 10**6, 10**9
+BEGIN_NS = 1_700_000_000 * S
+NAMES = ["left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "advice"), [("lft", "did you mean left?"), ("zoo", "write * for all of them")]
+)
+def test_a_fault_names_a_sensor_of_the_session(sensor: str, advice: str) -> None:
+    with pytest.raises(UsageError, match=f"one of left, right, found '{sensor}'") as caught:
+        FaultReplay([parse_fault(f"drop:{sensor}:5%")], 0, NAMES)
+    assert str(caught.value).endswith(advice)
+
+
+# -- packets ------------------------------------------------------------------------------------
+
+# (receive time in ms after the first packet, index of the sensor, payload)
+Seen = tuple[int, int, bytes]
+FEED: list[Seen] = [
+    (0, 0, b"a0"),
+    (1, 1, b"b0"),
+    (10, 0, b"a1"),
+    (11, -1, b"c0"),
+    (20, 0, b"a2"),
+    (21, 1, b"b1"),
+    (30, 0, b"a3"),
+]
+
+
+def batches(feed: Sequence[Seen], each: int) -> Iterator[PacketBatch]:
+    """The feed in batches of `each` packets, in one buffer that is reused."""
+    data = np.zeros(64, np.uint8)
+    for at in range(0, len(feed), each):
+        part = feed[at : at + each]
+        payload = b"".join(one[2] for one in part)
+        data[:] = 0
+        data[: len(payload)] = np.frombuffer(payload, np.uint8)
+        size = np.array([len(one[2]) for one in part], np.int64)
+        host_ns = np.array([BEGIN_NS + one[0] * MS for one in part], np.int64)
+        sensor = np.array([one[1] for one in part], np.int64)
+        yield PacketBatch(data, np.cumsum(size) - size, size, sensor, host_ns)
+
+
+def owner(batch: PacketBatch) -> I64Array:
+    """Streams have the indices of sensors here."""
+    return batch.stream
+
+
+def replay(specs: str, each: int = 100, seed: int = 0) -> tuple[list[Seen], FaultReplay]:
+    """The feed with faults (separated by blanks)."""
+    faults = FaultReplay([parse_fault(spec) for spec in specs.split()], seed, NAMES)
+    seen = []
+    for batch in faults.batches(batches(FEED, each), owner):
+        for start, size, stream, host_ns in zip(
+            batch.start, batch.size, batch.stream, batch.host_ns, strict=True
+        ):
+            late_ms, rest = divmod(int(host_ns) - BEGIN_NS, MS)
+            assert rest == 0
+            seen.append((late_ms, int(stream), batch.data[start : start + size].tobytes()))
+    return seen, faults
+
+
+def without(*payloads: bytes) -> list[Seen]:
+    """The feed without some packets."""
+    return [one for one in FEED if one[2] not in payloads]
+
+
+@pytest.mark.parametrize("each", [1, 3, 100])
+@pytest.mark.parametrize(
+    ("specs", "gone"),
+    [
+        ("drop:right:100%", (b"b0", b"b1")),
+        ("drop:*:100%", (b"a0", b"a1", b"a2", b"a3", b"b0", b"b1")),
+        # The begin of a window is inside, its end is not.
+        ("stall:left:10ms-30ms", (b"a1", b"a2")),
+        ("late:left:10ms", (b"a0",)),
+        ("early:left:10ms", (b"a1", b"a2", b"a3")),
+        ("late:right:1s early:left:25ms", (b"b0", b"b1", b"a3")),
+    ],
+)
+def test_removed_packets(specs: str, gone: tuple[bytes, ...], each: int) -> None:
+    seen, faults = replay(specs, each)
+    assert seen == without(*gone)
+    assert sum(count.packets for count in faults.counts) == len(gone)
+    assert sum(ledger.removed for ledger in faults.ledgers) == len(gone)
+
+
+@pytest.mark.parametrize("each", [1, 2, 3, 100])
+def test_a_delayed_sensor_is_merged_by_its_new_receive_times(each: int) -> None:
+    seen, faults = replay("delay:left:11ms", each)
+    # Equal receive times at 11, 21 and 31 ms: the earlier packet is first.
+    assert seen == [
+        (1, 1, b"b0"),
+        (11, 0, b"a0"),
+        (11, -1, b"c0"),
+        (21, 0, b"a1"),
+        (21, 1, b"b1"),
+        (31, 0, b"a2"),
+        (41, 0, b"a3"),
+    ]
+    assert faults.counts == (FaultCount("delay:left:11ms", 4),)
+
+
+@pytest.mark.parametrize("each", [1, 2, 3, 100])
+def test_every_second_packet_is_moved_if_all_are_chosen(each: int) -> None:
+    seen, faults = replay("reorder:left:100%", each)
+    assert seen == [
+        (1, 1, b"b0"),
+        (10, 0, b"a1"),
+        (10, 0, b"a0"),
+        (11, -1, b"c0"),
+        (21, 1, b"b1"),
+        (30, 0, b"a3"),
+        (30, 0, b"a2"),
+    ]
+    assert faults.counts == (FaultCount("reorder:left:100%", 2),)
+
+
+@pytest.mark.parametrize("each", [1, 2, 100])
+def test_a_moved_packet_without_a_next_one_is_last(each: int) -> None:
+    seen, faults = replay("early:left:25ms reorder:left:100%", each)
+    assert seen == [
+        (1, 1, b"b0"),
+        (10, 0, b"a1"),
+        (10, 0, b"a0"),
+        (11, -1, b"c0"),
+        (21, 1, b"b1"),
+        (30, 0, b"a2"),
+    ]
+    assert [count.packets for count in faults.counts] == [1, 1]
+
+
+@pytest.mark.parametrize("each", [1, 3, 100])
+def test_copies_follow_the_original(each: int) -> None:
+    seen, faults = replay("dup:right:100%", each)
+    assert seen == [one for one in FEED for _ in range(2 if one[1] == 1 else 1)]
+    assert faults.ledgers == (FaultLedger(4, 0, 0, 4), FaultLedger(2, 0, 2, 4))
+
+
+@pytest.mark.parametrize("each", [1, 3, 100])
+def test_one_bit_flips(each: int) -> None:
+    seen, faults = replay("bitflip:left:100%", each)
+    assert [one[:2] for one in seen] == [one[:2] for one in FEED]
+    for (_, sensor, payload), (_, _, before) in zip(seen, FEED, strict=True):
+        difference = int.from_bytes(payload, "big") ^ int.from_bytes(before, "big")
+        assert difference.bit_count() == (1 if sensor == 0 else 0)
+    assert faults.counts == (FaultCount("bitflip:left:100%", 4),)
+
+
+def test_two_faults_may_damage_the_same_packet() -> None:
+    """Each fault draws its own bit; copies of a damaged packet are equal."""
+    seen, _ = replay("bitflip:left:100% bitflip:left:100% dup:left:100%")
+    damaged = [payload for _, sensor, payload in seen if sensor == 0]
+    assert damaged[::2] == damaged[1::2]
+    flips = {
+        (int.from_bytes(now, "big") ^ int.from_bytes(before, "big")).bit_count()
+        for now, before in zip(damaged[::2], [b"a0", b"a1", b"a2", b"a3"], strict=True)
+    }
+    assert flips <= {0, 2}
+    assert 2 in flips
+
+
+@pytest.mark.parametrize("each", [1, 3, 100])
+def test_truncated_payloads_are_shorter_and_not_empty(each: int) -> None:
+    seen, faults = replay("truncate:right:100%", each)
+    # One of two bytes remains.
+    assert seen == [(ms, s, data[:1] if s == 1 else data) for ms, s, data in FEED]
+    assert faults.counts == (FaultCount("truncate:right:100%", 2),)
+
+
+def test_faults_are_applied_in_one_order() -> None:
+    """Removal is first: a packet moves behind the next one that remains."""
+    seen, faults = replay("reorder:left:100% stall:left:5ms-15ms")
+    assert [data for _, sensor, data in seen if sensor == 0] == [b"a2", b"a0", b"a3"]
+    assert [count.packets for count in faults.counts] == [1, 1]
+
+
+def test_messages_stay_in_their_batches_in_order() -> None:
+    """Also where a batch has no packet left."""
+    topic = Topic("/imu", "sensor_msgs/Imu", "cdr")
+    source = []
+    for number, batch in enumerate(batches(FEED, 2)):
+        batch.data = batch.data.copy()
+        batch.messages = (Message(topic, number, b""), Message(topic, number, b"x"))
+        source.append(batch)
+    faults = FaultReplay([parse_fault("drop:*:100%")], 0, NAMES)
+    given = list(faults.batches(iter(source), owner))
+    assert [len(batch) for batch in given] == [0, 1, 0, 0]
+    assert [(one.host_ns, one.data) for batch in given for one in batch.messages] == [
+        (number, data) for number in range(4) for data in (b"", b"x")
+    ]
+
+
+def test_the_batch_of_the_reader_is_not_changed() -> None:
+    batch = next(batches(FEED, 100))
+    batch.data.flags.writeable = False
+    for array in (batch.start, batch.size, batch.stream, batch.host_ns):
+        array.flags.writeable = False
+    specs = ["bitflip:*:100%", "truncate:*:100%", "reorder:*:100%", "delay:*:5ms", "dup:*:100%"]
+    faults = FaultReplay([parse_fault(spec) for spec in specs], 0, NAMES)
+    assert sum(len(one) for one in faults.batches(iter([batch]), owner)) == 13
+
+
+def test_times_count_from_the_first_packet_of_a_sensor() -> None:
+    """Other packets, which a capture has and a bag has not, do not matter."""
+    start, size, stream, host_ns = (np.array([one]) for one in (0, 8, -1, BEGIN_NS - 50 * MS))
+    first = PacketBatch(np.zeros(8, np.uint8), start, size, stream, host_ns)
+    faults = FaultReplay([parse_fault("late:left:10ms")], 0, NAMES)
+    given = faults.batches(iter([first, *batches(FEED, 100)]), owner)
+    assert sum(len(batch) for batch in given) == 1 + 6
+    assert faults.begin_ns == BEGIN_NS
+
+
+# -- clocks -------------------------------------------------------------------------------------
+
+
+def at_ms(*moments: int) -> I64Array:
+    """Receive times."""
+    return BEGIN_NS + MS * np.array(moments, np.int64)
+
+
+def test_a_clock_step_shifts_later_packets() -> None:
+    seen, faults = replay("jump:left:-37s@20ms")
+    assert seen == FEED
+    assert faults.shift_ns(0, at_ms(0, 19, 20, 21)).tolist() == [0, 0, -37 * S, -37 * S]
+    assert faults.shift_ns(1, at_ms(0, 20)).tolist() == [0, 0]
+    assert faults.counts == (FaultCount("jump:left:-37s@20ms", 2),)
+
+
+def test_a_drift_grows_with_time() -> None:
+    _, faults = replay("drift:*:50ppm")
+    # 50 microseconds per second: 0.5 microseconds after 10 ms, 3 ms after a minute.
+    for sensor in (0, 1):
+        assert faults.shift_ns(sensor, at_ms(0, 10, 60_000)).tolist() == [0, 500, 3 * MS]
+
+
+def test_shifts_add_up() -> None:
+    _, faults = replay("drift:left:-1ppm jump:left:1s@1s jump:*:5s@2s")
+    shifts = faults.shift_ns(0, at_ms(1000, 2000)).tolist()
+    assert shifts == [S - 1000, 6 * S - 2000]
+
+
+def test_clock_steps_do_not_depend_on_the_delay() -> None:
+    """The time of the step is that of the recording."""
+    _, faults = replay("delay:left:60ms jump:left:1s@20ms")
+    assert faults.shift_ns(0, at_ms(79, 80)).tolist() == [0, S]

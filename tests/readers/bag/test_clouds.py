@@ -1,0 +1,212 @@
+"""Clouds of bags as packets of a recording: ledgers, notes, and packets beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from mlbatch.readers import merge, open_recording
+from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+from mlbatch.report.ledger import check_capture
+from mlbatch.ros.point_packets import Layout
+from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
+from tests.builders.bags import Body, Recorded, packet_message
+from tests.builders.points import (
+    CLOUD,
+    CUSTOM2,
+    HEAD_BYTES,
+    OUSTER,
+    STAMP_NS,
+    XYZ,
+    Form,
+    cloud_message,
+    read_packets,
+    write_points,
+)
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import write_rosbag2
+
+
+def _bag(folder: Path, messages: Sequence[Recorded], encoding: str = "cdr") -> Path:
+    write = write_rosbag2 if encoding == "cdr" else write_rosbag1
+    return write(folder / f"clouds.{encoding}", messages)
+
+
+def _open(path: Path) -> tuple[CloudRecording, StreamTable]:
+    table = StreamTable()
+    inner = open_recording(path, table)
+    return CloudRecording(inner, table, cloud_topics(inner.topics)), table
+
+
+def _payloads(batches: Iterator[PacketBatch]) -> list[tuple[int, int, bytes]]:
+    """Stream, arrival and bytes of all packets."""
+    found = []
+    for batch in batches:
+        rows = zip(*(a.tolist() for a in _of(batch)), strict=True)
+        found += [
+            (stream, host_ns, batch.data[start : start + size].tobytes())
+            for start, size, stream, host_ns in rows
+        ]
+    return found
+
+
+def _of(batch: PacketBatch) -> tuple[npt.NDArray[np.int64], ...]:
+    return batch.start, batch.size, batch.stream, batch.host_ns
+
+
+def _turn(number: int) -> bytes:
+    """Three columns of two points; the last has a point without a place."""
+    at = number * 100_000_000
+    points = [(1 + number, 1, ring, 9, 1000 * column, ring) for ring in (0, 1) for column in (0, 1)]
+    points += [(0, 0, 0, 0, 2000, 0), (5, 5, 5, 9, 2000, 1)]
+    return cloud_message(OUSTER, points, STAMP_NS + at)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
+    points = [(1, 1, ring, 9, 1000 * column, ring) for ring in (0, 1) for column in (0, 1)]
+    data = [cloud_message(OUSTER, points, STAMP_NS + turn, Form(encoding)) for turn in (0, 10**8)]
+    recording, table = _open(_bag(tmp_path, write_points("/left/points", data), encoding))
+    for _ in range(2):  # Counts and notes begin anew with every pass.
+        packets = _payloads(recording.packets())
+        assert [host_ns - STAMP_NS for _, host_ns, _ in packets] == [10**8] * 2 + [2 * 10**8] * 2
+        columns = read_packets(np.stack([np.frombuffer(p, np.uint8) for _, _, p in packets]))
+        stamps_ns = [column.stamp_ns - STAMP_NS for column in columns]
+        assert stamps_ns == [0, 1000, 10**8, 10**8 + 1000]
+        assert (recording.counts.frames, recording.counts.datagrams) == (4, 4)
+        assert recording.notes == []
+        assert recording.verdicts == [
+            "/left/points: times of points from t (uint32), ns after the header's stamp; up to 2 "
+            "points a column in turn; left out of 8 points: none"
+        ]
+    assert table.streams == [Stream(topic="/left/points")]
+    assert table.untimed == {0}
+    assert recording.frames == {"/left/points": "lidar"}
+    assert recording.container == recording.inner.container
+
+
+def test_what_is_left_out_is_told(tmp_path: Path) -> None:
+    messages = write_points("/points", [_turn(0), b"\0\1\0\0", _turn(1), _turn(2)[:-40]])
+    recording, _ = _open(_bag(tmp_path, messages))
+    assert len(_payloads(recording.packets())) == 6
+    (first,), (second,) = recording.verdicts, recording.notes
+    assert first.endswith("left out of 12 points: 2 without a place (NaN or zero)")
+    assert second.startswith("/points: 2 clouds could not be read; the first: expected 4 bytes")
+    assert (recording.counts.frames, recording.counts.datagrams) == (8, 6)
+    assert recording.counts.skipped == {"truncated": 2}
+    assert not check_capture(recording.counts)
+
+
+def test_clouds_without_a_place_are_told_and_nothing_else(tmp_path: Path) -> None:
+    empty = cloud_message(OUSTER, [(0, 0, 0, 9, 5, 1)] * 3)
+    messages = write_points("/points", [empty, cloud_message(OUSTER, [])])
+    recording, _ = _open(_bag(tmp_path, messages))
+    assert list(recording.packets()) == []
+    assert recording.verdicts == ["/points: left out of 3 points: 3 without a place (NaN or zero)"]
+    assert recording.counts.frames == 0
+
+
+def test_rings_beyond_those_of_the_first_cloud_are_told(tmp_path: Path) -> None:
+    turns = [
+        cloud_message(OUSTER, [(1, 1, 1, 9, 0, ring) for ring in range(first, first + 16)], stamp)
+        for first, stamp in ((0, STAMP_NS), (8, STAMP_NS + 10**8), (16, STAMP_NS + 2 * 10**8))
+    ]
+    turns.append(cloud_message((*XYZ, ("t", "uint32")), [(1, 1, 1, 0)]))
+    recording, _ = _open(_bag(tmp_path, write_points("/points", turns)))
+    packets = _payloads(recording.packets())
+    assert len(packets) == 2
+    (left_out,), (fault,) = recording.verdicts, recording.notes
+    assert left_out.endswith("left out of 48 points: 24 on rings beyond those of the first cloud")
+    assert fault.endswith("the first: expected rings as in the first cloud, found none")
+
+
+def test_each_pass_starts_anew(tmp_path: Path) -> None:
+    recording, _ = _open(_bag(tmp_path, write_points("/points", [_turn(n) for n in range(5)])))
+    packets = recording.packets()
+    assert len(_payloads(iter([next(packets)]))) > 0
+    packets.close()
+    assert len(_payloads(recording.packets())) == 15
+    assert (recording.counts.frames, recording.counts.datagrams) == (15, 15)
+
+
+def test_messages_are_handed_over_where_they_are_asked_for(tmp_path: Path) -> None:
+    text = Recorded("/note", "std_msgs/String", STAMP_NS + 3, Body("cdr").text("hello").done())
+    bag = _bag(tmp_path, [text, *write_points("/points", [_turn(0)])])
+    recording, _ = _open(bag)
+    for keep in (frozenset[str](), frozenset({"/note"}), frozenset({"/note", "/points"})):
+        recording.keep = keep
+        names = [m.topic.name for batch in recording.packets() for m in batch.messages]
+        assert set(names) == keep
+        assert len(names) == len(keep)
+
+
+def test_raw_packets_keep_their_place_between_clouds(tmp_path: Path) -> None:
+    payloads = [bytes([number]) * 40 for number in range(6)]
+    raw = [
+        Recorded("/os/lidar_packets", "ouster_sensor_msgs/PacketMsg", STAMP_NS + at * 10**7, data)
+        for at, data in zip(
+            (1, 8, 12, 18, 25, 40), (packet_message("cdr", p) for p in payloads), strict=True
+        )
+    ]
+    clouds = write_points("/points", [_turn(n) for n in range(3)])
+    bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
+    recording, table = _open(bag)
+    packets = _payloads(recording.packets())
+    arrivals_ns = [host_ns for _, host_ns, _ in packets]
+    assert arrivals_ns == sorted(arrivals_ns)
+    number = table.number(Stream(topic="/os/lidar_packets"))
+    assert [data for stream, _, data in packets if stream == number] == payloads
+    assert len(packets) == 6 + 9
+    assert not check_capture(recording.counts)
+    assert recording.counts.datagrams == 15
+
+
+def test_large_clouds_come_in_parts_and_lose_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = [
+        Recorded(
+            "/os/lidar_packets",
+            "ouster_sensor_msgs/PacketMsg",
+            STAMP_NS + at * 10**7,
+            packet_message("cdr", bytes([at]) * 40),
+        )
+        for at in range(5, 60, 5)
+    ]
+    clouds = write_points("/points", [_turn(n) for n in range(5)])
+    bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
+    whole = _payloads(_open(bag)[0].packets())
+    monkeypatch.setattr("mlbatch.readers.bag.clouds._BATCH_BYTES", 1)
+    batches = list(_open(bag)[0].packets())
+    assert len(batches) > 4
+    assert _payloads(iter(batches)) == whole
+
+
+def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
+    table = StreamTable()
+    layouts: dict[str, Layout] = {}
+    recordings = []
+    for number, data in enumerate([_turn(0), cloud_message(OUSTER, [(1, 2, 3, 9, 5, 0)])]):
+        (tmp_path / str(number)).mkdir()
+        (sent,) = write_points("/points", [data])
+        sent = replace(sent, log_ns=sent.log_ns + number * 10**8)
+        inner = open_recording(_bag(tmp_path / str(number), [sent]), table)
+        recordings.append(CloudRecording(inner, table, cloud_topics(inner.topics), layouts))
+    packets = _payloads(merge(recordings))
+    assert {len(data) for _, _, data in packets} == {HEAD_BYTES + 2 * 20}
+    assert len(packets) == 4
+
+
+def test_topics_of_clouds_are_told_by_type() -> None:
+    topics = (
+        Topic("/a", CLOUD, "cdr"),
+        Topic("/b", "sensor_msgs/Imu", "cdr"),
+        Topic("/c", CUSTOM2, "ros1"),
+        Topic("/d", CLOUD, "json"),
+    )
+    assert [topic.name for topic in cloud_topics(topics)] == ["/a", "/c"]

@@ -1,0 +1,146 @@
+"""Real calibration files of Velodyne and HESAI, by values read by eye."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mlbatch.lidar.geometry import read_rotor_words, rotor_words
+from mlbatch.sensors.hesai.angles import read_angles, read_at128
+from mlbatch.sensors.hesai.at128 import at128_projection
+from mlbatch.sensors.velodyne.calibration import VelodyneFile
+from tests.recordings import RECORDINGS
+from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, by_the_sheet, points
+from tests.sensors.velodyne.test_calibration import read
+from tests.sensors.velodyne.test_hdl64 import check_many_points
+
+VELODYNE_FOLDER = RECORDINGS / "velodyne"
+# Real files: the first lines, read by eye; angles of docs/sources/velodyne.md section 6.
+VELODYNE = {
+    "vlp16_ros2_dual/VLP16.yaml": (16, 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
+    "vlp32c_ros2/VLP32.yaml": (32, 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
+    "calibration-without-recording/HDL32.yaml": (32, 0.002, {0: -30.67, 1: -9.33, 31: 10.67}),
+    "calibration-without-recording/VLP16_hires.yaml": (16, 0.002, {0: -10.0, 1: 0.667, 15: 10.0}),
+    "calibration-without-recording/HDL64e_s2.yaml": (64, 0.002, {}),
+    "calibration-without-recording/HDL64e_s3.yaml": (64, 0.002, {}),
+}
+
+
+def real(name: str) -> VelodyneFile:
+    path = VELODYNE_FOLDER / name
+    return read(path.read_bytes(), path)
+
+
+@pytest.mark.parametrize("name", VELODYNE)
+def test_real_files(name: str) -> None:
+    lasers, unit_m, elevation_deg = VELODYNE[name]
+    file = real(name)
+    assert (file.lasers, file.unit_m, file.notes) == (lasers, unit_m, ())
+    assert file.enabled.all()
+    for laser, angle_deg in elevation_deg.items():
+        assert math.degrees(file.elevation_rad[laser]) == pytest.approx(angle_deg, abs=4e-4)
+
+
+def test_a_real_vlp_32c_has_azimuths() -> None:
+    # rot_correction is minus the manual's offset: +1.4, -4.2 degrees.
+    rot_deg = [math.degrees(angle) for angle in real("vlp32c_ros2/VLP32.yaml").azimuth_rad[:2]]
+    assert rot_deg == pytest.approx([-1.4, 4.2])
+
+
+HESAI_FOLDER = RECORDINGS / "hesai"
+
+# First and last line of the files, as a text editor shows them: elevation, azimuth in deg.
+FILES = {
+    "pandar40p/Pandar40P.csv": (40, (14.794, -1.042), (-24.985, -1.042)),
+    "pandar64/Pandar64.csv": (64, (14.9, -1.042), (-24.879, -1.042)),
+    "pandarqt64/PandarQT64.csv": (64, (-52.121, 8.736), (52.133, -7.892)),
+    "pandarxt16/PandarXT16.csv": (16, (15, 0), (-15, 0)),
+    "pandarxt32/PandarXT32.csv": (32, (14.972363, 0.082385), (-16.023602, -0.129679)),
+    "calibration-without-recording/Pandar128E4X.csv": (128, (15.139, 0.157), (-24.71, 0.302)),
+    "calibration-without-recording/PandarAT128.csv": (128, (12.93, 2.4), (-12.47, 0.65)),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_real_csv_files(name: str) -> None:
+    channels, first, last = FILES[name]
+    found = read_angles(HESAI_FOLDER / name, (HESAI_FOLDER / name).read_bytes())
+    assert found is not None
+    assert found.path == HESAI_FOLDER / name
+    assert found.azimuth_rad.shape == found.elevation_rad.shape == (channels,)
+    for at, (elevation, azimuth) in ((0, first), (-1, last)):
+        assert found.elevation_rad[at] == pytest.approx(math.radians(elevation), abs=1e-15)
+        assert found.azimuth_rad[at] == pytest.approx(math.radians(azimuth), abs=1e-15)
+
+
+def test_at128_real_dat_file() -> None:
+    path = HESAI_FOLDER / "calibration-without-recording" / "PandarAT128.dat"
+    found = read_at128(path, path.read_bytes())
+    assert found is not None
+    degrees = 180 / math.pi
+    # From the sheet, rounded there to 0.01 deg.
+    assert found.start_rad * degrees == pytest.approx([23.33, 143.21, 263.15], abs=0.005)
+    assert np.abs(found.azimuth_rad).max() * degrees == pytest.approx(2.4, abs=0.005)
+    assert found.elevation_rad.min() * degrees == pytest.approx(-12.46, abs=0.011)
+    assert found.elevation_rad.max() * degrees == pytest.approx(12.92, abs=0.011)
+
+
+AT128 = RECORDINGS / "hesai" / "calibration-without-recording" / "PandarAT128.dat"
+
+
+def test_real_file_against_plain_loops() -> None:
+    file = read_at128(AT128, AT128.read_bytes())
+    assert file is not None
+    rng = np.random.default_rng(7)
+    columns = 40
+    firing_ns = rng.integers(0, 15_000, (2, CHANNELS))
+    encoder = rotor_words(
+        rng.random(columns), rng.choice([-200, 0, 200], columns) / 60, rng.integers(0, 2, columns)
+    )
+    projection = at128_projection(file, firing_ns, np.eye(4), 64)
+    range_m = rng.uniform(1, 180, (columns, CHANNELS)).astype(np.float32)
+    found = points(projection, encoder, range_m)
+    angle, speed, table = read_rotor_words(encoder)
+    worst_m = 0.0
+    for column in range(columns):
+        for channel in range(CHANNELS):
+            rotor = angle[column] + speed[column] * firing_ns[table[column], channel]
+            vector = np.array(by_the_sheet(file, float(rotor), channel))
+            expected = vector * float(range_m[column, channel])
+            worst_m = max(worst_m, float(np.abs(found[column, channel] - expected).max()))
+    # Single precision, at up to 180 m: 3e-7 of it.
+    assert worst_m < 6e-5
+
+
+def test_field_of_view_of_the_real_file() -> None:
+    """Beams with adjustments cover 30 to 150 deg and a margin."""
+    file = read_at128(AT128, AT128.read_bytes())
+    assert file is not None
+    projection = at128_projection(file, NO_FIRING, np.eye(4), 180)
+    encoder = rotor_words(np.arange(180) / 180, np.zeros(180))
+    found = points(projection, encoder, np.ones((180, CHANNELS), np.float32))
+    given = file.azimuth_adjust_rad.T != 0
+    azimuth = np.arctan2(found[:, :, 0], found[:, :, 1])[given] / DEG
+    assert 10 < azimuth.min() < 30
+    assert 150 < azimuth.max() < 170
+    elevation = np.arcsin(found[:, :, 2][given]) / DEG
+    assert -15 < elevation.min() < -12
+    assert 12 < elevation.max() < 15
+
+
+def test_a_real_hdl_64e_has_all_corrections() -> None:
+    file = real("calibration-without-recording/HDL64e_s2.yaml")
+    assert file.azimuth_rad[0] == -0.1248942899601548
+    assert file.elevation_rad[:2].tolist() == [-0.15304134919741974, -0.1458455539136526]
+    assert file.dist_correction_m[:2].tolist() == [1.5195264000000002, 1.5145139]
+    assert file.dist_correction_x_m[0] == 1.5500304
+    assert file.dist_correction_y_m[1] == 1.5491043
+    assert file.vert_offset_m[0] == 0.19548199
+    assert file.horiz_offset_m[:2].tolist() == [0.025999999, -0.025999999]
+
+
+@pytest.mark.parametrize("name", ["HDL64e_s2.yaml", "HDL64e_s3.yaml"])
+def test_points_of_real_hdl_64e_files_equal_the_scalar_loop(name: str) -> None:
+    check_many_points(real(f"calibration-without-recording/{name}"))

@@ -1,0 +1,232 @@
+"""Real recordings against the vendor's own decoder (MANIFEST.md of the recordings, reference A)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.arrays import BoolArray, F32Array, I64Array
+from tests.builders.run import Cloud, command
+from tests.recordings import RECORDINGS
+
+FOLDER = RECORDINGS / "ouster"
+TOLERANCE_M = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A recording, its metadata and the decoder's output; `only` is a serial number."""
+
+    name: str
+    pcap: str
+    metadata: tuple[str, ...]
+    reference: str = "reference.npz"
+    only: str = ""
+
+    def options(self) -> list[str | Path]:
+        """What comes before the options of a test."""
+        folder = FOLDER / self.name
+        words: list[str | Path] = ["convert", folder / self.pcap]
+        for name in self.metadata:
+            words += ["--metadata", folder / name]
+        return words + (["--only", self.only] if self.only else [])
+
+
+def single(name: str, pcap: str, metadata: str) -> Case:
+    """A case of one sensor."""
+    return Case(name, pcap, (metadata,))
+
+
+def twins(kind: str) -> tuple[Case, Case]:
+    """The sensors of a recording of two: OS-0-128 (json .1), OS-1-64-AH (json .2)."""
+    name, stem = f"two-sensors_same-ports_{kind}", f"same_ports_{kind}"
+    metadata = (f"{stem}.1.json", f"{stem}.2.json")
+    return (
+        Case(name, f"{stem}.pcap", metadata, "reference.1.npz", "122247000785"),
+        Case(name, f"{stem}.pcap", metadata, "reference.2.npz", "122239000672"),
+    )
+
+
+OS0_32 = "OS-0-32-U1_v2.2.0_1024x10"
+SINGLES = (
+    single(
+        "os0-128_v2.3.0_rng15",
+        "OS-0-128-U1_v2.3.0_1024x10.pcap",
+        "OS-0-128-U1_v2.3.0_1024x10.json",
+    ),
+    single("os0-32_v2.2.0_rng19-dual", f"{OS0_32}.pcap", f"{OS0_32}.json"),
+    single("os0-32_v2.2.0_single-packet", f"{OS0_32}-single-packet.pcap", f"{OS0_32}.json"),
+    single(
+        "os1-128_v2.3.0_rng15_3frames",
+        "OS-1-128_v2.3.0_1024x10_lb_n3.pcap",
+        "OS-1-128_v2.3.0_1024x10.json",
+    ),
+    single(
+        "os1-32-g_v2.1.1_legacy", "OS-1-32-G_v2.1.1_1024x10.pcap", "OS-1-32-G_v2.1.1_1024x10.json"
+    ),
+    single(
+        "os1-64_fw2.0_legacy_reduced-config",
+        "OS-1-64_1024x10_fw20.pcap",
+        "OS-1-64_sensor_config_reduced.json",
+    ),
+    single("os1-64_fw1_legacy_broadcast", "ouster_example.pcap", "ouster_example.json"),
+    single("os0-128_512x10_crc", "crc_test.pcap", "crc_test.json"),
+    single("os2-128_duplicate-ip-id", "duplicate_id.pcap", "duplicate_id.json"),
+    single("os0-128_windowed", "windowed_frame1.pcap", "windowed_frame1_0.json"),
+)
+PAIRS = (twins("legacy"), twins("nonlegacy"))
+ALONE = (*SINGLES, *(case for pair in PAIRS for case in pair))
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Valid pixels of the decoder's output in the order of our points; columns by stamp."""
+
+    stamp_ns: I64Array
+    ring: I64Array
+    range_mm: I64Array
+    reflectivity: I64Array
+    signal: I64Array | None
+    xyz_m: F32Array
+    column_stamp_ns: I64Array
+
+    @classmethod
+    def of(cls, case: Case) -> Reference:
+        """Pixels with a range, in columns that the sensor calls valid."""
+        with np.load(FOLDER / case.name / case.reference) as npz:
+            valid: BoolArray = npz["valid"]
+            stamp_ns = npz["timestamp_ns"].astype(np.int64)
+            range_mm = npz["range_mm"].astype(np.int64)
+            hit = (range_mm > 0) & valid[:, None, :, None]
+            frame, row, column, which = np.nonzero(hit)
+            at_ns = stamp_ns[frame, column]
+            order = np.lexsort((which, row, at_ns))
+            return cls(
+                at_ns[order],
+                row[order],
+                range_mm[hit][order],
+                npz["reflectivity"][hit].astype(np.int64)[order],
+                npz["signal"][hit].astype(np.int64)[order] if "signal" in npz.files else None,
+                npz["xyz_m"][hit][order],
+                np.sort(stamp_ns[valid]),
+            )
+
+
+def name_of(case: Case) -> str:
+    """Name of a case in the list of tests."""
+    return f"{case.name}-{case.only}" if case.only else case.name
+
+
+def compare(got: Cloud, want: Reference, *, ring_base: int = 0) -> None:
+    """Every pixel, in order, and nothing else; stamps aside."""
+    assert len(got.range_m) == len(want.range_mm)
+    assert np.array_equal(got.ring, want.ring + ring_base)
+    # Whole millimetres in float32, exact to its last bit.
+    assert np.array_equal(got.range_m, (want.range_mm / 1000).astype(np.float32))
+    reflectivity = got.intensity if got.reflectivity is None else got.reflectivity
+    assert np.array_equal(reflectivity, want.reflectivity)
+    if want.signal is not None:
+        assert np.array_equal(got.intensity, want.signal)
+    error_m = np.abs(got.xyz.astype(np.float64) - want.xyz_m).max(axis=1)
+    assert error_m.max() <= TOLERANCE_M
+
+
+@pytest.mark.parametrize("case", ALONE, ids=name_of)
+def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
+    result = command(*case.options(), "-o", tmp_path / "scans", "--keep-partial")
+    assert result.code == 0, result.err
+    got, want = Cloud.of_all(tmp_path / "scans"), Reference.of(case)
+    assert np.array_equal(got.column_stamp_ns, want.column_stamp_ns)
+    assert np.array_equal(got.stamp_ns, want.stamp_ns)
+    assert np.array_equal(got.at_ns, want.stamp_ns)
+    compare(got, want)
+
+
+@pytest.mark.parametrize("case", SINGLES, ids=name_of)
+def test_metadata_next_to_the_recording_is_found(case: Case, tmp_path: Path) -> None:
+    explicit = command(*case.options(), "--dry-run", "--keep-partial", "--quiet")
+    found = command("convert", FOLDER / case.name / case.pcap, "--dry-run", "--keep-partial")
+    assert found.code == 0, found.err
+    assert _without_timing(found.out) == _without_timing(explicit.out)
+
+
+def _without_timing(text: str) -> dict[str, object]:
+    report: dict[str, object] = json.loads(text)
+    del report["timing"]
+    return report
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].name)
+def test_clocks_thousands_of_seconds_apart_are_an_error(
+    pair: tuple[Case, Case], tmp_path: Path
+) -> None:
+    both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
+    result = command(*both.options(), "-o", tmp_path / "scans", "--identity-extrinsics")
+    assert result.code == 1
+    assert result.err.count("\n") == 1, result.err
+    assert "--clock host" in result.err
+    assert "clock.offset_s" in result.err
+    for case in pair:
+        assert f"ouster_{case.only}" in result.err
+        assert f"{_offset_s(case):.3f}" in result.err
+    assert not (tmp_path / "scans").exists()
+
+
+def _offset_s(case: Case) -> float:
+    """First stamp minus receive time, as the decoder's output has them."""
+    with np.load(FOLDER / case.name / case.reference) as npz:
+        receive_ns = npz["packet_timestamp_ns"].astype(np.int64)
+        stamp = npz["timestamp_ns"].astype(np.int64)[npz["valid"]]
+    return float(stamp.min() - receive_ns[receive_ns > 0].min()) / 1e9
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].name)
+def test_two_sensors_by_receive_time(pair: tuple[Case, Case], tmp_path: Path) -> None:
+    both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
+    result = command(
+        *both.options(),
+        *("-o", tmp_path / "scans", "--keep-partial", "--clock", "host", "--identity-extrinsics"),
+    )
+    assert result.code == 0, result.err
+    cloud, total, ring_base = Cloud.of_all(tmp_path / "scans"), 0, 0
+    # Sensors are ordered by serial number.
+    for number, case in enumerate(sorted(pair, key=lambda case: case.only)):
+        got, want = cloud.of_sensor(number), Reference.of(case)
+        compare(got, want, ring_base=ring_base)
+        # A single packet each, hence one constant.
+        assert len(np.unique(got.stamp_ns - want.stamp_ns)) == 1
+        assert len(np.unique(got.column_stamp_ns - want.column_stamp_ns)) == 1
+        total += len(want.range_mm)
+        ring_base += _channels(case)
+    assert len(cloud.range_m) == total
+
+
+def _channels(case: Case) -> int:
+    with np.load(FOLDER / case.name / case.reference) as npz:
+        return int(npz["range_mm"].shape[1])
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("empty-pcap/empty_pcap.pcap", ["no UDP packet"]),
+        ("os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap", ["IMU", "zone monitor", "7513", "7514"]),
+    ],
+)
+def test_recordings_without_lidar_data_say_so(path: str, words: list[str], tmp_path: Path) -> None:
+    result = command("convert", FOLDER / path, "-o", tmp_path / "scans", "--keep-partial")
+    assert result.code == 1
+    assert result.out == ""
+    assert result.err.count("\n") == 1, result.err
+    for word in ("no lidar packets", "wanted", path.split("/")[-1], *words):
+        assert word in result.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_case_is_tested() -> None:
+    tested = {case.name for case in ALONE} | {"empty-pcap", "os0-128_imu-zone-no-lidar"}
+    assert {path.name for path in FOLDER.iterdir() if path.is_dir()} == tested

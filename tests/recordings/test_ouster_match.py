@@ -1,0 +1,148 @@
+"""Real Ouster packets: IMU samples, which metadata fit, names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.sensors import describe, read_calibration
+from mlbatch.sensors.ouster import sensor as ouster
+from mlbatch.sensors.ouster.sensor import OusterCalibration
+from mlbatch.types import Stream
+from tests.builders.streams import beside
+from tests.recordings.ouster import (
+    CASES,
+    OUSTER,
+    Case,
+    datagrams,
+    evidence,
+)
+
+
+def test_real_packets_equal_the_reference() -> None:
+    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    reference = case.arrays()
+    calibration = read_calibration(case.metadata_path)
+    assert calibration is not None
+    lidar = calibration.lidar({}, None)
+    assert lidar.notes == ("lidar output is off according to the metadata",)
+    assert not lidar.is_imu(680)
+    assert lidar.is_imu(452)
+    packets = [lidar.imu(payload[None], 0) for payload in case.payloads(452)]
+    kept = (reference["imu_status"] & 1) != 0
+    stamps = np.concatenate([samples.stamp_ns for samples in packets])
+    acceleration = np.concatenate([samples.acceleration for samples in packets])
+    turn = np.concatenate([samples.angular_velocity for samples in packets])
+    assert kept.sum() == len(stamps) > 0
+    assert np.array_equal(stamps, reference["imu_timestamp"][kept])
+    assert np.array_equal(acceleration, reference["imu_acc"][kept].astype(np.float64))
+    assert np.array_equal(turn, reference["imu_gyro"][kept].astype(np.float64))
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 5])
+def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) -> None:
+    case = CASES[number]
+    calibration = read_calibration(case.metadata_path)
+    assert calibration is not None
+    lidar = calibration.lidar({}, None)
+    assert lidar.is_imu(48)
+    samples = [lidar.imu(payload[None], 0) for payload in case.payloads(48)]
+    stamps = np.concatenate([sample.stamp_ns for sample in samples])
+    packets = case.payloads(lidar.packet_size)
+    stamp_ns = lidar.heads(packets, np.zeros(len(packets), np.int64)).stamp_ns
+    first, last = np.sort(stamp_ns.ravel())[[0, -1]]
+    assert len(stamps) >= 10
+    assert (np.diff(stamps) > 0).all()
+    # A turn to either side, since one lidar measures half of its turn only.
+    assert ((stamps > first - 100_000_000) & (stamps < last + 100_000_000)).all()
+    for sample in samples:
+        assert np.linalg.norm(sample.acceleration) == pytest.approx(9.8, abs=1.5)
+        assert np.abs(sample.angular_velocity).max() < 2.0
+
+
+SAME = OUSTER / "two-sensors_same-ports_nonlegacy"
+
+
+SOURCES = {1: "169.254.92.158", 2: "169.254.238.111"}
+
+
+def calibration_at(path: Path) -> OusterCalibration:
+    found = read_calibration(path)
+    assert isinstance(found, OusterCalibration)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "sizes"), [("legacy", (24896, 12608)), ("nonlegacy", (16640,) * 2)]
+)
+def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> None:
+    folder = OUSTER / f"two-sensors_same-ports_{kind}"
+    for number, size in zip(SOURCES, sizes, strict=True):
+        found = evidence(folder / f"same_ports_{kind}.pcap", size, SOURCES[number])
+        fits = {
+            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").fit(found)
+            for other in SOURCES
+        }
+        assert fits[number] > 0
+        assert [other for other in SOURCES if fits[other]] == [number]
+
+
+def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
+    found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
+    assert (7502, 48) in {(one.stream.port, one.size) for one in found.beside}
+    shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
+    apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
+    assert shared.fit(found) > apart.fit(found) > 0
+    moved = replace(found, beside=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
+    assert apart.fit(moved) > shared.fit(moved) > 0
+
+
+def test_no_metadata_take_packets_of_another_unit() -> None:
+    calibrations = [calibration_at(case.metadata_path) for case in CASES]
+    for case in CASES:
+        own = calibration_at(case.metadata_path)
+        size = own.metadata.layout.packet_size
+        found = evidence(OUSTER / case.folder / case.capture, size, case.source)
+        for other in calibrations:
+            # Without serial numbers any unit with packets of this size may be the one.
+            might = own.serial in ("", other.serial) or own.metadata.layout.legacy
+            same = might and other.metadata.layout.packet_size == size
+            assert (other.fit(found) > 0) == same, (case, other.path)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
+def test_real_packets_are_named(case: Case) -> None:
+    calibration = calibration_at(case.metadata_path)
+    layout = calibration.metadata.layout
+    packets = case.payloads(layout.packet_size)[:4]
+    text = describe(layout.packet_size, packets)
+    if layout.legacy:
+        assert text == f"Ouster lidar, LEGACY, {layout.beams} beams"
+    else:
+        assert text == (
+            f"Ouster lidar, serial {calibration.serial}, {layout.packet_size} bytes: "
+            "needs its metadata"
+        )
+    longer = np.hstack([packets, packets[:, :1]])
+    assert describe(layout.packet_size + 1, longer) == text
+
+
+def test_real_imu_and_zone_packets_are_named() -> None:
+    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    serial = "serial 122247000785"
+    assert describe(452, case.payloads(452)) == f"Ouster IMU, {serial}, 452 bytes"
+    assert describe(680, case.payloads(680)) == f"Ouster zone monitor, {serial}, 680 bytes"
+    assert describe(48, CASES[0].payloads(48)[:4]) == "Ouster IMU"
+
+
+@pytest.mark.parametrize("path", ["velodyne/vlp16_gps", "velodyne/hdl32e_named-vlp32", "other"])
+def test_real_packets_of_other_vendors_are_unknown(path: str) -> None:
+    checked = 0
+    for capture in sorted((OUSTER.parent / path).rglob("*.pcap")):
+        for _source, _port, data in datagrams(capture):
+            assert ouster.describe(len(data), np.frombuffer(data, np.uint8)[None, :]) is None
+            checked += 1
+    assert checked

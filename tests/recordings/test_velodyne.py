@@ -1,0 +1,141 @@
+"""Real Velodyne recordings, converted whole, against the points of velodyne-decoder.
+
+Figures: recordings/MANIFEST.md; docs/sources/velodyne.md section 11 (how well decoders agree) and
+12 (where that one is wrong).
+"""
+
+from __future__ import annotations
+
+import struct
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.arrays import F64Array
+from tests.builders.run import Cloud
+from tests.builders.traffic import read_pcap
+from tests.builders.velodyne_tables import MODELS
+from tests.recordings.references import (
+    US_NS,
+    apart,
+    assert_same_points,
+    converted,
+    heading_deg,
+)
+from tests.recordings.velodyne import BELIED, CASES, DUAL, GAPS, GPS, Case
+
+every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder)
+
+
+@every_case
+@pytest.mark.parametrize("rate", ["10", "7.5", "100/3"])
+def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_path: Path) -> None:
+    ours = converted(case.alone(tmp_path), tmp_path / "out", "--rate", rate).cloud
+    check(case, ours, added_m=0 * case.heights_m)
+
+
+@pytest.mark.parametrize("case", [DUAL, GAPS], ids=lambda case: case.folder)
+def test_every_point_with_the_file_next_to_the_bag(case: Case, tmp_path: Path) -> None:
+    """The file, found by itself, holds the vendor's angles, but no heights of the origins."""
+    made = converted(case.path, tmp_path / "found")
+    assert made.sensor["calibration"] == case.file
+    check(case, made.cloud, added_m=case.heights_m)
+    built_in = converted(
+        case.alone(tmp_path), tmp_path / "alone", "--decode", "vertical_offset=off"
+    )
+    assert built_in.sensor["calibration"] == "built in"
+    assert np.abs(built_in.cloud.xyz - made.cloud.xyz).max() < 1e-4
+
+
+def check(case: Case, ours: Cloud, added_m: F64Array) -> None:
+    """Ranges, rings and levels equal; angles and times as near as both decoders can be."""
+    theirs = case.theirs
+    assert len(ours.range_m) == case.points
+    assert (ours.lidar_id == 0).all()
+    assert ours.reflectivity is None
+    # The first sequence of a packet begins at the packet's stamp.
+    assert np.array_equal(ours.column_stamp_ns[:: case.columns], theirs.packet_ns)
+    assert len(ours.column_stamp_ns) == case.packets * case.columns
+    found, good = apart(ours, theirs, case.heights_m, added_m), case.known_well(theirs)
+    assert int(good.sum()) == (129_711 if case is GAPS else case.points)
+    # Less than half a count means equal counts; theirs went through single precision.
+    assert found.range_m.max() < 5e-5
+    assert found.up_m.max() < 5e-5
+    assert found.turn_deg[good].max() < 0.03
+    assert found.time_ns[good].max() < US_NS
+
+
+@every_case
+def test_the_report(case: Case, tmp_path: Path) -> None:
+    made, theirs = converted(case.path, tmp_path / "out"), case.theirs
+    sensor, points = made.sensor, made.sensor["points"]
+    assert (sensor["model"], sensor["mode"]) == (case.model, case.mode)
+    assert sensor["calibration"] == (case.file or "built in")
+    assert made.report["timescale"] == case.timescale
+    packets = {"read": case.packets, "accepted": case.packets, "rejected": {}}
+    assert sensor["packets"] == {**packets, "lost": 0, "reordered": 0}
+    assert sensor["columns"]["written"] == case.packets * case.columns
+    assert sensor["clock"]["offset_to_host_ms"] == pytest.approx(-theirs.host_ahead_ms, abs=1e-3)
+    returns = 2 if case is DUAL else 1
+    beams = len(MODELS[case.model].elevation_deg)
+    assert points["slots"] == case.packets * case.columns * beams * returns
+    twice = int((theirs.which == 3).sum())
+    assert points["repeated"] == twice
+    assert points["written"] == len(theirs.ring)
+    both = converted(case.path, tmp_path / "both", "--keep-repeated").sensor["points"]
+    assert both["repeated"] == 0
+    assert both["written"] == len(theirs.ring) + twice
+    warnings = [one["message"] for one in made.report["warnings"]]
+    assert len(warnings) == made.err.count("\n") == (case is BELIED)
+    if warnings:
+        assert "VLP-16" in warnings[0]
+        assert "product byte says HDL-32E" in warnings[0]
+
+
+@pytest.mark.parametrize("decode", ["on", "off"])
+def test_angle_follows_time_over_blind_sectors(decode: str, tmp_path: Path) -> None:
+    """The unit is silent for half of each revolution, but its rotor keeps its speed."""
+    words = ("--decode", f"firing_azimuth={decode}")
+    ours = converted(GAPS.path, tmp_path / "out", *words).cloud
+    assert GAPS.theirs.behind_jump.sum() == 26
+    assert (np.diff(ours.column_stamp_ns) > 0).all()
+    # All columns have points.
+    assert len(np.unique(ours.column)) == GAPS.packets * GAPS.columns
+    table = MODELS["VLP-32C"]
+    order = np.argsort(table.elevation_deg)
+    rotor_deg = heading_deg(ours.xyz) - np.array(table.azimuth_deg)[order][ours.ring]
+    when_ns = ours.at_ns if decode == "on" else ours.stamp_ns
+    past_s = (when_ns - when_ns[0]) / 1e9
+    turns = rotor_deg / 360
+    turns += np.rint(past_s * 10 - (turns - turns[0]))
+    slope, start = np.polyfit(past_s, turns, 1)
+    assert slope == pytest.approx(10.0, abs=0.01)
+    assert np.abs((turns - start) / slope - past_s).max() < 20e-6
+
+
+def test_time_of_the_first_packet_by_hand(tmp_path: Path) -> None:
+    """GPRMC gives the hour, the packet the microseconds past it; the pulse is locked: UTC."""
+    payloads = [frame[42:] for _, frame in read_pcap(GPS.path)]
+    position = next(one for one in payloads if len(one) == 512)
+    assert position[202] == 2
+    sentence = position[206:334].split(b",")
+    assert sentence[:3] == [b"$GPRMC", b"081802.00", b"A"]
+    assert sentence[9] == b"210116"
+    packet = next(one for one in payloads if len(one) == 1206)
+    (past_hour_us,) = struct.unpack_from("<I", packet, 1200)
+    # 18 min 2.340595 s, by the sentence.
+    assert past_hour_us == 1_082_340_595
+    hour_s = int(datetime(2016, 1, 21, 8, tzinfo=timezone.utc).timestamp())
+    made = converted(GPS.path, tmp_path / "out")
+    assert made.cloud.column_stamp_ns[0] == hour_s * 1_000_000_000 + past_hour_us * US_NS
+    assert made.cloud.column_stamp_ns[0] == 1_453_364_282_340_595_000
+    assert made.report["timescale"] == made.sensor["clock"]["epoch"] == "utc"
+
+
+@every_case
+def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None:
+    whole = converted(case.path, tmp_path / "whole").cloud
+    for number, words in enumerate((("--rate", "29.97"), ("--rate", "5", "--slices", "7"))):
+        assert_same_points(converted(case.path, tmp_path / str(number), *words).cloud, whole)

@@ -1,0 +1,169 @@
+"""Points of the AT128 by hand, and in plain loops (docs/sources/hesai.md section 6)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.lidar.geometry import Projection, rotor_words
+from mlbatch.sensors.hesai.angles import At128File
+from mlbatch.sensors.hesai.at128 import at128_projection
+
+DEG = math.pi / 180
+CHANNELS = 128
+NO_FIRING = np.zeros((1, CHANNELS), np.int64)
+
+
+def plain_file() -> At128File:
+    """Mirrors at 30, 150, 270 deg; no azimuth; channel c at elevation c / 10 deg.
+
+    Adjust of channel 10: azimuth 1 and 3 deg at rotor angles 60 and 62; elevation 2 deg at 358.
+    """
+    azimuth_adjust, elevation_adjust = np.zeros((CHANNELS, 180)), np.zeros((CHANNELS, 180))
+    azimuth_adjust[10, 30], azimuth_adjust[10, 31], elevation_adjust[10, 179] = 1, 3, 2
+    return At128File(
+        Path("at.dat"),
+        np.array([30.0, 150.0, 270.0]) * DEG,
+        np.array([150.0, 270.0, 30.0]) * DEG,
+        np.zeros(CHANNELS),
+        np.arange(CHANNELS) / 10 * DEG,
+        azimuth_adjust * DEG,
+        elevation_adjust * DEG,
+    )
+
+
+def words(rotor_deg: list[float], turns_per_s: float = 0.0) -> I64Array:
+    return rotor_words(np.array(rotor_deg) / 360, np.full(len(rotor_deg), turns_per_s))
+
+
+def points(projection: Projection, encoder: I64Array, range_m: F32Array) -> F32Array:
+    projection.prepare(np.zeros(len(encoder), np.int64), encoder)
+    # As the core calls it: x, y, z are strided by the intensity.
+    wide = np.zeros((*range_m.shape, 4), np.float32)
+    projection.project(range_m, wide[:, :, :3])
+    assert not wide[:, :, 3].any()
+    return wide[:, :, :3]
+
+
+def point(rotor_deg: float, channel: int, range_m: float = 10.0) -> list[float]:
+    ranges_m = np.full((1, CHANNELS), range_m, np.float32)
+    projection = at128_projection(plain_file(), NO_FIRING, np.eye(4), 4)
+    found: list[float] = points(projection, words([rotor_deg]), ranges_m)[0, channel].tolist()
+    return found
+
+
+# (rotor, channel, azimuth, elevation) in deg, worked by hand: azimuth = 2 (rotor - start) + adjust.
+BY_HAND = [
+    (75.0, 0, 90.0, 0.0),
+    (60.0, 0, 60.0, 0.0),
+    (195.0, 0, 90.0, 0.0),
+    (330.0, 100, 120.0, 10.0),
+    (0.0, 0, 180.0, 0.0),
+    (29.0, 0, 238.0, 0.0),
+    (30.001, 0, 0.002, 0.0),
+    # At a step, half and a quarter of the way to the next one, and the way there and back.
+    (60.0, 10, 61.0, 1.0),
+    (61.0, 10, 64.0, 1.0),
+    (61.5, 10, 65.5, 1.0),
+    (59.0, 10, 58.5, 1.0),
+    (63.0, 10, 67.5, 1.0),
+    # Elevation, over the end of the turn.
+    (358.0, 10, 176.0, 3.0),
+    (359.5, 10, 179.0, 1.5),
+    (357.0, 10, 174.0, 2.0),
+]
+
+
+@pytest.mark.parametrize(("rotor", "channel", "azimuth", "elevation"), BY_HAND)
+def test_points_worked_by_hand(
+    rotor: float, channel: int, azimuth: float, elevation: float
+) -> None:
+    flat = 10 * math.cos(elevation * DEG)
+    expected = [
+        flat * math.sin(azimuth * DEG),
+        flat * math.cos(azimuth * DEG),
+        10 * math.sin(elevation * DEG),
+    ]
+    assert point(rotor, channel) == pytest.approx(expected, abs=2e-6)
+
+
+def test_beam_to_the_right_lies_on_x_and_behind_on_y() -> None:
+    assert point(75.0, 0) == pytest.approx([10, 0, 0], abs=1e-6)
+    assert point(120.0, 0) == pytest.approx([0, -10, 0], abs=1e-6)
+
+
+def test_beams_fire_while_the_rotor_turns() -> None:
+    # 200 rpm: 1.2 deg a ms. After 0.5 ms the rotor is 0.6 deg on, the beam 1.2.
+    firing_ns = NO_FIRING.copy()
+    firing_ns[0, 5] = 500_000
+    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 1)
+    found = points(
+        projection, words([60.0], turns_per_s=200 / 60), np.ones((1, CHANNELS), np.float32)
+    )
+    azimuth = np.arctan2(found[0, :, 0], found[0, :, 1]) / DEG
+    assert azimuth[4] == pytest.approx(60.0, abs=1e-4)
+    assert azimuth[5] == pytest.approx(61.2, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("rotor", "rpm", "azimuth"),
+    [
+        # 0.6 deg on or back, over the step at 60 deg, where channel 10 has 1 deg, and 3 at 62 deg.
+        (59.9, 200, 2 * 30.5 + 1.5),
+        (60.5, -200, 2 * 29.9 + 0.95),
+        # Back over the start of the turn.
+        (0.3, -200, 2 * 89.7),
+    ],
+)
+def test_beams_pass_a_step_while_firing(rotor: float, rpm: int, azimuth: float) -> None:
+    firing_ns = np.full((1, CHANNELS), 500_000)
+    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 1)
+    found = points(projection, words([rotor], rpm / 60), np.ones((1, CHANNELS), np.float32))
+    assert math.atan2(found[0, 10, 0], found[0, 10, 1]) / DEG == pytest.approx(azimuth, abs=1e-4)
+
+
+def test_silent_beams_count_as_the_column_and_words_choose_the_table() -> None:
+    firing_ns = np.stack([np.full(CHANNELS, -1), np.full(CHANNELS, 1_000_000)])
+    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 2)
+    encoder = rotor_words(np.full(2, 60 / 360), np.full(2, 200 / 60), np.array([0, 1]))
+    found = points(projection, encoder, np.ones((2, CHANNELS), np.float32))
+    azimuth = np.arctan2(found[:, 0, 0], found[:, 0, 1]) / DEG
+    assert azimuth == pytest.approx([60.0, 62.4], abs=1e-4)
+
+
+def test_pose_turns_and_moves_the_points() -> None:
+    # Quarter turn about z: the sensor's x is the body's y, its y the body's -x.
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    pose[:3, 3] = [1, 2, 3]
+    projection = at128_projection(plain_file(), NO_FIRING, pose, 1)
+    found = points(projection, words([75.0]), np.full((1, CHANNELS), 10, np.float32))
+    assert found[0, 0].tolist() == pytest.approx([1, 12, 3], abs=2e-6)
+
+
+def by_the_sheet(file: At128File, rotor_rad: float, channel: int) -> tuple[float, float, float]:
+    """The unit vector of a beam; the rule of the source, in degrees."""
+    rotor = math.degrees(rotor_rad) % 360
+    starts, ends = np.degrees(file.start_rad), np.degrees(file.end_rad)
+    for start, end in zip(starts, ends, strict=True):
+        if (rotor - start) % 360 < (end - start) % 360:
+            past = (rotor - start) % 360
+    low = int(rotor // 2)
+    part = rotor / 2 - low
+
+    def adjust(table: F64Array) -> float:
+        row = np.degrees(table[channel])
+        return float(row[low] + part * (row[(low + 1) % 180] - row[low]))
+
+    azimuth = 2 * past - math.degrees(file.azimuth_rad[channel]) + adjust(file.azimuth_adjust_rad)
+    elevation = math.degrees(file.elevation_rad[channel]) + adjust(file.elevation_adjust_rad)
+    flat = math.cos(math.radians(elevation))
+    return (
+        flat * math.sin(math.radians(azimuth)),
+        flat * math.cos(math.radians(azimuth)),
+        math.sin(math.radians(elevation)),
+    )

@@ -1,0 +1,136 @@
+"""All vendors together: models, calibration files, names of packets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mlbatch import sensors
+from mlbatch.errors import RigError
+from mlbatch.sensors.ouster.profiles import PROFILES
+from tests.builders.others import (
+    filled,
+    livox2_packets,
+    rows,
+    velodyne_packets,
+)
+from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
+from tests.builders.streams import named
+
+
+def test_every_model_has_its_own_name_and_a_vendor() -> None:
+    names = [model.name for model in sensors.models()]
+    assert len(set(names)) == len(names)
+    assert {model.vendor for model in sensors.models()} == {
+        plugin.VENDOR for plugin in sensors.plugins() if plugin.MODELS
+    }
+
+
+def test_every_model_states_how_it_was_verified() -> None:
+    verified = {model.verified for model in sensors.models()}
+    assert verified == {"real recording", "two sources", "one source"}
+
+
+def test_the_models_of_ouster() -> None:
+    rows = {model.name: model for model in sensors.models() if model.vendor == "Ouster"}
+    real = {name for name, model in rows.items() if model.verified == "real recording"}
+    assert real == {"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"}
+    assert rows["OS1-16"].channels == 16
+    assert rows["OSDome-128"].returns == (1, 2)
+
+
+def test_a_metadata_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "front.json"
+    path.write_text(json.dumps(metadata_json(OusterSpec(serial=77))))
+    found = sensors.read_calibration(path)
+    assert found is not None
+    assert (found.path, found.model, found.serial) == (path, "OS-1-128", "77")
+
+
+def test_files_that_cannot_be_read_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(
+        RigError, match=r"none\.json: expected a calibration file, found no such file"
+    ):
+        sensors.read_calibration(tmp_path / "none.json")
+    with pytest.raises(RigError, match="expected a calibration file, found a directory"):
+        sensors.read_calibration(tmp_path)
+
+
+def test_a_file_too_large_for_a_calibration_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "large.json"
+    content = json.dumps(metadata_json(OusterSpec())).encode()
+    path.write_bytes(content + b" " * (sensors.MAX_CALIBRATION_BYTES - len(content)))
+    assert sensors.read_calibration(path) is not None
+    with path.open("ab") as file:
+        file.write(b" ")
+    assert sensors.read_calibration(path) is None
+
+
+def test_no_vendor_knows_an_odd_packet() -> None:
+    assert sensors.describe(3, np.zeros((2, 3), np.uint8)) is None
+
+
+def test_a_damaged_packet_does_not_hide_a_stream() -> None:
+    xt16 = filled(568, {0: bytes.fromhex("eeff06010000100801040201"), 550: b"\x37"})
+    streams = [
+        velodyne_packets(b"\x37\x22", 110.592),
+        rows([xt16] * 2),
+        livox2_packets(1, 14, 96),
+    ]
+    for packets in streams:
+        whole = np.concatenate([packets, packets[-1:]])
+        expected = named(whole)
+        assert expected is not None
+        whole[1] = np.random.default_rng(5).integers(0, 256, packets.shape[1], np.uint8)
+        assert named(whole) == expected
+
+
+@pytest.mark.parametrize("profile", [name for name, one in PROFILES.items() if one.fields])
+def test_packets_of_ouster_are_unknown_to_others(profile: str) -> None:
+    for beams in (16, 32, 64, 128):
+        spec = OusterSpec(profile=profile, beams=beams, columns_per_frame=512)
+        ranges = np.full((512, beams, 1), 4000)
+        packets = encode_frame(spec, 1_700_000_000_000_000_000, 5, ranges)[:4]
+        sample = rows(packets)
+        assert named(sample) is None
+        assert all(named(packet[None]) is None for packet in sample)
+
+
+def test_imu_packets_of_ouster_are_unknown_to_others() -> None:
+    spec = OusterSpec(imu_profile="ACCEL32_GYRO32_NMEA")
+    data = imu_packet(spec, np.arange(1, 9), np.ones((8, 3)), np.ones((8, 3)))
+    assert named(rows([data])) is None
+
+
+SIZES = [34, 42, 51, 80, 99, 512, 568, 678, 786, 812, 861, 918, 978, 1072, 1080, 1127, 1194, 1200]
+
+
+@settings(max_examples=150)
+@given(st.sampled_from(SIZES) | st.integers(1, 1500), st.integers(0, 2**32), st.integers(1, 4))
+def test_random_bytes_are_unknown(size: int, seed: int, count: int) -> None:
+    noise = np.random.default_rng(seed).integers(0, 256, (count, size), np.uint8)
+    assert named(noise) is None
+
+
+@settings(max_examples=100)
+@given(st.binary(min_size=1, max_size=1500), st.integers(1, 3))
+def test_any_bytes_give_a_name_or_none(payload: bytes, count: int) -> None:
+    assert "\n" not in (named(rows([payload] * count)) or "")
+
+
+@pytest.mark.parametrize("fill", [0, 1, 2, 0x55, 0xEE, 0xFE, 0xFF])
+def test_bytes_that_are_all_the_same_are_unknown(fill: int) -> None:
+    for size in range(1, 1500):
+        assert named(np.full((2, size), fill, np.uint8)) is None
+
+
+def test_nothing_is_unknown() -> None:
+    for plugin in sensors.plugins():
+        assert plugin.describe(0, np.zeros((0, 0), np.uint8)) is None
+        assert plugin.describe(1206, np.zeros((0, 1206), np.uint8)) is None
+        assert plugin.describe(1206, np.zeros((1, 100), np.uint8)) is None
