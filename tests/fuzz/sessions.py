@@ -118,7 +118,7 @@ def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
     """Kernels are made for 128 channels or more, and kept from run to run."""
     with (
         kernels_kept(),
-        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
         patch.object(numba_engine, "load", loading),
     ):
         yield
