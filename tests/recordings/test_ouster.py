@@ -222,7 +222,7 @@ def test_recordings_without_lidar_data_say_so(path: str, words: list[str], tmp_p
     assert result.code == 1
     assert result.out == ""
     assert result.err.count("\n") == 1, result.err
-    for word in ("no lidar packets", "wanted", path.split("/")[-1], *words):
+    for word in ("no lidar packets", "expected", "found", path.split("/")[-1], *words):
         assert word in result.err
     assert not list(tmp_path.iterdir())
 
