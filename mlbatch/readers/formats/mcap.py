@@ -32,7 +32,7 @@ from mlbatch.readers.source import BUFFER_BYTES, MAX_RECORD_BYTES, Source
 from mlbatch.types import Recording, StreamTable, Topic
 
 CONTAINER = "MCAP"
-# How far to search for topics in a file without a summary; capturing programs write them at the front.
+# How far to search for topics in a file without a summary; usually they are at the front.
 _SEARCH_BYTES = 64 << 20
 _PEEK_BYTES = 1 << 16
 # A summary of more records is not kept in memory; the file is read without it.
@@ -148,7 +148,9 @@ def _portions(
             skip = frozenset(
                 place for place, inside in summary.chunks.items() if inside <= unselected
             )
-            walk = Walk(source, recording.selects, summary.channels, skip, buffer_bytes=buffer_bytes)
+            walk = Walk(
+                source, recording.selects, summary.channels, skip, buffer_bytes=buffer_bytes
+            )
             numbers = _TopicNumbers(recording, walk.channels)
             try:
                 for messages in walk.messages():
