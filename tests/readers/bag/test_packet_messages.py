@@ -48,7 +48,7 @@ AROUND = {
     "robosense_msgs/RobosenseScan": "robosense_msgs/RobosensePacket",
 }
 INFO = "robosense_msgs/RobosenseInfoPacket"
-# Types whose packets carry the time of their arrival (section 3); pandar_msgs does only in ROS 2.
+# Types whose packets carry their receive time (section 3); pandar_msgs does only in ROS 2.
 STAMPED = {name for name, text in OWN.items() if text.startswith("time")} | {*AROUND, INFO}
 FIXED = {"velodyne": 1206, "pandar_msgs/PandarS": 1500, "pandar_msgs/PandarP": 1500}
 FIXED |= {"rslidar_msgs": 1248, "robosense": 1248}
@@ -185,9 +185,9 @@ def test_alignment_follows_the_frame_name(frame: str) -> None:
     assert found.host_ns.tolist() == [STAMP_NS, STAMP_NS + 1]
 
 
-@pytest.mark.parametrize(("told", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
-def test_the_size_of_a_pandar_packet_tells_the_valid_bytes(told: int, expected: int) -> None:
-    body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", told)
+@pytest.mark.parametrize(("stated", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
+def test_the_size_field_of_a_pandar_packet_limits_its_bytes(stated: int, expected: int) -> None:
+    body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", stated)
     _, got = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
     assert got == [bytes(expected)]
 
