@@ -18,8 +18,8 @@ SHAPES = arrays.array_shapes(min_dims=1, max_dims=2, max_side=40)
 @given(arrays.arrays(np.float64, SHAPES))
 def test_of_reals(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
     with np.errstate(all="ignore"):
-        got, wanted = median(values), float(np.median(values))
-    assert got == wanted or (math.isnan(got) and math.isnan(wanted))
+        found, expected = median(values), float(np.median(values))
+    assert found == expected or (math.isnan(found) and math.isnan(expected))
 
 
 @given(arrays.arrays(np.int64, SHAPES, elements=st.integers(-(2**63), 2**63 - 1)))
@@ -27,10 +27,10 @@ def test_of_whole_numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]
     assert median(values) == float(np.median(values))
 
 
-@pytest.mark.parametrize(("values", "wanted"), [([3, 1, 2], 2.0), ([4, 1, 3, 2], 2.5)])
-def test_by_hand(values: list[int], wanted: float) -> None:
+@pytest.mark.parametrize(("values", "expected"), [([3, 1, 2], 2.0), ([4, 1, 3, 2], 2.5)])
+def test_by_hand(values: list[int], expected: float) -> None:
     given_values = np.array(values)
-    assert median(given_values) == wanted
+    assert median(given_values) == expected
     assert given_values.tolist() == values
 
 

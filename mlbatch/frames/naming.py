@@ -74,7 +74,7 @@ _CLOSENESS = ("namespace", "place", "word", "plain")
 
 
 def candidates(
-    maker: str,
+    vendor: str,
     places: Sequence[str],
     *,
     alone: bool,
@@ -86,7 +86,7 @@ def candidates(
     places: topics of its packets, or its name in the rig; alone: the only sensor of this vendor;
     frame_id: of its own messages; sensor_from_lidar: (4, 4), m, of its metadata.
     """
-    naming = NAMINGS.get(maker.lower(), _OTHER)
+    naming = NAMINGS.get(vendor.lower(), _OTHER)
     found: dict[str, Candidate] = {}
     if clean(frame_id):
         found[clean(frame_id)] = Candidate(clean(frame_id), _rank("stated", "plain"))

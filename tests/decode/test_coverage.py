@@ -1,4 +1,4 @@
-"""Outlines of scans by the kernel: those of numpy, whatever the columns are."""
+"""Column statistics by hand, and by the kernel: equal to those of numpy for any columns."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def columns(seed: int, count: int, most: int) -> WindowColumns:
 
 @pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
 @pytest.mark.parametrize("seed", range(4))
-def test_outlines_are_those_of_numpy(seed: int, count: int) -> None:
+def test_the_kernel_equals_numpy(seed: int, count: int) -> None:
     compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
     for again in range(3):
         due = columns(seed * 10 + again, count, 500)
@@ -52,13 +52,13 @@ def test_positions_beyond_the_turn_are_left_to_numpy() -> None:
     assert compiled.measure(fine) == plain.measure(fine)
 
 
-@pytest.mark.parametrize("outliner", [ColumnStatistics, CompiledColumnStatistics])
-def test_an_outline_by_hand(outliner: type[ColumnStatistics]) -> None:
+@pytest.mark.parametrize("statistics", [ColumnStatistics, CompiledColumnStatistics])
+def test_statistics_by_hand(statistics: type[ColumnStatistics]) -> None:
     # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
     stamp_ns = np.array([0, 10, 40, 45, 50, 51])
     encoder = np.array([0, 2, 3, 1, 1 << 31, 359])
     sensor = np.array([0, 0, 0, 0, 1, 0])
-    found = outliner((360, None, 8)).measure(WindowColumns(stamp_ns, sensor, stamp_ns, encoder))
+    found = statistics((360, None, 8)).measure(WindowColumns(stamp_ns, sensor, stamp_ns, encoder))
     assert found == [
         ColumnStats(5, 30, 3 / 120, 1 / 120),
         ColumnStats(1, 0, 1 / 120, 0.0),

@@ -1,4 +1,4 @@
-"""The ring of raw packets: what was stored at a place is found there while it is needed."""
+"""Packet ring: records stay at their places while they are needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mlbatch.lidar.interface import Records
 
 @dataclass
 class Stored:
-    """A ring beside a plain dictionary of what each place holds."""
+    """A ring, and a dictionary of the expected record at each place."""
 
     packet_size: int
     record_start: int

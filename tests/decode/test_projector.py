@@ -1,4 +1,4 @@
-"""Turning sensors that are decoded together: their points are those of each one alone."""
+"""Sensors with rotor words that one projector decodes: points equal those of each sensor alone."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
-    ("matrix", "wanted_and_got"),
+    ("matrix", "message"),
     [
         (_matrix(X, Y), "expected 4 (or 3) rows of 4 finite numbers, found shape (2, 4)"),
         (_matrix(X, Y, (0, 0, math.nan, 0), W), "expected 4 (or 3) rows of 4 finite numbers, "),
@@ -141,10 +141,10 @@ X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
         (_matrix((-1, 0, 0, 0), Y, Z), "expected a rotation (determinant 1), found a mirror image"),
     ],
 )
-def test_what_is_not_rigid_is_refused(matrix: F64Array, wanted_and_got: str) -> None:
+def test_what_is_not_rigid_is_refused(matrix: F64Array, message: str) -> None:
     with pytest.raises(RigError) as caught:
         rigid(matrix)
-    assert str(caught.value).startswith(wanted_and_got)
+    assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
 
 

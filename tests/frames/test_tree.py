@@ -102,7 +102,7 @@ def test_frames_that_nothing_connects() -> None:
     assert tree.top("d") == ("c", "")
 
 
-def test_a_missing_frame_is_told_with_the_nearest() -> None:
+def test_a_missing_frame_names_the_nearest() -> None:
     with pytest.raises(RigError) as caught:
         _tree(_edge("base_link", "os_left")).chain("base_link", "os_lefft")
     assert str(caught.value) == (

@@ -54,7 +54,7 @@ def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) 
 
 
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic", "floating", "planar", ""])
-def test_joints_that_move_are_told_apart(kind: str) -> None:
+def test_moving_joints_are_not_fixed(kind: str) -> None:
     text = _robot(_joint(LINKS, kind, "turret"))
     (joint,) = joints(text)
     assert (joint.name, joint.kind, joint.is_fixed) == ("turret", kind, False)
@@ -123,7 +123,7 @@ def test_descriptions_that_cannot_be_used(text: str, message: str) -> None:
     assert str(caught.value) == f"robot_description (URDF){message}{REMEDY}"
 
 
-def test_halves_of_characters_are_told_in_one_line() -> None:
+def test_surrogates_give_one_line() -> None:
     with pytest.raises(RigError, match="expected an XML document") as caught:
         joints("<robot name='\ud800'/>")
     assert "\n" not in str(caught.value)

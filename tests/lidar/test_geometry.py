@@ -62,15 +62,15 @@ def test_beams_fire_while_the_rotor_goes_on(axis: str, lens_m: float, rotor_hz: 
         for beam in range(4):
             fired_s = float(FIRING_NS[table[column], beam]) * 1e-9
             angle = 2 * math.pi * (float(turns[column]) + rotor_hz * fired_s)
-            wanted = _by_hand(axis, beam, float(range_m[column, beam]), angle, lens_m)
+            expected = _by_hand(axis, beam, float(range_m[column, beam]), angle, lens_m)
             # float32 at 120 m, and 136 us at 20 turns a second: 8e-7 rad of the series left out.
             allowed = 5e-5 + (1e-4 if abs(rotor_hz) > 10 else 0)
-            np.testing.assert_allclose(points[column, beam, :3], wanted, atol=allowed)
+            np.testing.assert_allclose(points[column, beam, :3], expected, atol=allowed)
 
 
 def test_a_beam_to_the_right_at_a_quarter_turn() -> None:
     """Clockwise: after a quarter of a turn forward has become right, which is -y or +x."""
-    for axis, wanted in (("x", (0.0, -2.0, 0.0)), ("y", (2.0, 0.0, 0.0))):
+    for axis, expected in (("x", (0.0, -2.0, 0.0)), ("y", (2.0, 0.0, 0.0))):
         table = BeamTable(
             spherical(np.zeros(1), np.zeros(1), axis), np.zeros((3, 1, 3)), np.zeros(1)
         )
@@ -78,7 +78,7 @@ def test_a_beam_to_the_right_at_a_quarter_turn() -> None:
         turning.prepare(np.zeros(1, np.int64), rotor_words(np.array([0.25]), np.zeros(1)))
         out = np.empty((1, 1, 3), np.float32)
         turning.project(np.full((1, 1), 2.0, np.float32), out)
-        np.testing.assert_allclose(out[0, 0], wanted, atol=1e-6)
+        np.testing.assert_allclose(out[0, 0], expected, atol=1e-6)
 
 
 def _points(projection: Projection, member: I64Array, encoder: I64Array) -> F32Array:

@@ -1,4 +1,4 @@
-"""What each mistake in a rig file is answered with: one line, to the letter."""
+"""Mistakes in rig files, each with its exact one-line error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ exclude_boxes_m: [[-3, -2, -1, 1, 2, 4]]
 
 
 def _answer(file: Path) -> str:
-    """What is said of the file; nothing where it is fine."""
+    """Return the error of the file, empty if it is valid."""
     try:
         read_rig(file)
     except RigError as err:
@@ -227,12 +227,12 @@ MISTAKES: list[tuple[str, str]] = [
 
 
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
-def test_mistakes_are_told(tmp_path: Path, text: str, message: str) -> None:
+def test_mistakes_have_exact_errors(tmp_path: Path, text: str, message: str) -> None:
     expected = f"{tmp_path / 'rig.yaml'}:{message}".replace("FOLDER", str(tmp_path))
     assert _fault(tmp_path, text) == expected
 
 
-def test_files_that_are_no_text_are_told(tmp_path: Path) -> None:
+def test_unreadable_files(tmp_path: Path) -> None:
     file = tmp_path / "rig.yaml"
     with pytest.raises(RigError) as caught:
         read_rig(file)
@@ -265,7 +265,7 @@ def test_deep_nesting_ends_in_an_error(tmp_path: Path, text: str) -> None:
 
 
 @given(st.text(max_size=60), st.integers(min_value=0, max_value=len(VALID)))
-def test_any_text_is_read_or_told_in_one_line(
+def test_any_text_is_read_or_gives_one_line(
     tmp_path_factory: pytest.TempPathFactory, text: str, position: int
 ) -> None:
     file = tmp_path_factory.getbasetemp() / "noise.yaml"

@@ -1,4 +1,4 @@
-"""The rig file: what it means, and that it is written as it is read."""
+"""Rig files: meaning of every key, and that a written rig reads back equal."""
 
 from __future__ import annotations
 
