@@ -1,4 +1,4 @@
-"""What flows through mlbatch: packets in batches, columns that wait, scans that leave."""
+"""Values passed between the packages: packets, columns, scans, messages."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Where packets come from: a (source IP, destination port) of a capture, or a topic of a bag.
+    """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.
 
-    Source ports are left out on purpose: they are ephemeral.
+    Source ports are ephemeral and no part of it.
     """
 
     source_ip: str = ""
-    port: int = 0
+    port: int = 0  # destination
     topic: str = ""
 
     def __str__(self) -> str:
@@ -26,40 +26,33 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a bag as its recording describes it.
-
-    type: package/Type, without the /msg/ of ROS 2; encoding: `cdr` or `ros1`; definition: text
-    stored in the recording ("" if none) in the format `ros1msg`, `ros2msg` or `ros2idl`; qos: the
-    recorder's text; latched: ROS 1 latching, or transient local durability.
-    """
+    """A topic of a bag as its recording describes it."""
 
     name: str
-    type: str
-    encoding: str
-    definition: str = ""
-    format: str = ""
-    qos: str = ""
-    latched: bool = False
+    type: str  # package/Type, without the /msg/ of ROS 2
+    encoding: str  # `cdr` or `ros1`
+    definition: str = ""  # of the type, as stored in the recording; "": none
+    format: str = ""  # of the definition: `ros1msg`, `ros2msg` or `ros2idl`
+    qos: str = ""  # QoS profiles, as stored in the recording
+    latched: bool = False  # ROS 1 latching, or transient local durability
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message that holds no lidar packets, as it is stored; host_ns: log time."""
+    """A message without lidar packets, as stored."""
 
     topic: Topic
-    host_ns: int
+    host_ns: int  # log time
     data: bytes
 
 
 @dataclass(slots=True)
 class StreamTable:
-    """Numbers the streams of a session; all its readers share one table.
-
-    untimed: streams whose packets have no arrival time of their own (`host_ns` is then the log
-    time of the message that holds many of them), so that `--clock host` cannot be used.
-    """
+    """Numbers the streams of a session; all its readers share one table."""
 
     streams: list[Stream] = field(default_factory=list)
+    # Streams whose packets have no receive time of their own: `host_ns` is the log time of a
+    # message with many packets, so that `--clock host` cannot be used.
     untimed: set[int] = field(default_factory=set)
     _numbers: dict[Stream, int] = field(default_factory=dict)
 
@@ -67,28 +60,25 @@ class StreamTable:
         """Number of `stream`, given at its first packet."""
         found = self._numbers.get(stream)
         if found is None:
-            found = self._numbers[stream] = len(self.streams)
+            found = len(self.streams)
+            self._numbers[stream] = found
             self.streams.append(stream)
         return found
 
 
 @dataclass(slots=True)
 class PacketBatch:
-    """UDP payloads in arrival order; valid only until the next batch, since readers reuse `data`.
+    """UDP payloads in receive order; valid only until the next batch, since readers reuse `data`.
 
     Payload i is `data[start[i] : start[i] + size[i]]`.
-    data: (bytes,) uint8; start, size: (n,) int64; stream: (n,) int64, numbers of a `StreamTable`;
-    host_ns: (n,) int64, time of arrival at the recorder (of the completing fragment); messages:
-    those of the topics that the recording was asked to `keep`, in file order, whose time has come
-    with this batch.
     """
 
-    data: U8Array
-    start: I64Array
-    size: I64Array
-    stream: I64Array
-    host_ns: I64Array
-    messages: tuple[Message, ...] = ()
+    data: U8Array  # (bytes,)
+    start: I64Array  # (n,)
+    size: I64Array  # (n,)
+    stream: I64Array  # (n,) numbers in a `StreamTable`
+    host_ns: I64Array  # (n,) receive time at the capture host, of the completing fragment
+    messages: tuple[Message, ...] = ()  # of the topics in `Recording.keep`, in file order
 
     def __len__(self) -> int:
         return len(self.start)
@@ -102,35 +92,34 @@ class PacketBatch:
 
 @dataclass(slots=True)
 class CaptureCounts:
-    """The ledger of a reader: frames = datagrams + sum(skipped)."""
+    """Frames of a reader: frames = datagrams + sum(skipped)."""
 
     frames: int = 0
     datagrams: int = 0
-    skipped: dict[str, int] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)  # by reason
 
     def skip(self, reason: str, count: int = 1) -> None:
-        """Count `count` frames that gave no datagram; reasons: `ledger.CAPTURE_REASONS`."""
+        """Count frames without a datagram; reasons: `ledger.CAPTURE_REASONS`."""
         if count:
             self.skipped[reason] = self.skipped.get(reason, 0) + count
 
 
 @dataclass(slots=True)
 class Recording:
-    """An opened recording; each container derives its own `packets`.
-
-    container: name of the format; size_bytes: of the files on disk; topics: all topics of a bag;
-    keep: names of topics whose messages the batches include (set before `packets` is called);
-    counts: frames of the current pass; notes: what is wrong with the recording, one line each;
-    position_bytes: how much of `size_bytes` the current pass has read.
-    """
+    """An opened recording; each container derives its own `packets`."""
 
     path: Path
-    container: str
-    size_bytes: int
+    container: str  # name of the format
+    size_bytes: int  # of the files on disk
+    # All topics of a bag.
     topics: tuple[Topic, ...] = field(default=(), kw_only=True)
+    # Topics whose messages the batches include; set before `packets` is called.
     keep: frozenset[str] = field(default=frozenset(), kw_only=True)
+    # Frames of the current pass.
     counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)
+    # Damage of the recording, one line each.
     notes: list[str] = field(default_factory=list, kw_only=True)
+    # Part of `size_bytes` that the current pass has read.
     position_bytes: int = field(default=0, kw_only=True)
 
     def packets(self) -> Generator[PacketBatch, None, None]:
@@ -145,9 +134,9 @@ class Recording:
 
 
 class WrappedRecording(Recording):
-    """A recording that changes the packets of another one; all else is that of the inner one.
+    """A recording that changes the packets of another one.
 
-    Only `keep` is its own. Attributes that are not set here are looked up in `inner`.
+    Only `keep` is its own; attributes that are not set here are looked up in `inner`.
     """
 
     __slots__ = ("inner",)
@@ -167,15 +156,11 @@ class WrappedRecording(Recording):
 
 @dataclass(slots=True)
 class Columns:
-    """Columns of one sensor: small fixed records; their pixels stay raw in the sensor's ring.
+    """Columns of one sensor: small fixed records; their pixels stay raw in the sensor's ring."""
 
-    stamp_ns: (n,) int64, common clock; ring_index: (n,) int64, row of the sensor's `PacketRing`;
-    encoder: (n,) int64, rotor position (index into the sensor's angle table).
-    """
-
-    stamp_ns: I64Array
-    ring_index: I64Array
-    encoder: I64Array
+    stamp_ns: I64Array  # (n,) common clock
+    ring_index: I64Array  # (n,) row of the sensor's `PacketRing`
+    encoder: I64Array  # (n,) index into the angle table of the beams, or rotor word
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -187,104 +172,85 @@ class Columns:
 
 @dataclass(slots=True)
 class ColumnHeaders:
-    """What the columns of P packets say of themselves, before any pixel is decoded.
+    """Headers of the C columns of P packets, read before any pixel is decoded."""
 
-    stamp_ns: (P, C) int64, sensor clock, the column's earliest nominal firing;
-    encoder: (P, C) int64; valid: (P, C) bool, the sensor's own word that the column was measured.
-    """
-
-    stamp_ns: I64Array
-    encoder: I64Array
-    valid: BoolArray
+    stamp_ns: I64Array  # (P, C) sensor clock, the column's earliest nominal firing
+    encoder: I64Array  # (P, C) rotor position, as in `Columns`
+    valid: BoolArray  # (P, C) True where the sensor reports the column as measured
 
 
 @dataclass(slots=True)
 class Pixels:
-    """Readings of n columns of one return: (n, channels) each.
+    """Readings of n columns of one return: (n, channels) each."""
 
-    range_m: float32, 0 where nothing came back; intensity: float32, sensor units;
-    reflectivity: uint16, or None where the sensor has none.
-    """
-
-    range_m: F32Array
-    intensity: F32Array
-    reflectivity: U16Array | None
+    range_m: F32Array  # 0: no return
+    intensity: F32Array  # sensor units
+    reflectivity: U16Array | None  # None: the sensor has none
 
 
 @dataclass(frozen=True, slots=True)
 class SensorInfo:
-    """What outputs say of a sensor; `body_from_sensor` is (4, 4) float64, metres."""
+    """A sensor as outputs describe it."""
 
     name: str
     model: str
     channels: int
     returns: int
-    ring_base: int
-    body_from_sensor: F64Array
+    ring_base: int  # first ring number of its channels
+    body_from_sensor: F64Array  # (4, 4) m
 
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """What is the same for all scans of a run.
+    """Properties that all scans of a run share."""
 
-    rate_hz: the exact rate as text ("10", "10/3"); timescale: utc, tai, uptime or unknown;
-    layout: dense or organized; sensors in the order of `lidar_id`.
-    """
-
-    sensors: tuple[SensorInfo, ...]
-    frame_id: str
-    rate_hz: str
-    timescale: str
-    slices: int = 1
-    layout: str = "dense"
+    sensors: tuple[SensorInfo, ...]  # in the order of `lidar_id`
+    frame_id: str  # of the body
+    rate_hz: str  # exact rate as text: "10", "10/3"
+    timescale: str  # utc, tai, uptime or unknown
+    slices: int = 1  # a window
+    layout: str = "dense"  # or organized
 
 
-# Arrays of a scan that not every output has a place for; only those that are asked for are made.
+# Optional arrays of a scan: those that the output cannot store are not made.
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
-# Said together with EXTRAS by outputs that also hold IMU samples.
+# Listed with EXTRAS by outputs that store IMU samples.
 IMU = "imu"
-# Likewise by outputs that take messages of a recording as they are: the encodings they have a
-# place for.
+# Listed with EXTRAS by outputs that store recorded messages: the encodings they can store.
 MESSAGE_ENCODINGS = frozenset({"cdr", "ros1"})
 
 
 @dataclass(slots=True)
 class Scan:
-    """All columns of one window of the common clock, sorted by stamp; fields as in the npz.
+    """All columns of one window of the common clock, sorted by timestamp; fields as in the npz.
 
-    Dense: p points, only valid returns, never NaN. Organized: (n, slots) each, NaN where empty.
-    xyz: (p, 3) float32, m, body frame; intensity, range_m: (p,) float32; reflectivity: (p,) uint16
-    or None; time_ns: (p,) uint32 after `start_ns`; ring: (p,) uint16; return_type, lidar_id:
-    (p,) uint8; column: (p,) uint32, or None when organized; column_stamp_ns: (n,) int64;
-    column_lidar_id: (n,) uint8. The arrays of EXTRAS are None where nobody asked for them.
-    `ready_host_ns` is the arrival of the packet that closed the window; `max_gap_ns[s]` the widest
-    step between columns of sensor s (0: fewer than two); `coverage[s]`, `overlap[s]`: shares of a
-    turn that its rotor passed at least once, and more than once.
+    n columns. Dense: p points, only valid returns, never NaN. Organized: arrays of points are
+    (n, slots[, 3]), NaN where empty. Arrays of EXTRAS are None where the output cannot store them.
     """
 
     info: RunInfo
-    index: int
-    slice: int
+    index: int  # of the window, from t_init
+    slice: int  # within the window
     start_ns: int
     end_ns: int
-    complete: bool
-    ready_host_ns: int
-    xyz: F32Array
-    intensity: F32Array
-    reflectivity: U16Array | None
-    range_m: F32Array | None
-    time_ns: U32Array
-    ring: U16Array
-    return_type: U8Array
-    lidar_id: U8Array
-    column: U32Array | None
-    column_stamp_ns: I64Array
-    column_lidar_id: U8Array
+    complete: bool  # every sensor covers the window in time
+    ready_host_ns: int  # receive time of the packet that closed the window
+    xyz: F32Array  # (p, 3) m, body frame
+    intensity: F32Array  # (p,)
+    reflectivity: U16Array | None  # (p,)
+    range_m: F32Array | None  # (p,)
+    time_ns: U32Array  # (p,) after `start_ns`
+    ring: U16Array  # (p,)
+    return_type: U8Array  # (p,)
+    lidar_id: U8Array  # (p,)
+    column: U32Array | None  # (p,) index of the point's column; None when organized
+    column_stamp_ns: I64Array  # (n,)
+    column_lidar_id: U8Array  # (n,)
     points: int
     columns_per_sensor: tuple[int, ...]
-    max_gap_ns: tuple[int, ...]
-    coverage: tuple[float, ...] = ()
-    overlap: tuple[float, ...] = ()
+    max_gap_ns: tuple[int, ...]  # by sensor, widest step between columns; 0: fewer than two
+    coverage: tuple[float, ...] = ()  # by sensor, share of a revolution passed at least once
+    overlap: tuple[float, ...] = ()  # by sensor, share of a revolution passed more than once
 
     @property
     def slices(self) -> int:
@@ -294,26 +260,18 @@ class Scan:
 
 @dataclass(slots=True)
 class ImuSamples:
-    """Samples of one sensor's IMU, in its IMU frame.
+    """Samples of one sensor's IMU, in its IMU frame."""
 
-    sensor: index in `RunInfo.sensors`; stamp_ns: (n,) int64, the lidar's clock;
-    acceleration: (n, 3) float64, m/s2; angular_velocity: (n, 3) float64, rad/s.
-    """
-
-    sensor: int
-    stamp_ns: I64Array
-    acceleration: F64Array
-    angular_velocity: F64Array
+    sensor: int  # index in `RunInfo.sensors`
+    stamp_ns: I64Array  # (n,) the lidar's clock
+    acceleration: F64Array  # (n, 3) m/s2
+    angular_velocity: F64Array  # (n, 3) rad/s
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a writer may add at the end of a run.
+    """Results of a run that a writer may store at its end."""
 
-    t_init_ns: None when the run never started; report_json: report.json without timings and paths;
-    scans_csv: text of scans.csv.
-    """
-
-    t_init_ns: int | None
-    report_json: str
-    scans_csv: str
+    t_init_ns: int | None  # None: no window was reached
+    report_json: str  # report.json without timings and paths
+    scans_csv: str  # text of scans.csv

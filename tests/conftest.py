@@ -13,6 +13,29 @@ from tests.builders.sessions import Shell
 settings.register_profile("mlbatch", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("mlbatch")
 
+# Whole suites of cases, a folder or a file each: `make test-quick` leaves them out.
+LONG = (
+    "bench/",
+    "fuzz/",
+    "golden/",
+    "matrix/",
+    "property/",
+    "recordings/",
+    "decode/kernels/",
+    "batching/test_reference.py",
+    "cli/test_bench.py",
+    "clocks/test_simulated.py",
+    "contract/test_models.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of long suites."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.relative_to(here).as_posix().startswith(LONG):
+            item.add_marker(pytest.mark.long)
+
 
 @pytest.fixture
 def shell(

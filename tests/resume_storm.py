@@ -88,7 +88,8 @@ def write_recordings(folder: Path, turns: int) -> None:
     records += left.imu_records(turns * 10)
     write_pcap(folder / "session" / "drive.pcap", sorted(records))
     write_mcap(folder / "bag" / "drive.mcap", _messages(left, right, turns))
-    pieces, begin_ns = [], left.begin_ns
+    pieces = []
+    begin_ns = left.begin_ns
     for number, step_ns in enumerate((0, 37 * NS_PER_S, -20 * NS_PER_S)):
         begin_ns += step_ns
         ahead_ns = left.begin_ns + number * 10 * TURN_NS - begin_ns
@@ -115,7 +116,8 @@ def _turns(unit: Unit, count: int) -> list[Unit]:
 
 def _messages(left: Unit, right: Unit, turns: int) -> list[Recorded]:
     """Packets of two lidars, an IMU, and large texts."""
-    kind, found = "ouster_sensor_msgs/PacketMsg", []
+    kind = "ouster_sensor_msgs/PacketMsg"
+    found = []
     for name, unit in (("left", left), ("right", right)):
         topic = f"/{name}/ouster/lidar_packets"
         for turn in _turns(unit, turns):
@@ -170,7 +172,8 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
         os.dup2(said.fileno(), 2)
     resume.INTERVAL_S = interval_s
     sys.argv = ["mlbatch", *words]
-    calls, begun = 0, False
+    calls = 0
+    begun = False
 
     def count(frame: FrameType, event: str, call: Any) -> None:
         nonlocal calls
@@ -285,7 +288,8 @@ class Storm:
     def _tear(self, place: Path) -> None:
         """Cut off the end of a state file, as if its last line had not been written whole."""
         for state in place.glob("*.state"):
-            size, text = state.stat().st_size, state.read_bytes()
+            size = state.stat().st_size
+            text = state.read_bytes()
             last = size - text.rfind(b"\n", 0, -1)
             if self._chance.random() < 0.3:
                 os.truncate(state, size - self._chance.randrange(max(1, last)))
@@ -312,7 +316,8 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=40, help="length of recordings, 0.1 s")
     parser.add_argument("--again", type=int, default=2, help="most further kills of an output")
     given = parser.parse_args()
-    outputs, wrong = 0, list[str]()
+    outputs = 0
+    wrong = list[str]()
     names = list(CASES)
     with storm(given.seed, given.turns, given.again) as one:
         while one.kills < given.count and len(wrong) < 5:

@@ -38,23 +38,19 @@ _NONE = np.empty(0, np.int64)
 
 @dataclass(slots=True)
 class Track:
-    """State of one sensor.
-
-    first_ns: t0; newest_ns: largest stamp delivered; offset_ns: first stamp minus its receive time;
-    gaps: (begin, end) of steps longer than the idle-source timeout; waiting: columns of windows
-    that are open; decoded: columns of accepted packets; dropped: columns by reason.
-    """
+    """State of one sensor."""
 
     intake: Intake
-    first_ns: int = NEVER
-    newest_ns: int = NEVER
-    offset_ns: int | None = None
+    first_ns: int = NEVER  # t0
+    newest_ns: int = NEVER  # largest stamp delivered
+    offset_ns: int | None = None  # first stamp minus its receive time
+    # (begin, end) of steps longer than the idle-source timeout.
     gaps: list[tuple[int, int]] = field(default_factory=list)
-    waiting: list[Columns] = field(default_factory=list)
+    waiting: list[Columns] = field(default_factory=list)  # columns of windows that are open
     # Lower bound of the ring indices of all waiting columns.
     oldest_ring_index: int = FOREVER
-    decoded: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
+    decoded: int = 0  # columns of accepted packets
+    dropped: dict[str, int] = field(default_factory=dict)  # columns by reason
 
     def drop(self, reason: str, count: int) -> None:
         """Count columns that are written to no window."""
@@ -64,15 +60,11 @@ class Track:
 
 @dataclass(slots=True)
 class Progress:
-    """State before the first delivery of a batch, and after each of its E deliveries.
+    """State before the first delivery of a batch, and after each of its E deliveries."""
 
-    newest: (S, E + 1) int64, newest stamp of each sensor; watermark: (E + 1,) int64; host_ns: (E,)
-    int64, receive time of each delivery.
-    """
-
-    newest: I64Array
-    watermark: I64Array
-    host_ns: I64Array
+    newest: I64Array  # (S, E + 1) int64, newest stamp of each sensor
+    watermark: I64Array  # (E + 1,) int64
+    host_ns: I64Array  # (E,) int64, receive time of each delivery
 
 
 class Batcher:

@@ -33,18 +33,13 @@ _NONE = np.empty(0, np.int64)
 
 @dataclass(slots=True)
 class Arrival:
-    """Packets of one sensor in one batch, in order of receive time.
+    """Packets of one sensor in one batch, in order of receive time."""
 
-    position: (P,) int64, index in the batch; host_ns: (P,) int64, receive time; key: (P,) int64,
-    equal for duplicates, negative for packets without identity; headers: their columns, sensor
-    clock; ring_index: (P,) int64, ring index of the packet's first column.
-    """
-
-    position: I64Array
-    host_ns: I64Array
-    key: I64Array
-    headers: ColumnHeaders
-    ring_index: I64Array
+    position: I64Array  # (P,) int64, index in the batch
+    host_ns: I64Array  # (P,) int64, receive time
+    key: I64Array  # (P,) int64, equal for duplicates, negative for packets without identity
+    headers: ColumnHeaders  # their columns, sensor clock
+    ring_index: I64Array  # (P,) int64, ring index of the packet's first column
 
     def take(self, index: BoolArray | I64Array) -> Arrival:
         """The packets at `index`."""
@@ -60,13 +55,10 @@ class Arrival:
 
 @dataclass(slots=True)
 class Accepted:
-    """Accepted packets of one sensor on the common clock, in order of delivery.
-
-    newest_ns: (A,) int64, largest valid stamp of each packet, NEVER where none is valid.
-    """
+    """Accepted packets of one sensor on the common clock, in order of delivery."""
 
     packets: Arrival
-    newest_ns: I64Array
+    newest_ns: I64Array  # (A,) int64, largest valid stamp of each packet, NEVER where none is valid
 
 
 def extremes(headers: ColumnHeaders) -> tuple[I64Array, I64Array]:

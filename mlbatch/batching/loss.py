@@ -93,7 +93,7 @@ class SequenceLoss:
             if self._doubtful is None or abs(self._signed(number - self._doubtful)) > BELIEVED_STEP:
                 self._doubtful = number
                 return
-            # A long gap forward is loss; a step back is a restart, which counts from anew.
+            # A long gap forward is loss; a step back is a restart of the count.
             if step > 0 and self._is_sure:
                 self.lost += step - 2
             self._newest = number
@@ -127,7 +127,7 @@ _STEP_NS = NS_PER_S
 # Bins of a revolution for the angles of columns: about 0.0055 degrees, half of the finest encoder.
 _BIN_BITS = 16
 _BINS = 1 << _BIN_BITS
-_TURNS_PER_TICK = 2.0**-32
+_REVOLUTIONS_PER_TICK = 2.0**-32
 # A dark sector is wider than so many steps between columns.
 _MIN_WIDTH = 2.5
 # A sector without columns is dark if the rotor passed it so often during gaps: random loss would
@@ -149,16 +149,13 @@ _JITTER = 1 / 360
 
 @dataclass(slots=True)
 class _Packets:
-    """Packets of one sensor, (n,) each; bins: (n, C) uint16, angle bins of all columns.
+    """Packets of one sensor, (n,) each."""
 
-    stamp_ns: of the first column; first, last: angles of the first and last column, revolutions.
-    """
-
-    stamp_ns: I64Array
+    stamp_ns: I64Array  # of the first column
     host_ns: I64Array
-    first: F64Array
-    last: F64Array
-    bins: U16Array
+    first: F64Array  # angle of the first column, revolutions
+    last: F64Array  # angle of the last column, revolutions
+    bins: U16Array  # (n, C) angle bins of all columns
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -213,8 +210,8 @@ class GapLoss:
             # A copy, so that the stamps of all columns are not kept in memory.
             headers.stamp_ns[:, 0].copy(),
             host_ns,
-            ticks[:, 0].astype(np.float64) * _TURNS_PER_TICK,
-            ticks[:, -1].astype(np.float64) * _TURNS_PER_TICK,
+            ticks[:, 0].astype(np.float64) * _REVOLUTIONS_PER_TICK,
+            ticks[:, -1].astype(np.float64) * _REVOLUTIONS_PER_TICK,
             (ticks >> (32 - _BIN_BITS)).astype(np.uint16),
         )
         if len(measured) < len(packets):
@@ -365,14 +362,14 @@ class _Sectors:
 
 
 def _dark_sectors(
-    packets: _Packets, begin: F64Array, turned: F64Array, column_turns: float
+    packets: _Packets, begin: F64Array, turned: F64Array, column_revolutions: float
 ) -> _Sectors:
     """Sectors in which the sensor measures nothing; begin, turned: (g,) gaps.
 
     These are sectors without a column that the rotor passed during many gaps, or within a packet,
     where nothing can be lost.
     """
-    bare = _bare_sectors(packets.bins, column_turns)
+    bare = _bare_sectors(packets.bins, column_revolutions)
     is_dark = np.count_nonzero(bare.passes(begin, turned), axis=0) >= _MIN_PASSES
     if not is_dark.all():
         span = (packets.last - packets.first) % 1.0
@@ -382,8 +379,8 @@ def _dark_sectors(
     return _Sectors(bare.begin[is_dark], bare.width[is_dark])
 
 
-def _bare_sectors(bins: U16Array, column_turns: float) -> _Sectors:
-    """Sectors without a column; column_turns: step between columns, revolutions."""
+def _bare_sectors(bins: U16Array, column_revolutions: float) -> _Sectors:
+    """Sectors without a column; column_revolutions: step between columns, revolutions."""
     bare = np.bincount(bins.ravel(), minlength=_BINS) == 0
     # Rotated so that no sector contains the end.
     first = int(np.argmin(bare))
@@ -392,5 +389,5 @@ def _bare_sectors(bins: U16Array, column_turns: float) -> _Sectors:
     end = np.flatnonzero(edge == -1) + 1
     # On average half of the bin at each edge is dark as well.
     width = (end - begin + 1) / _BINS
-    wide = width > _MIN_WIDTH * column_turns
+    wide = width > _MIN_WIDTH * column_revolutions
     return _Sectors(((begin + first - 0.5) / _BINS % 1.0)[wide], width[wide])

@@ -91,7 +91,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A written window or slice; columns: (sensor, its accepted packet, column in the packet)."""
+    """A written window or slice."""
 
     index: int
     slice: int
@@ -99,7 +99,7 @@ class Window:
     end_ns: int
     complete: bool
     ready_host_ns: int
-    columns: list[tuple[int, int, int]]
+    columns: list[tuple[int, int, int]]  # (sensor, its accepted packet, column in the packet)
 
 
 @dataclass(frozen=True, slots=True)

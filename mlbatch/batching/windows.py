@@ -28,37 +28,28 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """Options of batching.
+    """Options of batching."""
 
-    max_wait_ns: idle-source timeout, None: none (the paper to the letter); keep_partial: write the
-    window before t_init and the one of the last stamp; start, end: limits of window starts.
-    """
-
-    max_wait_ns: int | None = NS_PER_S
-    keep_partial: bool = False
-    start: Limit | None = None
-    end: Limit | None = None
+    max_wait_ns: int | None = NS_PER_S  # idle-source timeout; None: none, as in the paper
+    keep_partial: bool = False  # also write the window before t_init and the one of the last stamp
+    start: Limit | None = None  # windows start at or after it
+    end: Limit | None = None  # windows start before it
 
 
 @dataclass(slots=True)
 class Window:
-    """Columns of all sensors in one window or slice, sorted by stamp, sensor, order of delivery.
+    """Columns of all sensors in one window or slice, sorted by stamp, sensor, order of delivery."""
 
-    index: number of the window from t_init, -1 for the one before (the head); start_ns, end_ns:
-    half open; complete: every sensor covers the window in time; ready_host_ns: receive time of the
-    packet that closed it. stamp_ns, sensor, ring_index, encoder: (n,) int64, as in `Columns`.
-    """
-
-    index: int
-    slice: int
-    start_ns: int
-    end_ns: int
-    complete: bool
-    ready_host_ns: int
-    stamp_ns: I64Array
-    sensor: I64Array
-    ring_index: I64Array
-    encoder: I64Array
+    index: int  # number of the window from t_init, -1 for the one before (the head)
+    slice: int  # within the window
+    start_ns: int  # inclusive
+    end_ns: int  # exclusive
+    complete: bool  # every sensor covers the window in time
+    ready_host_ns: int  # receive time of the packet that closed it
+    stamp_ns: I64Array  # (n,) common clock
+    sensor: I64Array  # (n,) index of the column's sensor
+    ring_index: I64Array  # (n,) as in `Columns`
+    encoder: I64Array  # (n,) as in `Columns`
 
 
 class Schedule:

@@ -32,8 +32,8 @@ def command_line(first: str = "") -> typer.Typer:
     return app
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_given: bool) -> None:
+    if is_given:
         typer.echo(f"mlbatch {mlbatch.__version__}")
         raise typer.Exit
 

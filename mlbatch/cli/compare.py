@@ -23,7 +23,7 @@ def compare(
     ] = None,
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Sensor metadata or calibration; repeatable. [default: beside]"),
+        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
     ] = None,
     clock: Annotated[
         str, typer.Option(help="sensor: timestamps of the packets; host: their receive times.")

@@ -76,7 +76,7 @@ def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
 
 def _iso_ns(text: str) -> int:
     text = text.replace("Z", "+00:00")
-    # Python 3.10 takes three or six decimals only.
+    # Python 3.10 accepts three or six decimals only.
     text = re.sub(r"\.(\d{1,6})(?!\d)", lambda found: f".{found[1]:0<6}", text)
     moment = datetime.datetime.fromisoformat(text)
     if moment.tzinfo is None:
@@ -104,7 +104,7 @@ def box_m(text: str) -> tuple[float, ...]:
     if not ordered:
         raise UsageError(
             f"--exclude-box: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
-            f"got {text!r}; write --exclude-box=-1,-1,0,1,1,2"
+            f"found {text!r}; write --exclude-box=-1,-1,0,1,1,2"
         )
     return values
 

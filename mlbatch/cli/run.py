@@ -139,7 +139,7 @@ def _converted(
     resume_log: ResumeLog | None,
     last: Last,
 ) -> tuple[Conversion, RunReport]:
-    """Run a job; errors that leave a resumable output say so."""
+    """Run a job; errors that leave a resumable output mention `--resume`."""
     try:
         return convert(job, open_output, progress, resume_log, last)
     except (ExportError, RecordingError) as err:

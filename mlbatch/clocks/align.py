@@ -35,17 +35,13 @@ _FAR = 2**62
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """Map of one segment: offsets to add at stamps (k,), ns, straight between them.
-
-    rate: slope beyond the stamps; least_ns, most_ns: limits of aligned stamps, so that segments
-    keep their order.
-    """
+    """Map of one segment: offsets to add at stamps (k,), ns, straight between them."""
 
     stamp_ns: I64Array
     offset_ns: I64Array
-    rate: float
-    least_ns: int
-    most_ns: int
+    rate: float  # slope beyond the stamps
+    least_ns: int  # lower limit of aligned stamps, so that segments keep their order
+    most_ns: int  # upper limit of aligned stamps
 
     def apply(self, stamp_ns: I64Array) -> I64Array:
         """Aligned stamps; exact, since only differences become floats."""
@@ -66,16 +62,12 @@ class _Piece:
 
 @dataclass(frozen=True, slots=True)
 class ClockMap:
-    """Map of a sensor's stamps onto another clock; it keeps their order.
+    """Map of a sensor's stamps onto another clock; it keeps their order."""
 
-    to: `host` or `first`; knots: of all segments; residual_p50_ns, residual_max_ns: distance of the
-    fastest packets from the map.
-    """
-
-    to: str
-    knots: int
-    residual_p50_ns: int
-    residual_max_ns: int
+    to: str  # `host` or `first`
+    knots: int  # number, in all segments
+    residual_p50_ns: int  # median distance of the fastest packets from the map
+    residual_max_ns: int  # largest distance of the fastest packets from the map
     segments: tuple[Segment, ...]
     _pieces: tuple[_Piece, ...]
 

@@ -47,17 +47,13 @@ Named: TypeAlias = tuple[str, ClockEstimate]
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Correction that makes the stamps of a sensor comparable with those of `reference`.
-
-    offset_ns: to add to the stamps; epoch: `tai` or `gps` if the clock counts that, else "";
-    error_ns: upper limit of the difference that remains.
-    """
+    """Correction that makes the stamps of a sensor comparable with those of `reference`."""
 
     sensor: str
     reference: str
-    offset_ns: int
-    epoch: str
-    error_ns: int
+    offset_ns: int  # to add to the stamps
+    epoch: str  # `tai` or `gps` if the clock counts that, else ""
+    error_ns: int  # upper limit of the difference that remains
 
     def rig_text(self) -> str:
         """The line for the sensor in a rig file."""
@@ -71,22 +67,17 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Difference of two clocks: how far that of `two` is ahead of that of `one`, ns.
-
-    low_ns, high_ns: smallest and largest while both were seen; uncertainty_ns: of both; whole: name
-    of a known difference, or ""; correction: of `two`, if a constant one is enough; why: reason for
-    the verdict.
-    """
+    """Difference of two clocks: how far that of `two` is ahead of that of `one`, ns."""
 
     one: str
     two: str
-    low_ns: int
-    high_ns: int
-    uncertainty_ns: int
-    whole: str
+    low_ns: int  # smallest difference while both were seen
+    high_ns: int  # largest difference while both were seen
+    uncertainty_ns: int  # sum of both
+    whole: str  # name of the known difference, or ""
     verdict: str
-    correction: Correction | None
-    why: str
+    correction: Correction | None  # of `two`, if a constant one is enough
+    why: str  # reason for the verdict
 
     @property
     def bound_ns(self) -> int:
@@ -112,16 +103,14 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Clocks of all sensors of a recording.
-
-    bound_ns: upper limit of the difference of any two stamps (after the corrections), None if
-    there is none; reference: the sensor that corrections refer to; estimates: by sensor, with jumps
-    that all sensors share as steps of the capture host's clock.
-    """
+    """Clocks of all sensors of a recording."""
 
     verdict: str
+    # Upper limit of the difference of any two stamps (after the corrections), None if there
+    # is none.
     bound_ns: int | None
-    reference: str
+    reference: str  # the sensor that corrections refer to
+    # By sensor, with jumps that all sensors share as steps of the capture host's clock.
     estimates: tuple[Named, ...]
     pairs: tuple[Pair, ...]
     corrections: tuple[Correction, ...]

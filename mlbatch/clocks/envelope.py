@@ -36,16 +36,12 @@ _WIDTH = 16
 
 @dataclass(frozen=True, slots=True)
 class BinTable:
-    """Bins of packets without a break: rows (bins, 16) int64, ns, in order of receive time.
-
-    per_bin: packets of a bin (the last one may have fewer); last: (stamp, receive time) of the last
-    packet.
-    """
+    """Bins of packets without a break: rows (bins, 16) int64, ns, in order of receive time."""
 
     rows: I64Array
-    per_bin: int
+    per_bin: int  # packets of a bin (the last one may have fewer)
     packets: int
-    last: tuple[int, int]
+    last: tuple[int, int]  # (stamp, receive time) of the last packet
 
     @property
     def first(self) -> tuple[int, int]:
@@ -166,7 +162,7 @@ def _largest(key: I64Array, starts: I64Array) -> I64Array:
 GROUP_NS = NS_PER_S // 4
 GROUP_PACKETS = 64
 MAX_GROUPS = 512
-# Points on each side among which a damaged stamp stands out, by at least this much.
+# Points on each side among which a damaged stamp is an outlier, by at least this much.
 _REACH = 16
 _OUTLIER_NS = NS_PER_MS
 _OUTLIER_SCALES = 10
@@ -174,16 +170,13 @@ _OUTLIER_SCALES = 10
 
 @dataclass(frozen=True, slots=True)
 class BinRange:
-    """Rows `begin` to `end` of a table: a clock that runs without a step.
-
-    first, last: (stamp, receive time) of its first and last packet, ns.
-    """
+    """Rows `begin` to `end` of a table: a clock that runs without a step."""
 
     table: BinTable
     begin: int
     end: int
-    first: tuple[int, int]
-    last: tuple[int, int]
+    first: tuple[int, int]  # (stamp, receive time) of its first packet, ns
+    last: tuple[int, int]  # (stamp, receive time) of its last packet, ns
 
     @property
     def packets(self) -> int:
@@ -260,19 +253,14 @@ _MEDIAN_ERROR = 1.25
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The envelope of a range: the offset at knots, straight between them, ns.
+    """The envelope of a range: the offset at knots, straight between them, ns."""
 
-    host_ns, offset_ns: (k,) int64, k >= 1; rate: overall change of the offset, ns per ns, also
-    beyond the knots; rate_error: three standard errors of it, infinite where there is no rate;
-    scatter_ns: robust standard deviation of the points; residual_ns: (n,) their absolute distances.
-    """
-
-    host_ns: I64Array
-    offset_ns: I64Array
-    rate: float
-    rate_error: float
-    scatter_ns: float
-    residual_ns: F64Array
+    host_ns: I64Array  # (k,) receive times of the knots, k >= 1
+    offset_ns: I64Array  # (k,) offsets at the knots
+    rate: float  # overall change of the offset, ns per ns, also beyond the knots
+    rate_error: float  # three standard errors of the rate, infinite where there is no rate
+    scatter_ns: float  # robust standard deviation of the points
+    residual_ns: F64Array  # (n,) absolute distances of the points from the envelope
 
     def at(self, host_ns: I64Array) -> I64Array:
         """The offset at receive times, ns."""

@@ -46,16 +46,12 @@ _PAUSE_PERIODS = 16
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A step between two ranges: stamp and receive time of the packets before and after it, ns.
-
-    size_ns: change of the offset; side: `sensor` if the stamps step, `host` if the receive times
-    do, "" if a pause hides it.
-    """
+    """A step between two ranges: stamp and receive time of the packets before and after it, ns."""
 
     before: tuple[int, int]
     after: tuple[int, int]
-    size_ns: int
-    side: str
+    size_ns: int  # change of the offset
+    side: str  # `sensor` if the stamps step, `host` if the receive times do, "" if a pause hides it
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +164,10 @@ def _level_changes(level: F64Array) -> F64Array:
 
 @dataclass(frozen=True, slots=True)
 class StepLocation:
-    """A step in the rows of a table, and the packets before and after it (stamp, receive time).
+    """A step in the rows of a table, and the packets before and after it (stamp, receive time)."""
 
-    end: of the rows before the step; start: of the rows after it.
-    """
-
-    end: int
-    start: int
+    end: int  # end of the rows before the step
+    start: int  # first row after it
     before: tuple[int, int]
     after: tuple[int, int]
 

@@ -44,21 +44,17 @@ _PPM = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """A step of a clock.
+    """A step of a clock."""
 
-    host_ns: receive time of the first packet after it; stamp_before_ns, stamp_after_ns: stamps of
-    the packets before and after it; size_ns: change of stamp minus receive time. kind: `forward`,
-    `backward`, `restart` or `wrap` of the sensor's clock; `host`: the capture host's clock stepped;
-    `delay`: the transport delay of this sensor alone changed (longer: negative). side: `sensor` or
-    `host`, what stepped between the two packets, "" after a pause.
-    """
-
-    host_ns: int
-    stamp_before_ns: int
-    stamp_after_ns: int
-    size_ns: int
+    host_ns: int  # receive time of the first packet after it
+    stamp_before_ns: int  # stamp of the packet before it
+    stamp_after_ns: int  # stamp of the packet after it
+    size_ns: int  # change of stamp minus receive time
+    # `forward`, `backward`, `restart` or `wrap` of the sensor's clock; `host`: the capture
+    # host's clock stepped; `delay`: the transport delay of this sensor alone changed (longer:
+    # negative).
     kind: str
-    side: str
+    side: str  # `sensor` or `host`, what stepped between the two packets, "" after a pause
 
     def describe(self) -> str:
         """The jump as text."""
@@ -91,32 +87,26 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """Estimate of a sensor's clock.
-
-    domain: utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest segment;
-    offset_ns: stamp minus receive time of the fastest packets in the middle of it (`at_host_ns`),
-    and its uncertainty; drift_ppm: rate of the sensor's clock relative to the capture host's, None
-    if the recording is too short; resolution_ns: greatest common divisor of all steps of stamps (0:
-    no step); jitter_p50_ns, jitter_p99_ns: delay of packets relative to the fastest; damaged:
-    packets whose stamp fits neither the one before nor the one after; unsteady: more than
-    MAX_SEGMENTS segments; mode: time source that the sensor reports.
-    """
+    """Estimate of a sensor's clock."""
 
     packets: int
-    damaged: int
-    domain: str
+    damaged: int  # packets whose stamp fits neither the one before nor the one after
+    domain: str  # utc, tai, gps, top_of_hour, uptime, wrong_year or unknown, of the longest segment
+    # Stamp minus receive time of the fastest packets in the middle of that segment.
     offset_ns: int
-    uncertainty_ns: int
-    at_host_ns: int
+    uncertainty_ns: int  # of the offset
+    at_host_ns: int  # receive time in the middle of that segment
+    # Rate of the sensor's clock relative to the capture host's, None if the recording is too
+    # short.
     drift_ppm: float | None
     drift_uncertainty_ppm: float | None
     jumps: tuple[Jump, ...]
-    resolution_ns: int
-    jitter_p50_ns: int
-    jitter_p99_ns: int
+    resolution_ns: int  # greatest common divisor of all steps of stamps (0: no step)
+    jitter_p50_ns: int  # median delay of packets relative to the fastest
+    jitter_p99_ns: int  # 99th percentile of it
     segments: tuple[Segment, ...]
-    unsteady: bool
-    mode: str = ""
+    unsteady: bool  # more than MAX_SEGMENTS segments
+    mode: str = ""  # time source that the sensor reports
 
     @property
     def sensor_jumps(self) -> tuple[Jump, ...]:

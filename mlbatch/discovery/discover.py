@@ -369,7 +369,7 @@ def _known(names: Sequence[str]) -> str:
 
 
 def _choose(found: Sequence[DetectedSensor], selection: SensorSelection) -> list[DetectedSensor]:
-    """Apply --only and --ignore; both take names and serial numbers."""
+    """Apply --only and --ignore; both accept names and serial numbers."""
     known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
     for option, words in (("--only", selection.only), ("--ignore", selection.ignore)):
         for word in words:

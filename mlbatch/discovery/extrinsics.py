@@ -225,24 +225,21 @@ def _places(
 
 @dataclass(slots=True)
 class _FramesFound:
-    """Frames of sensors under a body frame; reasons: why the other sensors have none."""
+    """Frames of sensors under a body frame."""
 
     body: str = ""
     frames: dict[str, Candidate] = field(default_factory=dict)
     poses: dict[str, Pose] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)  # why the other sensors have none
 
 
 @dataclass(frozen=True, slots=True)
 class _FrameFinder:
-    """Finds the frames of sensors in a tree.
-
-    candidates: by sensor; unused: by child frame, why an edge is missing in the tree.
-    """
+    """Finds the frames of sensors in a tree."""
 
     tree: FrameTree
-    candidates: Mapping[str, Sequence[Candidate]]
-    unused: Mapping[str, str]
+    candidates: Mapping[str, Sequence[Candidate]]  # by sensor
+    unused: Mapping[str, str]  # by child frame, why an edge is missing in the tree
 
     def best(self) -> _FramesFound:
         """Frames under base_link if it is above all of them, else under their common ancestor."""

@@ -56,10 +56,7 @@ _CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "calibration", "not_s
 
 @dataclass(frozen=True, slots=True)
 class StreamReport:
-    """One packet kind: origin, description, counts; times are receive times.
-
-    offset_ms: first timestamp minus its receive time; extrinsics: their source, or "".
-    """
+    """One packet kind: origin, description, counts; times are receive times."""
 
     stream: str
     what: str = ""
@@ -74,9 +71,9 @@ class StreamReport:
     first_host_ns: int = 0
     last_host_ns: int = 0
     timescale: str = ""
-    offset_ms: float | None = None
+    offset_ms: float | None = None  # first timestamp minus its receive time
     calibration: str = ""
-    extrinsics: str = ""
+    extrinsics: str = ""  # their source, or ""
     missing: str = ""
 
     def row(self) -> list[str]:
@@ -105,18 +102,15 @@ class StreamReport:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """All streams of the first 10 seconds of a session.
+    """All streams of the first 10 seconds of a session."""
 
-    streams: one for each packet kind; files: metadata of sensors that are files, by name of the
-    sensor; clocks: None without timestamps.
-    """
-
-    streams: tuple[StreamReport, ...]
+    streams: tuple[StreamReport, ...]  # one for each packet kind
     sensors: tuple[DetectedSensor, ...]
     body_frame: str = DEFAULT_BODY_FRAME
+    # Metadata of sensors that are files, by name of the sensor.
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    clocks: Comparison | None = None
+    clocks: Comparison | None = None  # None without timestamps
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""

@@ -41,10 +41,10 @@ class Matched:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A calibration that matches packets; number: its index."""
+    """A calibration that matches packets."""
 
     score: int
-    number: int
+    number: int  # index of the calibration
     lidar: Lidar
 
 
@@ -224,11 +224,11 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedSensor:
-    """A sensor of the rig, and calibrations it may have; options: of the command line."""
+    """A sensor of the rig, and calibrations it may have."""
 
     rig: RigSensor
     calibrations: Sequence[Calibration]
-    options: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, str] = field(default_factory=dict)  # of the command line
 
     @property
     def name(self) -> str:
@@ -246,7 +246,7 @@ class ExpectedSensor:
         return {**self.options, **self.rig.decode}
 
     def usable(self) -> list[Calibration]:
-        """Calibrations of its serial number; those that leave the model open take the rig's."""
+        """Calibrations of its serial number; those without a model get the rig's."""
         serial = self.selector.serial
         usable = [one for one in self.calibrations if not serial or one.serial in ("", serial)]
         model = self.rig.model
@@ -370,7 +370,7 @@ def _chosen(
 
 
 def describe(sampler: Sampler, kind: PacketKind) -> str | None:
-    """Description of the packets of a kind by their content; None if no vendor knows them."""
+    """Description of the packets of a kind by their content; None if no vendor recognises them."""
     evidence = sampler.evidence(kind)
     return sensors.describe(evidence.size, evidence.sample)
 

@@ -174,7 +174,7 @@ def read_given(path: Path) -> Calibration:
     if calibration is None:
         raise RigError(
             f"{path}: expected the metadata or calibration of a lidar, found another kind of file; "
-            "give the file that the sensor's driver or recorder saved"
+            "give the file that the sensor's driver or recording software saved"
         )
     return calibration
 

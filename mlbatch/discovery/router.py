@@ -28,10 +28,10 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Destination of the packets of a kind; sensors: indices of those that may have sent them."""
+    """Destination of the packets of a kind."""
 
     role: Role
-    sensors: tuple[int, ...] = ()
+    sensors: tuple[int, ...] = ()  # indices of those that may have sent them
 
 
 class Router:

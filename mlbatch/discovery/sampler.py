@@ -29,20 +29,15 @@ _WORD_BYTES = 4
 
 @dataclass(slots=True)
 class KindSamples:
-    """Samples and counts of one packet kind; times are receive times.
+    """Samples and counts of one packet kind; times are receive times."""
 
-    payloads, host_ns: of the packets that were kept; packets: count of all; first_words: of the
-    packets kept for their first word; keep_next: True after the first packet of a quarter of a
-    second.
-    """
-
-    payloads: list[bytes]
-    host_ns: list[int]
-    packets: int
+    payloads: list[bytes]  # of the kept packets
+    host_ns: list[int]  # of the kept packets, receive times
+    packets: int  # count, kept or not
     first_host_ns: int
     last_host_ns: int
-    first_words: set[int]
-    keep_next: bool = False
+    first_words: set[int]  # of the packets kept for their first word
+    keep_next: bool = False  # True after the first packet of a quarter of a second
 
     def arrays(self) -> tuple[U8Array, I64Array]:
         """Kept payloads (k, size) and their receive times (k,)."""
@@ -53,12 +48,10 @@ class KindSamples:
 
 @dataclass(slots=True)
 class Sampler:
-    """Keeps the first packets of every kind and some later ones, and counts them all.
-
-    kinds: samples of each kind, in receive order of their first packets.
-    """
+    """Keeps the first packets of every kind and some later ones, and counts them all."""
 
     table: StreamTable
+    # Samples of each kind, in receive order of their first packets.
     kinds: dict[PacketKind, KindSamples] = field(default_factory=dict)
     _kinds_of_ip: dict[str, list[PacketKind]] = field(default_factory=dict)
 

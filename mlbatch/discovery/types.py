@@ -34,16 +34,13 @@ class Note:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Extrinsics of a sensor.
+    """Extrinsics of a sensor."""
 
-    body_from_sensor: (4, 4) float64, m; source: rig, tf_static, tf, urdf, metadata or identity (of
-    a chain through several sources, the least trusted one); chain: frames from body to sensor, None
-    where the source gives the matrix.
-    """
-
-    body_from_sensor: F64Array
+    body_from_sensor: F64Array  # (4, 4) float64, m
+    # rig, tf_static, tf, urdf, metadata or identity; of a chain through several sources the least
+    # trusted one.
     source: str
-    chain: Chain | None = None
+    chain: Chain | None = None  # frames from body to sensor, None where the source gives the matrix
 
     @classmethod
     def identity(cls) -> Pose:
@@ -62,21 +59,17 @@ class Pose:
 
 @dataclass(slots=True, eq=False)
 class DetectedSensor:
-    """A sensor of a session: its decoder, its packets, its pose.
+    """A sensor of a session: its decoder, its packets, its pose."""
 
-    name: in all outputs; selector: streams it may send on; kinds: its lidar packets (later ones
-    join while packets are read); notes: texts of warnings; rig: entry in the rig file, None without
-    a rig; offset_ns: correction of its timestamps by the rig, added.
-    """
-
-    name: str
+    name: str  # in all outputs
     lidar: Lidar
-    selector: StreamSelector = field(default_factory=StreamSelector)
+    selector: StreamSelector = field(default_factory=StreamSelector)  # streams it may send on
+    # Its lidar packets (later ones join while packets are read).
     kinds: set[PacketKind] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # texts of warnings
     pose: Pose = field(default_factory=Pose.identity)
-    rig: RigSensor | None = None
-    offset_ns: int = 0
+    rig: RigSensor | None = None  # entry in the rig file, None without a rig
+    offset_ns: int = 0  # correction of its timestamps by the rig, added
 
     @property
     def streams(self) -> set[int]:

@@ -21,7 +21,7 @@ class SensorModel:
     """A row of `mlbatch sensors`: a supported model.
 
     returns: supported numbers of returns; clock, calibration: their sources; verified: how the
-    model was tested; same_packets_as: the model that is reported instead, if packets do not differ.
+    model was tested; same_packets_as: the model that is reported instead, as packets are equal.
     """
 
     name: str

@@ -35,11 +35,11 @@ Item = TypeVar("Item")
 
 @dataclass(slots=True)
 class Stages:
-    """Seconds spent in each stage; merge_s: all that makes windows, without reading."""
+    """Seconds spent in each stage."""
 
     read_s: float = 0.0
     decode_s: float = 0.0
-    merge_s: float = 0.0
+    merge_s: float = 0.0  # ingest and batching, with reading
     write_s: float = 0.0
     _started_s: tuple[float, float] = field(
         default_factory=lambda: (time.perf_counter(), time.process_time())
@@ -125,7 +125,7 @@ class Conversion:
         with contextlib.closing(self.session.packets()) as packets:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
-                ingested = self.session.ingest.columns(batch, self._oldest_places())
+                ingested = self.session.ingest.columns(batch, self._oldest_ring_indexes())
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -167,14 +167,15 @@ class Conversion:
                 yield scan, task.only
         self.close()
 
-    def _oldest_places(self) -> list[int | None]:
-        """First ring place of each sensor that is still needed, to be batched or decoded."""
+    def _oldest_ring_indexes(self) -> list[int | None]:
+        """First ring index of each sensor that is still needed, to be batched or decoded."""
         oldest = []
         for sensor in self.sensors:
-            places = [self.batcher.oldest_ring_index(sensor.index)]
+            ring_indexes = [self.batcher.oldest_ring_index(sensor.index)]
             if self._pool is not None:
-                places.append(self._pool.oldest_ring_index(sensor.index))
-            oldest.append(min((place for place in places if place is not None), default=None))
+                ring_indexes.append(self._pool.oldest_ring_index(sensor.index))
+            known = (index for index in ring_indexes if index is not None)
+            oldest.append(min(known, default=None))
         return oldest
 
     def _is_too_incomplete(self, window: Window) -> bool:

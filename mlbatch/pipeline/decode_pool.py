@@ -14,7 +14,7 @@ from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Scan
 
-# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_FATES`.
+# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_OUTCOMES`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
 # Gives a decoder of these sensors; with `--split` of one sensor, whose index is the second.
 NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
@@ -22,15 +22,12 @@ NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
 
 @dataclass(slots=True)
 class DecodeTask:
-    """Columns of one scan, to be decoded.
-
-    only: with `--split` the index of their sensor; outcomes: as in `Decoder.scan`.
-    """
+    """Columns of one scan, to be decoded."""
 
     columns: WindowColumns
     label: ScanHeader
-    only: int | None
-    outcomes: Outcomes | None
+    only: int | None  # with `--split` the index of their sensor
+    outcomes: Outcomes | None  # as in `Decoder.scan`
     is_decoded: bool = False
 
     @property
@@ -73,10 +70,10 @@ class DecodeWorker:
     def decode(self, task: DecodeTask) -> Decoded:
         """Decode a task; the arrays are valid as long as the decoder's buffers last."""
         decoder = self._decoders[task.only or 0]
-        before = [counts.fates for counts in decoder.counts]
+        before = [counts.outcomes for counts in decoder.counts]
         scan = decoder.scan(task.columns, task.label, task.outcomes)
         task.is_decoded = True
-        after = [counts.fates for counts in decoder.counts]
+        after = [counts.outcomes for counts in decoder.counts]
         outcomes = [
             [late - early for late, early in zip(now, was, strict=True)]
             for now, was in zip(after, before, strict=True)
@@ -157,7 +154,7 @@ class DecodePool:
         """Point counters of a sensor, over all workers."""
         total = PointCounts()
         for worker in self.workers:
-            total.add(worker.points[sensor].fates)
+            total.add(worker.points[sensor].outcomes)
         return total
 
 

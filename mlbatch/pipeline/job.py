@@ -1,4 +1,4 @@
-"""What to make of which recordings: the options of `mlbatch convert` as values."""
+"""Options of a conversion as values: recordings, sensors, windows, output."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_SLICES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What to make of which recordings: the options of a conversion."""
+    """Options of a conversion; names and defaults as in `mlbatch convert`."""
 
     recordings: tuple[Path, ...]
     selection: SensorSelection = field(default_factory=SensorSelection)

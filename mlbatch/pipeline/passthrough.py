@@ -38,7 +38,7 @@ TimeLimits = tuple[int | None, int | None]
 
 
 class Passthrough:
-    """What a run forwards beside its scans: IMU samples of lidars, messages of bags."""
+    """Data that a run forwards in addition to scans: IMU samples of lidars, messages of bags."""
 
     def __init__(self, sensors: Sequence[Sensor], job: Job) -> None:
         self.imu = ImuQueue(
@@ -206,7 +206,7 @@ class MessageQueue:
         self._patterns = list(patterns)
         self._encodings = encodings
         self._begin_ns = begin_ns
-        # A heap by timestamp, then file order: recordings hold messages in any order.
+        # A heap by timestamp, then file order: recordings contain messages in any order.
         self._waiting: list[tuple[int, int, Message]] = []
         self._added = 0
 

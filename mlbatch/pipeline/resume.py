@@ -51,7 +51,7 @@ _NOT_IDENTITY = frozenset(
 )
 _DIGITS = 12
 
-# Slots of a scan by outcome, one list a sensor; see `ledger.POINT_FATES`.
+# Slots of a scan by outcome, one list a sensor; see `ledger.POINT_OUTCOMES`.
 Row: TypeAlias = list[list[int]]
 Line: TypeAlias = dict[str, object]
 
@@ -61,15 +61,11 @@ Line: TypeAlias = dict[str, object]
 
 @dataclass(frozen=True, slots=True)
 class EarlierRun:
-    """What an earlier run to the same output left.
+    """Remains of an earlier run to the same output."""
 
-    state: None if there is nothing to resume; is_complete: the output exists, without a `.partial`;
-    was_published: it is complete, and the run was killed before it removed its state file.
-    """
-
-    state: State | None
-    is_complete: bool
-    was_published: bool
+    state: State | None  # None if there is nothing to resume
+    is_complete: bool  # the output exists, without a `.partial`
+    was_published: bool  # it is complete, and the run was killed before it removed its state file
 
 
 def find(target: Path) -> EarlierRun:
@@ -216,18 +212,13 @@ class ResumeLog:
 
 @dataclass(slots=True)
 class State:
-    """Content of a state file.
+    """Content of a state file."""
 
-    identity: of the job, see `job_identity` and `input_identity`; segment: of the session; rows: of
-    the scans that are safe; kept_bytes: of the output's file with these scans; length: bytes of the
-    lines that count.
-    """
-
-    identity: dict[str, str]
-    segment: str
-    rows: list[Row] = field(default_factory=list)
-    kept_bytes: int = 0
-    length: int = 0
+    identity: dict[str, str]  # of job and inputs: see `job_identity` and `input_identity`
+    segment: str  # of the session, as text
+    rows: list[Row] = field(default_factory=list)  # one for each safe scan
+    kept_bytes: int = 0  # of the output's file, with these scans
+    length: int = 0  # bytes of the valid lines
 
 
 def state_path(target: Path) -> Path:

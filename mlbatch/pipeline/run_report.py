@@ -103,14 +103,16 @@ def final_notes(run: Conversion) -> list[Note]:
             reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
             text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
             notes.append(Note("rejected", sensor.name, text))
-        decoded, late = sensor.ledger.columns.decoded, sensor.ledger.columns.dropped.get("late", 0)
+        decoded = sensor.ledger.columns.decoded
+        late = sensor.ledger.columns.dropped.get("late", 0)
         if late > MANY * decoded:
             text = (
                 f"{sensor.name}: {late} of {decoded} columns were late, after a timestamp in the "
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
-    table, seen = run.session.setup.sampler.table, run.session.setup.sampler.kinds
+    table = run.session.setup.sampler.table
+    seen = run.session.setup.sampler.kinds
     for kind in sorted(run.session.ingest.samples):
         what = _what(run, kind)
         # A rig lists the sensors to use; others need no warning.
@@ -132,7 +134,7 @@ def message_notes(run: Conversion) -> list[Note]:
     notes = []
     for topic, counts in run.passthrough.messages.counts.items():
         if run.passthrough.messages.has_place and (other := counts.dropped.get("no_place")):
-            text = f"{topic}: {other} message(s) dropped: the output cannot hold its ROS version"
+            text = f"{topic}: {other} message(s) dropped: the output cannot store its ROS version"
             notes.append(Note("other_ros", "", text))
         if other := counts.dropped.get("other_clock"):
             text = (
@@ -238,7 +240,8 @@ def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
 
 
 def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
-    setup, rows = run.session.setup, []
+    setup = run.session.setup
+    rows = []
     streams = setup.sampler.table.streams
     # Not by stream number, which depends on the order of reading.
     by_name = sorted(

@@ -61,7 +61,7 @@ class ScanTask:
         self._timed(self._job.pack)
 
     def append(self) -> None:
-        """Count the scan, write what precedes it, take its place in the output. In order."""
+        """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
             self._run.account(self._decoded.scan)
         for item in self._before:

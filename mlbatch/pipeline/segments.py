@@ -49,7 +49,8 @@ class ClippedRecording(WrappedRecording):
             batches.close()
 
     def _inside(self, batch: PacketBatch) -> BoolArray:
-        low, high = self.segment.begin_ns, self.segment.end_ns
+        low = self.segment.begin_ns
+        high = self.segment.end_ns
         inside = np.ones(len(batch), np.bool_)
         if low is not None:
             inside &= batch.host_ns >= low
@@ -61,7 +62,8 @@ class ClippedRecording(WrappedRecording):
         return tuple(message for message in batch.messages if self._is_due(message))
 
     def _is_due(self, message: Message) -> bool:
-        low, high = self.segment.begin_ns, self.segment.end_ns
+        low = self.segment.begin_ns
+        high = self.segment.end_ns
         if high is not None and message.host_ns >= high:
             return False
         return low is None or message.host_ns >= low or is_metadata(message.topic)

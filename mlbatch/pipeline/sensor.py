@@ -22,18 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class SensorClock:
-    """How the timestamps of a sensor become timestamps of the common clock.
+    """How the timestamps of a sensor become timestamps of the common clock."""
 
-    by_host: receive times replace the sensor's timestamps; offset_ns: the rig's correction, added
-    to the sensor's timestamps; has_receive_times: False where packets share the log time of a
-    message; watch: measures timestamp minus receive time; map: of `--align-clocks`, once fitted.
-    """
-
-    by_host: bool
-    offset_ns: int
-    has_receive_times: bool
-    watch: ClockWatch
-    map: ClockMap | None = None
+    by_host: bool  # receive times replace the sensor's timestamps
+    offset_ns: int  # the rig's correction, added to the sensor's timestamps
+    has_receive_times: bool  # False where packets share the log time of a message
+    watch: ClockWatch  # measures timestamp minus receive time
+    map: ClockMap | None = None  # of `--align-clocks`, once fitted
 
     @property
     def source(self) -> str:
@@ -61,20 +56,15 @@ class Limits:
 
 @dataclass(slots=True)
 class Sensor:
-    """A lidar of this run: how it is read, where it sits, its clock, its packets and counters.
+    """A lidar of this run: its decoder, pose, clock, packets and counters."""
 
-    index: `lidar_id` in outputs; detected: what discovery knows of it; ring_base: first ring
-    number of its channels; columns_per_s: nominal rate, None if unknown; ring: raw packets until
-    their window closes.
-    """
-
-    index: int
-    detected: DetectedSensor
+    index: int  # `lidar_id` in outputs
+    detected: DetectedSensor  # result of discovery
     clock: SensorClock
     limits: Limits
-    ring_base: int
-    columns_per_s: float | None
-    ring: PacketRing
+    ring_base: int  # first ring number of its channels
+    columns_per_s: float | None  # nominal rate, None if unknown
+    ring: PacketRing  # raw packets until their window closes
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property

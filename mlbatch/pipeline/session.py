@@ -70,7 +70,9 @@ class Session:
 
     def _sensor(self, found: DetectedSensor) -> Sensor:
         """The next sensor, with an empty ring and ledger."""
-        job, rig, lidar = self.job, found.rig, found.lidar
+        job = self.job
+        rig = found.rig
+        lidar = found.lidar
         sampler = self.setup.sampler
         ring_base = 0
         if self.sensors:
@@ -127,7 +129,7 @@ class Session:
     def begin_ns(self) -> int | None:
         """Receive time of the first packet of any sensor, among those sampled by discovery.
 
-        Not of the first packet read: bags hold many in a message, sensor by sensor.
+        Not of the first packet read: bags store many in a message, sensor by sensor.
         """
         firsts_ns = map(self.setup.sampler.first_host_ns, self.setup.sensors)
         return min((first_ns for first_ns in firsts_ns if first_ns is not None), default=None)

@@ -24,7 +24,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.readers.byte_records import SLACK
 
 BUFFER_BYTES = 4 << 20
-# No recorder makes larger chunks or messages: rosbag2 has 0.75 to 4 MB, others less than 100 MB.
+# Chunks and messages are smaller in practice: 0.75 to 4 MB in rosbag2, else less than 100 MB.
 MAX_RECORD_BYTES = 1 << 28
 HEAD_BYTES = 64
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -14,26 +14,29 @@ CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost"
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 # `incomplete`: of windows left out by --drop-incomplete.
 COLUMN_REASONS = (
-    *("before_start", "late", "tail", "head", "invalid", "outside_time", "incomplete"),
+    "before_start",
+    "late",
+    "tail",
+    "head",
+    "invalid",
+    "outside_time",
+    "incomplete",
 )
 # `no_place`: the output format cannot store them.
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
-# What becomes of a slot of a written column.
-POINT_FATES = ("no_return", "range", "box", "repeated", "written")
+# Outcomes of a slot of a written column.
+POINT_OUTCOMES = ("no_return", "range", "box", "repeated", "written")
 
 
 @dataclass(slots=True)
 class PacketCounts:
-    """Lidar packets of a sensor: read = accepted + sum(rejected).
-
-    lost: gaps in the sequence; reordered: packets received after a later one.
-    """
+    """Lidar packets of a sensor: read = accepted + sum(rejected)."""
 
     read: int = 0
     accepted: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
-    lost: int = 0
-    reordered: int = 0
+    lost: int = 0  # gaps in the sequence
+    reordered: int = 0  # packets received after a later one
 
     def reject(self, reason: str, count: int = 1) -> None:
         """Count rejected packets."""
@@ -65,15 +68,15 @@ class PointCounts:
     written: int = 0
 
     @property
-    def fates(self) -> list[int]:
-        """What became of the slots, in the order of POINT_FATES."""
+    def outcomes(self) -> list[int]:
+        """Slots by outcome, in the order of POINT_OUTCOMES."""
         return [self.no_return, self.range, self.box, self.repeated, self.written]
 
-    def add(self, fates: Sequence[int]) -> None:
-        """Count slots by their fates, in the order of POINT_FATES."""
-        self.slots += sum(fates)
-        for fate, count in zip(POINT_FATES, fates, strict=True):
-            setattr(self, fate, getattr(self, fate) + count)
+    def add(self, outcomes: Sequence[int]) -> None:
+        """Count slots by outcome, in the order of POINT_OUTCOMES."""
+        self.slots += sum(outcomes)
+        for name, count in zip(POINT_OUTCOMES, outcomes, strict=True):
+            setattr(self, name, getattr(self, name) + count)
 
 
 @dataclass(slots=True)
@@ -88,12 +91,14 @@ class SensorLedger:
 
     def check(self) -> list[str]:
         """Counters that do not balance, a line each; empty if all do."""
-        packets, columns, points = self.packets, self.columns, self.points
+        packets = self.packets
+        columns = self.columns
+        points = self.points
         samples = self.imu_samples
         return [
             *_balance("packets", packets.read, (packets.accepted, *packets.rejected.values())),
             *_balance("columns", columns.decoded, (columns.written, *columns.dropped.values())),
-            *_balance("points", points.slots, tuple(points.fates)),
+            *_balance("points", points.slots, tuple(points.outcomes)),
             *_balance("IMU samples", samples.decoded, (samples.written, *samples.dropped.values())),
             *_unknown("packets", packets.rejected, PACKET_REASONS),
             *_unknown("columns", columns.dropped, COLUMN_REASONS),
@@ -103,17 +108,17 @@ class SensorLedger:
 
 def check_capture(counts: CaptureCounts) -> list[str]:
     """Counters of a reader that do not balance, a line each."""
-    fates = (counts.datagrams, *counts.skipped.values())
+    parts = (counts.datagrams, *counts.skipped.values())
     return [
-        *_balance("frames", counts.frames, fates),
+        *_balance("frames", counts.frames, parts),
         *_unknown("frames", counts.skipped, CAPTURE_REASONS),
     ]
 
 
 def check_datagrams(datagrams: int, sensors: Sequence[SensorLedger], unassigned: int) -> list[str]:
     """Imbalance between recordings and sensors, as a line."""
-    fates = [(one.packets.read, one.imu_packets) for one in sensors]
-    return _balance("datagrams", datagrams, (*itertools.chain(*fates), unassigned))
+    parts = [(one.packets.read, one.imu_packets) for one in sensors]
+    return _balance("datagrams", datagrams, (*itertools.chain(*parts), unassigned))
 
 
 def check_messages(topic: str, read: int, written: int, dropped: dict[str, int]) -> list[str]:
@@ -132,10 +137,10 @@ def _add(counts: dict[str, int], reason: str, count: int) -> None:
         counts[reason] = counts.get(reason, 0) + count
 
 
-def _balance(what: str, total: int, fates: tuple[int, ...]) -> list[str]:
-    if total == sum(fates):
+def _balance(what: str, total: int, parts: tuple[int, ...]) -> list[str]:
+    if total == sum(parts):
         return []
-    return [f"{what}: expected {total} accounted for, found {' + '.join(map(str, fates))}"]
+    return [f"{what}: expected {total} accounted for, found {' + '.join(map(str, parts))}"]
 
 
 def _unknown(what: str, counts: dict[str, int], reasons: tuple[str, ...]) -> list[str]:

@@ -42,11 +42,11 @@ class InputReport:
 
 @dataclass(frozen=True, slots=True)
 class Unassigned:
-    """A stream of no sensor; what: description of its packets."""
+    """A stream of no sensor."""
 
     stream: str
     packets: int
-    what: str
+    what: str  # description of its packets
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True)
 class SensorReport:
-    """One sensor; calibration: file name without folder."""
+    """One sensor."""
 
     name: str
     model: str
@@ -73,12 +73,12 @@ class SensorReport:
     clock: ClockReport
     extrinsics_source: str
     body_from_sensor: F64Array
-    calibration: str
+    calibration: str  # file name without folder
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Costs of a run; recorded_s: length of the recording; engine: numpy or numba."""
+    """Costs of a run."""
 
     wall_s: float
     cpu_s: float
@@ -86,10 +86,10 @@ class Timing:
     decode_s: float
     merge_s: float
     write_s: float
-    recorded_s: float
+    recorded_s: float  # length of the recording
     points_per_s: float
     peak_rss_mb: float
-    engine: str
+    engine: str  # numpy or numba
 
     @property
     def realtime_factor(self) -> float:
@@ -117,24 +117,21 @@ class FaultReport:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """A warning; sensor: "" if it concerns the run."""
+    """A warning."""
 
     code: str
-    sensor: str
+    sensor: str  # "" if it concerns the run
     message: str
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Content of a report; t_init_ns: None if no window was reached.
-
-    repeated: datagrams that injected faults duplicated, less those they removed.
-    """
+    """Content of a report."""
 
     inputs: tuple[InputReport, ...]
     timescale: str
     rate_hz: str
-    t_init_ns: int | None
+    t_init_ns: int | None  # None: no window was reached
     slices: int
     capture: CaptureCounts
     sensors: tuple[SensorReport, ...]
@@ -144,7 +141,7 @@ class RunReport:
     warnings: tuple[Warned, ...] = ()
     messages: tuple[ForwardedMessages, ...] = ()
     faults: tuple[FaultReport, ...] = ()
-    repeated: int = 0
+    repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
 
 
 def build_report(run: RunReport) -> Section:
@@ -243,7 +240,8 @@ def _timing(timing: Timing) -> Section:
 
 
 def _sensor(sensor: SensorReport) -> Section:
-    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    packets = sensor.ledger.packets
+    columns = sensor.ledger.columns
     return {
         "name": sensor.name,
         "model": sensor.model,
@@ -279,7 +277,8 @@ def _sensor(sensor: SensorReport) -> Section:
 
 
 def _summary_row(sensor: SensorReport) -> tuple[str, ...]:
-    packets, columns = sensor.ledger.packets, sensor.ledger.columns
+    packets = sensor.ledger.packets
+    columns = sensor.ledger.columns
     counts = (
         packets.read,
         packets.lost,

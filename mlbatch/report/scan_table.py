@@ -57,13 +57,15 @@ class ScanTable:
         self._last: tuple[int, int] | None = None
         self._spans_ns = array("q")
         self._periods_ns = array("d")
-        self._written = self._incomplete = self._points = 0
+        self._written = 0
+        self._incomplete = 0
+        self._points = 0
         names = [sensor.name for sensor in info.sensors]
         start = ["index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns"]
         counts = ["points", "columns", *(f"columns_{name}" for name in names), "complete"]
         gaps = (f"max_gap_ns_{name}" for name in names)
-        turns = (f"{word}_{name}" for word in ("coverage", "overlap", "missing") for name in names)
-        self._append([*start, *counts, *gaps, *turns, "ready_host_ns"])
+        shares = (f"{word}_{name}" for word in ("coverage", "overlap", "missing") for name in names)
+        self._append([*start, *counts, *gaps, *shares, "ready_host_ns"])
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
     def add(self, scan: Scan) -> None:
@@ -107,9 +109,10 @@ class ScanTable:
         )
 
     def _close_row(self) -> None:
-        row, self._open = self._open, None
+        row = self._open
         if row is None:
             return
+        self._open = None
         self._append([*row.cells(), *self._missing(row), row.ready_host_ns])
         self._written += 1
         self._incomplete += not row.complete

@@ -258,7 +258,7 @@ def _rosbags_definition(name: str) -> str:
 
 # -- quality of service ---------------------------------------------------------------------------
 
-# Words that recorders from Jazzy on write; the index is the number (rmw/types.h).
+# Words that ROS 2 Jazzy and later write; the index is the number (rmw/types.h).
 _QOS_WORDS = {
     "history": ("system_default", "keep_last", "keep_all", "unknown"),
     "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),

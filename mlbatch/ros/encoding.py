@@ -34,7 +34,7 @@ class MessageError(RecordingError):
 
 
 class EncapsulationError(MessageError):
-    """A message in a kind of CDR that no recorder of ROS 2 writes."""
+    """A message in a kind of CDR that ROS 2 does not write."""
 
 
 # -- reading --------------------------------------------------------------------------------------

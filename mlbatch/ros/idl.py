@@ -63,10 +63,13 @@ def _member(words: list[str], scope: list[str], aliases: dict[str, Field]) -> Fi
     """A field (or typedef) from its words: type, name and perhaps [count]."""
     count: int | None = None
     if words[-1] == "]" and len(words) > 4 and words[-2].isdecimal():
-        words, count = words[:-3], int(words[-2][:_MOST_DIGITS])
-    name, kind = words[-1], words[:-1]
+        count = int(words[-2][:_MOST_DIGITS])
+        words = words[:-3]
+    name = words[-1]
+    kind = words[:-1]
     if kind[:2] == ["sequence", "<"]:
-        kind, count = kind[2:-1], SEQUENCE
+        kind = kind[2:-1]
+        count = SEQUENCE
         kind = kind[: kind.index(",")] if "," in kind else kind
     kind = kind[: kind.index("<")] if "<" in kind else kind
     text = " ".join(kind)

@@ -171,7 +171,7 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
 def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:
     """Points by stamp, then ring, then message order: their order, and which begin a new stamp.
 
-    The stamps lie within seconds, so that a ring fits below them in 64 bits.
+    The stamps are within seconds, so that a ring fits below them in 64 bits.
     """
     key = (points.stamp_ns - points.stamp_ns.min()) << 16
     if points.ring is not None:

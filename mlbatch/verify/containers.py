@@ -31,12 +31,14 @@ def check_unpacked_size(size: int, stored: int) -> None:
 class Message:
     """A message in a file."""
 
+    # File, topic and number in it.
     where: str
     topic: str
     # package/Type
     type: str
     # cdr or ros1
     encoding: str
+    # Log time, and publish time where the container has one.
     log_ns: int
     publish_ns: int
     data: bytes | memoryview

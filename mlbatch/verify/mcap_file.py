@@ -64,7 +64,9 @@ class _Place:
     """Where a record is in the file."""
 
     opcode: int
+    # Offset of the record in the file, with its head.
     at: int
+    # Bytes with the head.
     size: int
 
 
@@ -74,15 +76,21 @@ class _ChunkFound:
 
     place: _Place
     compression: str
+    # Bytes in the file.
     stored_size: int
     # Uncompressed.
     size: int = 0
     # False where the chunk is damaged: its messages are not known.
     whole: bool = False
+    # (log time, offset) of the messages found, by channel.
     messages: Index = field(default_factory=dict)
+    # The same as the message indexes have it.
     indexed: Index = field(default_factory=dict)
+    # Offset of the message index of each channel.
     index_at: dict[int, int] = field(default_factory=dict)
+    # Of all message indexes.
     index_bytes: int = 0
+    # First and last log time.
     first_ns: int | None = None
     last_ns: int = 0
 

@@ -97,10 +97,12 @@ class BagFile:
         if index_at != first_index_at:
             raise DamageError(f"an index at byte {first_index_at}", f"byte {index_at}")
         found = (kinds[RecordType.CONNECTION], len(indexed))
+        # The library reads as many records as the counts say, and nothing after them.
         if counts != found:
             raise DamageError(
                 f"{counts[0]} connections, {counts[1]} chunks in the index", f"{found}"
             )
+        self._log.ok("container")
         # The library follows these positions without a check.
         if indexed != list(chunks):
             raise DamageError(f"chunks at {list(chunks)} in the index", f"{indexed}")
@@ -120,6 +122,9 @@ class BagFile:
             for connection in reader.connections
         }
         seen: set[int] = set()
+        # Position, first and last log time, message counts of each chunk: found, and by the index.
+        infos: list[tuple[int, int, int, dict[int, int]]] = []
+        indexed_infos: list[tuple[int, int, int, dict[int, int]]] = []
         for info in reader.chunk_infos:
             chunk = chunks[info.pos]
             where = f"{self._where} chunk at byte {info.pos}"
@@ -142,10 +147,13 @@ class BagFile:
             log.equal("container", name, found, index)
             times_ns = [time_ns for entries in found.values() for time_ns, _ in entries]
             counts = {number: len(entries) for number, entries in found.items()}
+            first_ns = min(times_ns, default=2**63 - 1)
+            infos.append((info.pos, first_ns, max(times_ns, default=-1), counts))
             # The library adds 1 to the end.
-            expected = (min(times_ns, default=2**63 - 1), max(times_ns, default=-1) + 1, counts)
-            said = (info.start_time, info.end_time, dict(info.connection_counts))
-            log.equal("container", f"{where} in the index", expected, said)
+            last_ns = info.end_time - 1
+            indexed_counts = dict(info.connection_counts)
+            indexed_infos.append((info.pos, info.start_time, last_ns, indexed_counts))
+        log.equal("container", f"{self._where} chunks in the index", infos, indexed_infos)
         log.equal("container", f"{self._where} connections in the index", set(topics), seen)
 
     def _in_chunk(

@@ -24,7 +24,9 @@ class StoredScan:
     # The only sensor of the scan (`--split`).
     sensor: int | None = None
     end_ns: int | None = None
+    # Of the scan, as in its name.
     index: int | None = None
+    # Of a window (`--slices`).
     slice: int | None = None
     complete: bool | None = None
     intensity: F32Array | None = None
@@ -35,13 +37,16 @@ class StoredScan:
     angles_rad: tuple[F32Array, F32Array] | None = None
     # After `start_ns`; error up to `time_step_ns`.
     time_ns: I64Array | None = None
+    # Resolution of `time_ns`.
     time_step_ns: int = 0
     ring: U16Array | I64Array | None = None
     return_type: U8Array | None = None
     lidar_id: U8Array | None = None
+    # Column of each point.
     column: U32Array | None = None
     # (n,)
     column_stamp_ns: I64Array | None = None
+    # (n,)
     column_lidar_id: U8Array | None = None
 
     @property

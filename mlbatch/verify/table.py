@@ -29,18 +29,22 @@ _LATE_NS = 2**62
 class Table:
     """Rows of scans.csv, (n,) int64 each; (n, s) by sensor."""
 
+    # Name of the file.
     where: str
+    # Names, from the head line.
     sensors: tuple[str, ...]
     index: I64Array
     slice: I64Array
     start_ns: I64Array
     end_ns: I64Array
+    # Timestamp of the first column, and of the last.
     first_ns: I64Array
     last_ns: I64Array
     points: I64Array
     columns: I64Array
     # (n, s)
     columns_of: I64Array
+    # (n, s): longest time without a column.
     gap_ns: I64Array
     # (n,) bool
     complete: BoolArray

@@ -75,6 +75,7 @@ class Check:
     name: str
     # Number of values that were checked.
     checked: int
+    # Their number, also of those that are not kept.
     violations: int
     # Reason why nothing, or only a part, is checkable in this output.
     limit: str
@@ -92,6 +93,7 @@ class Verdict:
     """The result for one output."""
 
     path: str
+    # As in `convert --format`.
     format: str
     scans: int
     points: int

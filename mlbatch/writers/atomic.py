@@ -24,7 +24,7 @@ SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
 _SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(\w+)")
-# The same for a ROS 2 bag. Recorders write such files as well: a scans.csv marks our own.
+# The same for a ROS 2 bag. Other programs write such files too: scans.csv marks an own output.
 _OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')

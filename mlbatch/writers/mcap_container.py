@@ -183,7 +183,7 @@ class McapContainer:
         is_ros1 = topic.encoding == "ros1"
         text = topic.definition
         if not text and not is_ros1 and is_known(topic.type):
-            # Older recorders store no definitions.
+            # Bags of ROS 2 Humble and older contain no definitions.
             text = definition(topic.type)
         encoding = topic.format or ("ros1msg" if is_ros1 else "ros2msg")
         name = _ros2_name(topic.type) if encoding.startswith("ros2") else topic.type

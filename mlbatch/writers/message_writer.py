@@ -410,6 +410,6 @@ def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:
     )
     row = product[int(np.argmax(np.diagonal(product)))]
     x, y, z, w = (row / np.sqrt((row * row).sum())).tolist()
-    # Adding 0.0 turns -0.0 into 0.0, so that equal poses give equal bytes.
+    # Adding 0.0 changes -0.0 to 0.0, so that equal poses give equal bytes.
     sign = -1.0 if w < 0 else 1.0
     return sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0

@@ -145,7 +145,7 @@ def open_buffered(path: Path, kept_bytes: int | None) -> BinaryIO:
 
 
 class _KeptFile:
-    """Drops the first `kept_bytes` that are written; `tell` counts them."""
+    """Drops the first `kept_bytes` that are written; positions include them."""
 
     def __init__(self, path: Path, kept_bytes: int) -> None:
         self._path = path

@@ -178,7 +178,7 @@ def test_a_single_step_back_is_rejected() -> None:
 
 
 def test_invalid_columns_are_no_stamps() -> None:
-    """The stamp of a masked column neither holds a packet nor counts as newest."""
+    """The stamp of a masked column neither delays a packet nor counts as newest."""
     intake = Intake("left")
     arrival = _arrival([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
     accepted = intake.accept(arrival)

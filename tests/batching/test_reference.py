@@ -225,7 +225,7 @@ def test_confirmation_reaches_one_second_from_the_held_stamp() -> None:
     inside = batched([packet(0, 50), packet(0, 9_000), packet(0, 10_000)], TEN_HZ)
     assert inside.rejected == [{}]
     outside = batched([packet(0, 50), packet(0, 9_000), packet(0, 10_001)], TEN_HZ)
-    # The first is disproved, the second then held to the end.
+    # The first is rejected, the second then held to the end.
     assert outside.rejected == [{"bad_stamp": 2}]
 
 

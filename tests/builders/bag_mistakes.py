@@ -1,4 +1,4 @@
-"""Mistakes with bags and the line that answers each; their files: `test_cli_bag_mistakes.py`."""
+"""Mistakes with bags and the error line of each; their files: `cli/test_bag_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "clouds.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
         "the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
-        "read; the first: wanted a message of little-endian CDR (00 01 00 00), got 00 00 00 00; "
-        "convert the recording to that encoding)",
+        "read; the first: expected a message of little-endian CDR (00 01 00 00), found 00 00 00 "
+        "00; convert the recording to that encoding)",
     ),
     "clouds without times": (
         "timeless.db3",
@@ -19,8 +19,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "timeless.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
         "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
         "the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
-        "read; the first: wanted the time of each point in a field t, time, timestamp, "
-        "time_stamp, timestamps, offset_time or ts, got x, y, z; record the raw packets, or "
+        "read; the first: expected the time of each point in a field t, time, timestamp, "
+        "time_stamp, timestamps, offset_time or ts, found x, y, z; record the raw packets, or "
         "clouds with times)",
     ),
     "one of two lidars": (
@@ -92,8 +92,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "head.mcap: no lidar packets; expected raw UDP packets of a supported lidar (see `mlbatch "
         "sensors`), found no UDP packet at all; check that the recording contains the sensor's "
-        "data port (head.mcap: byte 20: the file ends within a record: wanted its footer; the rest "
-        "was read)",
+        "data port (head.mcap: byte 20: the file ends within a record: expected its footer; the "
+        "rest was read)",
     ),
     "cut ROS 1 bag": (
         "head.bag",
@@ -113,24 +113,26 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "output inside": (
         "bag -o bag/scans",
         1,
-        "bag/scans: wanted an output outside the recordings, got one inside bag; choose "
+        "bag/scans: expected an output outside the recordings, found one inside bag; choose "
         "another folder",
     ),
     "output inside a file name": (
         "bag -o bag/scans.mcap",
         1,
-        "bag/scans.mcap: wanted an output outside the recordings, got one inside bag; choose "
+        "bag/scans.mcap: expected an output outside the recordings, found one inside bag; choose "
         "another folder",
     ),
     "output over the bag": (
         "bag -o bag --overwrite",
         1,
-        "bag: wanted an output besides the recordings, got one of them; choose another name",
+        "bag: expected an output that is no recording, found one of the inputs; choose another "
+        "name",
     ),
     "output over the file": (
         "drive.mcap -o drive.mcap --overwrite",
         1,
-        "drive.mcap: wanted an output besides the recordings, got one of them; choose another name",
+        "drive.mcap: expected an output that is no recording, found one of the inputs; choose "
+        "another name",
     ),
     "strange metadata": (
         "stranger.db3",
@@ -157,7 +159,7 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown topic to pass": (
         "drive.mcap --pass /imu/dat -o scans.mcap",
         2,
-        "--pass /imu/dat: wanted a topic of the recording, got none that matches; see "
+        "--pass /imu/dat: expected a topic of the recording, found none that matches; see "
         "`mlbatch inspect`",
     ),
     "existing folder": (

@@ -1,4 +1,4 @@
-"""Mistakes of users and the line that answers each; their files: `test_cli_mistakes.py`."""
+"""Mistakes of users and the error line of each; their files: `cli/test_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ NO_LIDAR = (
 )
 DATA_PORT = "; check that the recording contains the sensor's data port"
 
-# (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} stands
-# for words of the parser, which differ between its versions, and for lists that grow.
+# (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} matches
+# words of the parser, which differ between its versions, and lists that grow.
 MISTAKES: dict[str, tuple[str, int, str]] = {
     "nothing at all": ("-o out", 2, "Missing argument {*}; see `mlbatch --help`"),
     "misspelt option": (
@@ -51,7 +51,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "no output": (
         f"{FIX} --quiet",
         2,
-        "-o: wanted an output, got none; give -o scans.mcap, or --dry-run",
+        "-o: expected an output, found none; give -o scans.mcap, or --dry-run",
     ),
     "file name for a folder": (
         f"{FIX} -o out.npz",
@@ -102,55 +102,54 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "output over a rig": (
         "fix/two_lidars.pcap --rig fix/rig.yaml -o fix/rig.yaml --format mcap --overwrite",
         1,
-        "fix/rig.yaml: wanted an output that leaves fix/rig.yaml as it is, got one that writes "
-        "there; choose another name",
+        "fix/rig.yaml: expected an output that does not overwrite fix/rig.yaml, found one that "
+        "does; choose another name",
     ),
     "report over the growing output": (
         f"{FIX} -o out.mcap --report out.mcap.partial",
         1,
-        "out.mcap.partial: wanted a report besides the files of the output, got the place of one; "
-        "choose another name for the report",
+        "out.mcap.partial: expected a report that is no file of the output, found one; choose "
+        "another name for the report",
     ),
     "report over a scan": (
         f"{FIX} -o out --report out/000000.npz",
         1,
-        "out/000000.npz: wanted a report besides the files of the output, got the place of one; "
-        "choose another name for the report",
+        "out/000000.npz: expected a report that is no file of the output, found one; choose "
+        "another name for the report",
     ),
     "report in a folder that a dry run does not make": (
         f"{FIX} -o out --dry-run --report out/r.json",
         1,
-        "out/r.json: wanted a report in an existing folder, got out, which is none; create it "
-        "(mkdir -p) or choose another",
+        "out/r.json: expected a report in an existing folder, found none at out; create it (mkdir "
+        "-p) or choose another",
     ),
     "report folder missing": (
         f"{FIX} --report none/r.json",
         1,
-        "none/r.json: wanted a report in an existing folder, got none, which is none; create it "
+        "none/r.json: expected a report in an existing folder, found none at none; create it "
         "(mkdir -p) or choose another",
     ),
     "report is a folder": (
         f"{FIX} --report old",
         1,
-        "old: wanted a file for the report, got a folder; add a name",
+        "old: expected a file for the report, found a folder; add a name",
     ),
     "report over metadata of the rig": (
         f"{FIX} --report fix/left.json",
         1,
-        "fix/left.json: wanted a new file or an earlier report, got something else; choose "
+        "fix/left.json: expected a new file or an earlier report, found another file; choose "
         "another name for the report",
     ),
     "report over a device": (
         f"{FIX} --report /dev/null",
         1,
-        "/dev/null: wanted a new file or an earlier report, got something else; choose another "
+        "/dev/null: expected a new file or an earlier report, found another file; choose another "
         "name for the report",
     ),
     "report over the recording": (
         f"{FIX} --report fix/two_lidars.pcap",
         1,
-        "fix/two_lidars.pcap: wanted a new file for the report, got one that is read; "
-        "choose another",
+        "fix/two_lidars.pcap: expected a new file for the report, found an input; choose another",
     ),
     "rate no number": (
         f"{FIX} --rate fast",
@@ -166,78 +165,78 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "no slices": (
         f"{FIX} --slices 0",
         2,
-        "--slices: wanted a whole number from 1 to 10000, got 0; leave it out for 1",
+        "--slices: expected a whole number from 1 to 10000, found 0; leave it out for 1",
     ),
     "wait": (
         f"{FIX} --max-wait soon",
         2,
-        "--max-wait: wanted seconds above 0, or inf, got 'soon'; write 1.0",
+        "--max-wait: expected seconds above 0, or inf, found 'soon'; write 1.0",
     ),
     "no wait": (
         f"{FIX} --max-wait 0",
         2,
-        "--max-wait: wanted seconds above 0, or inf, got '0'; write 1.0",
+        "--max-wait: expected seconds above 0, or inf, found '0'; write 1.0",
     ),
     "box of three": (
         f"{FIX} --exclude-box 1,2,3",
         2,
-        "--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, got "
-        "'1,2,3'; write --exclude-box=-1,-1,0,1,1,2",
+        "--exclude-box: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+        "found '1,2,3'; write --exclude-box=-1,-1,0,1,1,2",
     ),
     "box inside out": (
         f"{FIX} --exclude-box=1,0,0,-1,1,1",
         2,
-        "--exclude-box: wanted x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, got "
-        "'1,0,0,-1,1,1'; write --exclude-box=-1,-1,0,1,1,2",
+        "--exclude-box: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+        "found '1,0,0,-1,1,1'; write --exclude-box=-1,-1,0,1,1,2",
     ),
     "negative range": (
         f"{FIX} --min-range=-1",
         2,
-        "--min-range: wanted 0 or more metres, got -1.0; write 0.5",
+        "--min-range: expected 0 or more metres, found -1.0; write 0.5",
     ),
     "range nan": (
         f"{FIX} --max-range nan",
         2,
-        "--max-range: wanted more than --min-range (0.0 m), got nan m; write 100",
+        "--max-range: expected more than --min-range (0.0 m), found nan m; write 100",
     ),
     "ranges swapped": (
         f"{FIX} --min-range 5 --max-range 3",
         2,
-        "--max-range: wanted more than --min-range (5.0 m), got 3.0 m; write 100",
+        "--max-range: expected more than --min-range (5.0 m), found 3.0 m; write 100",
     ),
     "start no time": (
         f"{FIX} --start yesterday",
         2,
-        "--start: wanted epoch seconds, an ISO time or +SECONDS, got 'yesterday'; write "
+        "--start: expected epoch seconds, an ISO time or +SECONDS, found 'yesterday'; write "
         "1700000000.5, 2026-05-01T12:00:00 or +12.5",
     ),
     "end before start": (
         f"{FIX} --start +3 --end +2",
         2,
-        "--end: wanted a time after --start (3 s), got 2 s; swap them",
+        "--end: expected a time after --start (3 s), found 2 s; swap them",
     ),
     "date for an uptime clock": (
         "uptime/drive.pcap --start 2026-05-04T08:00",
         2,
-        "--start/--end: wanted seconds, since the sensors' clock (uptime) knows no date, got a "
-        "date; write +SECONDS after the first scan",
+        "--start/--end: expected seconds, since the sensors' clock has no date (timescale "
+        "uptime), found a date; write +SECONDS after the first scan",
     ),
     "start after the end": (
         "uptime/drive.pcap --start +60",
         1,
-        "uptime/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "uptime/drive.pcap: no scan: expected a whole window of 100 ms with all sensors, found "
         "ouster_111 from 1000.000000 to 1000.299805 s; choose another --start/--end, or a "
         "recording where all sensors run together",
     ),
     "clock": (
         f"{FIX} --clock gps",
         2,
-        "--clock: wanted sensor or host, got 'gps'; choose one of them",
+        "--clock: expected sensor or host, found 'gps'; choose one of them",
     ),
     "layout": (
         f"{FIX} --layout round",
         2,
-        "--layout: wanted dense or organized, got 'round'; choose one of them",
+        "--layout: expected dense or organized, found 'round'; choose one of them",
     ),
     "organized ply": (
         f"{FIX} --format ply --layout organized",
@@ -253,12 +252,12 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "engine": (
         f"{FIX} --engine cuda",
         2,
-        "--engine: wanted auto or numpy or numba, got 'cuda'; choose one of them",
+        "--engine: expected auto or numpy or numba, found 'cuda'; choose one of them",
     ),
     "jobs": (
         f"{FIX} --jobs 0",
         2,
-        "--jobs: wanted 1 to 64, got 0; give the number of free cores",
+        "--jobs: expected 1 to 64, found 0; give the number of free cores",
     ),
     "level of compression": (
         f"{FIX} -o x.mcap --compression zstd:23",
@@ -274,7 +273,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "decoder option": (
         f"{FIX} --decode crc=no",
         2,
-        "--decode crc: wanted check, got 'no'; write --decode crc=check",
+        "--decode crc: expected check, found 'no'; write --decode crc=check",
     ),
     "unknown sensor": (
         f"{FIX} --only front",
@@ -340,7 +339,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/two_lidars.pcap --metadata fix/rig.yaml",
         1,
         "fix/rig.yaml: expected the metadata or calibration of a lidar, found another kind of "
-        "file; give the file that the sensor's driver or recorder saved",
+        "file; give the file that the sensor's driver or recording software saved",
     ),
     "metadata of another lidar": (
         "bare/drive.pcap --metadata pair/222.json",
@@ -374,8 +373,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with a duplicate": (
         "twice/drive.pcap --strict",
         1,
-        "sensor ouster_111: 1 packet(s) rejected as duplicate while --strict was given; leave it "
-        "out to count them and go on",
+        "sensor ouster_111: expected no rejected packet because of --strict, found 1 rejected as "
+        "duplicate; leave --strict out to count them instead",
     ),
     "strict with a warning": (
         "cut/drive.pcap --strict",
@@ -386,14 +385,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "only partial scans": (
         "short/drive.pcap",
         1,
-        "short/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "short/drive.pcap: no scan: expected a whole window of 100 ms with all sensors, found "
         "ouster_111 from 1800000000.020000 to 1800000000.119805 s; write the partial ones with "
         "--keep-partial",
     ),
     "no common window": (
         "parted/drive.pcap --identity-extrinsics --max-wait inf --end 1800000001",
         1,
-        "parted/drive.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        "parted/drive.pcap: no scan: expected a whole window of 100 ms with all sensors, found "
         "ouster_111 from 1800000000.020000 to 1800000000.319805 s; ouster_222 from "
         "1800000009.020000 to 1800000009.319805 s; choose another --start/--end, or a recording "
         "where all sensors run together",
@@ -405,7 +404,7 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         f"{ONE_UNIT}.pcap --metadata {DIGEST}",
         1,
         f"{DIGEST}: expected the metadata or calibration of a lidar, found another kind of file; "
-        "give the file that the sensor's driver or recorder saved",
+        "give the file that the sensor's driver or recording software saved",
     ),
     "TCP only": (
         "R/other/sick-tcp_pcapng/test.pcapng",
@@ -439,10 +438,10 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         "-1718728642.002 s for ouster_122247000785; use --align-clocks or --clock host, or give "
         "clock.offset_s or clock.epoch in the rig",
     ),
-    "one turn is never a whole window": (
+    "one revolution is never a whole window": (
         f"{ONE_UNIT}.pcap",
         1,
-        f"{ONE_UNIT}.pcap: no scan: wanted a whole window of 100 ms seen by all sensors, got "
+        f"{ONE_UNIT}.pcap: no scan: expected a whole window of 100 ms with all sensors, found "
         "ouster_122150000150 from 1462.559462 to 1462.659327 s; write the partial ones with "
         "--keep-partial",
     ),

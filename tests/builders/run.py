@@ -55,7 +55,7 @@ BY_HOST = replace(FIXTURE, selection=replace(FIXTURE.selection, host_clock=True)
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What a command said, and its exit code."""
+    """Output of a command, and its exit code."""
 
     code: int
     out: str
@@ -64,7 +64,9 @@ class Told:
 
 def command(*words: str | Path) -> Told:
     """Run `mlbatch` with these words in this process."""
-    out, err, before = io.StringIO(), io.StringIO(), sys.argv
+    out = io.StringIO()
+    err = io.StringIO()
+    before = sys.argv
     sys.argv = ["mlbatch", *map(str, words)]
     code: object = 0
     try:
@@ -177,7 +179,7 @@ Values = tuple[str | int | bool | tuple[int, ...], ...]
 
 
 def print_of(scan: Scan) -> Values:
-    """All of a scan but the arrival of the packet that closed it; arrays as digests."""
+    """All of a scan but the receive time of the packet that closed it; arrays as digests."""
     values: list[str | int | bool | tuple[int, ...]] = []
     for part in fields(scan):
         value = getattr(scan, part.name)
@@ -220,7 +222,7 @@ def buffers_of(size: int) -> Iterator[None]:
         yield
 
 
-# -- what lies in a folder of npz files -----------------------------------------------------------
+# -- content of a folder of npz files -------------------------------------------------------------
 
 
 def scan_files(folder: Path) -> list[Path]:

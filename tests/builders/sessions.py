@@ -1,6 +1,6 @@
 """Small sessions of Ouster lidars as captures, and the command line run within the test's process.
 
-Every unit turns 512 columns at 10 Hz; packets arrive `latency_ns` after their last column.
+A revolution has 512 columns, at 10 Hz; packets are received `latency_ns` after their last column.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 FIXTURE = REPOSITORY / "fixtures" / "two_lidars"
 RECORDINGS = REPOSITORY / ".." / "shared" / "recordings"
 NO_RECORDINGS = "the folder of real recordings is not here"
-NS_PER_S, NS_PER_MS = 10**9, 10**6
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
 EPOCH_NS = 1_800_000_000 * NS_PER_S
 PACKETS_PER_TURN = 32
 SMALL = OusterSpec(beams=16, columns_per_frame=512, serial=111)
@@ -35,7 +36,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Unit:
-    """A lidar in a session; begin_ns: its first stamp; host_ns: what the recorder's clock adds."""
+    """A lidar in a session; begin_ns: its first stamp; host_ns: host clock minus sensor clock."""
 
     spec: OusterSpec = SMALL
     ip: str = "10.0.0.1"
@@ -49,7 +50,7 @@ class Unit:
 
     @property
     def payloads(self) -> list[tuple[int, bytes]]:
-        """(arrival, payload) of every lidar packet."""
+        """(receive time, payload) of every lidar packet."""
         ranges = np.full((512, self.spec.beams, 1), self.range_mm)
         found = []
         for turn in range(self.turns):
@@ -62,14 +63,14 @@ class Unit:
 
     @property
     def records(self) -> Records:
-        """(arrival, frame) of every lidar packet."""
+        """(receive time, frame) of every lidar packet."""
         return [
             (host_ns, udp_frame(payload, self.ip, dport=self.port)[0])
             for host_ns, payload in self.payloads
         ]
 
     def imu_records(self, count: int = 5, port: int = 7503) -> Records:
-        """(arrival, frame) of legacy IMU packets, 10 ms apart from the first stamp on."""
+        """(receive time, frame) of legacy IMU packets, 10 ms apart from the first stamp on."""
         zero = np.zeros((1, 3))
         stamps = [self.begin_ns + i * 10 * NS_PER_MS for i in range(count)]
         return [
@@ -91,7 +92,7 @@ def twin(unit: Unit, serial: int, ip: str = "10.0.0.2") -> Unit:
 def write_session(
     folder: Path, *units: Unit, more: Records | None = None, metadata: bool = True
 ) -> Path:
-    """A capture of the units (and `more` records) in `folder`, their metadata beside it."""
+    """A capture of the units (and `more` records) in `folder`, with their metadata."""
     folder.mkdir(parents=True, exist_ok=True)
     records = [*(more or []), *(record for unit in units for record in unit.records)]
     if metadata:
@@ -108,7 +109,7 @@ def write_metadata(path: Path, spec: OusterSpec) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a run of the command line left: its exit code and what it printed."""
+    """Result of a command: exit code and printed text."""
 
     code: int
     out: str

@@ -1,4 +1,4 @@
-"""Mistakes with lidars of all makers, and lines; their files: `test_cli_maker_mistakes.py`."""
+"""Mistakes with lidars of all vendors, and error lines; files: `cli/test_vendor_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RIGS: dict[str, tuple[str, ...]] = {
 }
 
 # As in `mistakes.py`.
-MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
+VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
     "HESAI without its angles": (
         "xt16_bare/drive.pcap",
         1,
@@ -46,7 +46,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "return; expected metadata that match, found none in the recording's directory; give the "
         "sensor's with --metadata FILE",
     ),
-    "angles of another HESAI beside the recording": (
+    "angles of another HESAI next to the recording": (
         "xt16_other/drive.pcap",
         1,
         "xt16_other/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
@@ -60,14 +60,14 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "return; expected metadata that match, found only 32.csv; give the sensor's with "
         "--metadata FILE",
     ),
-    "angles of another maker": (
+    "angles of another vendor": (
         "xt16_bare/drive.pcap --metadata files/rs16.csv",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only rs16.csv; give the sensor's with "
         "--metadata FILE",
     ),
-    "angles of another maker in the rig": (
+    "angles of another vendor in the rig": (
         "xt16_bare/drive.pcap --rig rs16_csv.yaml",
         1,
         "rs16_csv.yaml: sensor top: expected packets that match files/rs16.csv, found HESAI lidar "
@@ -80,13 +80,13 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "files: xt16_alike/a.csv, xt16_alike/b.csv; expected one; name the sensor of each source "
         "with stream.source_ip in a rig file (--rig), or give only its --metadata",
     ),
-    "broken angles beside the recording": (
+    "broken angles next to the recording": (
         "xt16_broken/drive.pcap",
         1,
         "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 16.csv; give the sensor's with "
-        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: wanted azimuth from -360 to "
-        "360 deg, got zero; read the correction file from the lidar again)",
+        "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to "
+        "360 deg, found zero; read the correction file from the lidar again)",
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",
@@ -131,10 +131,9 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "ROBOSENSE angles of another model": (
         "helios_bare/drive.pcap --metadata files/rs32.csv",
         1,
-        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: wanted the angles of "
-        "its channels, got no DIFOP packet beside its point packets; record its device port "
-        "(7788) as well, or give a csv of `elevation,azimuth` lines with --metadata (without a "
-        "match: rs32.csv)",
+        "helios_bare/drive.pcap: 10.0.0.8 > port 6699: ROBOSENSE Helios 16: expected the angles "
+        "of its channels, found no DIFOP packets; record its device port (7788) as well, or give "
+        "a csv of `elevation,azimuth` lines with --metadata (without a match: rs32.csv)",
     ),
     "serial number of another ROBOSENSE": (
         "helios/drive.pcap --rig serial.yaml",
@@ -172,9 +171,9 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "HDL-64E with another file": (
         "hdl64/drive.pcap --metadata files/vlp16.yml",
         1,
-        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: wanted its calibration, got none; give "
-        "the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (without a match: "
-        "vlp16.yml)",
+        "hdl64/drive.pcap: 10.0.0.8 > port 2368: HDL-64E: expected its calibration, found none; "
+        "give the unit's YAML or db.xml with --metadata or as `metadata:` in the rig (without a "
+        "match: vlp16.yml)",
     ),
     "strict with the file of another Velodyne": (
         "vlp32c/drive.pcap --metadata files/vlp16.yml --strict",
@@ -212,13 +211,13 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "vlp32c.yaml: sensor top: expected packets of the model VLP-32C, found those of VLP-16; "
         "correct model, stream or metadata",
     ),
-    "model of another maker": (
+    "model of another vendor": (
         "vlp16/drive.pcap --rig xt16.yaml",
         1,
         "xt16.yaml: sensor top: expected packets of the model PandarXT-16, found those of VLP-16; "
         "correct model, stream or metadata",
     ),
-    "model of yet another maker": (
+    "model of a third vendor": (
         "vlp16/drive.pcap --rig os1.yaml",
         1,
         "os1.yaml: sensor top: expected packets of the model OS1-32, found those of VLP-16; "
@@ -236,7 +235,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "vlp16.yaml: sensor top: expected packets of the model VLP-16, found HESAI lidar "
         "PandarXT-16, strongest return (10.0.0.8 > port 2368); correct model, stream or metadata",
     ),
-    "file of another maker in the rig": (
+    "file of another vendor in the rig": (
         "vlp16/drive.pcap --rig xt16_csv.yaml",
         1,
         "xt16_csv.yaml: sensor top: expected packets that match files/xt16.csv, found Velodyne "
@@ -273,13 +272,14 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "decoder option with another value": (
         "vlp16/drive.pcap --decode firing_azimuth=maybe",
         2,
-        "--decode firing_azimuth: wanted on or off, got 'maybe'; write --decode firing_azimuth=on",
+        "--decode firing_azimuth: expected on or off, found 'maybe'; write --decode "
+        "firing_azimuth=on",
     ),
     "unknown decoder option": (
         "vlp16/drive.pcap --decode nonsense=1",
         2,
-        "--decode: wanted one of crc, firing_azimuth, optical_centre, packet_stamp, "
-        "vertical_offset, got 'nonsense'; write --decode crc=check",
+        "--decode: expected one of crc, firing_azimuth, optical_centre, packet_stamp, "
+        "vertical_offset, found 'nonsense'; write --decode crc=check",
     ),
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",
@@ -295,7 +295,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "velodyne_2; use --align-clocks or --clock host, or give clock.offset_s or clock.epoch in "
         "the rig",
     ),
-    "counter since power-on beside a clock": (
+    "counter since power-on and a clock": (
         "livox/drive.pcap --identity-extrinsics",
         1,
         "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
@@ -310,7 +310,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
         "extrinsic), or accept the body origin with --identity-extrinsics",
     ),
-    "lidars of two makers without extrinsics": (
+    "lidars of two vendors without extrinsics": (
         "pair/drive.pcap",
         1,
         "extrinsics unknown for ouster_111, velodyne_1; required for every sensor when there are "
@@ -324,7 +324,7 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
         "10.0.0.8 > port 2368, 10.0.0.9 > port 2368; name its stream (source_ip, port, topic or "
         "serial)",
     ),
-    "one of two makers": (
+    "one of two vendors": (
         "pair/drive.pcap --rig any.yaml",
         1,
         "any.yaml: sensor top: expected packets of one lidar, found those of several (OS-1-16, "
@@ -375,8 +375,8 @@ MAKER_MISTAKES: dict[str, tuple[str, int, str]] = {
     "strict with a change of the return mode": (
         "changed/drive.pcap --strict",
         1,
-        "sensor velodyne_1: 400 packet(s) rejected as bad_header while --strict was given; "
-        "leave it out to count them and go on",
+        "sensor velodyne_1: expected no rejected packet because of --strict, found 400 rejected "
+        "as bad_header; leave --strict out to count them instead",
     ),
     "strict with packets of two sizes": (
         "p40/drive.pcap --strict",

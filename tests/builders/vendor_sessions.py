@@ -1,4 +1,4 @@
-"""Short sessions of lidars of all makers, as records of a capture or messages of a bag.
+"""Short sessions of lidars of all vendors, as records of a capture or messages of a bag.
 
 Every lidar sees walls at one distance; all begin at the same time by their clocks.
 """
@@ -18,25 +18,26 @@ from tests.builders.sessions import Records, Unit
 # 800 s past the full hour.
 BEGIN_NS = 1_700_000_000 * 10**9
 BEGIN_US = 800_000_000.0
-RAW_RANGE, LEVEL = 2000, 50
+RAW_RANGE = 2000
+LEVEL = 50
 Payloads = list[tuple[int, bytes]]
 
 
 def velodyne_payloads(spec: velodyne.VelodyneSpec, packets: int) -> Payloads:
-    """(arrival, payload) of data packets."""
+    """(receive time, payload) of data packets."""
     shape = packets * spec.columns_per_packet, len(spec.table.elevation_deg), spec.returns
     sent = velodyne.encode(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
     return listed(sent)
 
 
 def listed(sent: velodyne.Sent) -> Payloads:
-    """(arrival, payload)."""
+    """(receive time, payload)."""
     rows = [payload.tobytes() for payload in sent.payloads]
     return list(zip(sent.host_ns.tolist(), rows, strict=True))
 
 
 def hesai_payloads(spec: hesai.HesaiSpec, packets: int) -> Payloads:
-    """(arrival, payload) of point packets."""
+    """(receive time, payload) of point packets."""
     shape = packets * spec.groups, spec.row.channels, spec.returns
     levels = np.full(shape, LEVEL)
     payloads = hesai.encode_packets(spec, np.full(shape, RAW_RANGE), levels)
@@ -44,19 +45,19 @@ def hesai_payloads(spec: hesai.HesaiSpec, packets: int) -> Payloads:
 
 
 def robosense_payloads(spec: robosense.RobosenseSpec, packets: int) -> Payloads:
-    """(arrival, payload) of point packets."""
+    """(receive time, payload) of point packets."""
     shape = round(packets * spec.columns_per_packet), spec.row.channels, spec.returns
     return robosense.msop(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
 
 
 def difop_payloads(spec: robosense.RobosenseSpec, count: int = 4) -> Payloads:
-    """(arrival, payload) of device packets, ten a second."""
+    """(receive time, payload) of device packets, ten a second."""
     payload = robosense.difop(spec, robosense.fan(spec))
     return [(spec.start_ns + n * 100_000_000, payload) for n in range(count)]
 
 
 def livox_payloads(spec: livox.LivoxSpec, packets: int) -> Payloads:
-    """(arrival, payload) of point packets."""
+    """(receive time, payload) of point packets."""
     points = packets * spec.points
     coordinates = np.full((points, spec.returns, 3), RAW_RANGE)
     return livox.point_packets(spec, coordinates, np.full((points, spec.returns), LEVEL))
@@ -81,7 +82,7 @@ def hesai_csv(path: Path, channels: int, lowest_deg: float = -15.0) -> None:
 
 
 def robosense_csv(path: Path, channels: int) -> None:
-    """An angle file of the maker."""
+    """An angle file of the vendor."""
     path.write_text("".join(f"{n - 8}.0,0.5\n" for n in range(channels)), encoding="utf-8")
 
 
@@ -92,7 +93,7 @@ def rslidar_message(payload: bytes) -> bytes:
 
 
 def rslidar_messages(payloads: Payloads, topic: str = "/rslidar_packets") -> list[Recorded]:
-    """Point and device packets on one topic, as the maker's driver publishes them."""
+    """Point and device packets on one topic, as the vendor's driver publishes them."""
     return [
         Recorded(topic, "rslidar_msg/RslidarPacket", host_ns, rslidar_message(payload))
         for host_ns, payload in sorted(payloads)

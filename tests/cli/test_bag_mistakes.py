@@ -1,4 +1,4 @@
-"""What users do wrong with bags: one line, no traceback; the table is in `bag_mistakes.py`."""
+"""Mistakes with bags: one line, no traceback; the table is in `builders/bag_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STILL = (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with everything that the mistakes are made with."""
+    """A folder with the inputs of all mistakes."""
     folder = tmp_path_factory.mktemp("bags")
     _write_sessions(folder)
     _write_rigs(folder)

@@ -22,7 +22,8 @@ def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
     found = json.loads(done.out)
     rows = {row["program"]: row for row in found["rows"]}
     assert list(rows) == ["numpy", "python with numpy", "memory copy"]
-    ours, copied = rows["numpy"], rows["memory copy"]
+    ours = rows["numpy"]
+    copied = rows["memory copy"]
     assert ours["scans"] > 5
     # 32 slots in a block of 110.592 us, of three sensors, in whole windows.
     assert ours["slots"] == pytest.approx(3 * 32 * ours["scans"] * 0.1 / 110.592e-6, rel=0.001)

@@ -47,7 +47,7 @@ def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
         "dropped",
         "points",
     ]
-    # 7 windows of 512 columns; head and tail hold the other 752 of 4336 (SOURCE.md).
+    # 7 windows of 512 columns; head and tail have the other 752 of 4336 (SOURCE.md).
     assert left.split() == ["left", "OS-0-32-U1", "271", "0", "0", "3584", "752", "90790"]
     assert right.split() == ["right", "OS-1-32-U1", "271", "0", "0", "3584", "752", "105196"]
     assert scans == (
@@ -105,10 +105,11 @@ def test_the_version_and_the_help_go_to_stdout(shell: Shell) -> None:
 
 
 def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:
-    table, listed = shell("sensors"), json.loads(shell("sensors --json").out)
+    table = shell("sensors")
+    listed = json.loads(shell("sensors --json").out)
     lines = table.out.splitlines()
     assert lines[0].split() == list(listed[0])
-    # Columns of the table are two blanks or more apart; names hold one at most.
+    # Columns of the table are two blanks or more apart; names have one at most.
     cells = [re.split(r" {2,}", line)[0] for line in lines[1:]]
     assert cells == [row["model"] for row in listed]
     assert {"OS0-32", "VLP-16", "PandarXT-32", "Helios 16", "Livox SDK2"} <= set(cells)
@@ -184,8 +185,8 @@ def test_an_interrupted_run_leaves_nothing_under_the_final_name(tmp_path: Path) 
     assert process.returncode == 130
     assert out.splitlines()[0] == "a scan"
     assert err == (
-        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
-        "on\n"
+        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
+        "--resume continues\n"
     )
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["out.partial", "out.partial.state"]

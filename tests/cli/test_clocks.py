@@ -1,4 +1,4 @@
-"""Clocks on the command line: what is told of them, and how they are aligned."""
+"""Clocks on the command line: reports and alignment."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_drift_is_told(shell: Shell, tmp_path: Path) -> None:
     assert sensor["clock"]["drift_ppm"] == pytest.approx(40, abs=3)
 
 
-def test_clocks_apart_are_told_with_the_remedy(shell: Shell) -> None:
+def test_clocks_apart_are_reported_with_the_remedy(shell: Shell) -> None:
     report = _dry(shell, f"{RECORDING} --fault jump:right:0.3s@0s")
     assert _codes(report) == ["clocks"]
     (warning,) = report["warnings"]
@@ -106,8 +106,8 @@ def test_aligned_clocks_give_the_scans_of_synchronised_ones(
         _stamps(tmp_path / "mapped", sensor) - _stamps(tmp_path / "true", sensor)
         for sensor in (0, 1)
     ]
-    # By the recorder's clock, later than the columns by the way of a packet (1 ms) and what follows
-    # its last column (0.2 ms), which both share; by the first sensor's, where they were.
+    # On the capture host's clock, later than the columns by the packet's transport (1 ms) and its
+    # length (0.2 ms), the same for both; on the first sensor's clock, unchanged.
     expected = 1_200_000 if to == "host" else 0
     for one in away:
         assert np.abs(one - expected).max() < 500_000
@@ -118,4 +118,4 @@ def test_aligned_clocks_give_the_scans_of_synchronised_ones(
 def test_mistakes(shell: Shell) -> None:
     outcome = shell(f"convert {RECORDING} --dry-run --align-clocks --align-to second")
     assert outcome.code == 2
-    assert "--align-to: wanted host or first, got 'second'" in outcome.err
+    assert "--align-to: expected host or first, found 'second'" in outcome.err

@@ -13,7 +13,9 @@ from tests.builders.sessions import FIXTURE, Shell
 Report = dict[str, Any]
 RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 # Packets of the fixture (SOURCE.md).
-LEFT, RIGHT, IMU = 271, 271, 85
+LEFT = 271
+RIGHT = 271
+IMU = 85
 
 
 def _report(shell: Shell, *faults: str, more: str = "") -> Report:
@@ -118,7 +120,8 @@ def test_mistakes(shell: Shell, arguments: str, message: str) -> None:
 def test_many_late_columns_give_a_warning(shell: Shell) -> None:
     report = _report(shell, "delay:left:300ms", more="--max-wait 0.1")
     left, right = report["sensors"]
-    late, decoded = left["columns"]["dropped"]["late"], left["columns"]["decoded"]
+    late = left["columns"]["dropped"]["late"]
+    decoded = left["columns"]["decoded"]
     assert late > decoded / 2
     (warning,) = [one for one in report["warnings"] if one["code"] == "late"]
     assert warning["message"].startswith(f"left: {late} of {decoded} columns")

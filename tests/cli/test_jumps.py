@@ -26,8 +26,10 @@ TURN_NS = 100 * NS_PER_MS
 
 
 def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
-    """The same lidar, whose clock steps after every piece while the recorder's runs on."""
-    pieces, begin_ns, ahead_ns = [], unit.begin_ns, unit.host_ns
+    """The same lidar, whose clock steps after every piece; the capture host's does not."""
+    pieces = []
+    begin_ns = unit.begin_ns
+    ahead_ns = unit.host_ns
     for number, step_ns in enumerate((0, *steps_ns)):
         begin_ns, ahead_ns = begin_ns + step_ns, ahead_ns - step_ns
         pieces.append(
@@ -43,7 +45,8 @@ def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
     return pieces
 
 
-FORWARD, BACK = 37 * NS_PER_S, -20 * NS_PER_S
+FORWARD = 37 * NS_PER_S
+BACK = -20 * NS_PER_S
 
 
 @pytest.mark.parametrize(
@@ -74,7 +77,7 @@ def test_a_jump_is_an_error_that_names_its_times(
 
 
 def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
-    """Five seconds of silence, at the sensor and at the recorder."""
+    """Five seconds of silence, at the sensor and at the capture host."""
     first = Unit(turns=6)
     later = replace(first, begin_ns=first.begin_ns + 5 * NS_PER_S, first_frame=55)
     write_session(tmp_path, first, later)
@@ -145,10 +148,11 @@ def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path
 
 
 def test_passed_messages_go_to_one_part(shell: Shell, tmp_path: Path) -> None:
-    """The metadata, which stand at the start, are known in both."""
+    """The metadata are recorded at the start, and used for both."""
     one, two = _pieces(Unit(), FORWARD)
     messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
-    first_ns, last_ns = messages[0].log_ns, messages[-1].log_ns
+    first_ns = messages[0].log_ns
+    last_ns = messages[-1].log_ns
     messages += [
         Recorded("/note", "std_msgs/String", at, Body("cdr").text("here").done())
         for at in range(first_ns, last_ns, 20 * NS_PER_MS)
@@ -163,7 +167,8 @@ def test_passed_messages_go_to_one_part(shell: Shell, tmp_path: Path) -> None:
 
 
 def test_decoded_clouds_are_cut_where_their_clock_jumps(shell: Shell, tmp_path: Path) -> None:
-    columns, clouds = 100, 10
+    columns = 100
+    clouds = 10
     turn = [(5, 1, ring, 9, at * 10**6, ring) for at in range(columns) for ring in (0, 1)]
     stamps_ns = [STAMP_NS + n * TURN_NS + FORWARD * (n >= clouds) for n in range(2 * clouds)]
     messages = [cloud_message(OUSTER, turn, stamp_ns) for stamp_ns in stamps_ns]

@@ -1,4 +1,4 @@
-"""What users do wrong: one line says what, where, wanted, got and what to do; no traceback."""
+"""Mistakes of users: one line with what, where, expected, found and the remedy; no traceback."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with everything that the mistakes are made with."""
+    """A folder with the inputs of all mistakes."""
     folder = tmp_path_factory.mktemp("mistakes")
     (folder / "fix").mkdir()
     for file in FIXTURE.iterdir():
@@ -72,7 +72,7 @@ def _write_sessions(folder: Path) -> None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """All that stands under a final name."""
+    """All files under a final name."""
     return sorted(path for path in folder.rglob("*") if ".partial" not in str(path))
 
 
@@ -85,7 +85,7 @@ def shell(
 
 
 def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
-    """Run a mistake; nothing but the one line may come of it."""
+    """Run a mistake; nothing but the error line may result."""
     arguments, code, message = mistake
     before = _files(place)
     named = " -o " in f" {arguments}" or "--quiet" in arguments
@@ -93,8 +93,8 @@ def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
     assert outcome.out == ""
     lines = [line for line in outcome.err.splitlines() if "warning" not in line]
     assert len(lines) == 1
-    wanted = ".*".join(map(re.escape, message.split("{*}")))
-    assert re.fullmatch(f"mlbatch: error: {wanted}", lines[0]), lines[0]
+    pattern = ".*".join(map(re.escape, message.split("{*}")))
+    assert re.fullmatch(f"mlbatch: error: {pattern}", lines[0]), lines[0]
     assert outcome.code == code
     assert _files(place) == before
 
@@ -111,7 +111,7 @@ def test_mistake_with_a_real_recording(shell: Shell, place: Path, name: str) -> 
 
 
 def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:
-    """LEGACY packets say nothing of their sender, so two equal lidars need a rig."""
+    """LEGACY packets do not identify their sender, so two equal lidars need a rig."""
     old = replace(Unit(), spec=replace(SMALL, profile="LEGACY"))
     folder = place / "legacy"
     write_session(folder, old)

@@ -84,14 +84,16 @@ def _ledger_balances(report: Report) -> None:
     own = sum(s["packets"]["read"] + s["imu_packets"] for s in report["sensors"])
     assert capture["datagrams"] == own + unassigned
     for sensor in report["sensors"]:
-        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        packets = sensor["packets"]
+        columns = sensor["columns"]
+        points = sensor["points"]
         assert packets["read"] == packets["accepted"] + sum(packets["rejected"].values())
         assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
         assert points["slots"] == sum(points.values()) - points["slots"]
 
 
 def test_an_end_stops_the_reading(dry: Callable[[str], Report], tmp_path: Path) -> None:
-    """Of 90 s in two files the end lies in the first, whose buffer holds some 30 s."""
+    """Of 90 s in two files the end is in the first, whose buffer has some 30 s."""
     first = Unit(turns=450)
     second = replace(first, begin_ns=first.begin_ns + 45 * NS_PER_S, first_frame=455)
     one, two = write_session(tmp_path / "1", first), write_session(tmp_path / "2", second)
@@ -131,8 +133,10 @@ def test_range_limits(shell: Shell) -> None:
 def test_boxes_add_to_those_of_the_rig(shell: Shell) -> None:
     shell(f"convert {FIX} -o all")
     shell(f"convert {FIX} -o cut --exclude-box=0,-8,-1,20,8,9 --exclude-box=-20,0,-1,0,8,9")
-    whole, cut = arrays("all/000000.npz")["xyz"], arrays("cut/000000.npz")["xyz"]
-    x, y = whole[:, 0], whole[:, 1]
+    whole = arrays("all/000000.npz")["xyz"]
+    cut = arrays("cut/000000.npz")["xyz"]
+    x = whole[:, 0]
+    y = whole[:, 1]
     np.testing.assert_array_equal(cut, whole[(x < 0) & (y < 0)])
     first, second = (report_of(f"{name}/report.json") for name in ("all", "cut"))
     # 763 returns of `left` a window hit the machine, none of `right` (SOURCE.md).
@@ -151,9 +155,9 @@ def test_partial_windows_and_slices_have_their_own_names(shell: Shell) -> None:
         HEAD_POINTS,
     )
     shell(f"convert {FIX} -o sliced --keep-partial --slices 4")
-    # The first stamps lie 22 ms after the second: all slices of the head hold columns.
+    # The first stamps are 22 ms after the second: all slices of the head have columns.
     whole = [f"{name}-{j}.npz" for name in [*windows[:7], "head"] for j in range(4)]
-    # The last stamps lie 69 ms into window 7.
+    # The last stamps are 69 ms into window 7.
     assert names("sliced") == sorted([*whole, *(f"000007-{j}.npz" for j in range(3))])
     last = arrays("sliced/head-3.npz")
     assert (int(last["index"]), int(last["slice"]), int(last["slices"])) == (-1, 3, 4)
@@ -169,7 +173,8 @@ def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
     ]
     whole = arrays("merged/000004.npz")
     for number, sensor in enumerate(("left", "right")):
-        own, part = whole["lidar_id"] == number, arrays(f"split/{sensor}/000004.npz")
+        own = whole["lidar_id"] == number
+        part = arrays(f"split/{sensor}/000004.npz")
         np.testing.assert_array_equal(part["xyz"], whole["xyz"][own])
         np.testing.assert_array_equal(part["ring"], whole["ring"][own] - 32 * number)
         assert (int(part["index"]), bool(part["complete"])) == (4, True)
@@ -262,7 +267,7 @@ def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, 
     shutil.copy(CAPTURE, recording)
     outcome = shell(f"convert {recording} --identity-extrinsics -o drive.mcap")
     assert outcome.code == 1
-    assert f"wanted an output that leaves {recording} as it is" in outcome.err
+    assert f"expected an output that does not overwrite {recording}, found one" in outcome.err
     assert recording.read_bytes() == CAPTURE.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == [recording.name]
 
@@ -279,11 +284,11 @@ def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, 
 def test_a_report_takes_the_place_of_no_output(shell: Shell, output: str, report: str) -> None:
     outcome = shell(f"convert {FIX} -o {output} --report {report}")
     assert outcome.code == 1
-    assert f"{report}: wanted a report besides the files of the output" in outcome.err
+    assert f"{report}: expected a report that is no file of the output, found one" in outcome.err
     assert not Path(output).exists()
 
 
 def test_a_bag_is_not_read_where_it_is_replaced(shell: Shell) -> None:
     assert shell(f"convert {FIX} -o bag --format rosbag2").code == 0
     outcome = shell("convert bag/bag_0.mcap -o bag --format rosbag2 --overwrite")
-    assert (outcome.code, "leaves bag/bag_0.mcap as it is" in outcome.err) == (1, True)
+    assert (outcome.code, "does not overwrite bag/bag_0.mcap" in outcome.err) == (1, True)

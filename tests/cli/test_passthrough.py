@@ -20,19 +20,21 @@ from tests.builders.sessions import NS_PER_MS, Shell, Unit, twin
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 
 # Longer than what rates are measured over.
-TURNS, TURN_NS, EVERY_NS = 24, 100 * NS_PER_MS, 20 * NS_PER_MS
+TURNS = 24
+TURN_NS = 100 * NS_PER_MS
+EVERY_NS = 20 * NS_PER_MS
 NOTES = TURNS * TURN_NS // EVERY_NS
 
 
 def _lidar(name: str, unit: Unit, lost: Collection[int]) -> list[Recorded]:
-    """A lidar that lost a third of each of these turns, within one window."""
+    """A lidar that lost a third of each of these revolutions, within one window."""
     about, *packets = unit_messages(replace(unit, turns=TURNS), name)
     lossy = [at // 32 in lost and 10 <= at % 32 < 20 for at in range(len(packets))]
     return [about, *(one for one, is_lost in zip(packets, lossy, strict=True) if not is_lost)]
 
 
 def _messages(*lost: int, also: Collection[int] = ()) -> list[Recorded]:
-    """Two lidars that lost parts of turns, and notes beside them."""
+    """Two lidars that lost parts of revolutions, and messages of /note."""
     messages = _lidar("top", Unit(), lost) + _lidar("low", twin(Unit(), 222), also)
     messages += [
         Recorded("/note", "std_msgs/String", messages[0].log_ns + number * EVERY_NS, _text(number))
@@ -76,8 +78,8 @@ def test_windows_that_are_left_out_hold_no_message_back(
     assert outcome.code == 0, outcome.err
     report = json.loads((tmp_path / "out.mcap.report.json").read_text())
     assert report["scans"]["dropped_incomplete"] > 3
-    wanted = [(one.log_ns, one.data) for one in messages if one.topic == "/note"]
-    assert _notes(tmp_path / "out.mcap") == wanted
+    expected = [(one.log_ns, one.data) for one in messages if one.topic == "/note"]
+    assert _notes(tmp_path / "out.mcap") == expected
     assert report["messages"] == [
         {"topic": "/note", "read": NOTES, "written": NOTES, "dropped": {}}
     ]
@@ -107,7 +109,7 @@ def test_messages_alone_are_no_output(shell: Shell, tmp_path: Path, resumed: str
         f"{resumed}"
     )
     assert outcome.code == 1
-    assert "no scan: wanted a whole window" in outcome.err
+    assert "no scan: expected a whole window" in outcome.err
     assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
 
 

@@ -1,4 +1,4 @@
-"""What the command line says of sessions with lidars that have no decoder."""
+"""Messages of the command line about lidars that have no decoder."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ def _m1() -> Records:
 
 def test_a_recording_of_a_lidar_without_decoder_is_refused(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, more=_m1())
-    told = shell(f"convert {capture} -o out")
-    assert (told.code, told.out) == (1, "")
-    assert told.err == f"mlbatch: error: {capture}: {WHERE} carries {WHAT}; {ADVICE}\n"
+    outcome = shell(f"convert {capture} -o out")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err == f"mlbatch: error: {capture}: {WHERE} carries {WHAT}; {ADVICE}\n"
     assert not (tmp_path / "out").exists()
 
 
 def test_metadata_that_are_missing_are_asked_for_first(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1(), metadata=False)
-    told = shell(f"convert {capture} -o out")
-    assert told.code == 1
-    assert "10.0.0.1 > port 7502 carries Ouster lidar, serial 111" in told.err
-    assert "give the sensor's with --metadata FILE" in told.err
+    outcome = shell(f"convert {capture} -o out")
+    assert outcome.code == 1
+    assert "10.0.0.1 > port 7502 carries Ouster lidar, serial 111" in outcome.err
+    assert "give the sensor's with --metadata FILE" in outcome.err
 
 
 def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
-    told = shell(f"convert {capture} -o out")
-    assert told.code == 0, told.err
+    outcome = shell(f"convert {capture} -o out")
+    assert outcome.code == 0, outcome.err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     (warning,) = report["warnings"]
     assert warning["code"] == "no_decoder"
@@ -60,10 +60,10 @@ def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: P
 def test_a_sensor_of_the_rig_without_decoder(shell: Shell, tmp_path: Path, stream: str) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
     (tmp_path / "rig.yaml").write_text(f"sensors:\n  - name: front\n    stream: {stream}\n")
-    told = shell(f"convert {capture} --rig rig.yaml -o out")
-    assert told.code == 1
+    outcome = shell(f"convert {capture} --rig rig.yaml -o out")
+    assert outcome.code == 1
     selector = stream[1:-1].replace(":", "")
-    assert told.err == (
+    assert outcome.err == (
         f"mlbatch: error: rig.yaml: sensor front: {selector} carries {WHAT}; {ADVICE}\n"
     )
 
@@ -72,8 +72,8 @@ def test_inspect_says_what_is_missing(shell: Shell, tmp_path: Path) -> None:
     position = filled(512, {0: EE + b"712190403180"})
     beside = [(EPOCH_NS, frame) for frame in udp_frame(position, src="10.0.0.8", dport=10110)]
     capture = write_session(tmp_path, Unit(), more=_m1() + beside)
-    told = json.loads(shell(f"inspect {capture} --json").out)
-    found = {one["stream"]: (one["what"], one["missing"]) for one in told["streams"]}
+    outcome = json.loads(shell(f"inspect {capture} --json").out)
+    found = {one["stream"]: (one["what"], one["missing"]) for one in outcome["streams"]}
     assert found[WHERE] == (WHAT, "decoder")
     assert found["10.0.0.8 > port 10110"] == ("HESAI GPS packet", "")
     assert found["10.0.0.1 > port 7502"][1] == ""

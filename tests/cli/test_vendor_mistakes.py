@@ -1,4 +1,4 @@
-"""What users do wrong with lidars of all makers; the table is in `maker_mistakes.py`."""
+"""Mistakes with lidars of all vendors; the table is in `builders/vendor_mistakes.py`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions import NS_PER_S, Report, Shell, report_of, write_metadata
 from tests.builders.velodyne import VelodyneSpec, position_packets
 from tests.builders.velodyne_tables import calibration_yaml
-from tests.builders.vendor_mistakes import MAKER_MISTAKES, RIGS
+from tests.builders.vendor_mistakes import RIGS, VENDOR_MISTAKES
 from tests.builders.vendor_sessions import (
     BEGIN_NS,
     BEGIN_US,
@@ -43,15 +43,19 @@ XT16 = HesaiSpec("PandarXT-16")
 P40 = HesaiSpec("Pandar40P")
 HELIOS = RobosenseSpec("Helios 16")
 # Packets that suffice to be recognised, and those of more than a few windows.
-FEW, MANY = 20, 400
-PORT, RS_PORT, DIFOP_PORT = 2368, 6699, 7788
-IP, OTHER_IP = "10.0.0.8", "10.0.0.9"
+FEW = 20
+MANY = 400
+PORT = 2368
+RS_PORT = 6699
+DIFOP_PORT = 7788
+IP = "10.0.0.8"
+OTHER_IP = "10.0.0.9"
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with everything that the mistakes are made with."""
-    folder = tmp_path_factory.mktemp("makers")
+    folder = tmp_path_factory.mktemp("vendors")
     _write_velodyne(folder)
     _write_velodyne_sessions(folder)
     _write_hesai(folder)
@@ -125,7 +129,8 @@ def _write_hesai(folder: Path) -> None:
 
 
 def _write_robosense(folder: Path) -> None:
-    many, device = robosense_payloads(HELIOS, MANY), difop_payloads(HELIOS)
+    many = robosense_payloads(HELIOS, MANY)
+    device = difop_payloads(HELIOS)
     write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
     write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
     write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))
@@ -164,9 +169,9 @@ def shell(
     return Shell(monkeypatch, capsys)
 
 
-@pytest.mark.parametrize("name", MAKER_MISTAKES)
+@pytest.mark.parametrize("name", VENDOR_MISTAKES)
 def test_mistake_with_a_maker(shell: Shell, place: Path, name: str) -> None:
-    check(shell, place, MAKER_MISTAKES[name])
+    check(shell, place, VENDOR_MISTAKES[name])
 
 
 def _converted(shell: Shell, arguments: str, folder: Path) -> Report:
@@ -176,7 +181,7 @@ def _converted(shell: Shell, arguments: str, folder: Path) -> Report:
     return report_of(str(folder / "out" / "report.json"))
 
 
-def _told(report: Report) -> list[tuple[str, str]]:
+def _warnings(report: Report) -> list[tuple[str, str]]:
     return [(one["sensor"], one["message"]) for one in report["warnings"]]
 
 
@@ -193,7 +198,7 @@ def test_device_packets_on_the_topic_of_the_points_give_angles(
 def test_a_rig_may_name_a_model_that_packets_do_not(shell: Shell, tmp_path: Path) -> None:
     report = _converted(shell, "vlp16/drive.pcap --rig lite.yaml", tmp_path)
     assert report["sensors"][0]["model"] == "Puck LITE"
-    assert _told(report) == []
+    assert _warnings(report) == []
 
 
 def test_a_rig_that_names_another_model_than_packets_is_told(shell: Shell, tmp_path: Path) -> None:
@@ -201,8 +206,8 @@ def test_a_rig_that_names_another_model_than_packets_is_told(shell: Shell, tmp_p
     rig.write_text("sensors: [{name: top, model: Puck Hi-Res}]\n", encoding="utf-8")
     report = _converted(shell, f"vlp16/drive.pcap --rig {rig}", tmp_path)
     assert report["sensors"][0]["model"] == "Puck Hi-Res"
-    told = "read as Puck Hi-Res, which the rig names; it looks like Velodyne lidar VLP-16,"
-    assert _told(report) == [("top", f"{told} strongest return")]
+    text = "read as Puck Hi-Res, which the rig names; it looks like Velodyne lidar VLP-16,"
+    assert _warnings(report) == [("top", f"{text} strongest return")]
 
 
 def test_a_rig_chooses_the_lidar_of_its_model(shell: Shell, tmp_path: Path) -> None:
@@ -216,10 +221,10 @@ def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Pa
     report = _converted(shell, "p40/drive.pcap", tmp_path)
     (sensor,) = report["sensors"]
     assert sensor["packets"]["rejected"] == {"bad_size": MANY}
-    (name, told), (same, counted) = _told(report)
+    (name, text), (same, counted) = _warnings(report)
     assert name == same == "hesai_1"
     assert counted == f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size)"
-    assert told == (
+    assert text == (
         f"{IP} > port {PORT}: expected packets of 1262 bytes as at first, found 1266 bytes as "
         "well, which are rejected as bad_size; split the recording where the settings of the lidar "
         "change"
@@ -233,20 +238,20 @@ def test_packets_of_another_return_mode_are_rejected(
     report = _converted(shell, f"{session}/drive.pcap", tmp_path)
     assert report["sensors"][0]["packets"]["rejected"] == {"bad_header": MANY}
     assert report["sensors"][0]["packets"]["accepted"] == MANY
-    ((_, told),) = _told(report)
-    assert told.endswith(f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header)")
+    ((_, text),) = _warnings(report)
+    assert text.endswith(f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header)")
 
 
 def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> None:
     for session, path in (("vlp32c/drive.pcap", "vlp16.yml"), ("clouds.db3", "xt16.csv")):
         folder = tmp_path / path
         folder.mkdir()
-        told = _told(_converted(shell, f"{session} --metadata files/{path}", folder))
+        text = _warnings(_converted(shell, f"{session} --metadata files/{path}", folder))
         unused = "it is not used; leave it out, or name its sensor in a rig file (--rig)"
         assert (
             "",
             f"files/{path}: expected a sensor that it matches, found none; {unused}",
-        ) in told
+        ) in text
 
 
 def test_clouds_beside_raw_packets_are_left_alone(shell: Shell, tmp_path: Path) -> None:

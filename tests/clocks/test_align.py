@@ -89,7 +89,7 @@ def test_drift_that_comes_and_goes() -> None:
 
 
 def test_stamps_are_mapped_exactly() -> None:
-    """Days of ns since 1970 do not fit into a float64; an exact clock comes back to the ns."""
+    """Days of ns since 1970 do not fit into a float64; an exact clock is recovered to the ns."""
     one = heard(Clock(TAI_NS + 123), EXACT)
     aligned_ns = fitted(one).apply(one.stamp_ns)
     np.testing.assert_array_equal(aligned_ns, one.true_ns + 100 * NS_PER_US)

@@ -229,7 +229,7 @@ def test_never_synchronised_beyond_the_bound(recordings: list[Simulated]) -> Non
 
 
 def test_corrections_bring_clocks_together(recordings: list[Simulated]) -> None:
-    """What is written into the rig leaves no more than is said."""
+    """The correction for the rig leaves at most the stated error."""
     checked = 0
     for one in recordings:
         comparison = one.comparison

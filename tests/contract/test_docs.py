@@ -1,4 +1,4 @@
-"""README and docs/ say what the code does: commands run, tables agree, names are all there."""
+"""README and docs/ agree with the code: commands run, tables agree, all names are present."""
 
 from __future__ import annotations
 

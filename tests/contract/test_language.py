@@ -32,8 +32,11 @@ IDIOM = {
     r"wanted|wants": "expected",
 }
 WORDS = re.compile("|".join(rf"\b(?:{pattern})\b" for pattern in IDIOM), re.IGNORECASE)
-# Names of others: a function of typer, a field of a vendor's format.
-FOREIGN = re.compile(r"typer\.echo|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']")
+# Fixed names: functions of typer and of files, fields of JSON documents and of a vendor's format.
+FOREIGN = re.compile(
+    r"typer\.echo|\btell\(|`tell`|[`\"](?:maker|wanted)[`\"]"
+    r"|[`\"'](?:[\w.]*_)?echo(?:es)?[\w.]*[`\"']"
+)
 # Pages that the repository does not have, and the old place of the sources.
 OUTSIDE = re.compile(
     r"\b(?:STYLE|CONTRACT|ARCHITECTURE|REDESIGN)\.md|\bfacts/\w+\.md|\.\./shared/\w+\.md"

@@ -1,4 +1,4 @@
-"""Every supported model: what its maker's module offers, an encoder, a case, the laws of `Lidar`.
+"""Every supported model: what its vendor's module offers, an encoder, a case, the laws of `Lidar`.
 
 What is missing for a new one is named here; docs/add-a-sensor.md says where it goes.
 """
@@ -42,7 +42,7 @@ SOURCE = "192.168.1.201"
 START_NS = 1_700_000_000_000_000_000
 # Rows of encoders that go by another name than the model, or are a second kind of its packets.
 VARIANTS = {"Pandar64-7": "Pandar64", **ROBOSENSE_NAMES}
-# Sizes of packets that any maker knows, and of some that nobody does.
+# Sizes of packets that a vendor's module knows, and some unknown ones.
 SIZES = (*range(0, 64), 80, 512, 554, 568, 812, 820, 861, 1072, 1080, 1095, 1127, 1198, 1200, 1206)
 SIZES += (1210, 1212, 1248, 1262, 1266, 1268, 1270, 1362, 1380, 1392, 3392, 6464, 8448, 12608)
 
@@ -68,11 +68,11 @@ def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
     payloads = sent.seen.payloads
     packets = rows([payload for _, payload in payloads])
     host_ns = np.array([at for at, _ in payloads])
-    beside = tuple(
+    neighbours = tuple(
         NeighbourStream(Stream(SOURCE, 7788), len(payload), rows([payload]), np.array([at]))
         for at, payload in sent.neighbours
     )
-    evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, beside)
+    evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, neighbours)
     given = parse_calibration(Path(sent.file), sent.content) if sent.file else None
     known = built_in() if given is None else [given]
     found = [calibration for one in known if (calibration := _named(one, sent))]
@@ -91,7 +91,8 @@ def _named(calibration: Calibration, sent: Sent) -> Calibration | None:
 
 
 def _ouster(model: SensorModel) -> Stand:
-    beams, product = model.channels, model.name.replace("OS", "OS-", 1)
+    beams = model.channels
+    product = model.name.replace("OS", "OS-", 1)
     spec = ouster.OusterSpec(beams=beams, columns_per_frame=512, product=product)
     ranges = np.full((512, beams, 1), 4000)
     packets = rows(ouster.encode_frame(spec, START_NS, 5, ranges)[:8])
@@ -136,7 +137,7 @@ def test_a_plugin_offers_all_that_is_asked_of_it(plugin: Plugin) -> None:
     assert plugin.VENDOR
     assert plugin.MODELS
     for model in plugin.MODELS:
-        assert model.verified in WORDS, f"{model.name}: wanted one of {WORDS}"
+        assert model.verified in WORDS, f"{model.name}: expected one of {WORDS}"
         assert model.channels > 0
         assert model.returns
         assert model.clock
@@ -187,7 +188,8 @@ def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) 
     try:
         found = plugin.read_calibration(Path("some.file"), content)
     except MlbatchError as err:
-        found, refusal = None, str(err)
+        found = None
+        refusal = str(err)
     assert found is None
     assert refusal.startswith("some.file: ")
 
@@ -195,7 +197,8 @@ def test_random_files_are_left_alone_or_refused(plugin: Plugin, content: bytes) 
 @pytest.mark.parametrize("name", cases())
 def test_a_lidar_keeps_the_laws(name: str) -> None:
     stand = cases()[name]()
-    lidar, packets = stand.lidar, stand.packets
+    lidar = stand.lidar
+    packets = stand.packets
     _check_table(lidar)
     shape = (len(packets), lidar.columns_per_packet)
     headers = lidar.column_headers(packets, stand.host_ns)
@@ -218,7 +221,9 @@ def test_a_lidar_keeps_the_laws(name: str) -> None:
 @pytest.mark.parametrize("name", cases())
 def test_a_packet_says_the_same_in_any_company(name: str) -> None:
     stand = cases()[name]()
-    lidar, packets, host_ns = stand.lidar, stand.packets, stand.host_ns
+    lidar = stand.lidar
+    packets = stand.packets
+    host_ns = stand.host_ns
     order = np.random.default_rng(2).permutation(len(packets))
     whole, shuffled = (
         lidar.column_headers(packets, host_ns),
@@ -240,7 +245,7 @@ def test_a_packet_says_the_same_in_any_company(name: str) -> None:
 
 
 def _check_table(lidar: Lidar) -> None:
-    """What a lidar says of its columns before any packet."""
+    """Properties of a lidar's columns, before any packet."""
     model = next(m for m in models() if _is_named(lidar, m))
     assert (lidar.vendor, lidar.channels) == (model.vendor, model.channels)
     assert lidar.firing_ns.ndim == 2
@@ -253,7 +258,8 @@ def _check_table(lidar: Lidar) -> None:
     assert len(lidar.return_types) == lidar.returns
     assert lidar.typed_by in ("order", "level", "")
     assert lidar.beams.direction.shape == (3, lidar.channels, 3)
-    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    at = lidar.records
+    column = np.arange(lidar.columns_per_packet)
     begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
     assert begins.min() >= 0
     assert begins.max() + at.size <= lidar.packet_size
@@ -265,7 +271,8 @@ def _is_named(lidar: Lidar, model: SensorModel) -> bool:
 
 def _records(lidar: Lidar, packets: U8Array) -> U8Array:
     """The bytes of all columns, one by one."""
-    at, column = lidar.records, np.arange(lidar.columns_per_packet)
+    at = lidar.records
+    column = np.arange(lidar.columns_per_packet)
     begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
     found = packets[:, begins[:, None] + np.arange(at.size)]
     return np.ascontiguousarray(found.reshape(-1, at.size))

@@ -1,4 +1,4 @@
-"""What an installation holds, told from pyproject.toml without building anything."""
+"""Content of an installation, from pyproject.toml, without a build."""
 
 from __future__ import annotations
 

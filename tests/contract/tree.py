@@ -34,7 +34,7 @@ class Module:
 
 @dataclass(frozen=True, slots=True)
 class Import:
-    """An import of a module of the package, wherever in a file it stands."""
+    """An import of a module of the package, anywhere in a file."""
 
     target: str
     line: int
@@ -62,7 +62,7 @@ def _module(path: Path) -> Module:
 
 
 def imports(module: Module, names: frozenset[str]) -> Iterator[Import]:
-    """Imports from the package; `names`: all its modules, to tell them from what they define."""
+    """Imports from the package; `names`: all its modules, unlike what they define."""
     guarded, called = _inside(module.tree, _is_guard), _inside(module.tree, _is_function)
     for node in ast.walk(module.tree):
         for target in _targets(node, module, names):

@@ -54,13 +54,13 @@ def test_numpy_measures_positions_beyond_the_revolution() -> None:
     assert compiled.measure(fine) == plain.measure(fine)
 
 
-@pytest.mark.parametrize("outliner", [ColumnStatistics, CompiledColumnStatistics])
-def test_column_statistics_by_hand(outliner: type[ColumnStatistics]) -> None:
+@pytest.mark.parametrize("statistics", [ColumnStatistics, CompiledColumnStatistics])
+def test_column_statistics_by_hand(statistics: type[ColumnStatistics]) -> None:
     # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
     stamp_ns = np.array([0, 10, 40, 45, 50, 51])
     encoder = np.array([0, 2, 3, 1, 1 << 31, 359])
     sensor = np.array([0, 0, 0, 0, 1, 0])
-    found = outliner((360, None, 8)).measure(WindowColumns(stamp_ns, sensor, stamp_ns, encoder))
+    found = statistics((360, None, 8)).measure(WindowColumns(stamp_ns, sensor, stamp_ns, encoder))
     assert found == [
         ColumnStats(5, 30, 3 / 120, 1 / 120),
         ColumnStats(1, 0, 1 / 120, 0.0),

@@ -37,7 +37,7 @@ DUAL = replace(FLAT, profile="RNG19_RFL8_SIG16_NIR16_DUAL")
 
 
 @dataclass
-class Bench:
+class StoredSensor:
     """A sensor with a whole revolution in its ring; ranges_mm: (columns, beams) by field name."""
 
     folder: Path
@@ -81,22 +81,24 @@ def _ranges(value: int = 0, **cells: int) -> IntLike:
 
 
 def _decoder(
-    *benches: Bench, layout: str = "dense", boxes: Sequence[Sequence[float]] = ()
+    *stored: StoredSensor, layout: str = "dense", boxes: Sequence[Sequence[float]] = ()
 ) -> Decoder:
     sensors = tuple(
-        SensorInfo(f"s{number}", "", 16, bench.source.lidar.returns, bench.ring_base, np.eye(4))
-        for number, bench in enumerate(benches)
+        SensorInfo(f"s{number}", "", 16, one.source.lidar.returns, one.ring_base, np.eye(4))
+        for number, one in enumerate(stored)
     )
     info = RunInfo(sensors, "base_link", "10", "utc", layout=layout)
     boxes_m = np.array(boxes, np.float64).reshape(-1, 6)
-    return Decoder(info, [bench.source for bench in benches], boxes_m)
+    return Decoder(info, [one.source for one in stored], boxes_m)
 
 
-def _scan(decoder: Decoder, benches: Sequence[Bench], columns: Sequence[tuple[int, int]]) -> Scan:
+def _scan(
+    decoder: Decoder, stored: Sequence[StoredSensor], columns: Sequence[tuple[int, int]]
+) -> Scan:
     """A scan of (sensor, measurement id), 100 us apart."""
     sensor = np.array([number for number, _ in columns], np.int64)
     mids = np.array([mid for _, mid in columns], np.int64)
-    place = np.array([benches[s].ring_index[mid] for s, mid in columns], np.int64)
+    place = np.array([stored[s].ring_index[mid] for s, mid in columns], np.int64)
     stamps = START_NS + np.arange(len(columns), dtype=np.int64) * 100_000
     label = ScanHeader(3, 0, START_NS, START_NS + 10**8, True, 17)
     return decoder.scan(WindowColumns(stamps, sensor, place, mids), label)
@@ -124,15 +126,15 @@ def _xyz(scan: Scan) -> list[list[float]]:
     ],
 )
 def test_a_point_at_four_metres(tmp_path: Path, cell: str, xyz: list[float]) -> None:
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(**{cell: 4000})})
-    scan = _scan(_decoder(bench), [bench], [(0, mid) for mid in range(COLUMNS)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(**{cell: 4000})})
+    scan = _scan(_decoder(one), [one], [(0, mid) for mid in range(COLUMNS)])
     assert _xyz(scan) == [[round(value, 4) for value in xyz]]
 
 
 def test_extrinsics_rotate_then_translate(tmp_path: Path) -> None:
     pose = from_rpy_deg((10.0, 20.0, 30.0), (0.0, 0.0, 90.0))
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(c256_b2=4000)}, pose)
-    scan = _scan(_decoder(bench), [bench], [(0, 256)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(c256_b2=4000)}, pose)
+    scan = _scan(_decoder(one), [one], [(0, 256)])
     assert _xyz(scan) == [[10, 24, 30]]
     # The range is as measured.
     assert scan.range_m is not None
@@ -143,8 +145,8 @@ def test_beams_begin_at_their_distance_from_the_axis(tmp_path: Path) -> None:
     """n = 15.8 mm: (r - n) along the beam, plus n along the column's angle (section 6)."""
     spec = replace(FLAT, beam_offset_mm=(16.0, 0.0))
     ranges = _ranges(c256_b2=4000, c256_b1=4000)
-    bench = Bench(tmp_path, spec, {"RANGE": ranges})
-    scan = _scan(_decoder(bench), [bench], [(0, 256)])
+    one = StoredSensor(tmp_path, spec, {"RANGE": ranges})
+    scan = _scan(_decoder(one), [one], [(0, 256)])
     assert _xyz(scan) == [[0.016, -3.984, 0], [4, 0, 0]]
 
 
@@ -153,8 +155,8 @@ def test_beams_begin_at_their_distance_from_the_axis(tmp_path: Path) -> None:
 
 def test_points_are_sorted_by_column_then_channel(tmp_path: Path) -> None:
     ranges = _ranges(c7_b3=1000, c7_b5=2000, c2_b9=3000)
-    bench = Bench(tmp_path, FLAT, {"RANGE": ranges}, ring_base=40)
-    scan = _scan(_decoder(bench), [bench], [(0, 7), (0, 0), (0, 2)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": ranges}, ring_base=40)
+    scan = _scan(_decoder(one), [one], [(0, 7), (0, 0), (0, 2)])
     assert scan.ring.tolist() == [43, 45, 49]
     assert scan.column is not None
     assert scan.column.tolist() == [0, 0, 2]
@@ -168,8 +170,8 @@ def test_two_returns_share_a_ring_and_are_typed_by_range(tmp_path: Path) -> None
     """Numbering of docs/sources/outputs.md section 3; the strongest comes first."""
     strong = _ranges(c0_b0=1000, c0_b1=5000, c0_b2=3000)
     weak = _ranges(c0_b0=4000, c0_b1=2000)
-    bench = Bench(tmp_path, DUAL, {"RANGE": strong, "RANGE2": weak})
-    scan = _scan(_decoder(bench), [bench], [(0, 0)])
+    one = StoredSensor(tmp_path, DUAL, {"RANGE": strong, "RANGE2": weak})
+    scan = _scan(_decoder(one), [one], [(0, 0)])
     assert scan.ring.tolist() == [0, 0, 1, 1, 2]
     assert scan.range_m is not None
     assert scan.range_m.tolist() == [1.0, 4.0, 5.0, 2.0, 3.0]
@@ -178,8 +180,8 @@ def test_two_returns_share_a_ring_and_are_typed_by_range(tmp_path: Path) -> None
 
 
 def test_columns_of_sensors_are_merged_by_timestamp(tmp_path: Path) -> None:
-    first = Bench(tmp_path, FLAT, {"RANGE": _ranges(1000)})
-    second = Bench(tmp_path, DUAL, {"RANGE": _ranges(2000)}, ring_base=16)
+    first = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000)})
+    second = StoredSensor(tmp_path, DUAL, {"RANGE": _ranges(2000)}, ring_base=16)
     order = [(1, 0), (0, 5), (0, 6), (1, 1), (0, 7)]
     scan = _scan(_decoder(first, second), [first, second], order)
     assert scan.lidar_id.tolist() == np.repeat([1, 0, 0, 1, 0], 16).tolist()
@@ -195,9 +197,9 @@ def test_columns_of_sensors_are_merged_by_timestamp(tmp_path: Path) -> None:
 
 def test_every_slot_is_written_or_counted(tmp_path: Path) -> None:
     ranges = _ranges(c256_b2=400, c256_b3=4000, c256_b4=8000, c0_b5=4000)
-    bench = Bench(tmp_path, FLAT, {"RANGE": ranges}, min_range_m=0.5, max_range_m=6.0)
-    decoder = _decoder(bench, boxes=[[-5, -1, -1, -3, 1, 1]])
-    scan = _scan(decoder, [bench], [(0, 256), (0, 0)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": ranges}, min_range_m=0.5, max_range_m=6.0)
+    decoder = _decoder(one, boxes=[[-5, -1, -1, -3, 1, 1]])
+    scan = _scan(decoder, [one], [(0, 256), (0, 0)])
     assert _xyz(scan) == [[4, 0, 0]]
     (counts,) = decoder.counts
     assert (counts.slots, counts.no_return, counts.range, counts.box) == (32, 28, 2, 1)
@@ -206,20 +208,22 @@ def test_every_slot_is_written_or_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("low", "high", "kept"), [(4.0, 4.0001, 1), (4.001, 9, 0), (0, 3.999, 0)])
 def test_limits_are_kept(tmp_path: Path, low: float, high: float, kept: int) -> None:
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(c0_b2=4000)}, min_range_m=low, max_range_m=high)
-    assert _scan(_decoder(bench), [bench], [(0, 0)]).points == kept
+    one = StoredSensor(
+        tmp_path, FLAT, {"RANGE": _ranges(c0_b2=4000)}, min_range_m=low, max_range_m=high
+    )
+    assert _scan(_decoder(one), [one], [(0, 0)]).points == kept
 
 
 def test_an_empty_window_gives_an_empty_scan(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges()})
-    scan = _scan(_decoder(bench), [bench], [(0, 0), (0, 1)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges()})
+    scan = _scan(_decoder(one), [one], [(0, 0), (0, 1)])
     assert (scan.points, scan.xyz.shape, len(scan.column_stamp_ns)) == (0, (0, 3), 2)
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
 def test_a_window_without_a_column_gives_an_empty_scan(tmp_path: Path, layout: str) -> None:
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges()})
-    scan = _scan(_decoder(bench, layout=layout), [bench], [])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges()})
+    scan = _scan(_decoder(one, layout=layout), [one], [])
     assert (scan.points, len(scan.xyz), len(scan.column_stamp_ns)) == (0, 0, 0)
 
 
@@ -227,9 +231,11 @@ def test_a_window_without_a_column_gives_an_empty_scan(tmp_path: Path, layout: s
 
 
 def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
-    first = Bench(tmp_path, FLAT, {"RANGE": _ranges(c0_b3=1000)})
+    first = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(c0_b3=1000)})
     weak = _ranges(c1_b2=2000)
-    second = Bench(tmp_path, DUAL, {"RANGE": _ranges(c1_b2=3000), "RANGE2": weak}, ring_base=16)
+    second = StoredSensor(
+        tmp_path, DUAL, {"RANGE": _ranges(c1_b2=3000), "RANGE2": weak}, ring_base=16
+    )
     decoder = _decoder(first, second, layout="organized")
     scan = _scan(decoder, [first, second], [(0, 0), (1, 1)])
     assert scan.xyz.shape == (2, 32, 3)
@@ -254,7 +260,7 @@ def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
     """A scan of many tiles equals the scans of its columns, one after the other."""
     rng = np.random.default_rng(4)
     first, second = (
-        Bench(
+        StoredSensor(
             tmp_path,
             spec,
             {
@@ -267,12 +273,12 @@ def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
         )
         for spec, base in ((FLAT, 0), (DUAL, 16))
     )
-    benches = [first, second]
+    stored = [first, second]
     count = 2 * tile_columns(32) + 100
     columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, COLUMNS], (count, 2))]
-    whole = _scan(_decoder(*benches, layout=layout), benches, columns)
-    decoder = _decoder(*benches, layout=layout)
-    singles = [_arrays(_scan(decoder, benches, [column])) for column in columns]
+    whole = _scan(_decoder(*stored, layout=layout), stored, columns)
+    decoder = _decoder(*stored, layout=layout)
+    singles = [_arrays(_scan(decoder, stored, [column])) for column in columns]
     for number, array in enumerate(_arrays(whole)):
         np.testing.assert_array_equal(array, np.concatenate([one[number] for one in singles]))
 
@@ -284,10 +290,10 @@ def _arrays(scan: Scan) -> list[npt.NDArray[np.generic]]:
 
 
 def test_a_smaller_scan_after_a_larger_one_has_no_stale_points(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, FLAT, {"RANGE": _ranges(1000, c9_b4=0)})
-    decoder = _decoder(bench)
-    assert _scan(decoder, [bench], [(0, mid) for mid in range(100)]).points == 1599
-    scan = _scan(decoder, [bench], [(0, 9)])
+    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000, c9_b4=0)})
+    decoder = _decoder(one)
+    assert _scan(decoder, [one], [(0, mid) for mid in range(100)]).points == 1599
+    scan = _scan(decoder, [one], [(0, 9)])
     assert (scan.points, len(scan.xyz), len(scan.ring)) == (15, 15, 15)
     assert decoder.counts[0].written == 1599 + 15
 
@@ -311,8 +317,8 @@ def test_coverage_and_overlap_of_a_revolution(
 ) -> None:
     for name in ("1", "2"):
         (tmp_path / name).mkdir()
-    one = Bench(tmp_path / "1", FLAT, {"RANGE": _ranges(4000)})
-    two = Bench(tmp_path / "2", FLAT, {"RANGE": _ranges(4000)}, ring_base=16)
+    one = StoredSensor(tmp_path / "1", FLAT, {"RANGE": _ranges(4000)})
+    two = StoredSensor(tmp_path / "2", FLAT, {"RANGE": _ranges(4000)}, ring_base=16)
     columns = [(0, mid) for mid in mids]
     assert _scan(_decoder(one), [one], columns).coverage == pytest.approx((coverage,))
     scan = _scan(_decoder(one, two), [one, two], [*columns, (1, 7)])

@@ -41,7 +41,7 @@ def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
     recordings = [open_recording(path, table) for path in captures]
     host_ns = np.concatenate([batch.host_ns for batch in first_seconds(recordings)])
     assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
-    # 32 packets a turn of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
+    # 32 packets a revolution of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
     sampler, _ = probe(recordings, table)
     assert [samples.packets for samples in sampler.kinds.values()] == [60 * 32, 50 * 32 + 1]
 
@@ -101,7 +101,8 @@ def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: P
 
 
 def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) -> None:
-    first, second = tmp_path / "1", tmp_path / "2"
+    first = tmp_path / "1"
+    second = tmp_path / "2"
     for folder, serial in ((first, 1), (second, 2)):
         folder.mkdir()
         write_metadata(folder / "any name.JSON", replace(SMALL, serial=serial))

@@ -54,7 +54,7 @@ SIDES_M = {"left": [0, 1, 2], "right": [0, -1, 2]}
 
 @dataclass(frozen=True)
 class Given:
-    """What a session says of its extrinsics; static, tf: a transform a message."""
+    """Extrinsics in a session; static, tf: a transform a message."""
 
     frames: Frames = field(default_factory=lambda: PAIR)
     static: Sequence[Transform] = ()

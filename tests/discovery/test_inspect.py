@@ -28,7 +28,8 @@ from tests.builders.sessions import (
 CAPTURE = FIXTURE / "two_lidars.pcap"
 OUSTER = RECORDINGS / "ouster"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
-LEFT, RIGHT = "ouster_122647000123", "ouster_122648000456"
+LEFT = "ouster_122647000123"
+RIGHT = "ouster_122648000456"
 
 
 def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
@@ -151,7 +152,7 @@ def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
     assert (outcome.code, outcome.out) == (1, "")
     assert outcome.err == (
-        "mlbatch: error: rig.yaml: wanted a new rig file, got an existing one; choose another "
+        "mlbatch: error: rig.yaml: expected a new rig file, found an existing one; choose another "
         "name\n"
     )
     assert Path("rig.yaml").read_text() == "mine\n"
@@ -207,7 +208,7 @@ REAL = {
         53750: ("ouster_992108000265", 17, "uptime"),
         7503: ("ouster_992108000265", 10, ""),
     },
-    # 540.8 s ahead of the recorder: neither UTC nor TAI.
+    # 540.8 s ahead of the capture host: neither UTC nor TAI.
     "os2-128_duplicate-ip-id/duplicate_id.pcap": {34636: ("ouster_992219000042", 1, "unknown")},
     "os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap": {7513: ("", 8, ""), 7514: ("", 1, "")},
     "empty-pcap/empty_pcap.pcap": {},

@@ -24,44 +24,44 @@ PACKET_NS = {
 FILES = {"ouster": "front.json", "velodyne": "", "hesai": "unit.csv", "robosense": "angles.csv"}
 
 
-def one(maker: str) -> Sent:
-    return VENDORS[maker].send(Spell(BEGIN_NS, LENGTH_NS))
+def one(vendor: str) -> Sent:
+    return VENDORS[vendor].send(Spell(BEGIN_NS, LENGTH_NS))
 
 
-def both(maker: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
+def both(vendor: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
     """Packets of two lidars in receive order; of the second, sending and clock are ahead."""
     spell = Spell(BEGIN_NS + ahead_ns + clock_ahead_ns, LENGTH_NS, ahead_ns=-clock_ahead_ns)
-    mixed = one(maker).then(VENDORS[maker].send(spell))
+    mixed = one(vendor).then(VENDORS[vendor].send(spell))
     return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
 
 
-def converted(maker: str, sent: Sent, folder: Path) -> tuple[int, str]:
+def converted(vendor: str, sent: Sent, folder: Path) -> tuple[int, str]:
     """Exit code and error of a conversion of these packets, all from one address."""
     write_metadata(folder)
     frames = [
         (int(host_ns), frame)
         for host_ns, payload in zip(sent.host_ns, sent.payloads, strict=True)
-        for frame in udp_frame(payload, VENDORS[maker].ip, sport=9000, dport=VENDORS[maker].port)
+        for frame in udp_frame(payload, VENDORS[vendor].ip, sport=9000, dport=VENDORS[vendor].port)
     ]
     capture = write_pcap(folder / "drive.pcap", frames)
-    files: list[str | Path] = ["--metadata", folder / FILES[maker]] if FILES[maker] else []
+    files: list[str | Path] = ["--metadata", folder / FILES[vendor]] if FILES[vendor] else []
     result = command("convert", capture, *files, "--dry-run", "--quiet")
     return result.code, result.err
 
 
 @pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
-@pytest.mark.parametrize("maker", VENDORS)
-def test_two_lidars_that_alternate_are_refused(maker: str, share: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_two_lidars_that_alternate_are_refused(vendor: str, share: float, tmp_path: Path) -> None:
     # A third of a revolution apart, so that the rotors differ as well.
-    ahead_ns = 33 * NS_PER_MS // PACKET_NS[maker] * PACKET_NS[maker]
-    code, err = converted(maker, both(maker, ahead_ns + int(share * PACKET_NS[maker])), tmp_path)
+    ahead_ns = 33 * NS_PER_MS // PACKET_NS[vendor] * PACKET_NS[vendor]
+    code, err = converted(vendor, both(vendor, ahead_ns + int(share * PACKET_NS[vendor])), tmp_path)
     assert code == 1
     assert "several lidars share the address" in err
 
 
-@pytest.mark.parametrize("maker", VENDORS)
-def test_two_clocks_are_refused(maker: str, tmp_path: Path) -> None:
-    code, err = converted(maker, both(maker, 5 * NS_PER_MS, 700 * NS_PER_S), tmp_path)
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_two_clocks_are_refused(vendor: str, tmp_path: Path) -> None:
+    code, err = converted(vendor, both(vendor, 5 * NS_PER_MS, 700 * NS_PER_S), tmp_path)
     assert code == 1
     assert "several lidars share the address" in err
 
@@ -95,9 +95,9 @@ ONE: Mapping[str, Callable[[Sent], Sent]] = {
 
 
 @pytest.mark.parametrize("change", ONE)
-@pytest.mark.parametrize("maker", VENDORS)
-def test_one_lidar_is_not_refused(maker: str, change: str, tmp_path: Path) -> None:
-    code, err = converted(maker, ONE[change](one(maker)), tmp_path)
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_one_lidar_is_not_refused(vendor: str, change: str, tmp_path: Path) -> None:
+    code, err = converted(vendor, ONE[change](one(vendor)), tmp_path)
     assert code == 0, err
 
 

@@ -162,8 +162,8 @@ CASES = {
             (
                 "late_stream",
                 "",
-                f"10.0.0.2 > port 7502: {NEEDS_METADATA.format(222)}; it began after the first "
-                "10 s, where sensors are looked for, so that its packets are counted as "
+                f"10.0.0.2 > port 7502: {NEEDS_METADATA.format(222)}; it started after the "
+                "first 10 s, in which sensors are detected; its packets are counted as "
                 "unassigned; name the sensor in a rig file (--rig)",
             ),
         ),

@@ -18,7 +18,7 @@ from mlbatch.types import ColumnHeaders, PacketBatch, Pixels, Stream, StreamTabl
 from tests.fuzz.framing import Part
 from tests.fuzz.harness import BrokenLaw
 
-# What a parser of a fuzzed table could hand over; none of ours has so many.
+# What a parser of a fuzzed table could return; none of ours has so many.
 _MOST_COLUMNS = 4096
 # A ring is a uint16.
 _MOST_RINGS = 1 << 16

@@ -14,7 +14,7 @@ _PART = struct.Struct("<HqI")
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A datagram (or a text) of an input; kind: its port, or what else tells it from others."""
+    """A datagram (or a text) of an input; kind: its port, or another distinction."""
 
     kind: int
     host_ns: int
@@ -57,7 +57,7 @@ def mutated_parts(rng: random.Random, seeds: Seeds) -> bytes:
 
 
 def _alike(rng: random.Random, parts: Sequence[Part], seeds: Seeds) -> list[Part]:
-    """The same change to all parts of a kind: a sensor that always lies."""
+    """The same change to all parts of a kind: a sensor that always sends wrong values."""
     kind, state = rng.choice(parts).kind, rng.getstate()
     changed = []
     for part in parts:

@@ -1,6 +1,6 @@
-"""A campaign: seeded inputs to one target, each held to 5 s, 500 MB and errors of one clear line.
+"""A campaign: seeded inputs to one target, within 5 s, 500 MB and errors of one clear line each.
 
-Seconds are those of the processor, and memory is what comes on top of what the process held: how
+Seconds are those of the processor, and memory is what is allocated beyond what was in use: how
 busy the machine is, and what ran before, are no fault of an input. An input follows from the
 target's name, a seed and its number alone, so that a failure can be had again without those before
 it.
@@ -60,7 +60,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """An input that must not do what it did; place: where it came out, to tell causes apart."""
+    """An input that must not do what it did; place: where it was raised, to distinguish causes."""
 
     target: str
     seed: int
@@ -81,7 +81,7 @@ class Failure:
 class Tally:
     """What a campaign came to; refused: inputs that gave an error of mlbatch.
 
-    peak_bytes: most memory on top of what the process held before.
+    peak_bytes: most memory beyond what was in use before.
     """
 
     inputs: int = 0
@@ -123,7 +123,7 @@ def campaign(
     """Run the inputs of these numbers; one failure is kept of each place in the code."""
     tally = Tally()
     _seeds(target)
-    held = _memory_bytes()[1]
+    before_bytes = _memory_bytes()[1]
     with tempfile.TemporaryDirectory(dir=_quick_folder()) as name, guarded():
         folder = Path(name)
         for number in numbers:
@@ -133,8 +133,8 @@ def campaign(
             with _in_memory():
                 what, place = examine(target, data, folder)
             took_s = time.process_time() - began_s
-            if _ever_held_bytes() > held + tally.peak_bytes:
-                needed = _peak_bytes() - held
+            if _peak_ever_bytes() > before_bytes + tally.peak_bytes:
+                needed = _peak_bytes() - before_bytes
                 tally.peak_bytes = max(tally.peak_bytes, needed)
                 if needed > MOST_BYTES:
                     what, place = f"needed {needed >> 20} MB\n{what}", "memory"
@@ -218,7 +218,7 @@ def _in_memory() -> Iterator[None]:
 
 
 def _lift_limit() -> None:
-    """Give back memory, so that what happened can be told."""
+    """Give back memory, so that the result can be reported."""
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
     gc.collect()
@@ -229,7 +229,7 @@ def _late(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _memory_bytes() -> tuple[int, int]:
-    """Address space and resident memory of this process; 0 where they cannot be told."""
+    """Address space and resident memory of this process; 0 where unknown."""
     try:
         words = Path("/proc/self/statm").read_text(encoding="ascii").split()
     except OSError:
@@ -237,13 +237,13 @@ def _memory_bytes() -> tuple[int, int]:
     return int(words[0]) * resource.getpagesize(), int(words[1]) * resource.getpagesize()
 
 
-def _ever_held_bytes() -> int:
-    """Most memory that this process ever held; quicker than `_peak_bytes`."""
+def _peak_ever_bytes() -> int:
+    """Peak memory of this process; quicker than `_peak_bytes`."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _peak_bytes() -> int:
-    """Most memory that this process held since `_forget_peak`; 0 where it cannot be told."""
+    """Most memory that this process used since `_forget_peak`; 0 where unknown."""
     try:
         found = _PEAK.search(
             Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
@@ -254,7 +254,7 @@ def _peak_bytes() -> int:
 
 
 def _forget_peak() -> None:
-    """What was held before is of no interest (proc(5), clear_refs)."""
+    """Earlier use is of no interest (proc(5), clear_refs)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 

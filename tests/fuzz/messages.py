@@ -82,11 +82,11 @@ def _other_seeds() -> Seeds:
         text = Body(encoding).text(json.dumps(metadata(LEFT))).done()
         layout = Body(encoding).put("I", 0, 0).blob(b"Laser id,Elevation,Azimuth\n1,2,3\n").done()
         robot: Recorded = description(urdf(0.5), 10**18)
-        told = Body(encoding).text(urdf(0.25)).done() if encoding == "ros1" else robot.data
+        robot_text = Body(encoding).text(urdf(0.25)).done() if encoding == "ros1" else robot.data
         for type_name, name, message in (
             ("tf2_msgs/TFMessage", "tf_static", frames),
             ("std_msgs/String", "metadata", text),
-            ("std_msgs/String", "robot_description", told),
+            ("std_msgs/String", "robot_description", robot_text),
             (_CORRECTIONS, "lidar_corrections", layout),
         ):
             known = definition(type_name, encoding)
@@ -129,7 +129,7 @@ def _mutated(rng: random.Random, seeds: Seeds) -> bytes:
 
 
 def _read(data: bytes, folder: Path) -> None:
-    """A bag of one topic, from its messages to the sensors that they tell of."""
+    """A bag of one topic, from its messages to the sensors that they describe."""
     topic, messages = _topic_of(parts_of(data))
     if topic is None:
         return

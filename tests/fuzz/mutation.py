@@ -48,7 +48,7 @@ def _set(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
 
 
 def _extreme(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
-    """A number that nobody writes, or one next to what stands there."""
+    """A number that nobody writes, or one next to the present one."""
     width = rng.choice(_WIDTHS)
     at = _place(rng, data, width)
     _write(data, at, width, rng.choice(_ORDERS), _odd_number(rng, data, at, width))
@@ -68,8 +68,8 @@ def _odd_number(rng: random.Random, data: bytearray, at: int, width: int) -> int
     left, top = len(data) - at - width, 1 << 8 * width
     now = _read(data, at, width, "little")
     ends = (0, 1, 2, top - 1, top - 2, top >> 1, (top >> 1) - 1, top >> 8, (1 << 24) + 1)
-    beside = (left, left + 1, left - 1, len(data), now + 1, now - 1, now * 2, now + 256, now ^ 0x80)
-    return rng.choice((*ends, *beside))
+    near = (left, left + 1, left - 1, len(data), now + 1, now - 1, now * 2, now + 256, now ^ 0x80)
+    return rng.choice((*ends, *near))
 
 
 def _read(data: bytearray, at: int, width: int, order: Order) -> int:
@@ -156,7 +156,7 @@ def mutated_text(rng: random.Random, seeds: Seeds) -> bytes:
 
 
 def _number(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
-    """Put an odd number where one stands."""
+    """Put an odd number in place of another."""
     for _ in range(_TRIES):
         at = rng.randrange(len(data)) if data else 0
         if data[at : at + 1].isdigit():

@@ -1,4 +1,4 @@
-"""Targets: the packets of every model and mode, and the calibration files of every maker."""
+"""Targets: the packets of every model and mode, and the calibration files of every vendor."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ NAMES = (".json", ".yaml", ".xml", ".csv", ".dat")
 
 @lru_cache(maxsize=1)
 def _streams() -> dict[str, Seeds]:
-    """Inputs of every maker: a few packets of each model and mode, and what comes beside them."""
+    """Inputs of every vendor: a few packets of each model and mode, and their other packets."""
     found: dict[str, list[bytes]] = {"ouster": [], "livox": _livox()}
     for make, words in CASES:
         sent = make(*words)
@@ -71,7 +71,7 @@ def _streams() -> dict[str, Seeds]:
     found["ouster"] += [
         _ouster(profile) for profile in PROFILES if "RANGE" in PROFILES[profile].fields
     ]
-    return {maker: tuple(seeds) for maker, seeds in found.items()}
+    return {vendor: tuple(seeds) for vendor, seeds in found.items()}
 
 
 def _livox() -> list[bytes]:
@@ -81,9 +81,9 @@ def _livox() -> list[bytes]:
         shape = (12 * _PACKETS, spec.returns)
         coordinates = np.full((*shape, 3), 1500, np.int64)
         sent = point_packets(spec, coordinates, np.full(shape, 7, np.int64))
-        beside = imu_packet(spec, spec.start_ns, np.zeros(3), np.ones(3))
+        other = imu_packet(spec, spec.start_ns, np.zeros(3), np.ones(3))
         seeds.append(
-            joined([*(Part(56301, at, data) for at, data in sent), Part(56401, sent[0][0], beside)])
+            joined([*(Part(56301, at, data) for at, data in sent), Part(56401, sent[0][0], other)])
         )
     old = livox1_packets(2, 1362)
     seeds.append(joined(Part(56001, 10**18 + at, row.tobytes()) for at, row in enumerate(old)))
@@ -98,12 +98,12 @@ def _ouster(profile: str) -> bytes:
     payloads = ouster.encode_packets(
         spec, START_NS + mids * 195_312, mids, np.full(len(mids), 7), {"RANGE": ranges}
     )
-    beside = ouster.imu_packet(spec, np.array([START_NS]), np.ones((1, 3)), np.zeros((1, 3)))
+    other = ouster.imu_packet(spec, np.array([START_NS]), np.ones((1, 3)), np.zeros((1, 3)))
     return joined(
         [
             Part(CALIBRATION, NAMES.index(".json"), content),
             *(Part(7502, START_NS + number, row) for number, row in enumerate(payloads)),
-            Part(7503, START_NS, beside),
+            Part(7503, START_NS, other),
         ]
     )
 
@@ -149,7 +149,7 @@ def _files() -> dict[str, Seeds]:
 
 @lru_cache(maxsize=1)
 def _seen() -> Sequence[Part]:
-    """Sound packets of several makers, to be decoded with files that are not."""
+    """Sound packets of several vendors, to be decoded with files that are not."""
     streams = _streams()
     sounds = [parts_of(seeds[0]) for seeds in streams.values()] + [
         parts_of(seed) for seed in streams["hesai"][::9]
@@ -181,9 +181,9 @@ def _calibrate(suffix: str, data: bytes, folder: Path) -> None:
                     check_lidar(one.lidar({}, evidence), evidence.sample, evidence.host_ns)
 
 
-def seeds_of(maker: str) -> Seeds:
-    """Inputs of a maker's lidars."""
-    return _streams()[maker]
+def seeds_of(vendor: str) -> Seeds:
+    """Inputs of a vendor's lidars."""
+    return _streams()[vendor]
 
 
 def _files_of(suffix: str) -> Seeds:
@@ -193,8 +193,8 @@ def _files_of(suffix: str) -> Seeds:
 _SHARES = {"velodyne": 6, "hesai": 8, "robosense": 8, "livox": 6, "ouster": 6}
 TARGETS: Sequence[Target] = (
     *(
-        Target(f"packets {maker}", partial(seeds_of, maker), _decode, mutated_parts, share)
-        for maker, share in _SHARES.items()
+        Target(f"packets {vendor}", partial(seeds_of, vendor), _decode, mutated_parts, share)
+        for vendor, share in _SHARES.items()
     ),
     *(
         Target(

@@ -64,7 +64,7 @@ def read_all(recording: Recording, streams: StreamTable) -> None:
 
 
 def check_batch(batch: PacketBatch, streams: StreamTable) -> None:
-    """Payloads lie within the bytes, and streams are known."""
+    """Payloads are within the bytes, and streams are known."""
     if not len(batch):
         return
     end = batch.start + batch.size
@@ -73,7 +73,7 @@ def check_batch(batch: PacketBatch, streams: StreamTable) -> None:
     if int(batch.stream.min()) < 0 or int(batch.stream.max()) >= len(streams.streams):
         raise BrokenLaw("a stream without a name")
     if batch.host_ns.dtype != np.int64:
-        raise BrokenLaw("arrival times that are no int64")
+        raise BrokenLaw("receive times that are no int64")
 
 
 def _read_file(name: str, data: bytes, folder: Path) -> None:
@@ -91,30 +91,30 @@ def _both_engines(data: bytes, folder: Path) -> None:
     path = folder / "a.pcap"
     path.write_bytes(data)
     with kernels_kept():
-        one, other = (_told(path, engine) for engine in ("numpy", "numba"))
+        one, other = (_read(path, engine) for engine in ("numpy", "numba"))
     if one != other:
         raise BrokenLaw("compiled loops read other packets than numpy")
 
 
-def _told(path: Path, engine: str) -> list[object]:
+def _read(path: Path, engine: str) -> list[object]:
     """All that a reader says of a capture; how it cuts batches is its own affair."""
     streams = StreamTable()
     recording = open_recording(path, streams)
     recording.use_engine(engine)
     if isinstance(recording, CaptureRecording):
         recording.buffer_bytes = _BUFFERS[path.stat().st_size % len(_BUFFERS)]
-    told: list[object] = []
+    found: list[object] = []
     try:
         for batch in recording.packets():
             check_batch(batch, streams)
             rows = zip(batch.start, batch.size, batch.stream, batch.host_ns, strict=True)
-            told += [
+            found += [
                 (int(stream), int(host_ns), batch.data[start : start + size].tobytes())
                 for start, size, stream, host_ns in rows
             ]
     except MlbatchError as err:
-        told.append(str(err))
-    return [*told, recording.counts, recording.notes]
+        found.append(str(err))
+    return [*found, recording.counts, recording.notes]
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from tests.fuzz.targets import TARGETS
 
 FOLDER = Path("build") / "fuzz"
 _PART = 2000
-_TOLD = 50_000
+_REPORT_EVERY = 50_000
 # What Python cannot interrupt (a search in C) ends the process with the place where it hung.
 _HANG_S = 300
 
@@ -48,7 +48,7 @@ def main(words: Sequence[str] | None = None) -> int:
         for at, tally in pool.imap_unordered(_run, tasks):
             tallies[at].add(tally)
             done += tally.inputs
-            if done // _TOLD > (done - tally.inputs) // _TOLD:
+            if done // _REPORT_EVERY > (done - tally.inputs) // _REPORT_EVERY:
                 print(f"{done:,} inputs, {time.monotonic() - began_s:.0f} s", flush=True)
             for failure in tally.failures:
                 _save(failure)
@@ -71,7 +71,7 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _tasks(chosen: Sequence[int], seed: int, inputs: int) -> Iterator[Task]:
-    """All parts, every target by its share, taking turns so that a time limit is fair."""
+    """All parts, every target by its share, alternating, so that a time limit is fair."""
     shares = sum(TARGETS[at].share for at in chosen)
     left = {at: (0, -(-inputs * TARGETS[at].share // shares)) for at in chosen}
     while left:

@@ -1,6 +1,6 @@
 """Targets: whole conversions of mutated packets in sound frames, with every law of a run checked.
 
-Threads and compiled kernels read and write where arrays tell them: they must give the same bytes.
+Threads and compiled kernels read and write at places from arrays: they must give the same bytes.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _JOBS = (
 
 @lru_cache(maxsize=1)
 def _seeds() -> Seeds:
-    """Some of each maker's."""
-    makers = ("velodyne", "hesai", "robosense", "livox", "ouster")
-    return tuple(seed for maker in makers for seed in seeds_of(maker)[::_EVERY])
+    """Some of each vendor's."""
+    vendors = ("velodyne", "hesai", "robosense", "livox", "ouster")
+    return tuple(seed for vendor in vendors for seed in seeds_of(vendor)[::_EVERY])
 
 
 def _job(data: bytes, folder: Path) -> Job:
@@ -118,7 +118,7 @@ def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
     """Kernels are made for 128 channels or more, and kept from run to run."""
     with (
         kernels_kept(),
-        patch.object(numba_engine, "_LEAST_PAD", _CHANNELS),
+        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
         patch.object(numba_engine, "load", loading),
     ):
         yield
@@ -140,8 +140,8 @@ def _compile(data: bytes, folder: Path) -> None:
 @lru_cache(maxsize=1)
 def _compiled_seeds() -> Seeds:
     """Few: every kind of packets and number of returns takes a kernel, and seconds to make it."""
-    makers = ("velodyne", "hesai", "robosense", "ouster")
-    return tuple(seed for maker in makers for seed in seeds_of(maker)[:: 2 * _EVERY])
+    vendors = ("velodyne", "hesai", "robosense", "ouster")
+    return tuple(seed for vendor in vendors for seed in seeds_of(vendor)[:: 2 * _EVERY])
 
 
 def _warm_seeds() -> Seeds:

@@ -1,4 +1,4 @@
-"""Little that becomes much: bombs in every kind of compression, gigabytes beside a recording."""
+"""Little that becomes much: bombs in every kind of compression, gigabytes next to a recording."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ def test_a_compressed_database_is_unpacked_no_further_than_its_pages(
 
 
 def test_a_message_that_claims_to_swell_is_not_unpacked() -> None:
-    # A frame whose header tells 1 TB: magic, descriptor (8 byte size, no checksum), window, size.
-    lie = b"\x28\xb5\x2f\xfd\xc0\x58" + struct.pack("<Q", 1 << 40) + b"\x01\x00\x00"
+    # A frame whose header states 1 TB: magic, descriptor (8 byte size, no checksum), window, size.
+    wrong = b"\x28\xb5\x2f\xfd\xc0\x58" + struct.pack("<Q", 1 << 40) + b"\x01\x00\x00"
     kind = "ouster_sensor_msgs/PacketMsg"
 
     def run(data: bytes, folder: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_message_that_claims_to_swell_is_not_unpacked() -> None:
         readers.read_all(recording, streams)
         assert recording.counts.skipped == {"truncated": 2}
 
-    _sound(_examined(lie, run))
+    _sound(_examined(wrong, run))
 
 
 def _sparse(path: Path, size: int, begin: bytes = b"") -> Path:
@@ -152,7 +152,7 @@ def _sparse(path: Path, size: int, begin: bytes = b"") -> Path:
 @pytest.mark.parametrize(
     ("name", "begin"), [("a.json", b'{"sensor_info": {'), ("a.csv", b""), ("a.yaml", b"lasers:\n")]
 )
-def test_a_gigabyte_beside_the_recording_is_not_read(
+def test_a_gigabyte_next_to_the_recording_is_not_read(
     name: str, begin: bytes, tmp_path: Path
 ) -> None:
     def run(data: bytes, folder: Path) -> None:

@@ -30,7 +30,7 @@ OUSTER = "ouster_sensor_msgs/PacketMsg"
 COUNTS = (0, 1, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 
 
-def held(seeds: Sequence[bytes], run: Callable[[bytes, Path], None]) -> None:
+def check(seeds: Sequence[bytes], run: Callable[[bytes, Path], None]) -> None:
     """Run all inputs; each within 5 s and 500 MB, with errors of one line."""
     tally = campaign(Target("lies", lambda: seeds, run), range(len(seeds)))
     assert tally.inputs == len(seeds)
@@ -51,8 +51,8 @@ def with_counts(data: bytes, width: int, order: str) -> Iterator[bytes]:
 def test_every_length_in_a_head_may_lie(name: str, order: str) -> None:
     target = next(one for one in readers.TARGETS if one.name == f"read {name}")
     seed = min(target.seeds(), key=lambda data: (len(data) < 600, len(data)))
-    seeds = [lie for width in (4, 8) for lie in with_counts(seed, width, order)]
-    held(seeds[::7], target.run)
+    seeds = [wrong for width in (4, 8) for wrong in with_counts(seed, width, order)]
+    check(seeds[::7], target.run)
 
 
 def test_every_count_of_a_message_may_lie() -> None:
@@ -62,7 +62,7 @@ def test_every_count_of_a_message_may_lie() -> None:
         array = np.frombuffer(data + bytes(128), np.uint8)
         Unpacker(Topic("/a", OUSTER, "cdr")).find(array, 0, len(data), 0)
 
-    held(list(with_counts(whole, 4, "<")), run)
+    check(list(with_counts(whole, 4, "<")), run)
 
 
 # -- definitions ----------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ def test_definitions_may_not_take_for_ever(name: str) -> None:
             except RecordingError:
                 continue
 
-    held([text.encode()], run)
+    check([text.encode()], run)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_idl_that_never_ends_is_passed_over(text: str) -> None:
                 Topic("/a", "velodyne_msgs/VelodyneScan", "cdr", data.decode(), "ros2idl")
             ).find(np.zeros(200, np.uint8), 0, 70, 0)
 
-    held([text.encode()], run)
+    check([text.encode()], run)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_links_that_lead_to_themselves_are_one_line(tmp_path: Path) -> None:
         open_recording(bag, StreamTable())
 
 
-def test_a_rig_may_name_files_beside_its_folder_and_nothing_else(tmp_path: Path) -> None:
+def test_a_rig_may_name_files_next_to_its_folder_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "rigs").mkdir()
     (tmp_path / "left.json").write_text("{}", encoding="utf-8")
     rig = tmp_path / "rigs" / "rig.yaml"
@@ -250,7 +250,7 @@ def test_yaml_is_never_more_than_plain_values(name: str) -> None:
         (bag / "metadata.yaml").write_bytes(data)
         assert "cannot be read" in open_recording(bag, StreamTable()).notes[0]
 
-    held([YAML[name].encode()], run)
+    check([YAML[name].encode()], run)
 
 
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w.])", re.IGNORECASE)
@@ -259,24 +259,24 @@ WORDS = (b"NaN", b".nan", b"-Infinity", b".inf", b"1e999", b"-1e308", b"42949672
 
 @pytest.mark.parametrize("suffix", [".json", ".yaml", ".xml", ".csv"])
 def test_numbers_of_a_calibration_that_are_none(suffix: str) -> None:
-    """Each of the first numbers of a file in turn, then all of them at once."""
+    """Each of the first numbers of a file one by one, then all of them at once."""
     target = next(one for one in packets.TARGETS if one.name == f"calibration {suffix}")
-    lies = []
+    wrong_seeds = []
     for seed in sorted(target.seeds(), key=len)[:2]:
         places = [found.span() for found in NUMBER.finditer(seed)][:30]
         for word in WORDS:
-            lies.append(NUMBER.sub(word, seed))
-            lies += [seed[:begin] + word + seed[end:] for begin, end in places]
-    held(lies, target.run)
+            wrong_seeds.append(NUMBER.sub(word, seed))
+            wrong_seeds += [seed[:begin] + word + seed[end:] for begin, end in places]
+    check(wrong_seeds, target.run)
 
 
-@pytest.mark.parametrize("maker", ["velodyne", "hesai", "robosense", "livox", "ouster"])
-def test_packets_of_one_value_alone(maker: str) -> None:
-    """Packets that are zeros, or ones, behind what tells their maker."""
-    target = next(one for one in packets.TARGETS if one.name == f"packets {maker}")
-    seeds = target.seeds()[:: 4 if maker != "livox" else 1]
+@pytest.mark.parametrize("vendor", ["velodyne", "hesai", "robosense", "livox", "ouster"])
+def test_packets_of_one_value_alone(vendor: str) -> None:
+    """Packets that are zeros, or ones, after the bytes that identify their vendor."""
+    target = next(one for one in packets.TARGETS if one.name == f"packets {vendor}")
+    seeds = target.seeds()[:: 4 if vendor != "livox" else 1]
     shapes = [(keep, value) for value in (0, 0xFF, 0x80, 0x7F) for keep in (0, 8, 16, 64)]
-    held([_filled(seed, keep, value) for seed in seeds for keep, value in shapes], target.run)
+    check([_filled(seed, keep, value) for seed in seeds for keep, value in shapes], target.run)
 
 
 def _filled(seed: bytes, keep: int, value: int) -> bytes:
@@ -298,18 +298,18 @@ def test_a_capture_of_very_many_kinds_takes_seconds() -> None:
         for number, size in enumerate(rng.permutation(1400).tolist())
     ]
     target = next(one for one in packets.TARGETS if one.name == "packets livox")
-    held([joined(sent)], target.run)
+    check([joined(sent)], target.run)
 
 
 def test_names_of_topics_cannot_command_a_terminal(tmp_path: Path) -> None:
     message = packet_message("cdr", bytes(100))
     name = "/left\x1b]0;owned\x07\nnote: all is well"
     path = write_rosbag2(tmp_path / "a.db3", [Recorded(name, OUSTER, 10**18, message)] * 2)
-    told = command("inspect", path)
-    assert told.code == 0
-    assert "owned" in told.out
-    assert "\x1b" not in told.out
-    assert not any(line.startswith("note: all") for line in told.out.splitlines())
+    result = command("inspect", path)
+    assert result.code == 0
+    assert "owned" in result.out
+    assert "\x1b" not in result.out
+    assert not any(line.startswith("note: all") for line in result.out.splitlines())
 
 
 def test_lines_hold_nothing_that_a_terminal_obeys() -> None:

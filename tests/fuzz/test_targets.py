@@ -44,7 +44,7 @@ def test_an_input_follows_from_its_number(target: Target) -> None:
     assert len(set(first)) > 6
 
 
-def test_a_campaign_tells_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_campaign_reports_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """A campaign that finds nothing would look the same as one that does not look."""
 
     def crash(data: bytes, folder: Path) -> None:
@@ -62,21 +62,21 @@ def test_a_campaign_tells_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(harness, "LONGEST_S", 0.2)
     monkeypatch.setattr(harness, "WAITING_S", 2.0)
-    wanted = (
+    cases = (
         *((crash, "BrokenLaw: of thermodynamics"), (swell, "MemoryError")),
         *((turn, "TooLate"), (wait, "TooLate")),
     )
-    for run, said in wanted:
+    for run, said in cases:
         tally = campaign(Target(run.__name__, lambda: (b"x",), run), range(1))
         assert said in tally.failures[0].what
         assert "(1 bytes)" in str(tally.failures[0])
 
 
 def test_an_error_does_not_excuse_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the process held before, or took to make the input, is not held against it."""
+    """Memory in use before, or used to make the input, does not count."""
 
     def refuse(data: bytes, folder: Path) -> None:
-        raise MlbatchError(f"wanted less, got {len(b'1' * (len(data) * 80_000_000))} bytes")
+        raise MlbatchError(f"expected less, found {len(b'1' * (len(data) * 80_000_000))} bytes")
 
     def seeds() -> tuple[bytes, ...]:
         return (b"", b"1") if len(before) == 80_000_000 else ()

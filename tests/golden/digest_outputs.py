@@ -23,9 +23,16 @@ import zstandard
 
 # Of records of these kinds the place alone counts: they hold offsets and checksums, which move
 # with the length of the report.
-_END_OF_DATA, _ATTACHMENT_INDEX, _METADATA_INDEX, _SUMMARY_OFFSET, _FOOTER = 15, 10, 13, 14, 2
+_END_OF_DATA = 15
+_ATTACHMENT_INDEX = 10
+_METADATA_INDEX = 13
+_SUMMARY_OFFSET = 14
+_FOOTER = 2
 _PLACES = {_END_OF_DATA, _ATTACHMENT_INDEX, _METADATA_INDEX, _SUMMARY_OFFSET, _FOOTER}
-_CHUNK, _CHUNK_INDEX, _ATTACHMENT, _METADATA = 6, 8, 9, 12
+_CHUNK = 6
+_CHUNK_INDEX = 8
+_ATTACHMENT = 9
+_METADATA = 12
 _MAGIC_BYTES = 8
 _REPORT = "mlbatch.report"
 _READY = "ready_host_ns"

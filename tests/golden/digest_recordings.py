@@ -21,7 +21,7 @@ from tests.builders.points import OUSTER, STAMP_NS, Form, cloud_message, write_p
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import packets_only, told, write_mcap
-from tests.golden.maker_messages import Unit, merged, nebula, scans, singles
+from tests.golden.vendor_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
 from tests.matrix.containers import rig_text
 from tests.matrix.lidars import VENDORS, Spell, write_metadata

@@ -2,7 +2,7 @@
 
     python -m tests.golden.expected
 
-Only after a change of the output that is wanted; commit it alone, with the reason.
+Only after an intended change of the output; commit it alone, with the reason.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ def describe(folder: Path) -> dict[str, str | dict[str, Entry]]:
 
 def scan(path: Path) -> Entry:
     """One scan: readable figures, some points, the digests of all arrays."""
-    cloud, arrays = Cloud.of(path), load(path)
+    cloud = Cloud.of(path)
+    arrays = load(path)
     count = len(cloud.xyz)
     return {
         "start_ns": int(arrays["start_ns"]),

@@ -34,7 +34,8 @@ from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
 
 Write = Callable[[Path], Path]
 # SOURCE.md of the fixture: seven whole windows, 512 columns of each lidar in each.
-WHOLE_SCANS, COLUMNS = 7, 1024
+WHOLE_SCANS = 7
+COLUMNS = 1024
 SESSIONS: dict[str, Write] = {
     "MCAP": lambda folder: write_mcap(folder / "drive.mcap", told()),
     "db3 with types": lambda folder: write_rosbag2(folder / "drive.db3", told(), Form(schema=4)),
@@ -269,7 +270,8 @@ def test_inspect_of_a_folder_names_all_that_it_knows(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["MCAP", "split db3", "ROS 1"])
 def test_the_rig_of_inspect_gives_the_same_scans(name: str, plain: Made, tmp_path: Path) -> None:
-    bag, rig = SESSIONS[name](tmp_path), tmp_path / "rig.yaml"
+    bag = SESSIONS[name](tmp_path)
+    rig = tmp_path / "rig.yaml"
     assert command("inspect", bag, "--write-rig", rig).code == 0
     assert "metadata:" not in rig.read_text(encoding="utf-8")
     made = convert(tmp_path / "scans", bag, "--rig", rig)
@@ -283,7 +285,8 @@ def test_packets_without_serial_number_go_by_their_topics(tmp_path: Path) -> Non
     messages = sorted(
         [*unit_messages(old, "front"), *unit_messages(other, "rear")], key=lambda one: one.log_ns
     )
-    bag, rig = write_mcap(tmp_path / "drive.mcap", messages), tmp_path / "rig.yaml"
+    bag = write_mcap(tmp_path / "drive.mcap", messages)
+    rig = tmp_path / "rig.yaml"
     assert command("inspect", bag, "--write-rig", rig).code == 0
     topics = [sensor.stream.topic for sensor in read_rig(rig).sensors if sensor.stream]
     assert topics == ["/front/ouster/lidar_packets", "/rear/ouster/lidar_packets"]

@@ -37,7 +37,8 @@ def _policy(found: dict[str, Comparison], case: str, policy: str) -> SetReport:
 
 
 def _spans_ms(report: SetReport) -> tuple[float, float]:
-    low, high = report.span_ms.min, report.span_ms.max
+    low = report.span_ms.min
+    high = report.span_ms.max
     assert low is not None
     assert high is not None
     return low, high

@@ -52,9 +52,9 @@ def test_the_page_on_recordings_lists_all_types_and_frames() -> None:
     cells = [line.split("|") for line in page.splitlines() if line.startswith("|")]
     first = {row[1].strip().strip("`") for row in cells}
     assert set(PACKET_TYPES) <= first
-    by_maker = {row[1].strip().lower(): row for row in cells}
-    for maker, naming in NAMINGS.items():
-        shown = [re.findall(r"`(.+?)`", cell) for cell in by_maker[maker][2:5]]
+    by_vendor = {row[1].strip().lower(): row for row in cells}
+    for vendor, naming in NAMINGS.items():
+        shown = [re.findall(r"`(.+?)`", cell) for cell in by_vendor[vendor][2:5]]
         assert shown == [list(naming.points), list(naming.lidar), list(naming.nick)]
 
 
@@ -98,9 +98,9 @@ def test_bags_that_do_not_name_their_storage_are_read(name: str, tmp_path: Path)
 @pytest.mark.parametrize("name", BAGS)
 def test_inspect_shows_the_stream_of_a_real_bag(name: str) -> None:
     topic, packets, _ = BAGS[name]
-    told = command("inspect", real_bag(name))
-    assert (told.code, told.err) == (0, "")
-    row = next(line for line in told.out.splitlines() if line.startswith(topic))
+    outcome = command("inspect", real_bag(name))
+    assert (outcome.code, outcome.err) == (0, "")
+    row = next(line for line in outcome.out.splitlines() if line.startswith(topic))
     assert str(packets) in row.split()
-    maker = name.split("/", maxsplit=1)[0]
-    assert maker in row.lower() or "pandar" in row.lower()
+    vendor = name.split("/", maxsplit=1)[0]
+    assert vendor in row.lower() or "pandar" in row.lower()

@@ -42,7 +42,8 @@ from tests.golden.digest_recordings import (
 
 _HERE = Path(__file__).resolve().parent
 _REPOSITORY = _HERE.parents[1]
-_DIGESTS, _WORDING = _HERE / "digests.json", _HERE / "wording.json"
+_DIGESTS = _HERE / "digests.json"
+_WORDING = _HERE / "wording.json"
 _NO_NUMBA = "numba is not installed: pip install mlbatch[fast]"
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 
@@ -158,7 +159,8 @@ def _case(
 
 
 def _option_cases() -> dict[str, Case]:
-    two, four = "two_lidars", "four_makers"
+    two = "two_lidars"
+    four = "four_makers"
     cases = {
         "split": _case(two, "--split", runs=(_THREE_NUMBA, Run("db3"))),
         "split mcap": _case(four, "--split", format="mcap", runs=(_THREE_NUMBA, Run("mcap"))),
@@ -284,7 +286,9 @@ class Said:
 
 def command(*words: str) -> Said:
     """Run `mlbatch` with these words in this process."""
-    out, err, before = io.StringIO(), io.StringIO(), sys.argv
+    out = io.StringIO()
+    err = io.StringIO()
+    before = sys.argv
     sys.argv = ["mlbatch", *words]
     code: object = 0
     try:
@@ -518,7 +522,7 @@ def _lines(texts: Mapping[str, Sequence[str]]) -> set[str]:
 
 def _join(texts: dict[str, set[str]], found: Digests, command_name: str = "") -> None:
     for key, lines in found.texts.items():
-        # Outputs are called out or out.*, a report inside of one is as that beside.
+        # Outputs are called out or out.*, a report inside of one is as that next to it.
         if key.startswith("verify "):
             key = "verify " + key.split(" ", 2)[2]
         elif "report" in key:

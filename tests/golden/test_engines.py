@@ -1,6 +1,6 @@
 """The engines give the same bytes: every model and mode, fixtures, and real recordings.
 
-What the engine `numpy` gives is judged elsewhere (`test_every_model.py` and others).
+What the engine `numpy` gives is checked elsewhere (`test_every_model.py` and others).
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def test_outputs_do_not_tell_the_engine(suffix: str, tmp_path: Path) -> None:
     for engine in ("numpy", "numba"):
         target: list[str | Path] = ["-o", tmp_path / f"{engine}.{suffix}"]
         words = [*target, "--engine", engine, "--quiet"]
-        told = command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words)
-        assert (told.code, told.err) == (0, "")
+        outcome = command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words)
+        assert (outcome.code, outcome.err) == (0, "")
     one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "numba"))
     assert one == other
 

@@ -1,8 +1,8 @@
 """Every model and mode that the encoders know, from packets to points by whole conversions.
 
-A dozen packets of each look at the hall of `scene.py` from 1.5 m height. Models have to be told by
-their packets (where bytes cannot tell, a rig names them); ranges, levels, stamps and times come
-back to the count and ns, and points lie on surfaces.
+A dozen packets of each show the hall of `scene.py` from 1.5 m height. Models must be identified by
+their packets (where bytes do not identify them, by a rig); ranges, signals, stamps and times are
+equal to the count and ns, and points are on surfaces.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
 
 PACKETS = 12
-SOURCE, HOST = "192.168.1.201", "192.168.1.10"
+SOURCE = "192.168.1.201"
+HOST = "192.168.1.10"
 # Beams that point up see walls as well.
 EYE = Eye(hall(), pose((3.1, 1.3, 1.5), (9.0, 31.0, -41.0)))
 FLOAT32_M = 1e-5
-# Its firing sequence changes with the firmware and is measured: 12 stamps in whole us tell it to
+# Its firing sequence changes with the firmware and is measured: 12 stamps in whole us give it to
 # 1 us / 33, and the last of three sequences in a packet begins two of them after the stamp.
 MEASURED_NS = {"VLS-128": 61}
 
@@ -62,7 +63,7 @@ class Sent:
     """What a model sent; types: of its returns, () where they follow from the readings.
 
     model: as `mlbatch sensors` names it; neighbours: packets on port 7788; file, content:
-    calibration; is_named: only a rig tells the model.
+    calibration; is_named: only a rig names the model.
     """
 
     model: str
@@ -86,7 +87,7 @@ def velodyne_sent(model: str, mode: str, name: str = "") -> Sent:
     return Sent(name or model, sight, types, is_named=bool(name))
 
 
-# Models that only their angles tell apart.
+# Models that differ in their angles only.
 HESAI_BEAMS_DEG = {"Pandar20A": (7.9, -24.9), "Pandar20B": (2.9, -18.9)}
 
 
@@ -99,13 +100,16 @@ def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sen
     elevation = np.round(np.linspace(highest, lowest, channels), 3).tolist()
     azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
     beams: Beams = Angles(elevation, azimuth)
-    file, content = "unit.csv", angles_csv(elevation, azimuth)
+    file = "unit.csv"
+    content = angles_csv(elevation, azimuth)
     if model == "AT128":
         mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
-        beams, file, content = mirrors, "unit.dat", mirrors.dat()
+        beams = mirrors
+        file = "unit.dat"
+        content = mirrors.dat()
     sight = hesai_sees(spec, beams, EYE, PACKETS)
     types: tuple[int, ...] = {"33": (0,), "37": (1,), "38": (2,)}.get(mode, ())
-    if model == "JT16":  # Nothing in its packets tells.
+    if model == "JT16":  # Nothing in its packets identifies it.
         types = (0,)
     return Sent(model.removesuffix("-7"), sight, types, [], file, content)
 
@@ -121,8 +125,8 @@ def robosense_sent(model: str, mode: str, mount: str = "normal") -> Sent:
     if sight.returns < spec.returns:
         types = (0,)
     name = ROBOSENSE_NAMES.get(model, model)
-    beside = [(sight.payloads[0][0] + 1, robosense.difop(spec, angles))]
-    return Sent(name, sight, types, beside)
+    device_packets = [(sight.payloads[0][0] + 1, robosense.difop(spec, angles))]
+    return Sent(name, sight, types, device_packets)
 
 
 ROBOSENSE_NAMES = {
@@ -212,7 +216,7 @@ def test_all_comes_back(make: Callable[..., Sent], words: tuple[str, ...], tmp_p
         *(sent.model, sent.seen.channels),
         sent.seen.returns,
     )
-    # Of two returns in different packets the second may be told to be earlier.
+    # Of two returns in different packets the second may be the earlier one.
     order = np.argsort(sent.seen.stamp_ns, kind="stable")
     check_readings(sent, whole.scans, order)
     check_places(sent, whole.scans, order)
@@ -221,7 +225,8 @@ def test_all_comes_back(make: Callable[..., Sent], words: tuple[str, ...], tmp_p
 
 def check_readings(sent: Sent, scans: Sequence[Scan], order: I64Array) -> None:
     """Every slot of every column."""
-    sight, shape = sent.seen, sent.seen.counts.shape
+    sight = sent.seen
+    shape = sent.seen.counts.shape
     slack_ns = MEASURED_NS.get(sent.model, 0)
     stamps = np.concatenate([scan.column_stamp_ns for scan in scans])
     assert np.abs(stamps - sight.stamp_ns[order]).max() <= slack_ns
@@ -244,12 +249,12 @@ def check_types(sent: Sent, types: F64Array, order: I64Array) -> None:
     sight = sent.seen
     there = sight.counts[order] > 0
     if sent.types:
-        wanted = np.broadcast_to(np.array(sent.types, np.uint8), there.shape)
+        expected = np.broadcast_to(np.array(sent.types, np.uint8), there.shape)
     elif sight.returns == 2:
-        wanted = pair_types(sight.counts, sight.level)[order]
+        expected = pair_types(sight.counts, sight.level)[order]
     else:
-        wanted = np.zeros(there.shape, np.uint8)
-    assert np.array_equal(types[there], wanted[there])
+        expected = np.zeros(there.shape, np.uint8)
+    assert np.array_equal(types[there], expected[there])
 
 
 def check_places(sent: Sent, scans: Sequence[Scan], order: I64Array) -> None:
@@ -270,7 +275,7 @@ def check_places(sent: Sent, scans: Sequence[Scan], order: I64Array) -> None:
 def check_dense(sent: Sent, dense: Result, order: I64Array) -> None:
     """The order of points, and what is left out and counted."""
     columns = np.concatenate([[0], np.cumsum([len(one.column_stamp_ns) for one in dense.scans])])
-    wanted = Expected([sent.seen]).points(np.zeros(len(order), np.int64), order)
+    expected = Expected([sent.seen]).points(np.zeros(len(order), np.int64), order)
     column, at_ns = (
         np.concatenate(parts)
         for parts in (
@@ -281,10 +286,10 @@ def check_dense(sent: Sent, dense: Result, order: I64Array) -> None:
             [scan.time_ns.astype(np.int64) + scan.start_ns for scan in dense.scans],
         )
     )
-    assert np.array_equal(column, wanted.column)
-    assert np.array_equal(joined(dense.scans, "ring"), wanted.ring)
-    assert np.abs(at_ns - wanted.at_ns).max() <= MEASURED_NS.get(sent.model, 0)
-    assert np.array_equal(joined(dense.scans, "intensity"), wanted.level)
+    assert np.array_equal(column, expected.column)
+    assert np.array_equal(joined(dense.scans, "ring"), expected.ring)
+    assert np.abs(at_ns - expected.at_ns).max() <= MEASURED_NS.get(sent.model, 0)
+    assert np.array_equal(joined(dense.scans, "intensity"), expected.level)
     again = int(repeated(sent.seen.counts).sum())
     assert (again > 0) == (sent.seen.returns > 1)
     points = dense.report.sensors[0].ledger.points

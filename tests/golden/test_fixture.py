@@ -86,7 +86,8 @@ def same(one: Cloud, other: Cloud) -> None:
 
 
 def test_digests(folder: Path) -> None:
-    expected, got = json.loads(EXPECTED.read_text(encoding="utf-8")), describe(folder)
+    expected = json.loads(EXPECTED.read_text(encoding="utf-8"))
+    got = describe(folder)
     assert got == expected
 
 
@@ -100,7 +101,8 @@ def test_counts_are_those_of_the_scene(folder: Path) -> None:
 
 def test_windows_lie_on_the_grid_and_hold_exactly_their_columns(folder: Path) -> None:
     for number, path in enumerate(scan_files(folder)):
-        scan, cloud = load(path), Cloud.of(path)
+        scan = load(path)
+        cloud = Cloud.of(path)
         start_ns = T_INIT_NS + (number - 1) * PERIOD_NS
         assert int(scan["index"]) == number - 1
         assert (int(scan["start_ns"]), int(scan["end_ns"])) == (start_ns, start_ns + PERIOD_NS)
@@ -121,7 +123,8 @@ def test_every_point_lies_on_a_surface_of_the_scene(folder: Path) -> None:
         allowed_m = lidar.range_step_mm / 2000 + 1e-5
         assert hall().distance_to_surfaces(xyz_m).max() <= allowed_m
     # The rig's box is the machine with 0.1 m around.
-    low, high = np.array(MACHINE_LOW_M) - 0.1, np.array(MACHINE_HIGH_M) + 0.1
+    low = np.array(MACHINE_LOW_M) - 0.1
+    high = np.array(MACHINE_HIGH_M) + 0.1
     assert not ((cloud.xyz > low) & (cloud.xyz < high)).all(axis=1).any()
 
 
@@ -141,7 +144,7 @@ def test_ranges_agree_with_positions(folder: Path) -> None:
     for lidar_id, lidar in enumerate(LIDARS):
         own = cloud.of_sensor(lidar_id)
         centre = body_from_sensor(lidar) @ (0.0, 0.0, lidar.lift_mm / 1000, 1.0)
-        # A beam starts beside the rotor's axis by its offset, but the range counts from the axis:
+        # A beam starts at its offset from the rotor's axis, but the range counts from the axis:
         # the straight distance differs by less than the offset in any direction.
         straight_m: F64Array = np.linalg.norm(own.xyz - centre[:3], axis=1)
         assert np.abs(straight_m - own.range_m).max() <= lidar.offset_mm / 1000
@@ -154,7 +157,8 @@ def test_slices_sum_to_the_whole(slices: int, folder: Path, tmp_path: Path) -> N
     to_file(replace(FIXTURE, slices=slices), tmp_path / "slices", "npz")
     same(Cloud.of_all(tmp_path / "slices"), Cloud.of_all(folder))
     for path in scan_files(tmp_path / "slices"):
-        scan, stamps = load(path), Cloud.of(path).column_stamp_ns
+        scan = load(path)
+        stamps = Cloud.of(path).column_stamp_ns
         start_ns = T_INIT_NS + int(scan["index"]) * PERIOD_NS
         # Rounded up, see docs/batching.md.
         bounds = [start_ns - -part * PERIOD_NS // slices for part in range(slices + 1)]
@@ -171,7 +175,8 @@ def test_split_is_the_merged_scan_cut_by_sensor(folder: Path, tmp_path: Path) ->
         alone = tmp_path / "split" / lidar.name
         assert [path.name for path in scan_files(alone)] == [p.name for p in scan_files(folder)]
         for path in scan_files(folder):
-            part, whole = Cloud.of(alone / path.name), Cloud.of(path).of_sensor(lidar_id)
+            part = Cloud.of(alone / path.name)
+            whole = Cloud.of(path).of_sensor(lidar_id)
             rank = np.flatnonzero(Cloud.of(path).column_lidar_id == lidar_id)
             column = np.searchsorted(rank, whole.column).astype(np.uint32)
             ring = whole.ring - np.uint16(BEAMS * lidar_id)
@@ -218,7 +223,8 @@ def test_mcap_cloud_equals_npz(folder: Path, tmp_path: Path) -> None:
     clouds = [row for row in found if row[0] == "/points"]
     assert len(clouds) == len(COUNTS)
     for path, (_, message, ros) in zip(scan_files(folder), clouds, strict=True):
-        want, start_ns = Cloud.of(path), int(load(path)["start_ns"])
+        want = Cloud.of(path)
+        start_ns = int(load(path)["start_ns"])
         stamp = ros.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == message.log_time == start_ns
         assert ros.header.frame_id == "base_link"

@@ -1,4 +1,4 @@
-"""A rig of four makers, converted by one command: against the paper's loop, its scene and itself.
+"""A rig of four vendors, converted by one command: against the paper's loop, its scene and itself.
 
 Nothing expected comes from a decoder: stamps, ranges and firing times are those that the encoders
 put into the packets (`tests/builders/seen.py`); windows are those of `batching/reference.py`.
@@ -26,7 +26,8 @@ from tests.builders.scene import hall
 from tests.builders.seen import ASIDE_PER_M, Seen
 from tests.builders.seen_points import Expected, Points, pair_types, repeated
 
-PCAP, RIG = FOLDER / "four_makers.pcap", FOLDER / "rig.yaml"
+PCAP = FOLDER / "four_makers.pcap"
+RIG = FOLDER / "rig.yaml"
 SENSORS = [seen()[place.name] for place in PLACES]
 NAMES = [place.name for place in PLACES]
 ROOF = PLACES.index(VELODYNE)
@@ -61,17 +62,17 @@ def reference(rate: str, slices: int, *, keep_partial: bool) -> Outcome:
 
 
 def run(folder: Path, rate: str, slices: int, *words: str) -> Run:
-    """`mlbatch convert` beside the loop."""
+    """`mlbatch convert`, to compare with the loop."""
     said = ["--rig", str(RIG), "--rate", rate, "--slices", str(slices), "--quiet", *words]
-    told = command("convert", PCAP, "-o", folder, *said)
-    assert (told.code, told.err) == (0, "")
+    outcome = command("convert", PCAP, "-o", folder, *said)
+    assert (outcome.code, outcome.err) == (0, "")
     return Run(folder, reference(rate, slices, keep_partial="--keep-partial" in words))
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Everything in the recording, at 20 Hz."""
-    return run(tmp_path_factory.mktemp("makers") / "out", "20", 1, "--keep-partial")
+    return run(tmp_path_factory.mktemp("vendors") / "out", "20", 1, "--keep-partial")
 
 
 def columns_of(window: Window) -> tuple[I64Array, I64Array]:
@@ -82,7 +83,8 @@ def columns_of(window: Window) -> tuple[I64Array, I64Array]:
 
 
 def check_windows(converted: Run) -> None:
-    files, windows = scan_files(converted.folder), converted.outcome.windows
+    files = scan_files(converted.folder)
+    windows = converted.outcome.windows
     assert len(files) == len(windows)
     for path, window in zip(files, windows, strict=True):
         scan, (sensor, column) = load(path), columns_of(window)
@@ -99,20 +101,23 @@ def check_points(converted: Run, *, keep_repeated: bool = False, are_turned: boo
     """What each point is, when it was measured, where it lies, and the order of points."""
     expected = Expected(SENSORS, keep_repeated=keep_repeated)
     for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
-        cloud, wanted = Cloud.of(path), expected.points(*columns_of(window))
-        check_cloud(cloud, wanted)
+        cloud = Cloud.of(path)
+        expected_points = expected.points(*columns_of(window))
+        check_cloud(cloud, expected_points)
         # On the very ray, but for the azimuth.
-        away_m: F64Array = np.linalg.norm(cloud.xyz - wanted.xyz_m, axis=1)
-        assert (away_m < ASIDE_PER_M * wanted.range_m + FLOAT32_AT_20_M).all() == are_turned
+        away_m: F64Array = np.linalg.norm(cloud.xyz - expected_points.xyz_m, axis=1)
+        assert (
+            away_m < ASIDE_PER_M * expected_points.range_m + FLOAT32_AT_20_M
+        ).all() == are_turned
 
 
-def check_cloud(cloud: Cloud, wanted: Points) -> None:
-    assert np.array_equal(cloud.column, wanted.column)
-    assert np.array_equal(cloud.lidar_id, wanted.lidar_id)
-    assert np.array_equal(cloud.ring, wanted.ring)
-    assert np.array_equal(cloud.at_ns, wanted.at_ns)
-    assert np.array_equal(cloud.intensity, wanted.level)
-    np.testing.assert_array_max_ulp(cloud.range_m, wanted.range_m.astype(np.float32), 1)
+def check_cloud(cloud: Cloud, expected_points: Points) -> None:
+    assert np.array_equal(cloud.column, expected_points.column)
+    assert np.array_equal(cloud.lidar_id, expected_points.lidar_id)
+    assert np.array_equal(cloud.ring, expected_points.ring)
+    assert np.array_equal(cloud.at_ns, expected_points.at_ns)
+    assert np.array_equal(cloud.intensity, expected_points.level)
+    np.testing.assert_array_max_ulp(cloud.range_m, expected_points.range_m.astype(np.float32), 1)
 
 
 def check_places(cloud: Cloud) -> None:
@@ -121,7 +126,8 @@ def check_places(cloud: Cloud) -> None:
     assert np.isfinite(cloud.intensity).all()
     for number, (place, sight) in enumerate(zip(PLACES, SENSORS, strict=True)):
         own = cloud.of_sensor(number)
-        xyz_m, range_m = own.xyz.astype(np.float64), own.range_m.astype(np.float64)
+        xyz_m = own.xyz.astype(np.float64)
+        range_m = own.range_m.astype(np.float64)
         allowed_m = sight.unit_m / 2 + OFF_PER_M * range_m + FLOAT32_AT_20_M
         assert (hall().distance_to_surfaces(xyz_m) - allowed_m).max() < 0, place.name
         straight_m: F64Array = np.linalg.norm(xyz_m - place.body_from_sensor[:3, 3], axis=1)
@@ -202,11 +208,11 @@ def test_returns_have_their_types(tmp_path: Path) -> None:
     grid = organized(tmp_path)
     roof = SENSORS[ROOF]
     types = grid["return_type"][grid["column_lidar_id"] == ROOF]
-    wanted = pair_types(roof.counts, roof.level)
-    wanted[roof.counts == 0] = 0
+    expected_points = pair_types(roof.counts, roof.level)
+    expected_points[roof.counts == 0] = 0
     # Equal returns are one, and the second of them is left out.
-    wanted[repeated(roof.counts)] = 0
-    assert np.array_equal(types.reshape(wanted.shape), wanted)
+    expected_points[repeated(roof.counts)] = 0
+    assert np.array_equal(types.reshape(expected_points.shape), expected_points)
 
 
 def organized(folder: Path, *words: str) -> dict[str, Any]:
@@ -269,7 +275,9 @@ def test_ledgers_balance(whole: Run) -> None:
         report["capture"]["skipped"].values()
     )
     for sensor, sight in zip(report["sensors"], SENSORS, strict=True):
-        packets, columns, points = sensor["packets"], sensor["columns"], sensor["points"]
+        packets = sensor["packets"]
+        columns = sensor["columns"]
+        points = sensor["points"]
         assert packets["read"] == packets["accepted"] == len(sight.payloads)
         assert (packets["rejected"], packets["lost"], packets["reordered"]) == ({}, 0, 0)
         assert columns["decoded"] == columns["written"] == len(sight.stamp_ns)
@@ -277,9 +285,9 @@ def test_ledgers_balance(whole: Run) -> None:
 
 
 def test_streams_are_recognised_without_a_rig() -> None:
-    told = command("inspect", PCAP, "--json")
-    assert told.code == 0, told.err
-    streams = json.loads(told.out)["streams"]
+    outcome = command("inspect", PCAP, "--json")
+    assert outcome.code == 0, outcome.err
+    streams = json.loads(outcome.out)["streams"]
     models = {one["stream"]: one["model"] for one in streams if one["sensor"]}
     assert models == {f"{place.ip} > port {place.port}": place.model for place in PLACES}
 
@@ -287,5 +295,6 @@ def test_streams_are_recognised_without_a_rig() -> None:
 def test_fixture_is_made_again_to_the_byte(tmp_path: Path) -> None:
     main(tmp_path)
     for path in sorted(tmp_path.iterdir()):
-        made, kept = path.read_bytes(), (FOLDER / path.name).read_bytes()
+        made = path.read_bytes()
+        kept = (FOLDER / path.name).read_bytes()
         assert hashlib.sha256(made).hexdigest() == hashlib.sha256(kept).hexdigest(), path.name

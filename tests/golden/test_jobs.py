@@ -79,9 +79,9 @@ def test_outputs_do_not_depend_on_jobs(
     for jobs in JOBS:
         place = _place(recordings, f"{name} {jobs}")
         monkeypatch.chdir(place)
-        told = command(*_words(name, "--jobs", str(jobs)))
-        assert told.code == 0, told.err
-        found.append((contents(place), told.out.splitlines()[1:-1]))
+        outcome = command(*_words(name, "--jobs", str(jobs)))
+        assert outcome.code == 0, outcome.err
+        found.append((contents(place), outcome.out.splitlines()[1:-1]))
     for jobs, other in zip(JOBS[1:], found[1:], strict=True):
         differ = [key for key in found[0][0] if found[0][0][key] != other[0].get(key)]
         assert (jobs, differ) == (jobs, [])
@@ -95,17 +95,18 @@ def test_a_strict_run_fails_alike(
     """A packet in the midst has another size; scans before it may be under way."""
     monkeypatch.chdir(_place(recordings, f"{name} strict"))
     words = ("--fault", "truncate:ouster_111:1%", "--strict", "--overwrite")
-    told = [command(*_words(name, *words, "--jobs", str(jobs))) for jobs in JOBS]
-    assert told[0].code == 1
-    assert told[0].err.count("\n") == 1
-    assert told[1:] == told[:1] * 2
+    outcome = [command(*_words(name, *words, "--jobs", str(jobs))) for jobs in JOBS]
+    assert outcome[0].code == 1
+    assert outcome[0].err.count("\n") == 1
+    assert outcome[1:] == outcome[:1] * 2
 
 
 class Nth:
     """Fails at one of its calls."""
 
     def __init__(self, number: int, error: BaseException) -> None:
-        self._left, self._error = number, error
+        self._left = number
+        self._error = error
 
     def call(self) -> None:
         """Count a call."""
@@ -129,9 +130,11 @@ def test_an_error_of_any_stage_ends_the_run(
     recordings: Path, stage: str, jobs: int, number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
-    error, wanted = STAGES[stage]
+    error, message = STAGES[stage]
     nth = Nth(number, error)
-    scan, compress, write_all = Decoder.scan, Chunk.compress, output_file.write_all
+    scan = Decoder.scan
+    compress = Chunk.compress
+    write_all = output_file.write_all
 
     def failing_scan(*given: object) -> object:
         nth.call()
@@ -151,14 +154,14 @@ def test_an_error_of_any_stage_ends_the_run(
         monkeypatch.setattr(Chunk, "compress", failing_compress)
     else:
         monkeypatch.setattr(output_file, "write_all", failing_write)
-    told = command(*_words("mcap", "--jobs", str(jobs)))
-    assert told.code == 1
-    assert told.err.count("\n") == 1
-    assert wanted in told.err
+    outcome = command(*_words("mcap", "--jobs", str(jobs)))
+    assert outcome.code == 1
+    assert outcome.err.count("\n") == 1
+    assert message in outcome.err
     assert not Path("out.mcap").exists()
 
 
-def test_the_earliest_scan_that_fails_is_told(
+def test_the_earliest_failed_scan_is_reported(
     recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fourth fails at once, the second after a while: one job never comes to the fourth."""
@@ -175,8 +178,8 @@ def test_the_earliest_scan_that_fails_is_told(
 
     monkeypatch.setattr(Decoder, "scan", failing)
     for jobs in JOBS:
-        told = command(*_words("npz", "--jobs", str(jobs), "--overwrite"))
-        assert told.err.splitlines()[-1] == "mlbatch: error: scan 1"
+        outcome = command(*_words("npz", "--jobs", str(jobs), "--overwrite"))
+        assert outcome.err.splitlines()[-1] == "mlbatch: error: scan 1"
 
 
 SLOW = """
@@ -221,6 +224,6 @@ def test_an_interrupt_ends_the_run_and_it_goes_on(
     )
     assert said.count("\n") == 1
     monkeypatch.chdir(place)
-    told = command(*words, "--resume")
-    assert re.search(r"resumed after \d+ scans", told.err)
+    outcome = command(*words, "--resume")
+    assert re.search(r"resumed after \d+ scans", outcome.err)
     assert contents(place) == contents(whole)

@@ -1,8 +1,8 @@
 """Loss of every model and mode that the encoders know: what is taken out is what is lost.
 
-Packets come from the encoders, which follow the makers' sheets; nothing is measured in them, since
-only stamps, angles and counts tell of loss. Dark sectors are silent through the same angles in
-every turn.
+Packets come from the encoders, which follow the vendors' sheets; nothing is measured in them, since
+only stamps, angles and counts show loss. Dark sectors are silent through the same angles in
+every revolution.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes
 
-# Ten turns a second, and a dark sector is known by a dozen of them.
-LENGTH_NS, DARK_NS = 200_000_000, 1_350_000_000
+# Ten revolutions a second; a dark sector is recognised after a dozen.
+LENGTH_NS = 200_000_000
+DARK_NS = 1_350_000_000
 FIRST = 100
 DARK_DEG = {"": None, "dark": (100.0, 250.5), "dark through zero": (330.3, 29.7)}
 

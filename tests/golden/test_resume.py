@@ -16,7 +16,8 @@ import pytest
 from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, contents, write_recordings
 
-KILLS, SEED = 18, 3
+KILLS = 18
+SEED = 3
 LIMITED = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
@@ -74,7 +75,8 @@ def test_a_file_that_may_not_grow_is_continued(
     """A disk that refuses in the midst of a file, as a full one does."""
     case = CASES[name]
     words = ("convert", f"../in/{case.recording}", "-o", case.output, *case.options)
-    whole, place = recordings / f"{name} whole", recordings / name
+    whole = recordings / f"{name} whole"
+    place = recordings / name
     whole.mkdir()
     place.mkdir()
     assert _run("-m", "mlbatch", *words, cwd=whole).returncode == 0
@@ -82,7 +84,7 @@ def test_a_file_that_may_not_grow_is_continued(
     assert refused.returncode == 1
     assert re.search(
         r"partial: expected to write it, found 'File too large'; raise the limit of file sizes or "
-        r"choose another disk; then --resume goes on after the \d+ scans that are safe\n$",
+        r"choose another disk; then --resume continues after the \d+ scans that are safe\n$",
         refused.stderr,
     )
     resumed = _run("-m", "mlbatch", *words, "--resume", cwd=place)

@@ -135,7 +135,7 @@ def test_recorded_messages_are_counted(tmp_path: Path) -> None:
 
 
 def test_clouds_are_clean(tmp_path: Path) -> None:
-    """Points of a driver come twice where a shot had one echo; both returns have one stamp."""
+    """Points of a driver come twice where a shot had one return; both returns have one stamp."""
     firings = [
         (1 + column / 50, ring, 1, 9, ring, column * 5e-4)
         for column in range(180)

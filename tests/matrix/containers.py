@@ -16,7 +16,7 @@ from tests.builders.captures import Packet, Section, udp_frame, write_pcap, writ
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import write_mcap
-from tests.golden.maker_messages import Unit, merged, nebula, scans, singles
+from tests.golden.vendor_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.lidars import VENDORS, Sent
 
 # Scan messages contain the packets of so many ns, less than the shortest wait of the matrix.

@@ -45,12 +45,12 @@ def _rig(folder: Path, *clocks: str) -> Path:
 
 
 def test_an_offset_of_the_rig_brings_clocks_together(tmp_path: Path) -> None:
-    """One lidar on UTC, one on TAI, 37 s ahead: the rig says so, and the run is on UTC."""
+    """One lidar on UTC, one on TAI, 37 s ahead: the rig gives it, and the run is on UTC."""
     one = Unit()
     tai = replace(twin(one, 222), begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S)
     tai = replace(tai, host_ns=tai.host_ns + NS_PER_MS)
     capture = write_session(tmp_path, one, tai)
-    with pytest.raises(ClockError, match=r"37\.000 s apart"):
+    with pytest.raises(ClockError, match=r"expected at most 1 s between them, found 37\.000 s "):
         in_memory(_job(capture, identity=True))
     rig = _rig(tmp_path, "{source: sensor}", "{offset_s: -37}")
     result = in_memory(Job((capture,), SensorSelection(rig=rig)))
@@ -73,7 +73,7 @@ def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
     result = in_memory(Job((capture,), SensorSelection(rig=rig)))
     assert result.report.timescale == "utc"
     assert [sensor.clock.source for sensor in result.report.sensors] == ["sensor", "host"]
-    # The last column of a packet counts as its arrival: 1 ms and a column's 0.195 ms after it was.
+    # The last column of a packet gets its receive time: 1 ms and a column's 0.195 ms later.
     grid_ns = np.arange(1536) * 195_312.5 + 1_195_312.5 + one.begin_ns % NS_PER_S
     for scan in result.scans:
         start_ns = scan.start_ns % NS_PER_S
@@ -83,7 +83,7 @@ def test_one_lidar_of_a_rig_may_run_on_the_host_clock(tmp_path: Path) -> None:
 
 
 def test_mixed_timescales_are_told(tmp_path: Path) -> None:
-    """Half a second apart clocks compare, but 2.1 s off the recorder is no UTC."""
+    """Clocks half a second apart are merged, but 2.1 s from the capture host is not UTC."""
     one = replace(Unit(), host_ns=1_900 * NS_PER_MS)
     two = replace(twin(one, 222), host_ns=2_300 * NS_PER_MS)
     run, report = convert(_job(write_session(tmp_path, one, two), identity=True), None)
@@ -94,7 +94,7 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     assert [note.code for note in run.notes[1:]] == ["clocks"]
 
 
-# -- what a run tells while and after it runs -----------------------------------------------------
+# -- progress and report ---------------------------------------------------------------------------
 
 
 def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
@@ -102,11 +102,13 @@ def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
         write_session(tmp_path / name, replace(Unit(), begin_ns=EPOCH_NS + at * NS_PER_S))
         for name, at in (("1", 1), ("2", 2))
     )
-    told: list[tuple[int, int]] = []
-    convert(Job(captures, keep_partial=True), None, lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    convert(
+        Job(captures, keep_partial=True), None, lambda done, total: reported.append((done, total))
+    )
     size = sum(capture.stat().st_size for capture in captures)
-    assert told == sorted(told)
-    assert told[-1] == (size, size)
+    assert reported == sorted(reported)
+    assert reported[-1] == (size, size)
 
 
 def test_the_stages_take_no_longer_than_the_run() -> None:
@@ -115,7 +117,7 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
     assert timing is not None
     parts = timing.read_s + timing.decode_s + timing.merge_s + timing.write_s
     assert 0 < parts <= timing.wall_s
-    # From the first frame's arrival to the last (SOURCE.md: 20 to 870 ms).
+    # From the first receive time to the last (SOURCE.md: 20 to 870 ms).
     assert timing.recorded_s == pytest.approx(0.85, abs=0.01)
 
 
@@ -177,10 +179,10 @@ def test_a_writer_is_opened_with_the_first_scan_only(tmp_path: Path) -> None:
 
 
 def test_scans_in_python_are_those_of_the_command_line() -> None:
-    wanted = [scan for scan in in_memory(FIXTURE).scans if 0 <= scan.index < 7]
+    expected = [scan for scan in in_memory(FIXTURE).scans if 0 <= scan.index < 7]
     found = list(mlbatch.scans(CAPTURE, rig=RIG, rate=10))
     assert [scan.index for scan in found] == list(range(7))
-    for mine, theirs in zip(found, wanted, strict=True):
+    for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(mine.xyz, theirs.xyz)
         np.testing.assert_array_equal(mine.ring, theirs.ring)
         assert mine.info.sensors[0].name == "left"
@@ -193,21 +195,23 @@ def test_scans_in_python_may_be_kept() -> None:
 
 
 def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
-    with pytest.raises(UsageError, match="clock: wanted sensor or host, got 'gps'"):
+    with pytest.raises(UsageError, match="clock: expected sensor or host, found 'gps'"):
         next(iter(mlbatch.scans(CAPTURE, clock="gps")))
     with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
         next(iter(mlbatch.scans("none.pcap")))
     for seconds in (math.nan, 0.0, -1.0, -math.inf):
-        with pytest.raises(UsageError, match="max_wait: wanted seconds above 0, or inf, got "):
+        with pytest.raises(UsageError, match="max_wait: expected seconds above 0, or inf, found "):
             next(iter(mlbatch.scans(CAPTURE, max_wait=seconds)))
     for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan)):
-        with pytest.raises(UsageError, match=r"m(in|ax)_range: wanted "):
+        with pytest.raises(UsageError, match=r"m(in|ax)_range: expected "):
             next(iter(mlbatch.scans(CAPTURE, min_range=low_m, max_range=high_m)))
 
 
 @pytest.mark.parametrize("slices", [0, 2.5, 2.0, 10_001, "2", None])
 def test_scans_in_python_have_whole_numbers_of_slices(slices: object) -> None:
-    with pytest.raises(UsageError, match=r"slices: wanted a whole number from 1 to 10000, got "):
+    with pytest.raises(
+        UsageError, match=r"slices: expected a whole number from 1 to 10000, found "
+    ):
         next(iter(mlbatch.scans(CAPTURE, slices=slices)))  # type: ignore[arg-type]
 
 

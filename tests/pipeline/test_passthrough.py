@@ -31,8 +31,8 @@ def test_what_is_taken_by_and_by_is_all_in_the_order_of_times(
     for end, part in zip(sorted(ends), taken, strict=False):
         assert all(message.host_ns < end for message in part)
     # Of equal times the topics by name, and messages of one topic as they came.
-    wanted = sorted(messages, key=lambda message: (message.host_ns, message.topic.name))
-    assert [one for part in taken for one in part] == [m for m in wanted if m.host_ns >= low]
+    expected = sorted(messages, key=lambda message: (message.host_ns, message.topic.name))
+    assert [one for part in taken for one in part] == [m for m in expected if m.host_ns >= low]
     for topic in TOPICS:
         own = [message for message in messages if message.topic == topic]
         early = sum(message.host_ns < low for message in own)

@@ -1,4 +1,4 @@
-"""What `--resume` says and refuses, and what other ends of a run leave."""
+"""`--resume`: messages, refused jobs, files left by runs that end early."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ def shell(
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
     """Have the writing of a scan fail, once."""
-    encode, calls = npz.NpzEncoder.encode, 0
+    encode = npz.NpzEncoder.encode
+    calls = 0
 
     def failing(encoder: npz.NpzEncoder, found: Scan) -> list[Bytes]:
         nonlocal calls
@@ -68,7 +69,7 @@ def _whole(shell: Shell, words: str = CAPTURE) -> dict[str, object]:
     return contents(Path("whole"))
 
 
-def test_it_goes_on_after_the_scans_that_are_safe(
+def test_it_continues_after_the_scans_that_are_safe(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = _whole(shell)
@@ -90,12 +91,12 @@ def test_it_goes_on_after_the_scans_that_are_safe(
     assert contents(Path()) == whole
 
 
-def test_an_interrupt_tells_of_it(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_names_resume(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     _fail_at(monkeypatch, 2, KeyboardInterrupt())
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.err == (
-        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
-        "on\n"
+        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
+        "--resume continues\n"
     )
 
 
@@ -114,10 +115,10 @@ def test_a_request_to_end_is_an_interrupt(shell: Shell, monkeypatch: pytest.Monk
     assert '"synced":true' in STATE.read_text().splitlines()[-1]
 
 
-def test_nothing_to_resume_is_said(shell: Shell) -> None:
+def test_nothing_to_resume_is_reported(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert outcome.code == 0
-    assert outcome.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
     assert contents(Path()) == _whole(shell)
 
 
@@ -129,17 +130,17 @@ def test_a_complete_output_is_left_alone(shell: Shell) -> None:
     assert outcome.err == "mlbatch: out: is complete; there is nothing to resume\n"
     assert Path("out/report.json").read_bytes() == before
     again = shell(f"convert {CAPTURE} -o out --resume --overwrite")
-    assert again.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert again.err == "mlbatch: out: nothing to resume; started over\n"
     assert Path("out/report.json").read_bytes() != before
 
 
-def test_without_it_a_partial_is_replaced_and_the_way_on_named(shell: Shell) -> None:
+def test_without_it_a_partial_is_replaced_and_the_option_named(shell: Shell) -> None:
     _interrupt(shell)
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.code == 0
     assert outcome.err == (
-        "mlbatch: warning: interrupted: out.partial with 3 finished scans is begun anew; with "
-        "--resume a run goes on after them\n"
+        "mlbatch: warning: interrupted: out.partial with 3 finished scans is discarded; "
+        "--resume would continue after them\n"
     )
     assert contents(Path()) == _whole(shell)
 
@@ -161,11 +162,10 @@ def test_another_job_is_refused(shell: Shell, words: str, difference: str) -> No
     assert outcome.code == 2
     line = outcome.err.splitlines()[-1]
     assert line.startswith(
-        "mlbatch: error: out.partial: wanted the job of the interrupted run to go on with, got "
-        f"{difference}"
+        f"mlbatch: error: out.partial: expected the job of the interrupted run, found {difference}"
     )
-    assert line.endswith("; give the same, or leave out --resume to begin anew")
-    # And the right one still goes on.
+    assert line.endswith("; give the same, or leave out --resume to start over")
+    # The right job can still be resumed.
     assert shell(f"convert {CAPTURE} -o out --resume").err.count("resumed after 3 scans") == 1
 
 
@@ -174,14 +174,14 @@ def test_another_recording_calibration_or_pose_is_refused(shell: Shell, tmp_path
     words = f"{capture} -o out"
     _interrupt(shell, words)
     os.utime(capture, ns=(1, 1))
-    assert "got recording 1 'drive.pcap (" in shell(f"convert {words} --resume").err
+    assert "found recording 1 'drive.pcap (" in shell(f"convert {words} --resume").err
     _interrupt(shell, words)
     metadata = tmp_path / "in" / "111.json"
     found = json.loads(metadata.read_text())
     angles = found["beam_intrinsics"]["beam_altitude_angles"]
     angles[0] += 0.01
     metadata.write_text(json.dumps(found))
-    assert "got calibration of ouster_111 '" in shell(f"convert {words} --resume").err
+    assert "found calibration of ouster_111 '" in shell(f"convert {words} --resume").err
 
 
 def test_a_lost_scan_is_refused(shell: Shell) -> None:
@@ -212,26 +212,26 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
     )
 
 
-def _refuse(course: resume.ResumeLog) -> None:
+def _refuse(log: resume.ResumeLog) -> None:
     raise ExportError("stopped")
 
 
 @pytest.mark.parametrize("option", ["", "--resume"])
-def test_a_run_that_lives_is_not_disturbed(shell: Shell, option: str) -> None:
+def test_a_running_run_is_not_disturbed(shell: Shell, option: str) -> None:
     _interrupt(shell)
     with STATE.open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         outcome = shell(f"convert {CAPTURE} -o out {option}")
     assert outcome.code == 1
     assert outcome.err == (
-        "mlbatch: error: out: wanted to write it alone, got another run that does; wait for its "
-        "end or choose another output\n"
+        "mlbatch: error: out: expected no other run that writes it, found one; wait for its end "
+        "or choose another output\n"
     )
     assert STATE.is_file()
 
 
 @pytest.mark.parametrize("output", ["out", "out.mcap"])
-def test_a_run_that_began_after_the_look_is_not_disturbed(
+def test_a_run_that_began_after_the_check_is_not_disturbed(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, output: str
 ) -> None:
     """Two runs may both find nothing before one of them writes."""
@@ -246,7 +246,10 @@ def test_a_run_that_began_after_the_look_is_not_disturbed(
 
         monkeypatch.setattr(run, "check_target", other_run)
         outcome = shell(f"convert {CAPTURE} -o {output}")
-    assert (outcome.code, "got another run that does" in outcome.err) == (1, True)
+    assert (outcome.code, "expected no other run that writes it, found one" in outcome.err) == (
+        1,
+        True,
+    )
     assert state.read_bytes() == b"what it did"
     assert scan.read_bytes() == b"what it wrote"
 
@@ -266,11 +269,11 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
 @pytest.mark.parametrize(
     "text", ["", "{", "[]\n", "nonsense\n", '{"boot":"","schema":"mlbatch.state/2"}\n']
 )
-def test_a_state_that_says_nothing_is_none(shell: Shell, text: str) -> None:
+def test_an_unreadable_state_is_ignored(shell: Shell, text: str) -> None:
     _interrupt(shell)
     STATE.write_text(text)
     outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err == "mlbatch: out: nothing to resume; begun from the start\n"
+    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
     assert outcome.code == 0
 
 
@@ -309,7 +312,7 @@ def test_after_a_restart_only_what_reached_the_disk_counts(
     assert contents(Path()) == whole
 
 
-def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_names_the_remedy(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = _whole(shell)
     _fail_at(monkeypatch, 4, OSError(28, "No space left on device"))
     outcome = shell(f"convert {CAPTURE} -o out")
@@ -323,10 +326,10 @@ def test_a_full_disk_names_the_way_on(shell: Shell, monkeypatch: pytest.MonkeyPa
     assert contents(Path()) == whole
 
 
-def test_an_unreadable_disk_names_the_way_on(
+def test_an_unreadable_disk_names_the_remedy(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The reader's buffer holds 8 MB: the recording is longer, and breaks at its end."""
+    """The reader's buffer has 8 MB: the recording is longer, and breaks at its end."""
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=60))
     whole = _whole(shell, str(capture))
@@ -385,4 +388,4 @@ def test_a_kill_after_the_last_rename_leaves_nothing_to_do(
 def test_a_dry_run_leaves_nothing_to_resume(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} --dry-run --resume")
     assert outcome.code == 2
-    assert "--resume: wanted an output to go on with, got --dry-run" in outcome.err
+    assert "--resume: expected an output to continue, found --dry-run" in outcome.err

@@ -152,9 +152,9 @@ def test_several_files_in_any_order_are_one_session(
 
 
 def shuffled(rng: random.Random) -> Records:
-    """Frames of the two sensors interleaved anew, each in its own order, in bursts of any length.
+    """Frames of the two sensors, newly interleaved, each in its own order, in bursts of any length.
 
-    All stamps lie within 0.4 s: whoever waits lags by less than --max-wait.
+    All stamps are within 0.4 s: no sensor lags by more than --max-wait.
     """
     mine, others = (list(reversed(records)) for records in by_sensor())
     burst = rng.choice([1, 4, 40, 400, 4000])

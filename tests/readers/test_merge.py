@@ -91,29 +91,31 @@ class Notes(Batches):
             yield PacketBatch(np.zeros(0, np.uint8), none, none, none, none, tuple(messages))
 
 
-def _told(by_log_time: bool) -> list[tuple[int, int]]:
+def _delivered(by_log_time: bool) -> list[tuple[int, int]]:
     """Packets that had come, and messages, after each batch; of each all in the end."""
     packets = Batches(0, list(range(100, 400)), random.Random(0))
     notes = Notes(1, list(range(100, 400, 2)), random.Random(0))
-    arrivals: list[int] = []
-    told: list[int] = []
+    packet_ns: list[int] = []
+    message_ns: list[int] = []
     found = []
     for batch in merge([packets, notes], lambda one: by_log_time and one is notes):
-        told += [message.host_ns for message in batch.messages]
-        arrivals += batch.host_ns.tolist()
-        found.append((len(arrivals), len(told)))
-    assert told == notes.host_ns
-    assert arrivals == packets.host_ns
+        message_ns += [message.host_ns for message in batch.messages]
+        packet_ns += batch.host_ns.tolist()
+        found.append((len(packet_ns), len(message_ns)))
+    assert message_ns == notes.host_ns
+    assert packet_ns == packets.host_ns
     return found
 
 
 def test_messages_alone_are_read_before_all_packets() -> None:
-    assert all(told == 150 for come, told in _told(by_log_time=False) if come)
+    assert all(messages == 150 for packets, messages in _delivered(by_log_time=False) if packets)
 
 
 def test_messages_alone_are_read_by_their_log_times() -> None:
     """Two packets come for each message, but for what is read at once."""
-    assert all(abs(come - 2 * told) <= 12 for come, told in _told(by_log_time=True))
+    assert all(
+        abs(packets - 2 * messages) <= 12 for packets, messages in _delivered(by_log_time=True)
+    )
 
 
 def test_no_recordings_and_empty_recordings() -> None:

@@ -58,7 +58,7 @@ FIRING_NS = {
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A recording, all of it, and the turn that was published as a cloud.
+    """A recording, all of it, and the sweep that was published as a cloud.
 
     first_ns, last_ns: times of packets; block_ns: offsets of the first block of a packet and of its
     last one; differ, equal: pairs of returns; host_ahead_s: recording stamp minus lidar time,
@@ -78,8 +78,8 @@ class Case:
     differ: int
     equal: int
     host_ahead_s: tuple[float, float]
-    points_per_turn: tuple[int, ...]
-    turn: int
+    points_per_sweep: tuple[int, ...]
+    sweep: int
     limits_m: tuple[float, float]
 
     @property
@@ -108,7 +108,7 @@ class Case:
 
     @property
     def published(self) -> F64Array:
-        """(n, 3) the cloud of one turn, by firing group, channel and return."""
+        """(n, 3) the cloud of one sweep, by firing group, channel and return."""
         (pcd,) = (FOLDER / self.folder).glob("*.pcd")
         return xyz_of(read_pcd(pcd))
 
@@ -121,8 +121,8 @@ CASES = (
         differ=9147,
         equal=207_946,
         host_ahead_s=(168685362.42959, 168685362.43011),
-        points_per_turn=(152, 56530, 56723, 56762, 56604, 217),
-        turn=3,
+        points_per_sweep=(152, 56530, 56723, 56762, 56604, 217),
+        sweep=3,
         limits_m=(0.3, 200.0),
     ),
     Case(
@@ -132,8 +132,8 @@ CASES = (
         differ=14_744,
         equal=342_163,
         host_ahead_s=(80317350.51931, 80317350.52065),
-        points_per_turn=(244, 93079, 93672, 93591, 93463, 410),
-        turn=3,
+        points_per_sweep=(244, 93079, 93672, 93591, 93463, 410),
+        sweep=3,
         limits_m=(0.3, 200.0),
     ),
     Case(
@@ -143,8 +143,8 @@ CASES = (
         differ=6099,
         equal=143_589,
         host_ahead_s=(168692912.86951, 168692912.86985),
-        points_per_turn=(259, 33940, 34145, 34158, 33898, 268),
-        turn=3,
+        points_per_sweep=(259, 33940, 34145, 34158, 33898, 268),
+        sweep=3,
         limits_m=(0.1, 60.0),
     ),
     Case(
@@ -154,8 +154,8 @@ CASES = (
         differ=4192,
         equal=78_377,
         host_ahead_s=(168820178.59049, 168820178.59073),
-        points_per_turn=(7905, 26299, 26287, 26252, 18),
-        turn=2,
+        points_per_sweep=(7905, 26299, 26287, 26252, 18),
+        sweep=2,
         limits_m=(0.05, 120.0),
     ),
     Case(
@@ -165,8 +165,8 @@ CASES = (
         differ=8829,
         equal=234_474,
         host_ahead_s=(109375908.08108, 109375908.08198),
-        points_per_turn=(62826, 63058, 63040, 63021, 187),
-        turn=3,
+        points_per_sweep=(62826, 63058, 63040, 63021, 187),
+        sweep=3,
         limits_m=(0.05, 120.0),
     ),
 )

@@ -110,7 +110,7 @@ class Decoded:
 
     at_ns: since 1970; which: 1 strongest (odd block), 2 last (even block), 3 both, which are equal;
     packet_ns: (P,) stamps of packets; azimuth_cdeg: (P, 12) of their blocks; host_ahead_ms: by how
-    much the first one arrived after its stamp.
+    much the first one was received after its stamp.
     """
 
     xyz: F64Array

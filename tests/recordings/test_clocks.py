@@ -79,8 +79,8 @@ OUSTER = (
     Case("os0-128_windowed/windowed_frame1.pcap", "uptime", None, packets=17),
 )
 CASES = tuple(
-    (maker, case)
-    for maker, cases in (("hesai", HESAI), ("velodyne", VELODYNE), ("ouster", OUSTER))
+    (vendor, case)
+    for vendor, cases in (("hesai", HESAI), ("velodyne", VELODYNE), ("ouster", OUSTER))
     for case in cases
 )
 EMPTY = (
@@ -123,10 +123,10 @@ def estimates(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
     return {name: estimate for name, estimate in found.items() if estimate is not None}
 
 
-@pytest.mark.parametrize(("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value))
-def test_the_clock_of_a_recording(maker: str, case: Case) -> None:
-    period_ns = HOUR_NS if maker == "velodyne" else 0
-    (estimate,) = estimates(RECORDINGS / maker / case.path, period_ns).values()
+@pytest.mark.parametrize(("vendor", "case"), CASES, ids=lambda value: getattr(value, "path", value))
+def test_the_clock_of_a_recording(vendor: str, case: Case) -> None:
+    period_ns = HOUR_NS if vendor == "velodyne" else 0
+    (estimate,) = estimates(RECORDINGS / vendor / case.path, period_ns).values()
     assert estimate.domain == case.domain
     assert (estimate.packets, estimate.damaged, estimate.jumps) == (case.packets, 0, ())
     if case.offset_s is not None:

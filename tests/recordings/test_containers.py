@@ -9,8 +9,8 @@ import pytest
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.run import in_memory, prints
-from tests.golden.maker_messages import CONTAINERS, unit_of
-from tests.golden.test_maker_containers import job
+from tests.golden.test_vendor_containers import job
+from tests.golden.vendor_messages import CONTAINERS, unit_of
 from tests.recordings import RECORDINGS
 
 BAGS = {
@@ -20,7 +20,7 @@ BAGS = {
 
 
 def packets_of(path: Path) -> tuple[tuple[int, bytes], ...]:
-    """Arrival and payload of all packets of a recording."""
+    """Receive time and payload of all packets of a recording."""
     found = []
     for batch in open_recording(path, StreamTable()).packets():
         places = (batch.host_ns, batch.start, batch.size)
@@ -29,13 +29,13 @@ def packets_of(path: Path) -> tuple[tuple[int, bytes], ...]:
     return tuple(found)
 
 
-@pytest.mark.parametrize("maker", BAGS)
-def test_packets_of_a_real_bag_in_other_containers(maker: str, tmp_path: Path) -> None:
-    folder, bag, file = BAGS[maker]
+@pytest.mark.parametrize("vendor", BAGS)
+def test_packets_of_a_real_bag_in_other_containers(vendor: str, tmp_path: Path) -> None:
+    folder, bag, file = BAGS[vendor]
     metadata, source = RECORDINGS / folder / file, RECORDINGS / folder / bag
     whole = prints(in_memory(job(metadata, source)))
     assert len(whole) > 6
-    unit = unit_of(maker, packets_of(source))
+    unit = unit_of(vendor, packets_of(source))
     for number, write in enumerate(CONTAINERS.values()):
         (tmp_path / str(number)).mkdir()
         path = write(tmp_path / str(number), (unit,))

@@ -33,7 +33,7 @@ AS_PUBLISHED = ("--keep-repeated", "--decode", "firing_azimuth=off")
 
 @dataclass(frozen=True, slots=True)
 class Sorted:
-    """Points by column, channel and return; cdeg: the rotor's angle as the packets hold it."""
+    """Points by column, channel and return; cdeg: the rotor's angle as in the packets."""
 
     case: Case
     cloud: Cloud
@@ -49,7 +49,7 @@ class Sorted:
         beam_deg = case.azimuth_micro_deg[channel] / 1e6
         rotor = turned_deg(heading_deg(cloud.xyz[order], ahead=1), beam_deg) * 100
         cdeg = np.rint(rotor).astype(np.int64)
-        # Whole hundredths of a degree, as nothing turns the beams further.
+        # Whole hundredths of a degree, as nothing rotates the beams further.
         assert np.abs(rotor - cdeg).max() < 0.01
         return cls(case, cloud, order, channel, cdeg % 36_000)
 
@@ -60,17 +60,17 @@ class Sorted:
         same = (np.diff(column) == 0) & (np.diff(self.channel) == 0)
         return np.flatnonzero(same)
 
-    def turns(self) -> I64Array:
-        """Turn of each point, from 0: it ends where the beam's own azimuth passes 0 (rule 3)."""
+    def sweeps(self) -> I64Array:
+        """Sweep of each point, from 0: it ends where the beam's own azimuth passes 0 (rule 3)."""
         past_s = (self.cloud.stamp_ns - self.cloud.stamp_ns.min())[self.order] / 1e9
-        # Ten turns a second, to a few hundredths of a turn.
+        # Ten revolutions a second, to a few hundredths of one.
         rotor = self.cdeg / 36_000
         whole = np.rint(rotor[0] + past_s * 10 - rotor).astype(np.int64)
         micro_deg = (whole * 36_000 + self.cdeg) * 10_000
         azimuth = micro_deg + self.case.azimuth_micro_deg[self.channel]
         ended: I64Array = -(-azimuth // 360_000_000)
-        turns: I64Array = ended - ended.min()
-        return turns
+        sweeps: I64Array = ended - ended.min()
+        return sweeps
 
     def kept(self) -> BoolArray:
         """Rules 1 and 2: limits of range, and no first return that is like the last."""
@@ -87,12 +87,12 @@ class Sorted:
 @every_case
 def test_every_published_point_and_no_other(case: Case, tmp_path: Path) -> None:
     points = Sorted.of(case, converted(case.bag, tmp_path / "out", *AS_PUBLISHED).cloud)
-    turns, keep = points.turns(), points.kept()
-    assert tuple(np.bincount(turns[keep]).tolist()) == case.points_per_turn
-    ours = points.cloud.xyz[points.order[keep & (turns == case.turn)]]
+    sweeps, keep = points.sweeps(), points.kept()
+    assert tuple(np.bincount(sweeps[keep]).tolist()) == case.points_per_sweep
+    ours = points.cloud.xyz[points.order[keep & (sweeps == case.sweep)]]
     published = case.published
     assert ours.shape == published.shape
-    assert len(ours) == case.points_per_turn[case.turn]
+    assert len(ours) == case.points_per_sweep[case.sweep]
     # Both by firing group, channel and return.
     assert np.abs(ours - published).max() < 1e-4
 
@@ -182,8 +182,8 @@ def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None
         assert_same_points(again, whole)
 
 
-def test_the_published_turn_of_the_xt16_starts_when_the_manual_states(tmp_path: Path) -> None:
-    """The column at exactly 0, which the rule of the clouds still counts to the turn before."""
+def test_the_published_sweep_of_the_xt16_starts_when_the_manual_states(tmp_path: Path) -> None:
+    """The column at exactly 0, which the rule of the clouds still counts to the sweep before."""
     (case,) = (case for case in CASES if case.folder == "pandarxt16")
     points = Sorted.of(case, converted(case.bag, tmp_path / "out", *AS_PUBLISHED).cloud)
     at_zero = np.unique(points.cloud.stamp_ns[points.order][points.cdeg == 0])
@@ -197,8 +197,8 @@ def test_a_recording_whose_ranges_are_all_one(tmp_path: Path) -> None:
     assert _figures(both) == (7200 * 64 * 2, 0, 0)
     assert (both.cloud.range_m == np.float32(0x9696 / 250)).all()
     case = next(case for case in CASES if case.folder == "pandar64")
-    counts = np.bincount(Sorted.of(case, both.cloud).turns())
-    # 1800 groups of 0.2 degrees a turn, but for the motor's ripple and the turns cut off.
+    counts = np.bincount(Sorted.of(case, both.cloud).sweeps())
+    # 1800 groups of 0.2 degrees a revolution, but for the motor's ripple and partial revolutions.
     assert counts[1:-1] == pytest.approx(1800 * 64 * 2, rel=5e-3)
     one = converted(bag, tmp_path / "one")
     assert _figures(one) == (7200 * 64, 7200 * 64, 0)

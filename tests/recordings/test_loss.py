@@ -2,7 +2,7 @@
 
 No packet is known to be missing (recordings/MANIFEST.md): counts continue without a
 gap, the Pandar40P's and the Velodynes' packets follow at their pace, and the silence of the VLP-32C
-for half of each turn "is normal, not loss".
+for half of each revolution "is normal, not loss".
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from tests.recordings.test_clocks import CASES, Case
 # Fewer give no pace.
 FEWEST = 17
 every_case = pytest.mark.parametrize(
-    ("maker", "case"), CASES, ids=lambda value: getattr(value, "path", value)
+    ("vendor", "case"), CASES, ids=lambda value: getattr(value, "path", value)
 )
 every_long_case = pytest.mark.parametrize(
-    ("maker", "case"),
-    [(maker, case) for maker, case in CASES if case.packets >= FEWEST],
+    ("vendor", "case"),
+    [(vendor, case) for vendor, case in CASES if case.packets >= FEWEST],
     ids=lambda value: getattr(value, "path", value),
 )
 
 
 @lru_cache(maxsize=2)
-def _read(maker: str, path: str) -> Came:
+def _read(vendor: str, path: str) -> Came:
     """The packets of a recording of one lidar, found as the program finds them."""
-    place = RECORDINGS / maker / path
+    place = RECORDINGS / vendor / path
     if place.is_dir():
         (place,) = place.glob("*.db3")
     table = StreamTable()
@@ -56,8 +56,8 @@ def _read(maker: str, path: str) -> Came:
 
 
 @every_case
-def test_nothing_is_lost(maker: str, case: Case) -> None:
-    packets = _read(maker, case.path)
+def test_nothing_is_lost(vendor: str, case: Case) -> None:
+    packets = _read(vendor, case.path)
     assert len(packets.host_ns) == case.packets
     assert packets.counted() == (0, 0)
 
@@ -65,27 +65,29 @@ def test_nothing_is_lost(maker: str, case: Case) -> None:
 @every_long_case
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.4])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_is_taken_out_is_what_is_lost(maker: str, case: Case, share: float, seed: int) -> None:
+def test_what_is_taken_out_is_what_is_lost(
+    vendor: str, case: Case, share: float, seed: int
+) -> None:
     """All but the first and the last packet: the packets before are unknown."""
     came = np.random.default_rng(seed).random(case.packets) >= share
     came[[0, -1]] = True
-    packets, missing = _read(maker, case.path), int(np.count_nonzero(~came))
+    packets, missing = _read(vendor, case.path), int(np.count_nonzero(~came))
     assert packets.counted(came) == (missing, 0)
     assert packets.counted(came, size=7) == (missing, 0)
 
 
 @every_long_case
-def test_packets_lost_in_a_row(maker: str, case: Case) -> None:
+def test_packets_lost_in_a_row(vendor: str, case: Case) -> None:
     """A quarter of the recording, from its middle on."""
     silent = case.packets // 4
     came = np.ones(case.packets, bool)
     came[case.packets // 2 : case.packets // 2 + silent] = False
-    assert _read(maker, case.path).counted(came) == (silent, 0)
+    assert _read(vendor, case.path).counted(came) == (silent, 0)
 
 
 @every_long_case
-def test_packets_that_cross_are_not_lost(maker: str, case: Case) -> None:
-    packets = _read(maker, case.path)
+def test_packets_that_cross_are_not_lost(vendor: str, case: Case) -> None:
+    packets = _read(vendor, case.path)
     order = np.arange(case.packets)
     order[4:-4:10], order[5:-3:10] = order[5:-3:10].copy(), order[4:-4:10].copy()
     headers = packets.headers

@@ -79,7 +79,7 @@ def test_real_recordings(name: str) -> None:
 
 def test_every_real_recording_is_tested() -> None:
     folders = {
-        path.name for maker in ("hesai", "velodyne") for path in (RECORDINGS / maker).iterdir()
+        path.name for vendor in ("hesai", "velodyne") for path in (RECORDINGS / vendor).iterdir()
     }
     assert folders - {"calibration-without-recording"} == {
         name.split("/")[1] for name in REAL if not name.startswith("other")

@@ -121,17 +121,17 @@ def name_of(case: Case) -> str:
     return f"{case.name}-{case.only}" if case.only else case.name
 
 
-def compare(got: Cloud, want: Reference, *, ring_base: int = 0) -> None:
+def compare(found: Cloud, expected: Reference, *, ring_base: int = 0) -> None:
     """Every pixel, in order, and nothing else; stamps aside."""
-    assert len(got.range_m) == len(want.range_mm)
-    assert np.array_equal(got.ring, want.ring + ring_base)
+    assert len(found.range_m) == len(expected.range_mm)
+    assert np.array_equal(found.ring, expected.ring + ring_base)
     # Whole millimetres in float32, exact to its last bit.
-    assert np.array_equal(got.range_m, (want.range_mm / 1000).astype(np.float32))
-    reflectivity = got.intensity if got.reflectivity is None else got.reflectivity
-    assert np.array_equal(reflectivity, want.reflectivity)
-    if want.signal is not None:
-        assert np.array_equal(got.intensity, want.signal)
-    error_m = np.abs(got.xyz.astype(np.float64) - want.xyz_m).max(axis=1)
+    assert np.array_equal(found.range_m, (expected.range_mm / 1000).astype(np.float32))
+    reflectivity = found.intensity if found.reflectivity is None else found.reflectivity
+    assert np.array_equal(reflectivity, expected.reflectivity)
+    if expected.signal is not None:
+        assert np.array_equal(found.intensity, expected.signal)
+    error_m = np.abs(found.xyz.astype(np.float64) - expected.xyz_m).max(axis=1)
     assert error_m.max() <= TOLERANCE_M
 
 
@@ -139,11 +139,11 @@ def compare(got: Cloud, want: Reference, *, ring_base: int = 0) -> None:
 def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
     result = command(*case.options(), "-o", tmp_path / "scans", "--keep-partial")
     assert result.code == 0, result.err
-    got, want = Cloud.of_all(tmp_path / "scans"), Reference.of(case)
-    assert np.array_equal(got.column_stamp_ns, want.column_stamp_ns)
-    assert np.array_equal(got.stamp_ns, want.stamp_ns)
-    assert np.array_equal(got.at_ns, want.stamp_ns)
-    compare(got, want)
+    found, expected = Cloud.of_all(tmp_path / "scans"), Reference.of(case)
+    assert np.array_equal(found.column_stamp_ns, expected.column_stamp_ns)
+    assert np.array_equal(found.stamp_ns, expected.stamp_ns)
+    assert np.array_equal(found.at_ns, expected.stamp_ns)
+    compare(found, expected)
 
 
 @pytest.mark.parametrize("case", SINGLES, ids=name_of)
@@ -195,12 +195,12 @@ def test_two_sensors_by_receive_time(pair: tuple[Case, Case], tmp_path: Path) ->
     cloud, total, ring_base = Cloud.of_all(tmp_path / "scans"), 0, 0
     # Sensors are ordered by serial number.
     for number, case in enumerate(sorted(pair, key=lambda case: case.only)):
-        got, want = cloud.of_sensor(number), Reference.of(case)
-        compare(got, want, ring_base=ring_base)
+        found, expected = cloud.of_sensor(number), Reference.of(case)
+        compare(found, expected, ring_base=ring_base)
         # A single packet each, hence one constant.
-        assert len(np.unique(got.stamp_ns - want.stamp_ns)) == 1
-        assert len(np.unique(got.column_stamp_ns - want.column_stamp_ns)) == 1
-        total += len(want.range_mm)
+        assert len(np.unique(found.stamp_ns - expected.stamp_ns)) == 1
+        assert len(np.unique(found.column_stamp_ns - expected.column_stamp_ns)) == 1
+        total += len(expected.range_mm)
         ring_base += _channels(case)
     assert len(cloud.range_m) == total
 
@@ -222,7 +222,7 @@ def test_recordings_without_lidar_data_say_so(path: str, words: list[str], tmp_p
     assert result.code == 1
     assert result.out == ""
     assert result.err.count("\n") == 1, result.err
-    for word in ("no lidar packets", "wanted", path.split("/")[-1], *words):
+    for word in ("no lidar packets", "expected", "found", path.split("/")[-1], *words):
         assert word in result.err
     assert not list(tmp_path.iterdir())
 

@@ -35,11 +35,11 @@ def test_real_packets_equal_the_reference() -> None:
     kept = (reference["imu_status"] & 1) != 0
     stamps = np.concatenate([samples.stamp_ns for samples in packets])
     acceleration = np.concatenate([samples.acceleration for samples in packets])
-    turn = np.concatenate([samples.angular_velocity for samples in packets])
+    angular_velocity = np.concatenate([samples.angular_velocity for samples in packets])
     assert kept.sum() == len(stamps) > 0
     assert np.array_equal(stamps, reference["imu_timestamp"][kept])
     assert np.array_equal(acceleration, reference["imu_acc"][kept].astype(np.float64))
-    assert np.array_equal(turn, reference["imu_gyro"][kept].astype(np.float64))
+    assert np.array_equal(angular_velocity, reference["imu_gyro"][kept].astype(np.float64))
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 3, 5])
@@ -56,7 +56,7 @@ def test_real_legacy_packets_feel_gravity_at_the_time_of_the_lidar(number: int) 
     first, last = np.sort(stamp_ns.ravel())[[0, -1]]
     assert len(stamps) >= 10
     assert (np.diff(stamps) > 0).all()
-    # A turn to either side, since one lidar measures half of its turn only.
+    # A revolution to either side, since one lidar measures half of each only.
     assert ((stamps > first - 100_000_000) & (stamps < last + 100_000_000)).all()
     for sample in samples:
         assert np.linalg.norm(sample.acceleration) == pytest.approx(9.8, abs=1.5)

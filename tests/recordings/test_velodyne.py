@@ -38,7 +38,7 @@ def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_pa
 
 @pytest.mark.parametrize("case", [DUAL, GAPS], ids=lambda case: case.folder)
 def test_every_point_with_the_file_next_to_the_bag(case: Case, tmp_path: Path) -> None:
-    """The file, found by itself, holds the vendor's angles, but no heights of the origins."""
+    """The file, found automatically, has the vendor's angles, but no heights of the origins."""
     made = converted(case.path, tmp_path / "found")
     assert made.sensor["calibration"] == case.file
     check(case, made.cloud, added_m=case.heights_m)
@@ -108,11 +108,11 @@ def test_angle_follows_time_over_blind_sectors(decode: str, tmp_path: Path) -> N
     rotor_deg = heading_deg(ours.xyz) - np.array(table.azimuth_deg)[order][ours.ring]
     when_ns = ours.at_ns if decode == "on" else ours.stamp_ns
     past_s = (when_ns - when_ns[0]) / 1e9
-    turns = rotor_deg / 360
-    turns += np.rint(past_s * 10 - (turns - turns[0]))
-    slope, start = np.polyfit(past_s, turns, 1)
+    revolutions = rotor_deg / 360
+    revolutions += np.rint(past_s * 10 - (revolutions - revolutions[0]))
+    slope, start = np.polyfit(past_s, revolutions, 1)
     assert slope == pytest.approx(10.0, abs=0.01)
-    assert np.abs((turns - start) / slope - past_s).max() < 20e-6
+    assert np.abs((revolutions - start) / slope - past_s).max() < 20e-6
 
 
 def test_time_of_the_first_packet_by_hand(tmp_path: Path) -> None:

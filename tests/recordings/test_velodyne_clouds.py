@@ -28,12 +28,12 @@ from tests.recordings.references import (
 from tests.recordings.velodyne import DUAL, FOLDER, GAPS
 
 # Nebula's types from 4 on (first and last weak, identical, ..., first and last strongest), by what
-# its blocks hold: see the test.
+# its blocks contain: see the test.
 NEBULA = [WEAK_LAST, WEAK_FIRST, ONLY, 0, 0, STRONGEST_LAST, STRONGEST_FIRST]
 
 
 def test_returns_of_a_pair_are_distinguished(tmp_path: Path) -> None:
-    """Even blocks hold the last return: the farther one, wherever two are seen (section 3)."""
+    """Even blocks have the last return: the farther one, wherever two are seen (section 3)."""
     ours, theirs = converted(DUAL.path, tmp_path / "out").cloud, DUAL.theirs
     types = ours.return_type[np.lexsort((ours.range_m, ours.ring, ours.column))]
     # 97.8 % of pairs are equal; one return is missing in 528 and 57; 708 differ.
@@ -44,7 +44,7 @@ def test_returns_of_a_pair_are_distinguished(tmp_path: Path) -> None:
     first, last = (~alone & (theirs.which == kind) for kind in (1, 2))
     assert np.isin(types[first], (STRONGEST_FIRST, WEAK_FIRST)).all()
     assert np.isin(types[last], (STRONGEST_LAST, WEAK_LAST)).all()
-    # Both of a pair lie side by side in this order; one of them is the stronger.
+    # Both of a pair are adjacent in this order; one of them is the stronger.
     pair = first.nonzero()[0]
     assert np.array_equal(pair + 1, last.nonzero()[0])
     levels = theirs.intensity
@@ -84,16 +84,16 @@ class Pairs:
 
 
 def test_the_published_cloud_of_a_vlp_16(tmp_path: Path) -> None:
-    """It holds points from 0.3 m and up to 359 degrees, in the order of the packets."""
+    """It has points from 0.3 m and up to 359 degrees, in the order of the packets."""
     theirs = read_pcd(FOLDER / "vlp16_ros2_dual" / "1673400472138016708.pcd")
     ours = Pairs(tmp_path / "out")
     kept = ((ours.range_m >= 0.3) & (heading_deg(ours.xyz) % 360 < 359)).nonzero()[0]
-    wanted = theirs["channel"]
-    starts = np.lib.stride_tricks.sliding_window_view(ours.ring[kept], 200) == wanted[:200]
+    expected = theirs["channel"]
+    starts = np.lib.stride_tricks.sliding_window_view(ours.ring[kept], 200) == expected[:200]
     begin = int(starts.all(axis=1).nonzero()[0][0])
     chosen = kept[begin : begin + len(theirs)]
     assert len(chosen) == 14_831
-    assert np.array_equal(ours.ring[chosen], wanted)
+    assert np.array_equal(ours.ring[chosen], expected)
     assert np.abs(ours.range_m[chosen] - theirs["distance"]).max() < 5e-5
     assert np.array_equal(ours.ordered("intensity")[chosen], theirs["intensity"])
     away_m = np.linalg.norm(ours.xyz[chosen] - xyz_of(theirs), axis=1)
@@ -112,7 +112,7 @@ def test_the_published_cloud_of_a_vlp_16(tmp_path: Path) -> None:
 
 
 def test_the_published_cloud_of_a_vlp_32c(tmp_path: Path) -> None:
-    """It holds one turn, 0.4 to 50 m; their azimuths are re-enacted."""
+    """It has one revolution, 0.4 to 50 m; their azimuths are re-enacted."""
     theirs = xyz_of(read_pcd(FOLDER / "vlp32c_ros2" / "1713492677464078412.pcd"))
     limits = ("--min-range", "0.4", "--max-range", "50")
     ours = converted(GAPS.path, tmp_path / "out", *limits).cloud
@@ -127,7 +127,7 @@ def test_the_published_cloud_of_a_vlp_32c(tmp_path: Path) -> None:
     far_m = np.linalg.norm(theirs, axis=1)
     assert np.abs(ours.range_m[order] - far_m).max() < 5e-5
     assert np.abs(ours.xyz[order, 2] - theirs[:, 2]).max() < 5e-5
-    # It turns beams by the step to the next block, which the last one has not, and by 2.304 us for
+    # It rotates beams by the step to the next block (the last one has none), and by 2.304 us for
     # each laser, though two fire at once (traps 1 and 2). 0.0036 degrees a us; steps of whole cdeg.
     step_cdeg = np.diff(cdeg_of_blocks, append=0) % 36000
     step_cdeg[11::12] = 0

@@ -29,7 +29,7 @@ OLD = "hdl32e_named-vlp32/velodyne_vlp32.pcap"
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording holds, as the readers and the sampler give it; read with the best table."""
+    """Content of a recording, as the readers and the sampler give it; read with the best table."""
 
     evidence: Evidence
     sent: Sent
@@ -68,10 +68,10 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
     """Both recordings have valid sentences: wrong receive times have no effect."""
     one, result = recorded(name), reference(name)
     shift_ns = wrong_s * 1_000_000_000
-    beside = tuple(
+    neighbours = tuple(
         replace(other, host_ns=other.host_ns + shift_ns) for other in one.evidence.neighbours
     )
-    moved = replace(one.evidence, host_ns=one.evidence.host_ns + shift_ns, neighbours=beside)
+    moved = replace(one.evidence, host_ns=one.evidence.host_ns + shift_ns, neighbours=neighbours)
     lidar = lidar_for(moved)
     assert lidar.timestamp_mode == pulse
     headers = lidar.column_headers(one.sent.payloads, one.sent.host_ns + shift_ns)
@@ -82,7 +82,7 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
 
 
 def test_files_of_the_vendors_angles_change_nothing() -> None:
-    """Nebula's files hold the manual's angles, and no offsets."""
+    """Nebula's files have the manual's angles, and no offsets."""
     for name, file in ((DUAL, "VLP16.yaml"), (GAPS, "VLP32.yaml")):
         path = FOLDER / name.split("/")[0] / file
         read = velodyne.read_calibration(path, path.read_bytes())

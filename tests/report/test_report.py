@@ -33,17 +33,24 @@ from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 def ledger() -> SensorLedger:
     """A ledger that balances, every counter different."""
     counts = SensorLedger()
-    counts.packets.read, counts.packets.accepted = 110, 100
+    counts.packets.read = 110
+    counts.packets.accepted = 100
     counts.packets.reject("duplicate", 7)
     counts.packets.reject("bad_size", 2)
     counts.packets.reject("bad_size")
-    counts.packets.lost, counts.packets.reordered = 4, 5
-    counts.columns.decoded, counts.columns.written = 1600, 1500
+    counts.packets.lost = 4
+    counts.packets.reordered = 5
+    counts.columns.decoded = 1600
+    counts.columns.written = 1500
     counts.columns.drop("late", 100)
     counts.columns.drop("tail", 0)
     points = counts.points
-    points.slots, points.no_return, points.range = 6000, 1000, 300
-    points.box, points.repeated, points.written = 200, 0, 4500
+    points.slots = 6000
+    points.no_return = 1000
+    points.range = 300
+    points.box = 200
+    points.repeated = 0
+    points.written = 4500
     counts.imu_packets = 9
     return counts
 
@@ -105,17 +112,17 @@ def test_messages_that_nobody_accounts_for_are_found() -> None:
     passed = ForwardedMessages("/imu", 10, 6, {"no_place": 4})
     assert imbalances(replace(run(), messages=(passed,))) == []
     assert imbalances(replace(run(), messages=(passed, replace(passed, written=5)))) == [
-        "messages of /imu: wanted 10 accounted for, got 5 + 4"
+        "messages of /imu: expected 10 accounted for, found 5 + 4"
     ]
 
 
 @pytest.mark.parametrize("repeated", [0, 4, -3])
 def test_datagrams_that_reach_no_sensor_are_found(repeated: int) -> None:
-    """110 lidar packets, 9 of an IMU and 2 of nobody."""
+    """110 lidar packets, 9 of an IMU and 2 of no sensor."""
     counted = replace(run(), capture=CaptureCounts(121 - repeated, 121 - repeated))
     assert imbalances(replace(counted, repeated=repeated)) == []
     assert imbalances(replace(counted, repeated=repeated + 1)) == [
-        "datagrams: wanted 122 accounted for, got 110 + 9 + 2"
+        "datagrams: expected 122 accounted for, found 110 + 9 + 2"
     ]
 
 
@@ -125,7 +132,7 @@ def test_unknown_reasons_are_found() -> None:
     counts.packets.read += 1
     assert counts.check() == ["packets: unknown reason 'mood'"]
     capture = CaptureCounts(10, 8, {"not_udp": 1})
-    assert check_capture(capture) == ["frames: wanted 10 accounted for, got 8 + 1"]
+    assert check_capture(capture) == ["frames: expected 10 accounted for, found 8 + 1"]
 
 
 def test_table_of_scans_by_hand() -> None:
@@ -139,7 +146,8 @@ def test_table_of_scans_by_hand() -> None:
         "coverage_left,coverage_right,overlap_left,overlap_right,missing_left,missing_right,"
         "ready_host_ns"
     )
-    start, end = START_NS, START_NS + PERIOD_NS
+    start = START_NS
+    end = START_NS + PERIOD_NS
     last = start + 75_000_000  # four columns, 25 ms apart
     times = [start, end, start, last]
     # Nothing is known of rotors here, nor of what the sensors should have sent.
@@ -245,7 +253,7 @@ def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
 
 
 def test_names_that_are_no_text_come_back() -> None:
-    """A file called by two bytes that UTF-8 does not know."""
+    """A file name of two bytes that are not UTF-8."""
     name = os.fsdecode(b"/data/\xff\xfe.pcap")
     text = report_text(replace(run(), inputs=(InputReport(name, 1000, "pcap"),)))
     assert json.loads(text.encode("utf-8"))["inputs"][0]["path"] == name

@@ -34,7 +34,7 @@ def test_knowledge_is_decoded(encoding: str) -> None:
     assert decode_transforms(Topic("/t", "tf/tfMessage", encoding), data) == expected
 
 
-def test_knowledge_that_is_cut_off_is_told_in_one_line() -> None:
+def test_a_cut_off_message_is_reported_in_one_line() -> None:
     data = transforms_message("cdr", [("a", "b", (1, 2, 3), (0, 0, 0, 1))])
     with pytest.raises(RecordingError, match=r"^/tf: expected \d+ bytes at byte \d+") as caught:
         decode_transforms(Topic("/tf", "tf2_msgs/TFMessage", "cdr"), data[:-1])

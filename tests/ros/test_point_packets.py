@@ -1,4 +1,4 @@
-"""Points as columns: which share one, where they lie in it, and that none is lost."""
+"""Points as columns: which share one, their slots, and that none is lost."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.builders.points import (
 
 
 def _points(stamps_ns: Sequence[int], rings: Sequence[int] | None = None) -> Points:
-    """Points whose x tells them apart."""
+    """Points with distinct x."""
     count = len(stamps_ns)
     reals = np.zeros((4, count), np.float32)
     reals[0] = np.arange(1, count + 1)
@@ -85,7 +85,7 @@ def test_a_second_point_on_a_ring_starts_a_column_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("stamps_ns", "rings", "slots"),
     [
-        # No stamp tells anything; the widest; no more than is mostly used; the most of all.
+        # No stamp is informative; the widest; no more than is mostly used; the most of all.
         ([0] * 5000, None, 16),
         ([0] * 128 + [1] * 120, None, 128),
         ([0] * 50 + [*range(1, 51)], None, 2),

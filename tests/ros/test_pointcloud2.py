@@ -59,7 +59,7 @@ DRIVERS: dict[str, tuple[Sequence[tuple[str, str]], list[Point], list[int], str]
         [1_650_000_000_250_000_000, 1_650_000_000_312_500_000],
         "timestamp (float64), s since 1970",
     ),
-    # A float64 holds multiples of 256 ns there.
+    # A float64 resolves multiples of 256 ns there.
     "livox": (
         LIVOX,
         [(1, 2, 3, 9, 16, 4, 1.7e18), (4, 5, 6, 9, 0, 5, 1.7e18 + 25_600)],

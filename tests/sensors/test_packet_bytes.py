@@ -8,7 +8,7 @@ import pytest
 from mlbatch.sensors.packet_bytes import block_time_us
 
 HOUR_US = 3_600_000_000
-# Ten packets of twelve blocks; a block takes 50 us, in which the rotor turns 0.36 degrees.
+# Ten packets of twelve blocks; a block takes 50 us, in which the rotor rotates by 0.36 degrees.
 STAMP_US = np.arange(10) * 600
 AZIMUTH = (np.arange(10)[:, None] * 12 + np.arange(12)) * 36
 

@@ -128,7 +128,7 @@ def test_the_file_inside_is_a_whole_mcap(tmp_path: Path) -> None:
 
 
 def test_a_definition_that_was_not_stored_is_ours(tmp_path: Path) -> None:
-    """Bags of Humble hold no definitions."""
+    """Bags of Humble contain no definitions."""
     topic = Topic("/imu", "sensor_msgs/Imu", "cdr")
     source = read_back(written("rosbag2", tmp_path / "first", SCANS[:1]))
     [raw, _] = [r.raw for r in source if r.topic == "/left/imu"]

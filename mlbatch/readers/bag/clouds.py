@@ -43,12 +43,18 @@ def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
 class _TopicCounts:
     """Clouds and points of a topic; points: of all clouds that could be read."""
 
+    # How the times of points are encoded; empty before the first cloud.
     time_meaning: str = ""
     points: int = 0
+    # Points with coordinates that are NaN or zero.
     without_place: int = 0
+    # Points with a time that is not usable.
     without_time: int = 0
+    # Points with a ring that the first cloud did not have.
     beyond_rings: int = 0
+    # Clouds that could not be read.
     faults: int = 0
+    # Reason of the first of them.
     first_fault: str = ""
 
     def add(self, cloud: Cloud) -> None:

@@ -41,7 +41,7 @@ def bag_folder(folder: Path) -> BagFolder:
             "name the files inside it"
         )
     names = {path.name for path in files}
-    # A recorder that was stopped while compressing leaves both.
+    # `ros2 bag record` leaves both if it is stopped while compressing.
     whole = [path for path in files if path.suffix in (".db3", ".mcap") or path.stem not in names]
     filled = [path for path in whole if path.stat().st_size] or whole[:1]
     notes = [f"{path.name}: has 0 bytes and is left out" for path in whole if path not in filled]

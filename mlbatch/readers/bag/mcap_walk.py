@@ -53,7 +53,7 @@ _SKIPPED = range(Op.CHUNK + 1, Op.DATA_END)
 
 @dataclass(slots=True)
 class Messages:
-    """Messages of wanted channels in file order, (n,) int64 each.
+    """Messages of selected channels in file order, (n,) int64 each.
 
     Message i is `data[begin[i] : end[i]]`; valid until the next ones are requested.
     """
@@ -87,15 +87,15 @@ class Span:
 
 @dataclass(slots=True)
 class Scanner:
-    """Finds messages in bytes; `wants` selects the topics."""
+    """Finds messages in bytes; `selects` is true for the topics to read."""
 
-    wants: Callable[[Topic], bool]
+    selects: Callable[[Topic], bool]
     channels: Channels
-    _wanted: BoolArray = field(default_factory=lambda: np.zeros(1 << 16, bool))
+    _selected: BoolArray = field(default_factory=lambda: np.zeros(1 << 16, bool))
 
     def __post_init__(self) -> None:
         for number, topic in self.channels.topics.items():
-            self._wanted[number] = self.wants(topic)
+            self._selected[number] = self.selects(topic)
 
     def scan(self, data: U8Array, at: int, end: int, starts: list[int]) -> Span:
         """Walk over `data[at:end]`; places of whole messages are added to `starts`."""
@@ -114,7 +114,7 @@ class Scanner:
                 if at + HEAD.size + _CHANNEL.size > end:
                     return Span(at, size)
                 [channel] = _CHANNEL.unpack_from(view, at + HEAD.size)
-                if self._wanted[channel]:
+                if self._selected[channel]:
                     return Span(at, size, fault=_too_long(length, MAX_RECORD_BYTES))
             elif opcode in (Op.SCHEMA, Op.CHANNEL):
                 if at + size > end:
@@ -128,16 +128,16 @@ class Scanner:
             at += size
 
     def gather(self, data: U8Array, starts: list[int]) -> Iterator[Messages]:
-        """The wanted messages among those at `starts`, which is then empty."""
+        """The selected messages among those at `starts`, which is then empty."""
         if not starts:
             return
         at = np.array(starts, np.int64)
         starts.clear()
         head = records(data, _MESSAGE, at)
-        wanted = self._wanted[head["channel"]]
-        if not wanted.all():
-            at = at[wanted]
-            head = head[wanted]
+        selected = self._selected[head["channel"]]
+        if not selected.all():
+            at = at[selected]
+            head = head[selected]
         if len(at):
             end = at + head["length"].astype(np.int64) + HEAD.size
             channel = head["channel"].astype(np.int64)
@@ -146,14 +146,14 @@ class Scanner:
 
     def _learn(self, opcode: int, body: bytes) -> bool:
         """Add a schema or a channel; False if it cannot be parsed."""
-        # Many recorders repeat them in every chunk.
+        # Many MCAP writers repeat them in every chunk.
         if self.channels.knows(opcode, body):
             return True
         if not self.channels.add(opcode, body):
             return False
         if opcode == Op.CHANNEL:
             [number] = _CHANNEL.unpack_from(body)
-            self._wanted[number] = self.wants(self.channels.topics[number])
+            self._selected[number] = self.selects(self.channels.topics[number])
         return True
 
 
@@ -178,15 +178,15 @@ def _messages(view: memoryview, at: int, end: int, starts: list[int]) -> int:
 
 @dataclass(slots=True)
 class Walk:
-    """One pass over a file; `wants` selects the topics.
+    """One pass over a file; `selects` is true for the topics to read.
 
-    skip: places of chunks without wanted messages; lost: messages, or chunks of unknown content,
+    skip: places of chunks without selected messages; lost: messages, or chunks of unknown content,
     that could not be read; limit: place from which on nothing more is read; buffer_bytes: for
     tests, results do not depend on it; place: how far the walk has come in the file.
     """
 
     source: Source
-    wants: Callable[[Topic], bool]
+    selects: Callable[[Topic], bool]
     channels: Channels
     skip: Set[int] = frozenset()
     notes: list[str] = field(default_factory=list)
@@ -201,10 +201,10 @@ class Walk:
     _decompressor: Decompressor = field(default_factory=Decompressor)
 
     def __post_init__(self) -> None:
-        self._scanner = Scanner(self.wants, self.channels)
+        self._scanner = Scanner(self.selects, self.channels)
 
     def messages(self) -> Iterator[Messages]:
-        """All wanted messages; damage is noted, only a failing disk raises."""
+        """All selected messages; damage is noted, only a failing disk raises."""
         window = Window(self.source, self.buffer_bytes)
         window.begin = len(MAGIC)
         starts: list[int] = []

@@ -129,9 +129,13 @@ class Shape:
 class _Places:
     """Places of packets as they are found, in bytes of the array."""
 
+    # First byte of the payload.
     start: list[I64Array] = field(default_factory=list)
+    # Bytes of its array, used or not.
     room: list[I64Array] = field(default_factory=list)
+    # Of a field with the number of used bytes.
     size_at: list[I64Array] = field(default_factory=list)
+    # Of the timestamp of the packet.
     stamp_at: list[I64Array] = field(default_factory=list)
 
     def repeat(self, count: int, stride: int) -> None:

@@ -40,7 +40,7 @@ class Portion:
     topic: I64Array
 
 
-# Begins a pass over the messages that `BagRecording.wants`; reports losses to the recording.
+# Begins a pass over the messages that `BagRecording.selects`; reports losses to the recording.
 PortionReader: TypeAlias = "Callable[[BagRecording], Generator[Portion, None, None]]"
 
 
@@ -58,7 +58,7 @@ class BagRecording(Recording):
         for number, topic in enumerate(self.topics):
             self._numbers.setdefault(topic, number)
 
-    def wants(self, topic: Topic) -> bool:
+    def selects(self, topic: Topic) -> bool:
         """Whether the messages of a topic are read: they contain packets, or are to be kept."""
         return topic.name in self.keep or type_key(topic.type) in PACKET_TYPES
 

@@ -41,9 +41,13 @@ _UDP_BYTES = 8
 class _Set:
     """Fragments of one datagram so far; total: its length, known from the last fragment."""
 
+    # Receive time of the first fragment.
     birth_ns: int
+    # Data by offset in the datagram.
     parts: dict[int, bytes] = field(default_factory=dict)
+    # Number of frames.
     frames: int = 0
+    # Bytes of `parts`.
     received: int = 0
     total: int | None = None
 

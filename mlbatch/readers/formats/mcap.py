@@ -2,7 +2,7 @@
 
 Messages are found by walking from record to record, so that files without chunks, index or summary
 read like all others. A summary, if there is one, gives the topics at once, and the chunks without
-wanted messages.
+selected messages.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mlbatch.readers.source import BUFFER_BYTES, MAX_RECORD_BYTES, Source
 from mlbatch.types import Recording, StreamTable, Topic
 
 CONTAINER = "MCAP"
-# How far to search for topics in a file without a summary; recorders write them at the front.
+# How far to search for topics in a file without a summary; usually they are at the front.
 _SEARCH_BYTES = 64 << 20
 _PEEK_BYTES = 1 << 16
 # A summary of more records is not kept in memory; the file is read without it.
@@ -136,19 +136,21 @@ def _everything(topic: Topic) -> bool:
 def _portions(
     recording: BagRecording, files: Sequence[Path], buffer_bytes: int
 ) -> Generator[Portion, None, None]:
-    """The messages that a recording wants, file by file."""
+    """The messages that a recording selects, by file."""
     read_bytes = 0
     for file in files:
         with Source(file) as source:
             summary = _summary(source)
             topics = summary.channels.topics
-            wanted = {number for number, topic in topics.items() if recording.wants(topic)}
-            # A channel that the summary does not describe may be a wanted one.
-            unwanted = topics.keys() - wanted
+            selected = {number for number, topic in topics.items() if recording.selects(topic)}
+            # A channel that the summary does not describe may have a selected topic.
+            unselected = topics.keys() - selected
             skip = frozenset(
-                place for place, inside in summary.chunks.items() if inside <= unwanted
+                place for place, inside in summary.chunks.items() if inside <= unselected
             )
-            walk = Walk(source, recording.wants, summary.channels, skip, buffer_bytes=buffer_bytes)
+            walk = Walk(
+                source, recording.selects, summary.channels, skip, buffer_bytes=buffer_bytes
+            )
             numbers = _TopicNumbers(recording, walk.channels)
             try:
                 for messages in walk.messages():
@@ -181,7 +183,7 @@ class _TopicNumbers:
         topic = self._table[messages.channel]
         if (topic < 0).any():
             for number, known in self.channels.topics.items():
-                if self.recording.wants(known):
+                if self.recording.selects(known):
                     self._table[number] = self.recording.number(known)
             topic = self._table[messages.channel]
         return Portion(messages.data, messages.begin, messages.end, messages.log_ns, topic)

@@ -30,7 +30,7 @@ CONTAINER = "ROS 1 bag"
 
 _NAME = b"#ROSBAG V"
 _MAGIC = b"#ROSBAG V2.0\n"
-# The recorder begins a new chunk every 0.75 MB by default.
+# `rosbag record` begins a new chunk every 0.75 MB by default.
 _MAX_CHUNK_BYTES = 1 << 28
 _MAX_INDEX_BYTES = 16 << 20
 _PLAIN = "none"
@@ -148,7 +148,7 @@ def _places(raw: bytes) -> list[tuple[int, int, int]]:
 
 
 def _number(fields: dict[str, bytes], name: str) -> int:
-    """The value of a field that holds a little-endian number."""
+    """The value of a field that contains a little-endian number."""
     if name not in fields or len(fields[name]) not in (1, 4, 8):
         raise _HeadError(f"no number {name!r}")
     return int.from_bytes(fields[name], "little")
@@ -385,12 +385,12 @@ class _Pass:
         self._source = source
         self._reader = _HeaderReader()
         self._decompressor = Decompressor()
-        # Topic of each connection, -1 where its messages are not wanted.
+        # Topic of each connection, -1 where its topic is not selected.
         self._topics: dict[int, int] = {}
         self._cut = False
 
     def portions(self) -> Generator[Portion, None, None]:
-        """All wanted messages."""
+        """All selected messages."""
         window = Window(self._source)
         window.begin = len(_MAGIC)
         window.refill()
@@ -466,7 +466,7 @@ class _Pass:
         return found
 
     def _messages(self, data: U8Array, parts: list[_Records]) -> Generator[Portion, None, None]:
-        """The wanted messages among records; connections are remembered."""
+        """The selected messages among records; new connections are stored."""
         walked = _joined(parts)
         if not len(walked.head):
             return
@@ -495,7 +495,7 @@ class _Pass:
 
     def _connect(self, connection: int, topic: Topic) -> None:
         at = self._recording.number(topic)
-        self._topics[connection] = at if self._recording.wants(topic) else -1
+        self._topics[connection] = at if self._recording.selects(topic) else -1
 
     def _end(self, window: Window) -> Generator[Portion, None, None]:
         """The bytes left at the end of the file: none, or a part of a record."""

@@ -107,7 +107,7 @@ def _portions(
         numbers = {
             number: recording.number(topic)
             for number, topic in database.topics.items()
-            if recording.wants(topic)
+            if recording.selects(topic)
         }
         damage = _Damage()
         read = 0
@@ -189,7 +189,7 @@ class _Database:
         uri = self._plain.resolve().as_uri() + "?mode=ro"
         log = self._plain.with_name(self._plain.name + "-wal")
         if log.is_file() and log.stat().st_size:
-            # The last messages of a recorder that crashed are still in the log.
+            # After a crash of `ros2 bag record` the last messages are still in the log.
             with contextlib.suppress(sqlite3.Error):
                 connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
@@ -277,7 +277,7 @@ class _Page:
                         last = (last[0], number)
                         continue
                     if data.startswith(ZSTD_MAGIC):
-                        # Some recorders compress each message.
+                        # `ros2 bag record --compression-mode message` compresses each message.
                         data = decompressed(data, MAX_RECORD_BYTES)
                     end = fill + len(data)
                     if end > room:

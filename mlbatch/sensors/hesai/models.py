@@ -43,9 +43,13 @@ class Tail:
     """
 
     size: int
+    # Date and time of day to 1 s, 6 bytes.
     date_at: int
+    # Microseconds, u32.
     us_at: int
+    # Return mode.
     mode_at: int | None = None
+    # Rotor speed.
     rpm_at: int | None = None
     rpm_step: float = 1.0
     rpm_is_signed: bool = False
@@ -90,12 +94,15 @@ class Model:
 
     name: str
     channels: int
+    # Possible numbers of blocks in a packet.
     blocks: tuple[int, ...]
     tail: Tail
     timing: Timing
     firing_ns: I64Array
+    # Optical centre in the sensor frame.
     centre_mm: tuple[float, float, float]
     elevation_deg: tuple[float, float] | None
+    # As in the table of `mlbatch sensors`.
     verified: str
     same_packets_as: str = ""
     header: int = 12

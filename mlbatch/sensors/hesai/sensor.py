@@ -67,7 +67,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 
 
 class HesaiCalibration:
-    """Angle csv, for any model with as many channels; `Calibration` of lidar.py."""
+    """Angle csv, for any model with as many channels; implements `Calibration`."""
 
     __slots__ = ("_angles", "is_shared", "model", "path", "serial")
 
@@ -112,7 +112,7 @@ class HesaiCalibration:
 
 
 class At128Calibration:
-    """Correction file of an AT128; `Calibration` of lidar.py."""
+    """Correction file of an AT128; implements `Calibration`."""
 
     __slots__ = ("_file", "is_shared", "model", "path", "serial")
 
@@ -141,7 +141,7 @@ class At128Calibration:
 
 
 class HesaiLidar(BaseLidar):
-    """Decoder of one sensor; `Lidar` of lidar.py. Frame: x right, y forward, z up."""
+    """Decoder of one sensor; implements `Lidar`. Frame: x right, y forward, z up."""
 
     def __init__(
         self,

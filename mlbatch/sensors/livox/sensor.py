@@ -63,7 +63,7 @@ _SHARED_STAMP = (
 
 
 class LivoxCalibration:
-    """Livox needs no calibration; `Calibration` of lidar.py."""
+    """Livox needs no calibration; implements `Calibration`."""
 
     __slots__ = ()
 
@@ -98,7 +98,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 
 
 class LivoxLidar(BaseLidar):
-    """Decoder of one sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; implements `Lidar`.
 
     Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the last points read.
     """
@@ -163,7 +163,7 @@ class LivoxLidar(BaseLidar):
 
 
 class MovedPoints:
-    """The last points read, moved into the body frame; `Projection` of geometry.py."""
+    """The last points read, moved into the body frame; implements `Projection`."""
 
     def __init__(self, lidar: LivoxLidar, body_from_sensor: F64Array) -> None:
         self._lidar = lidar
@@ -173,7 +173,7 @@ class MovedPoints:
         """No rotor: nothing to prepare."""
 
     def project(self, range_m: F32Array, out: F32Array) -> None:
-        """Rotate and translate, summed in a fixed order (see geometry.py)."""
+        """Rotate and translate, summed in a fixed order (see `lidar/geometry.py`)."""
         x, y, z = self._lidar.last_xyz_m.T
         for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):
             out[:, 0, axis] = x * by_x + y * by_y + z * by_z + shift

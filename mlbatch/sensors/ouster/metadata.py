@@ -207,20 +207,25 @@ class Metadata:
     serial: int
     init_id: int
     layout: PacketLayout
+    # Type of the packet header.
     header: str
     columns_per_frame: int
     column_window: tuple[int, int]
     altitude_rad: F64Array
     azimuth_rad: F64Array
     beam_offset_m: tuple[float, float]
+    # (4, 4) transforms, m.
     lidar_to_sensor: F64Array
     imu_to_sensor: F64Array
+    # (4, 4) sensor to body, as `ouster-sdk` writes it.
     extrinsics: F64Array | None
     lidar_mode: str
     timestamp_mode: str
+    # Order of the returns in a packet.
     strongest_first: bool
     lidar_port: int
     imu_port: int
+    # Layout of IMU packets.
     imu_profile: str
     imu_samples: int
     notes: tuple[str, ...]

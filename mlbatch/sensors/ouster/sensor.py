@@ -89,7 +89,7 @@ def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
 
 
 class OusterCalibration:
-    """A metadata file; `Calibration` of lidar.py."""
+    """A metadata file; implements `Calibration`."""
 
     __slots__ = ("_headers", "is_shared", "metadata", "model", "path", "serial")
 
@@ -140,7 +140,7 @@ class OusterCalibration:
 
 
 class OusterLidar:
-    """Decoder of one sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; implements `Lidar`.
 
     Beyond the protocol: `lidar_port`, `init_id`. The sequence counts the packets within the column
     window of the metadata, modulo frames x packets per frame; it is negative for packets outside

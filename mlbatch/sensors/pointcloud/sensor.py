@@ -65,7 +65,7 @@ def _layout(sample: U8Array) -> Layout | None:
 
 
 class CloudCalibration:
-    """A topic of clouds, which needs no calibration; `Calibration` of lidar.py."""
+    """A topic of clouds, which needs no calibration; implements `Calibration`."""
 
     path: Path | None = None
     serial = ""
@@ -108,7 +108,7 @@ def describe(size: int, sample: U8Array) -> str | None:
 
 
 class CloudLidar(BaseLidar):
-    """A topic of clouds; `Lidar` of lidar.py."""
+    """A topic of clouds; implements `Lidar`."""
 
     sends_twice = False
     typed_by = ""
@@ -187,7 +187,7 @@ class _LastRead:
 
 
 class _MovedPoints:
-    """The last columns read, moved into the body frame; `Projection` of geometry.py."""
+    """The last columns read, moved into the body frame; implements `Projection`."""
 
     def __init__(self, last_read: _LastRead, body_from_sensor: F64Array) -> None:
         self._last_read = last_read

@@ -43,7 +43,7 @@ class Identity:
 
     name: in words.
     model: its row, None without a decoder.
-    other: a model that the type bytes may also stand for.
+    other: another model with the same type bytes.
     """
 
     name: str
@@ -167,8 +167,8 @@ def returns_of(packets: U8Array, model: Model) -> int:
     # A block has one round of two returns, or two rounds of one.
     took_us = block_time_us(_stamp_us(chosen, model), azimuth, _MINUTE_US)
     for returns in (1, 2):
-        wanted_us = model.rounds_per_block / returns * model.round_ns / 1000
-        if took_us is not None and abs(took_us - wanted_us) < _PACE_TOLERANCE * wanted_us:
+        expected_us = model.rounds_per_block / returns * model.round_ns / 1000
+        if took_us is not None and abs(took_us - expected_us) < _PACE_TOLERANCE * expected_us:
             return returns
     return 0
 

@@ -81,11 +81,14 @@ class Layout:
     point_at: byte that is 0 in point packets (0: none).
     """
 
+    # First bytes of a packet.
     magic: bytes
     header: int
+    # First bytes of a block.
     block_id: bytes
     blocks: int
     per_block: int
+    # Byte of the timestamp.
     time_at: int = 20
     mode_at: int = 0
     modes: Mapping[int, int] | None = None
@@ -146,8 +149,11 @@ class Model:
     firing_ns: tuple[tuple[int, ...], ...]
     units_per_m: int
     lens_m: tuple[float, float]
+    # Place of the beam angles in DIFOP packets.
     angles: AngleOffsets
+    # By value of DIFOP byte 300.
     modes: Mapping[int, ReturnMode]
+    # As in the table of `mlbatch sensors`.
     verified: str = "one source"
     is_calendar: bool = False
     range_mask: int = 0xFFFF

@@ -74,7 +74,7 @@ def read_calibration(path: Path, content: bytes) -> CsvCalibration | None:
 
 
 class DifopCalibration:
-    """A model with angles from its device packets; `Calibration` of lidar.py."""
+    """A model with angles from its device packets; implements `Calibration`."""
 
     __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
 
@@ -135,7 +135,7 @@ class DifopCalibration:
 
 
 class CsvCalibration:
-    """Csv file with the angles of one unit; `Calibration` of lidar.py.
+    """Csv file with the angles of one unit; implements `Calibration`.
 
     named: the model named in the rig.
     """
@@ -194,7 +194,7 @@ BUILT_IN: tuple[Calibration, ...] = tuple(DifopCalibration(row) for row in ROWS)
 
 
 class RobosenseLidar(BaseLidar):
-    """Decoder of one sensor; `Lidar` of lidar.py.
+    """Decoder of one sensor; implements `Lidar`.
 
     Dual mode of 128-line models: three blocks per packet do not divide by two, so each return is a
     separate column (`returns` 1) of unknown return type; the two returns of a shot may be in two

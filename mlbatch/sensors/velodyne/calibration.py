@@ -69,6 +69,7 @@ class _Quantity:
     yaml: str
     xml: str
     is_angle: bool
+    # Largest plausible absolute value, rad or m.
     limit: float
     required: bool = False
 
@@ -90,8 +91,10 @@ class _Format:
 
     id_key: str
     angle_unit: str
+    # Factor of angles to rad.
     rad: float
     length_unit: str
+    # Factor of lengths to m.
     m: float
     keys: Mapping[str, str]
 

@@ -53,6 +53,7 @@ class Model:
     name: str
     reported_as: str
     lasers: int
+    # Distance counts in a metre.
     units_per_m: int
     sequence_ns: int
     slots: int
@@ -63,8 +64,10 @@ class Model:
     banks: int = 1
     halves: int = 1
     stamp_ns: int = 0
+    # The packet stamp may be that of the last firing (`packet_stamp=end`).
     stamp_may_end: bool = False
     product: int | None = None
+    # As in the table of `mlbatch sensors`.
     verified: str = "two sources"
 
     def firing_ns(self, sequence_ns: float) -> I64Array:

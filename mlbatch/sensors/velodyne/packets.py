@@ -79,7 +79,7 @@ class Options:
 
 
 class VelodyneLidar(BaseLidar):
-    """Decoder of one sensor; `Lidar` of lidar.py."""
+    """Decoder of one sensor; implements `Lidar`."""
 
     def __init__(
         self,

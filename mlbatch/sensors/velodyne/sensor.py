@@ -61,7 +61,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
 
 
 class VelodyneCalibration:
-    """Built-in table of a model, or a file that replaces it; `Calibration` of lidar.py.
+    """Built-in table of a model, or a file that replaces it; implements `Calibration`.
 
     is_guessed: packets and file fit several models.
     is_named: the rig names this model.

@@ -1,4 +1,4 @@
-"""Clouds of bags as packets of a recording: ledgers, notes, and packets beside them."""
+"""Clouds of bags as packets of a recording: ledgers, notes, and raw packets in the same bag."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _open(path: Path) -> tuple[CloudRecording, StreamTable]:
 
 
 def _payloads(batches: Iterator[PacketBatch]) -> list[tuple[int, int, bytes]]:
-    """Stream, arrival and bytes of all packets."""
+    """Stream, receive time and bytes of all packets."""
     found = []
     for batch in batches:
         rows = zip(*(a.tolist() for a in _of(batch)), strict=True)
@@ -59,7 +59,7 @@ def _of(batch: PacketBatch) -> tuple[npt.NDArray[np.int64], ...]:
     return batch.start, batch.size, batch.stream, batch.host_ns
 
 
-def _turn(number: int) -> bytes:
+def _sweep(number: int) -> bytes:
     """Three columns of two points; the last has a point without a place."""
     at = number * 100_000_000
     points = [(1 + number, 1, ring, 9, 1000 * column, ring) for ring in (0, 1) for column in (0, 1)]
@@ -70,7 +70,9 @@ def _turn(number: int) -> bytes:
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
     points = [(1, 1, ring, 9, 1000 * column, ring) for ring in (0, 1) for column in (0, 1)]
-    data = [cloud_message(OUSTER, points, STAMP_NS + turn, Form(encoding)) for turn in (0, 10**8)]
+    data = [
+        cloud_message(OUSTER, points, STAMP_NS + past_ns, Form(encoding)) for past_ns in (0, 10**8)
+    ]
     recording, table = _open(_bag(tmp_path, write_points("/left/points", data), encoding))
     for _ in range(2):  # Counts and notes begin anew with every pass.
         packets = _payloads(recording.packets())
@@ -90,8 +92,8 @@ def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
     assert recording.container == recording.inner.container
 
 
-def test_what_is_left_out_is_told(tmp_path: Path) -> None:
-    messages = write_points("/points", [_turn(0), b"\0\1\0\0", _turn(1), _turn(2)[:-40]])
+def test_what_is_left_out_is_reported(tmp_path: Path) -> None:
+    messages = write_points("/points", [_sweep(0), b"\0\1\0\0", _sweep(1), _sweep(2)[:-40]])
     recording, _ = _open(_bag(tmp_path, messages))
     assert len(_payloads(recording.packets())) == 6
     (first,), (second,) = recording.verdicts, recording.notes
@@ -102,7 +104,7 @@ def test_what_is_left_out_is_told(tmp_path: Path) -> None:
     assert not check_capture(recording.counts)
 
 
-def test_clouds_without_a_place_are_told_and_nothing_else(tmp_path: Path) -> None:
+def test_clouds_without_coordinates_give_one_note(tmp_path: Path) -> None:
     empty = cloud_message(OUSTER, [(0, 0, 0, 9, 5, 1)] * 3)
     messages = write_points("/points", [empty, cloud_message(OUSTER, [])])
     recording, _ = _open(_bag(tmp_path, messages))
@@ -111,13 +113,13 @@ def test_clouds_without_a_place_are_told_and_nothing_else(tmp_path: Path) -> Non
     assert recording.counts.frames == 0
 
 
-def test_rings_beyond_those_of_the_first_cloud_are_told(tmp_path: Path) -> None:
-    turns = [
+def test_rings_beyond_those_of_the_first_cloud_are_reported(tmp_path: Path) -> None:
+    sweeps = [
         cloud_message(OUSTER, [(1, 1, 1, 9, 0, ring) for ring in range(first, first + 16)], stamp)
         for first, stamp in ((0, STAMP_NS), (8, STAMP_NS + 10**8), (16, STAMP_NS + 2 * 10**8))
     ]
-    turns.append(cloud_message((*XYZ, ("t", "uint32")), [(1, 1, 1, 0)]))
-    recording, _ = _open(_bag(tmp_path, write_points("/points", turns)))
+    sweeps.append(cloud_message((*XYZ, ("t", "uint32")), [(1, 1, 1, 0)]))
+    recording, _ = _open(_bag(tmp_path, write_points("/points", sweeps)))
     packets = _payloads(recording.packets())
     assert len(packets) == 2
     (left_out,), (fault,) = recording.verdicts, recording.notes
@@ -126,7 +128,7 @@ def test_rings_beyond_those_of_the_first_cloud_are_told(tmp_path: Path) -> None:
 
 
 def test_each_pass_starts_anew(tmp_path: Path) -> None:
-    recording, _ = _open(_bag(tmp_path, write_points("/points", [_turn(n) for n in range(5)])))
+    recording, _ = _open(_bag(tmp_path, write_points("/points", [_sweep(n) for n in range(5)])))
     packets = recording.packets()
     assert len(_payloads(iter([next(packets)]))) > 0
     packets.close()
@@ -136,7 +138,7 @@ def test_each_pass_starts_anew(tmp_path: Path) -> None:
 
 def test_messages_are_handed_over_where_they_are_asked_for(tmp_path: Path) -> None:
     text = Recorded("/note", "std_msgs/String", STAMP_NS + 3, Body("cdr").text("hello").done())
-    bag = _bag(tmp_path, [text, *write_points("/points", [_turn(0)])])
+    bag = _bag(tmp_path, [text, *write_points("/points", [_sweep(0)])])
     recording, _ = _open(bag)
     for keep in (frozenset[str](), frozenset({"/note"}), frozenset({"/note", "/points"})):
         recording.keep = keep
@@ -153,12 +155,12 @@ def test_raw_packets_keep_their_place_between_clouds(tmp_path: Path) -> None:
             (1, 8, 12, 18, 25, 40), (packet_message("cdr", p) for p in payloads), strict=True
         )
     ]
-    clouds = write_points("/points", [_turn(n) for n in range(3)])
+    clouds = write_points("/points", [_sweep(n) for n in range(3)])
     bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
     recording, table = _open(bag)
     packets = _payloads(recording.packets())
-    arrivals_ns = [host_ns for _, host_ns, _ in packets]
-    assert arrivals_ns == sorted(arrivals_ns)
+    received_ns = [host_ns for _, host_ns, _ in packets]
+    assert received_ns == sorted(received_ns)
     number = table.number(Stream(topic="/os/lidar_packets"))
     assert [data for stream, _, data in packets if stream == number] == payloads
     assert len(packets) == 6 + 9
@@ -178,7 +180,7 @@ def test_large_clouds_come_in_parts_and_lose_nothing(
         )
         for at in range(5, 60, 5)
     ]
-    clouds = write_points("/points", [_turn(n) for n in range(5)])
+    clouds = write_points("/points", [_sweep(n) for n in range(5)])
     bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
     whole = _payloads(_open(bag)[0].packets())
     monkeypatch.setattr("mlbatch.readers.bag.clouds._BATCH_BYTES", 1)
@@ -191,7 +193,7 @@ def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
     table = StreamTable()
     layouts: dict[str, Layout] = {}
     recordings = []
-    for number, data in enumerate([_turn(0), cloud_message(OUSTER, [(1, 2, 3, 9, 5, 0)])]):
+    for number, data in enumerate([_sweep(0), cloud_message(OUSTER, [(1, 2, 3, 9, 5, 0)])]):
         (tmp_path / str(number)).mkdir()
         (sent,) = write_points("/points", [data])
         sent = replace(sent, log_ns=sent.log_ns + number * 10**8)
@@ -202,7 +204,7 @@ def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
     assert len(packets) == 4
 
 
-def test_topics_of_clouds_are_told_by_type() -> None:
+def test_topics_of_clouds_are_recognised_by_type() -> None:
     topics = (
         Topic("/a", CLOUD, "cdr"),
         Topic("/b", "sensor_msgs/Imu", "cdr"),

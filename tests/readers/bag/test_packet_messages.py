@@ -48,7 +48,7 @@ AROUND = {
     "robosense_msgs/RobosenseScan": "robosense_msgs/RobosensePacket",
 }
 INFO = "robosense_msgs/RobosenseInfoPacket"
-# Types whose packets carry the time of their arrival (section 3); pandar_msgs does only in ROS 2.
+# Types whose packets carry their receive time (section 3); pandar_msgs does only in ROS 2.
 STAMPED = {name for name, text in OWN.items() if text.startswith("time")} | {*AROUND, INFO}
 FIXED = {"velodyne": 1206, "pandar_msgs/PandarS": 1500, "pandar_msgs/PandarP": 1500}
 FIXED |= {"rslidar_msgs": 1248, "robosense": 1248}
@@ -145,8 +145,10 @@ def test_payloads_of_every_type_come_out_whole(name: str, encoding: str) -> None
     many = name in AROUND
     for count in (1, 2, 5) if many else (1,):
         sent = payloads(name, count)
-        found, got = find(Topic("/t", name, encoding), serialised(name, encoding, sent), pad=count)
-        assert got == sent
+        found, read_back = find(
+            Topic("/t", name, encoding), serialised(name, encoding, sent), pad=count
+        )
+        assert read_back == sent
         own = name in STAMPED and not (name.startswith("pandar") and encoding == "ros1")
         stamps = [STAMP_NS + i * 1_000_000 if own else LOG_NS for i in range(count)]
         assert found.host_ns.tolist() == stamps
@@ -170,8 +172,8 @@ def test_a_single_packet_without_a_stamp_is_timed_by_its_log_time() -> None:
 
 def test_scans_without_packets_hold_none() -> None:
     name = "velodyne_msgs/VelodyneScan"
-    found, got = find(Topic("/t", name, "cdr"), serialised(name, "cdr", []))
-    assert got == []
+    found, read_back = find(Topic("/t", name, "cdr"), serialised(name, "cdr", []))
+    assert read_back == []
     assert not found.untimed
 
 
@@ -180,22 +182,22 @@ def test_alignment_follows_the_frame_name(frame: str) -> None:
     body = Body("cdr").header(STAMP_NS, frame).put("I", 2)
     for number in range(2):
         body.time(STAMP_NS + number).raw(bytes([number + 1]) * 1206)
-    found, got = find(Topic("/t", "velodyne_msgs/VelodyneScan", "cdr"), body.done())
-    assert got == [b"\1" * 1206, b"\2" * 1206]
+    found, read_back = find(Topic("/t", "velodyne_msgs/VelodyneScan", "cdr"), body.done())
+    assert read_back == [b"\1" * 1206, b"\2" * 1206]
     assert found.host_ns.tolist() == [STAMP_NS, STAMP_NS + 1]
 
 
-@pytest.mark.parametrize(("told", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
-def test_the_size_of_a_pandar_packet_tells_the_valid_bytes(told: int, expected: int) -> None:
-    body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", told)
-    _, got = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
-    assert got == [bytes(expected)]
+@pytest.mark.parametrize(("stated", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
+def test_the_size_field_of_a_pandar_packet_limits_its_bytes(stated: int, expected: int) -> None:
+    body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", stated)
+    _, read_back = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
+    assert read_back == [bytes(expected)]
 
 
 def test_a_packet_of_no_bytes_is_counted_apart() -> None:
     body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", 0)
-    found, got = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
-    assert (got, found.empty) == ([], 1)
+    found, read_back = find(Topic("/t", "pandar_msgs/PandarScan", "cdr"), body.done())
+    assert (read_back, found.empty) == ([], 1)
 
 
 def test_the_embedded_definition_wins() -> None:
@@ -262,8 +264,8 @@ def test_the_calibration_among_hesai_packets_is_kept_apart() -> None:
     body = Body("ros1").header(0).put("I", 2)
     body.time(STAMP_NS).blob(b"\xff\xee" + bytes(98)).put("I", 100)
     body.time(0).blob(pseudo).put("I", len(text))
-    found, got = find(Topic("/t", "hesai_lidar/PandarScan", "ros1"), body.done())
-    assert got == [b"\xff\xee" + bytes(98)]
+    found, read_back = find(Topic("/t", "hesai_lidar/PandarScan", "ros1"), body.done())
+    assert read_back == [b"\xff\xee" + bytes(98)]
     assert found.corrections == ((0, text),)
 
 
@@ -278,8 +280,8 @@ def test_the_calibration_among_hesai_packets_is_kept_apart() -> None:
 )
 def test_short_robosense_packets_lose_their_padding(payload: bytes, expected: int) -> None:
     body = Body("cdr").time(STAMP_NS).raw(payload.ljust(1248, b"\0"))
-    _, got = find(Topic("/t", "rslidar_msgs/rslidarPacket", "cdr"), body.done())
-    assert got == [payload.ljust(1248, b"\0")[:expected]]
+    _, read_back = find(Topic("/t", "rslidar_msgs/rslidarPacket", "cdr"), body.done())
+    assert read_back == [payload.ljust(1248, b"\0")[:expected]]
 
 
 def test_many_messages_give_what_they_give_one_by_one() -> None:

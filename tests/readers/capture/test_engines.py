@@ -27,8 +27,10 @@ def _kernels(tmp_path_factory: pytest.TempPathFactory) -> object:
         yield
 
 
-def told(path: Path, engine: str, buffer_bytes: int) -> tuple[list[Seen], object, object, object]:
-    """All that a reader says of a capture: packets, counts, notes and an error."""
+def outcome(
+    path: Path, engine: str, buffer_bytes: int
+) -> tuple[list[Seen], object, object, object]:
+    """Result of reading a capture: packets, counts, notes and an error."""
     recording = open_capture(path, engine=engine, buffer_bytes=buffer_bytes)
     try:
         seen, error = read(recording), ""
@@ -49,7 +51,7 @@ def test_captures_whole_and_damaged(tmp_path: Path, seed: int) -> None:
         except RecordingError:
             continue
         buffer_bytes = pick.choice(BUFFERS)
-        assert told(path, "numba", buffer_bytes) == told(path, "numpy", buffer_bytes)
+        assert outcome(path, "numba", buffer_bytes) == outcome(path, "numpy", buffer_bytes)
 
 
 def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
@@ -64,15 +66,15 @@ def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
                 one[place] = value
                 changed.append((len(changed), bytes(one)))
         path.write_bytes(pcap_bytes(changed))
-        assert told(path, "numba", 65_536) == told(path, "numpy", 65_536)
+        assert outcome(path, "numba", 65_536) == outcome(path, "numpy", 65_536)
 
 
 def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcap"
     frames = [(number, b"\x00" * (number % 3)) for number in range(40_000)]
     path.write_bytes(pcap_bytes([*frames, *((1, one) for one in udp_frame(b"last"))]))
-    found = told(path, "numba", 4 << 20)
-    assert found == told(path, "numpy", 4 << 20)
+    found = outcome(path, "numba", 4 << 20)
+    assert found == outcome(path, "numpy", 4 << 20)
     assert [one.payload for one in found[0]] == [b"last"]
 
 

@@ -45,7 +45,7 @@ def both_ways(
 
 
 def found(frames: list[bytes]) -> tuple[list[bytes], dict[str, int]]:
-    """Payloads and skipped frames of frames that arrive 1 us apart."""
+    """Payloads and skipped frames of frames received 1 us apart."""
     seen, skipped = both_ways([(i * 1000, frame) for i, frame in enumerate(frames)])
     return [one.payload for one in seen], skipped
 
@@ -172,7 +172,7 @@ def test_open_sets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [one[0] for one in sets] + [frame for one in sets for frame in one[1:]]
     payloads, skipped = found(frames)
     # The first fragments of sets 3 and 4 drop sets 0 and 1; their further fragments open sets
-    # again and drop 2, 3 and 4 in turn.
+    # again and drop 2, 3 and 4 one by one.
     assert payloads == []
     assert skipped == {"fragment_lost": 15}
 

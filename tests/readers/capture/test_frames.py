@@ -1,4 +1,4 @@
-"""What a frame holds does not depend on the frames beside it, usual ones are only found sooner."""
+"""The content of a frame does not depend on its neighbours; usual frames have a fast path."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ARP = bytes(12) + b"\x08\x06" + bytes(28)
 _ETHERNET = 1
 
 
-def held(frames: list[bytes], cut: int = 0, link: int = _ETHERNET) -> list[object]:
-    """What the first of some frames holds; cut: bytes that the capture left out of it."""
+def content(frames: list[bytes], cut: int = 0, link: int = _ETHERNET) -> list[object]:
+    """Content of the first of some frames; cut: bytes that the capture left out of it."""
     sizes = np.array([len(frame) for frame in frames])
     data = np.frombuffer(b"".join(frames) + bytes(SLACK), np.uint8)
     captured = sizes.copy()
@@ -56,27 +56,27 @@ def held(frames: list[bytes], cut: int = 0, link: int = _ETHERNET) -> list[objec
 
 
 def test_a_usual_frame_holds_its_payload() -> None:
-    assert held([_USUAL]) == [[(42, 10, 0x0A000001, 7502)], [], {}]
+    assert content([_USUAL]) == [[(42, 10, 0x0A000001, 7502)], [], {}]
 
 
 @pytest.mark.parametrize("at", range(42))
-def test_a_changed_header_means_the_same_alone_and_beside_others(at: int) -> None:
+def test_a_changed_header_means_the_same_alone_and_among_others(at: int) -> None:
     for value in range(256):
         changed = bytearray(_USUAL)
         changed[at] = value
-        assert held([bytes(changed)]) == held([bytes(changed), _ARP]), value
+        assert content([bytes(changed)]) == content([bytes(changed), _ARP]), value
 
 
 @pytest.mark.parametrize("cut", range(len(_USUAL) + 1))
-def test_a_cut_frame_means_the_same_alone_and_beside_others(cut: int) -> None:
-    assert held([_USUAL], cut) == held([_USUAL, _ARP], cut)
+def test_a_cut_frame_means_the_same_alone_and_among_others(cut: int) -> None:
+    assert content([_USUAL], cut) == content([_USUAL, _ARP], cut)
 
 
 @pytest.mark.parametrize("link", [0, 12, 101, 113, 276, 127])
-def test_other_links_mean_the_same_alone_and_beside_others(link: int) -> None:
-    assert held([_USUAL], link=link) == held([_USUAL, _ARP], link=link)
+def test_other_links_mean_the_same_alone_and_among_others(link: int) -> None:
+    assert content([_USUAL], link=link) == content([_USUAL, _ARP], link=link)
 
 
 def test_a_cut_frame_is_no_datagram_though_its_payload_is_there() -> None:
     padded = _USUAL + bytes(6)
-    assert held([padded], cut=6) == [[], [], {"truncated": 1}]
+    assert content([padded], cut=6) == [[], [], {"truncated": 1}]

@@ -79,7 +79,7 @@ def test_every_form_gives_the_packets_of_the_pcap(name: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["none", "zstd", "ROS 1"])
-def test_topics_are_told_as_the_file_tells_them(name: str, tmp_path: Path) -> None:
+def test_topics_are_those_of_the_file(name: str, tmp_path: Path) -> None:
     ros = FORMS[name].ros
     qos = {"latching": "1"} if ros == 1 else {"offered_qos_profiles": "- durability: 1\n"}
     form = replace(FORMS[name], qos=qos)
@@ -103,8 +103,8 @@ def test_kept_messages_come_whole_and_in_order(form: Form, tmp_path: Path) -> No
     recording, streams = opened(path, keep="/note")
     seen, messages = read(recording, streams)
     assert seen == EXPECTED[:20]
-    wanted = [(m.log_ns, m.data) for m in sent if m.topic == "/note"]
-    assert [(message.host_ns, message.data) for message in messages] == wanted
+    expected = [(m.log_ns, m.data) for m in sent if m.topic == "/note"]
+    assert [(message.host_ns, message.data) for message in messages] == expected
     recording.keep = frozenset()
     assert read(recording, streams) == (seen, [])
 
@@ -265,10 +265,10 @@ def test_a_cut_file_gives_what_is_whole(chunked: bool, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", [Form(), Form(ZSTD), Form(LZ4), Form(chunked=False)])
 def test_a_file_cut_after_its_last_message(form: Form, tmp_path: Path) -> None:
-    """All packets; nothing is known to be lost, but the missing end is told."""
+    """All packets; nothing is known to be lost, but the missing end is reported."""
     path = write_mcap(tmp_path / "a.mcap", packet_messages(PACKETS), replace(form, summary=False))
     data = path.read_bytes()
-    if form.chunked:  # Behind the last chunk stand its indexes: kind 7.
+    if form.chunked:  # The indexes of the last chunk follow it: kind 7.
         at, end = 8, 0
         while at < len(data):
             kind, length = struct.unpack_from("<BQ", data, at)
@@ -315,12 +315,12 @@ def test_a_corrupt_chunk_costs_itself(tmp_path: Path) -> None:
 
 
 def broken(kind: int, body: bytes, length: int | None = None) -> bytes:
-    """A record, with a length that may lie."""
+    """A record, with a length that may be wrong."""
     return struct.pack("<BQ", kind, len(body) if length is None else length) + body
 
 
 def chunk(size: int, compression: bytes, stored: bytes, length: int | None = None) -> bytes:
-    """A chunk, with sizes that may lie."""
+    """A chunk, with sizes that may be wrong."""
     head = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
     return broken(6, head + struct.pack("<Q", len(stored) if length is None else length) + stored)
 

@@ -172,8 +172,8 @@ def test_last_record_that_is_cut_off_is_one_truncated_frame(tmp_path: Path) -> N
 @pytest.mark.parametrize("claimed", [262_145, 10_000_000, 0xFFFFFFFF])
 def test_a_lying_record_ends_the_readable_part(tmp_path: Path, claimed: int) -> None:
     first = pcap_bytes([(0, udp_frame(b"first")[0])])
-    lie = struct.pack("<IIII", 0, 0, claimed, claimed)
-    (tmp_path / "a").write_bytes(first + lie + bytes(600_000))
+    wrong_record = struct.pack("<IIII", 0, 0, claimed, claimed)
+    (tmp_path / "a").write_bytes(first + wrong_record + bytes(600_000))
     recording = open_capture(tmp_path / "a")
     assert [one.payload for one in read(recording)] == [b"first"]
     assert recording.counts.skipped == {"truncated": 1}
@@ -210,7 +210,7 @@ def test_unknown_link_type_is_named(tmp_path: Path) -> None:
         open_capture(path)
 
 
-def test_fcs_bits_beside_the_link_type_are_ignored(tmp_path: Path) -> None:
+def test_fcs_bits_in_the_link_type_field_are_ignored(tmp_path: Path) -> None:
     path = write_pcap(tmp_path / "a", [(0, udp_frame(b"x")[0])], linktype=0x5400_0001)
     assert len(read(open_capture(path))) == 1
 

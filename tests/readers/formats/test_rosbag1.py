@@ -146,7 +146,7 @@ def test_damaged_bytes_never_raise_anything_else(tmp_path: Path, plain: bytes) -
         at = rng.randrange(4109, len(bag) - 4)
         bag[at : at + 4] = rng.randbytes(4)
         path.write_bytes(bag)
-        # An encoding that is not known ends a pass; it is told in one line.
+        # An unknown encoding ends a pass, with a note of one line.
         with contextlib.suppress(RecordingError):
             read(opened(path))
 
@@ -172,15 +172,15 @@ def test_messages_are_handed_over_in_file_order(tmp_path: Path) -> None:
     recording.keep = frozenset({"/tf_static", "/left/ouster/metadata", "/imu/data"})
     seen, kept = read(recording)
     assert seen == PACKETS
-    wanted = [message for message in messages if message.topic in recording.keep]
-    got = [(m.topic.name, m.topic.type, m.host_ns, m.data) for m in kept]
-    assert got == [(m.topic, m.type, m.log_ns, m.data) for m in wanted]
+    expected = [message for message in messages if message.topic in recording.keep]
+    found = [(m.topic.name, m.topic.type, m.host_ns, m.data) for m in kept]
+    assert found == [(m.topic, m.type, m.log_ns, m.data) for m in expected]
     metadata = next(message for message in kept if message.topic.type == "std_msgs/String")
     assert '"122647000123"' in decode_string(metadata.topic, metadata.data)
     assert metadata.topic.latched
 
 
-def test_unreadable_messages_are_counted_and_told(tmp_path: Path) -> None:
+def test_unreadable_messages_are_counted_and_reported(tmp_path: Path) -> None:
     good = packet_message("ros1", b"packet")
     messages = [Recorded("/p", OUSTER_ROS1, at, good[: 10 if at % 2 else 8]) for at in range(1, 8)]
     recording = opened(write_rosbag1(tmp_path / "a.bag", messages))

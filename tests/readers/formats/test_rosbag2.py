@@ -241,7 +241,7 @@ def test_messages_larger_than_the_buffer_are_read(tmp_path: Path) -> None:
     assert sizes == [9, 9, 9 << 20, 9, 9]
 
 
-def test_a_recorder_that_crashed_leaves_its_last_messages_in_a_log(tmp_path: Path) -> None:
+def test_last_messages_of_a_crashed_capture_are_read_from_the_log(tmp_path: Path) -> None:
     messages = fixture_messages("cdr")
     path = write_rosbag2(tmp_path / "a.db3", messages[:400])
     connection = sqlite3.connect(path)

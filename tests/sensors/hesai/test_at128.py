@@ -71,7 +71,7 @@ BY_HAND = [
     (61.5, 10, 65.5, 1.0),
     (59.0, 10, 58.5, 1.0),
     (63.0, 10, 67.5, 1.0),
-    # Elevation, over the end of the turn.
+    # Elevation, over the end of the revolution.
     (358.0, 10, 176.0, 3.0),
     (359.5, 10, 179.0, 1.5),
     (357.0, 10, 174.0, 2.0),
@@ -96,7 +96,7 @@ def test_beam_to_the_right_lies_on_x_and_behind_on_y() -> None:
     assert point(120.0, 0) == pytest.approx([0, -10, 0], abs=1e-6)
 
 
-def test_beams_fire_while_the_rotor_turns() -> None:
+def test_beams_fire_while_the_rotor_rotates() -> None:
     # 200 rpm: 1.2 deg a ms. After 0.5 ms the rotor is 0.6 deg on, the beam 1.2.
     firing_ns = NO_FIRING.copy()
     firing_ns[0, 5] = 500_000
@@ -115,7 +115,7 @@ def test_beams_fire_while_the_rotor_turns() -> None:
         # 0.6 deg on or back, over the step at 60 deg, where channel 10 has 1 deg, and 3 at 62 deg.
         (59.9, 200, 2 * 30.5 + 1.5),
         (60.5, -200, 2 * 29.9 + 0.95),
-        # Back over the start of the turn.
+        # Back over the start of the revolution.
         (0.3, -200, 2 * 89.7),
     ],
 )
@@ -136,7 +136,7 @@ def test_silent_beams_count_as_the_column_and_words_choose_the_table() -> None:
 
 
 def test_pose_turns_and_moves_the_points() -> None:
-    # Quarter turn about z: the sensor's x is the body's y, its y the body's -x.
+    # 90 degrees about z: the sensor's x is the body's y, its y the body's -x.
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     pose[:3, 3] = [1, 2, 3]

@@ -53,7 +53,7 @@ def test_dates(date: bytes, us: int, time_ns: int) -> None:
         (bytes([123, 1, 1, 0, 60, 0]), 0),
         (bytes([123, 1, 1, 0, 0, 60]), 0),
         (bytes([123, 1, 1, 0, 0, 0]), 1_000_001),
-        (b"\0" + bytes([255] * 5), 0),  # beyond what int64 ns can hold
+        (b"\0" + bytes([255] * 5), 0),  # beyond int64 ns
         (bytes([255] * 6), 0),
     ],
 )

@@ -42,7 +42,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Case:
-    """A packet: its header, and the bytes at which the tail's fields lie."""
+    """A packet: its header, and the offsets of the tail's fields."""
 
     model: str
     size: int

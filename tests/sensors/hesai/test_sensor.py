@@ -43,7 +43,7 @@ def _beams(channels: int, model: str = "") -> tuple[Beams, bytes]:
 
 
 def _encoded(spec: HesaiSpec) -> tuple[U8Array, I64Array, I64Array]:
-    """Packets, and the ranges and levels that they hold."""
+    """Packets, and their ranges and levels."""
     random = np.random.default_rng(7)
     shape = (COLUMNS // spec.groups * spec.groups, spec.row.channels, spec.returns)
     raw = random.integers(100, 30000, shape)
@@ -55,7 +55,7 @@ def _encoded(spec: HesaiSpec) -> tuple[U8Array, I64Array, I64Array]:
 
 @pytest.mark.parametrize(("model", "mode"), MODES)
 def test_what_was_sent_comes_back(model: str, mode: int) -> None:
-    # No column lies where one mirror of an AT128 takes over from another.
+    # No column is where one mirror of an AT128 takes over from another.
     spec = HesaiSpec(model, mode=mode, start_deg=350.07, rpm=600)
     packets, raw, levels = _encoded(spec)
     beams, content = _beams(spec.row.channels, model)
@@ -163,7 +163,7 @@ def test_checksums(model: str) -> None:
     assert not lidar.faults(packets).any()
     damaged = packets[:3].copy()
     damaged[0, 40] ^= 1  # a channel
-    damaged[1, 72 if model == "JT16" else -37] ^= 0x80  # where the tail or its checksum lies
+    damaged[1, 72 if model == "JT16" else -37] ^= 0x80  # in the tail or its checksum
     verdicts = [FAULTS[number] for number in lidar.faults(damaged)]
     assert verdicts == ["bad_crc", "bad_crc", ""]
     unchecked = calibration(content).lidar({}, evidence(packets))
@@ -278,7 +278,7 @@ def test_optical_centre_of_a_jt16_is_where_its_ranges_begin() -> None:
     assert lidar.projection(np.eye(4), 1) is None
     projection = Turning(lidar.beams, lidar.firing_ns, 1)
     points = np.empty((1, 16, 3), np.float32)
-    projection.prepare(np.zeros(1, np.int64), np.array([1 << 30]))  # a quarter turn to the right
+    projection.prepare(np.zeros(1, np.int64), np.array([1 << 30]))  # 90 degrees to the right
     projection.project(np.full((1, 16), 2.0, np.float32), points)
     assert points[0, 3].tolist() == pytest.approx([2.010955, 0.00625, 0.003911], abs=1e-6)
 

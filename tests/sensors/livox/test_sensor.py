@@ -27,7 +27,7 @@ from tests.builders.others import livox1_packets, livox2_packets, rows
 
 (CALIBRATION,) = livox.BUILT_IN
 STILL = np.eye(4)
-# Turns x to y, y to z, z to x; then 10, 20, 30 m on.
+# Rotates x to y, y to z, z to x; then 10, 20, 30 m on.
 TURNED = np.array([[0, 0, 1, 10], [1, 0, 0, 20], [0, 1, 0, 30], [0, 0, 0, 1]], np.float64)
 
 
@@ -98,7 +98,7 @@ def one_point(kind: int, *values: int) -> tuple[list[float], float]:
         # Centimetres: 2, 3, 6 m.
         (CARTESIAN16, (200, -300, 600), (2.0, -3.0, 6.0), 7.0),
         (CARTESIAN16, (-32_768, 0, 0), (-327.68, 0.0, 0.0), 327.68),
-        # 90 degrees from z is level; phi turns from x to y.
+        # 90 degrees from z is level; phi rotates from x to y.
         (SPHERICAL, (10_000, 9000, 0), (10.0, 0.0, 0.0), 10.0),
         (SPHERICAL, (10_000, 9000, 9000), (0.0, 10.0, 0.0), 10.0),
         (SPHERICAL, (10_000, 0, 1234), (0.0, 0.0, 10.0), 10.0),

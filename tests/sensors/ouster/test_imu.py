@@ -76,15 +76,15 @@ def test_encode_then_decode_is_identity(profile: str, count: int) -> None:
     spec = OusterSpec(beams=16, imu_profile=profile, imu_samples=8 * (count > 1))
     rng = np.random.default_rng(count)
     stamps = rng.integers(1, 2**60, count)
-    acceleration, turn = rng.normal(0, 9, (count, 3)), rng.normal(0, 1, (count, 3))
+    acceleration, angular_velocity = rng.normal(0, 9, (count, 3)), rng.normal(0, 1, (count, 3))
     valid = np.arange(count) % 4 != 3
-    data = imu_packet(spec, stamps, acceleration, turn, valid)
+    data = imu_packet(spec, stamps, acceleration, angular_velocity, valid)
     lidar = lidar_of(spec)
     assert lidar.is_imu(len(data))
     found = lidar.imu(payload_of(data)[None], 0)
     assert found.stamp_ns.tolist() == stamps[valid].tolist()
     np.testing.assert_allclose(found.acceleration, acceleration[valid], rtol=1e-6)
-    np.testing.assert_allclose(found.angular_velocity, turn[valid], rtol=1e-6)
+    np.testing.assert_allclose(found.angular_velocity, angular_velocity[valid], rtol=1e-6)
 
 
 def test_a_nan_that_signals_makes_no_noise(recwarn: pytest.WarningsRecorder) -> None:

@@ -165,7 +165,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
         altitude_deg=(0.0, 90.0),
         azimuth_deg=(0.0, 0.0),
         beam_offset_mm=(2.0, 1.0),
-        # A quarter turn about z, then 100 mm up.
+        # A rotation by 90 degrees about z, then 100 mm up.
         lidar_to_sensor_mm=[0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 100, 0, 0, 0, 1],
     )
     table = read(metadata_json(spec)).lidar({}, None).beams
@@ -176,7 +176,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
     assert angle == pytest.approx(1.5 * np.pi)
     for column, level, up in (
         (0, (0.0, 1 - n_m + 0.002, 0.101), (0.0, 0.002, 0.101 + 1 - n_m)),
-        # A quarter turn later, clockwise: lidar -y, which is sensor x.
+        # A quarter revolution later, clockwise: lidar -y, which is sensor x.
         (128, (1 - n_m + 0.002, 0.0, 0.101), (0.002, 0.0, 0.101 + 1 - n_m)),
     ):
         cosine, sine = np.cos(table.angle_rad[column]), np.sin(table.angle_rad[column])

@@ -232,8 +232,8 @@ def test_packets_of_a_window_are_numbered_without_gaps(
     spec = OusterSpec(beams=16, columns_per_frame=512, window=window)
     lidar = lidar_of(spec)
     mids = np.arange(512)
-    turn = stacked(encode_packets(spec, mids, mids, np.full(512, 3), {}))
-    numbers = lidar.sequence(turn)
+    revolution = stacked(encode_packets(spec, mids, mids, np.full(512, 3), {}))
+    numbers = lidar.sequence(revolution)
     assert lidar.sequence_modulus == packets * 2**16
     assert numbers[blocks].tolist() == [3 * packets + rank for rank in range(packets)]
     others = np.delete(numbers, blocks)
@@ -247,7 +247,7 @@ def test_a_standard_packet_with_the_other_layout_is_read_by_its_serial_number() 
     lidar = lidar_of(result)
     packets = two_packets(sent, frame=65536 + 9)
     assert lidar.sent_by_me(packets).all()
-    # The packets hold no checksum, as those of FUSA do.
+    # The packets have no checksum, as those of FUSA do.
     assert lidar.faults(packets).tolist() == [0, 0]
     assert lidar.sequence(packets).tolist() == [9 * 64, 9 * 64 + 1]
 

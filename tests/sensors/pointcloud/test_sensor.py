@@ -54,7 +54,7 @@ def _lidar(calibration: Calibration = CLOUD, kind: int = 0) -> Lidar:
     return calibration.lidar({}, _evidence(_packets(kind)[0]))
 
 
-def test_packets_tell_which_clouds_they_come_from() -> None:
+def test_packets_identify_their_clouds() -> None:
     for kind, one in enumerate(BUILT_IN):
         fits = [c.match_score(_evidence(_packets(kind)[0])) for c in sensors.built_in()]
         assert [c for c, fit in zip(sensors.built_in(), fits, strict=True) if fit] == [one]
@@ -74,7 +74,7 @@ def test_other_packets_are_not_recognised() -> None:
     for other in others:
         assert CLOUD.match_score(_evidence(other)) == 0
         assert sensors.describe(other.shape[1], other) is None or not len(other)
-    # Whatever a datagram holds, it is no message of a topic.
+    # Whatever a datagram contains, it is no message of a topic.
     assert CLOUD.match_score(_evidence(packets, Stream("10.0.0.1", 2368))) == 0
 
 
@@ -179,7 +179,7 @@ def test_points_stay_where_they_are_in_their_own_frame() -> None:
 
 
 def test_points_are_turned_and_moved_into_the_body_frame() -> None:
-    """A quarter turn to the left takes x to y and y to -x; then (10, 20, 30) is added."""
+    """A rotation by 90 degrees to the left maps x to y and y to -x; then (10, 20, 30) is added."""
     half = math.sqrt(0.5)
     pose = from_quaternion((10, 20, 30), (0, 0, half, half))
     range_m, xyz, _ = _decoded(pose)

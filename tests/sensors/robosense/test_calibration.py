@@ -89,7 +89,7 @@ def test_fields_of_a_device_packet() -> None:
 
 
 def test_device_packets_between_point_packets() -> None:
-    """Topics hold both kinds, which have one size."""
+    """Topics have both kinds, which have one size."""
     spec = RobosenseSpec("Helios 16", DUAL)
     sent = _sent(spec)
     mixed = [difop(spec, fan(spec)), *sent[:4], difop(spec, fan(spec)), *sent[4:]]

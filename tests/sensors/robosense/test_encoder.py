@@ -1,6 +1,6 @@
 """The encoder of ROBOSENSE packets, by bytes worked out by hand from docs/sources/robosense.md.
 
-At 600 rpm the rotor turns 0.0036 degrees in a microsecond. Readings count up from 1 in the order
+At 600 rpm the rotor rotates by 0.0036 degrees per us. Readings count up from 1 in the order
 (column, return, channel), levels likewise modulo 251.
 """
 
@@ -52,7 +52,7 @@ def packets(
     ]
 
 
-# Azimuths of blocks: 90 degrees, and what the rotor turns in the rounds before them.
+# Azimuths of blocks: 90 degrees, and the rotation in the rounds before them.
 @pytest.mark.parametrize(
     ("model", "size", "places"),
     [

@@ -42,7 +42,7 @@ def test_robosense(head: dict[int, bytes], lines: int, calendar: bool, model: st
     assert named(dual) == f"ROBOSENSE lidar {model}, dual return"
 
 
-def test_returns_of_robosense_that_a_packet_alone_does_not_tell() -> None:
+def test_returns_of_robosense_that_a_packet_alone_does_not_identify() -> None:
     packets = robosense_packets({0: FIRST, 30: b"\x01"}, count=1)
     assert named(packets) == "ROBOSENSE lidar RS-LiDAR-16"
 

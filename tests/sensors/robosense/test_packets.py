@@ -157,7 +157,7 @@ def test_heads_depend_on_their_packet_alone() -> None:
 
 @pytest.mark.parametrize("name", ["Ruby 128", "Ruby Plus 128"])
 def test_returns_of_128_lines_are_columns_of_one_time(name: str) -> None:
-    """Packets hold both returns of a shot and one of the next, or one and both."""
+    """Packets contain both returns of a shot and one of the next, or one and both."""
     spec = RobosenseSpec(name, DUAL)
     evidence = evidence_of(_sent(spec, 4), [difop(spec, fan(spec))])
     lidar = built_in(evidence).lidar({}, evidence)
@@ -220,7 +220,7 @@ def _readings(spec: RobosenseSpec, packets: int) -> tuple[I64Array, I64Array]:
 
 
 def _by_shot(found: Decoded, spec: RobosenseSpec, returns: int) -> tuple[Decoded, I64Array]:
-    """Columns of one return each as those of two, where a packet cannot hold both."""
+    """Columns of one return each as those of two, where a packet cannot contain both."""
     columns = np.arange(len(found.range_m))
     if returns == spec.returns:
         return found, columns
@@ -273,7 +273,7 @@ def test_mode_of_a_single_return(name: str, mode: str, kind: int) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("mode", [STRONGEST, DUAL])
-def test_point_packets_alone_tell_the_returns(name: str, mode: str) -> None:
+def test_point_packets_alone_identify_the_returns(name: str, mode: str) -> None:
     spec = RobosenseSpec(name, mode, start_deg=20.0)
     sent = msop(spec, *_readings(spec, packets=8))
     evidence = evidence_of([payload for _, payload in sent])

@@ -54,7 +54,7 @@ class TestSentences:
             (b"GPRMC", b"GPGGA"),
         ],
     )
-    def test_those_that_tell_no_time(self, old: bytes, new: bytes) -> None:
+    def test_those_without_a_time(self, old: bytes, new: bytes) -> None:
         body = b"GPRMC,081802,A,3650.1,N,00224.4,W,000.0,123.2,210116,000.5,W"
         assert old in body
         assert rmc_ns(rmc(body.replace(old, new))) is None
@@ -110,8 +110,8 @@ class TestHours:
         sent = random_packets(spec, 16)
         for valid, hours in ((True, 0), (False, -7)):
             times_us = np.arange(0, 4e6, 1e6, dtype=np.float64)
-            beside = beside_of(position_packets(spec, times_us, valid=valid))
-            offset_ns = clock_offset_ns(sent.payloads, sent.host_ns, [beside])
+            neighbour = beside_of(position_packets(spec, times_us, valid=valid))
+            offset_ns = clock_offset_ns(sent.payloads, sent.host_ns, [neighbour])
             away_ns = -spec.host_ahead_ns + hours * HOUR_NS
             assert offset_ns == pytest.approx(away_ns, abs=3_000_000)
 
@@ -133,7 +133,7 @@ def test_what_positions_say_of_the_pulse() -> None:
 
 
 class TestSpeeds:
-    def test_of_a_rotor_by_packets_of_many_turns(self) -> None:
+    def test_of_a_rotor_by_packets_of_many_revolutions(self) -> None:
         """600.06 rpm, azimuths rounded to 0.01 degree, samples as the sampler takes them."""
         stamp_ns = times_ns() + HOUR_NS - SECOND_NS
         azimuth = np.rint(stamp_ns * 3.60036e-4).astype(np.int64) % 36000

@@ -67,7 +67,7 @@ def project(
     projection = hdl64_projection(file, firing_ns, np.eye(4) if pose is None else pose, count + 3)
     words = rotor_words(azimuth_deg / 360, np.full(count, hz), np.full(count, table))
     projection.prepare(np.zeros(count, np.int64), words)
-    # As in a scan: points lie in rows with other fields behind them.
+    # As in a scan: points are in rows with other fields behind them.
     out = np.full((count, LASERS, 4), np.nan, np.float32)
     projection.project(range_m.astype(np.float32), out[..., :3])
     assert np.isnan(out[..., 3]).all()
@@ -119,8 +119,8 @@ def test_points_by_hand(
     assert project_one(laser, azimuth_deg, range_m) == pytest.approx(xyz, abs=3e-6)
 
 
-def test_beams_fire_while_the_rotor_turns() -> None:
-    # 50 us at 10 turns a second: 0.00314159 rad. Beams that do not fire (-1) stay where they are.
+def test_beams_fire_while_the_rotor_rotates() -> None:
+    # 50 us at 10 Hz: 0.00314159 rad. Beams that do not fire (-1) are not rotated.
     firing_ns = np.array([[0] * 64, [-1, 50_000] * 32])
     ranges = np.full((2, LASERS), 10.0)
     points = project(unit(Laser()), np.zeros(2), ranges, firing_ns, hz=10.0, table=1)

@@ -59,7 +59,7 @@ class TestEveryModel:
             assert np.abs(origin - origins(spec, seen.columns)).max() < 1e-5
 
     def test_columns_behind_a_blind_sector(self, model: str, mode: str) -> None:
-        """They fire when the rotor has passed it, wherever in a packet it lies."""
+        """They fire when the rotor has passed it, wherever it is in a packet."""
         for begin_deg in (30.0, 30.4, 31.3, 32.2):
             blind_deg = begin_deg, 250.0
             spec = VelodyneSpec(model, mode, start_azimuth_deg=29.0, blind_deg=blind_deg)
@@ -236,7 +236,7 @@ def test_damaged_packets_are_reported() -> None:
         packets = good.sent.payloads[:3].copy()
         packets[1, at : at + len(value)] = np.frombuffer(value, np.uint8)
         assert [FAULTS[code] for code in good.lidar.faults(packets)] == ["", "bad_header", ""]
-    # Blocks that a VLS-128 does not use with two returns may hold anything.
+    # Blocks that a VLS-128 does not use with two returns may have any content.
     wide = made_of(VelodyneSpec("VLS-128", "dual"))
     packets = wide.sent.payloads.copy()
     packets[:, 800:1200] = 0

@@ -14,7 +14,7 @@ from mlbatch.pipeline.job import Job
 from tests.builders import hesai, velodyne
 from tests.builders.hesai_angles import angles_csv
 from tests.builders.run import Values, buffers_of, in_memory, prints
-from tests.golden.maker_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
+from tests.golden.vendor_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
 
 LENGTH_NS = 250 * NS_PER_MS
 

@@ -18,15 +18,16 @@ from tests.builders.sessions_of_bags import Mcap, split_at, write_mcap
 
 NS_PER_MS = 1_000_000
 HOST = "192.168.1.10"
-# A driver hands out what came within a turn, a little after it.
-TURN_NS, LATER_NS = 100 * NS_PER_MS, 3 * NS_PER_MS
+# A driver publishes the packets of a revolution a little after its end.
+TURN_NS = 100 * NS_PER_MS
+LATER_NS = 3 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A lidar's packets, (arrival, payload); ip: sorts as its topic does."""
+    """A lidar's packets, (receive time, payload); ip: sorts as its topic does."""
 
-    maker: str
+    vendor: str
     ip: str
     topic: str
     packets: tuple[tuple[int, bytes], ...]
@@ -34,16 +35,16 @@ class Unit:
     def late(self, by_ns: int) -> Unit:
         """All packets arrive later."""
         packets = tuple((host_ns + by_ns, payload) for host_ns, payload in self.packets)
-        return Unit(self.maker, self.ip, self.topic, packets)
+        return Unit(self.vendor, self.ip, self.topic, packets)
 
 
-def unit_of(maker: str, packets: tuple[tuple[int, bytes], ...]) -> Unit:
-    """A unit where its maker's lidars are found."""
+def unit_of(vendor: str, packets: tuple[tuple[int, bytes], ...]) -> Unit:
+    """A unit where its vendor's lidars are found."""
     ip, topic = {
         "hesai": ("192.168.1.200", "/pandar_packets"),
         "velodyne": ("192.168.1.201", "/velodyne_packets"),
-    }[maker]
-    return Unit(maker, ip, topic, packets)
+    }[vendor]
+    return Unit(vendor, ip, topic, packets)
 
 
 Units = tuple[Unit, ...]
@@ -78,7 +79,7 @@ PACKET_OF = {
 
 def singles(unit: Unit, encoding: str) -> list[Recorded]:
     """A message a packet."""
-    put, _, kind = PACKET_OF[unit.maker]
+    put, _, kind = PACKET_OF[unit.vendor]
     return [
         Recorded(unit.topic, kind, host_ns, put(Body(encoding), host_ns, payload).done())
         for host_ns, payload in unit.packets
@@ -86,14 +87,14 @@ def singles(unit: Unit, encoding: str) -> list[Recorded]:
 
 
 def scans(unit: Unit, encoding: str, every_ns: int = TURN_NS) -> list[Recorded]:
-    """A message a turn: header, then the packets; recorded when the last one is there."""
-    put, kind, _ = PACKET_OF[unit.maker]
+    """A message a revolution: header, then the packets; recorded with the last one."""
+    put, kind, _ = PACKET_OF[unit.vendor]
     groups: dict[int, list[tuple[int, bytes]]] = {}
     for host_ns, payload in unit.packets:
         groups.setdefault(host_ns // every_ns, []).append((host_ns, payload))
     found = []
     for group in groups.values():
-        body = Body(encoding).header(group[0][0], unit.maker).put("I", len(group))
+        body = Body(encoding).header(group[0][0], unit.vendor).put("I", len(group))
         for host_ns, payload in group:
             put(body, host_ns, payload)
         found.append(Recorded(unit.topic, kind, group[-1][0] + LATER_NS, body.done()))
@@ -101,7 +102,7 @@ def scans(unit: Unit, encoding: str, every_ns: int = TURN_NS) -> list[Recorded]:
 
 
 def nebula(unit: Unit) -> list[Recorded]:
-    """As newer drivers of both makers record: nebula_msgs."""
+    """As newer drivers of both vendors record: nebula_msgs."""
     found = []
     for host_ns, payload in unit.packets:
         body = Body("cdr").header(host_ns, "").put("I", 1).time(host_ns).blob(payload)
@@ -146,7 +147,7 @@ def _mcap(folder: Path, units: Units) -> Path:
 
 
 def _mcap_of_nebula(folder: Path, units: Units) -> Path:
-    """One sensor a message a packet, the others a message a turn."""
+    """One sensor a message a packet, the others a message a revolution."""
     mixed = merged(nebula(units[0]), *(scans(unit, "cdr") for unit in units[1:]))
     return write_mcap(folder / "a.mcap", mixed, Mcap(chunked=False))
 
