@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch import writers
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
@@ -21,7 +22,7 @@ from mlbatch.report import ledger
 from mlbatch.report.report import build_report
 from mlbatch.rig.rig import read_rig
 from mlbatch.sensors import models
-from mlbatch.writers import format_names
+from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.contract.test_help import OPTIONS
 from tests.contract.tree import PACKAGE, ROOT, run_mlbatch, run_python
@@ -220,3 +221,21 @@ def test_every_module_is_on_the_map() -> None:
             assert f"`{path.name}/`" in page, path.name
         elif path.suffix == ".py" and not path.name.startswith("_"):
             assert f"`{path.name}`" in page, path.name
+
+
+def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Saved in a folder of formats, as the page says, it is found and writes every point."""
+    (example,) = re.findall(r"^```python\n(.*?)^```$", _page("add-a-writer.md"), re.M | re.S)
+    (tmp_path / "rawf32.py").write_text(example, encoding="utf-8")
+    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
+    writers.format_names.cache_clear()
+    try:
+        job = Job((ROOT / FIXTURE,), SensorSelection(rig=ROOT / RIG), extras=frozenset())
+        options = writers.WriterOptions()
+        target = tmp_path / "scans"
+        _, report = convert(job, lambda info: writers.open_writer("rawf32", target, info, options))
+    finally:
+        writers.format_names.cache_clear()
+    files = sorted(target.glob("*.rawf32"))
+    assert len(files) == report.scans.written
+    assert sum(path.stat().st_size for path in files) == 16 * report.scans.points > 0
