@@ -244,7 +244,10 @@ def read_document(path: Path) -> dict[tuple[str, str], dict[str, list[float]]]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         if found["schema"] != SCHEMA:
-            raise BenchError(f"{path}: expected schema {SCHEMA}, found {found['schema']}")
+            raise BenchError(
+                f"{path}: expected schema {SCHEMA}, found {found['schema']}; "
+                "measure again with this version"
+            )
         return {
             (str(row["case"]), str(row["program"])): {
                 name: [float(value) for value in row[name]] for name in _RUN_FIELDS
@@ -252,7 +255,9 @@ def read_document(path: Path) -> dict[tuple[str, str], dict[str, list[float]]]:
             for row in found["rows"]
         }
     except OSError as err:
-        raise BenchError(f"{path}: expected an earlier result, found {err.strerror}") from err
+        raise BenchError(
+            f"{path}: expected an earlier result, found {err.strerror}; check the path"
+        ) from err
     except (ValueError, KeyError, TypeError) as err:
         raise BenchError(
             f"{path}: expected the output of `mlbatch bench --json`, found something else "

@@ -48,9 +48,13 @@ class FaultCount:
 class FaultLedger:
     """Packets of one sensor; at the end, read = given + removed - repeated."""
 
+    # Packets of the recording.
     read: int
+    # Packets that a fault dropped.
     removed: int
+    # Copies that a fault added.
     repeated: int
+    # Packets after the faults.
     given: int
 
 

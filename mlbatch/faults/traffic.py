@@ -174,7 +174,7 @@ def _move_behind(traffic: Traffic, rows: I64Array, other: Traffic, other_rows: I
 
 
 class PacketQueue:
-    """Holds packets until their new receive time, and merges them with the others."""
+    """Delays packets until their new receive time, and merges them with the others."""
 
     def __init__(self) -> None:
         self._held: list[Traffic] = []

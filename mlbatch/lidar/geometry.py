@@ -100,18 +100,20 @@ def spherical(
     return np.stack([np.stack(row, axis=-1) for row in rows])
 
 
-def rotor_words(turns: F64Array, turns_per_s: F64Array, table: I64Array | int = 0) -> I64Array:
+def rotor_words(
+    revolutions: F64Array, revolutions_per_s: F64Array, table: I64Array | int = 0
+) -> I64Array:
     """Return the `encoder` of columns of sensors without an angle table; arguments broadcast.
 
-    turns: rotor angle at the timestamp of the column, in revolutions (whole ones are removed);
-    turns_per_s: rotor speed while the beams of the column fire, Hz, 0 to ignore it; table: row of
-    the column in `Lidar.firing_ns`.
+    revolutions: rotor angle at the timestamp of the column (whole revolutions are removed);
+    revolutions_per_s: rotor speed while the beams of the column fire, Hz, 0 to ignore it; table:
+    row of the column in `Lidar.firing_ns`.
     """
-    ticks = turns - np.floor(turns)
+    ticks = revolutions - np.floor(revolutions)
     ticks *= _REVOLUTION
     angle = np.rint(ticks, out=ticks).astype(np.int64)
     angle &= (1 << _ANGLE_BITS) - 1
-    steps = np.rint(turns_per_s * _SPEED_PER_HZ)
+    steps = np.rint(revolutions_per_s * _SPEED_PER_HZ)
     speed = np.minimum(np.maximum(steps, -_SPEED_LIMIT), _SPEED_LIMIT).astype(np.int64)
     speed &= (1 << _SPEED_BITS) - 1
     speed <<= _ANGLE_BITS

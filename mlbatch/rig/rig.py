@@ -40,7 +40,7 @@ class StreamSelector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
-    """One sensor of the rig; None: as the recording says.
+    """One sensor of the rig; None: taken from the recording.
 
     extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording; clock:
     sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the

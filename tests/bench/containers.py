@@ -3,7 +3,7 @@
     python -m tests.bench.containers write FOLDER/capture.pcap FOLDER/capture.mcap
     python -m tests.bench.containers read FOLDER/capture.mcap
 
-The forms are the defaults of recorders: MCAP in chunks without compression, db3 with schema 3
+The forms are the defaults of recording tools: MCAP in chunks without compression, db3 with schema 3
 (docs/sources/messages.md section 5).
 """
 

@@ -34,7 +34,7 @@ QUANTILES: Final = (0.5, 0.99, 1.0)
 
 @dataclass(slots=True)
 class PushTimes:
-    """CPU time of the thread and wall time of each push, ns; scans: number of scans it gave."""
+    """CPU time of the thread and wall time of each push, ns; scans: completed scans."""
 
     cpu_ns: list[int] = field(default_factory=list)
     wall_ns: list[int] = field(default_factory=list)
@@ -97,7 +97,7 @@ def measure(job: Job, warm: int, packets: int) -> PushTimes:
 
 
 def figures(times: PushTimes) -> dict[str, Figures]:
-    """Of pushes that give a scan, of the others, and of all."""
+    """Figures of pushes that complete a scan, of the others, and of all."""
     closing = np.array(times.scans) > 0
     chosen = {"closing": closing, "others": ~closing, "all": np.ones(len(closing), np.bool_)}
     return {

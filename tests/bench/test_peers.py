@@ -13,9 +13,10 @@ from mlbatch.bench.peers import PEERS, installed, run_peer
 from mlbatch.bench.recordings import make
 from mlbatch.bench.results import Workload
 
-VLP16, DUAL = RECORDINGS["three-vlp16"], RECORDINGS["dual-4"]
+VLP16 = RECORDINGS["three-vlp16"]
+DUAL = RECORDINGS["dual-4"]
 BY_NAME = {peer.name: peer for peer in PEERS}
-# Gives a sweep of five points after ten packets, and one of two points at the end.
+# Returns a sweep of five points after ten packets, and one of two points at the end.
 DECODER = """
 class Model:
     VLP16 = "VLP-16"

@@ -96,7 +96,8 @@ def test_fragments_join_to_the_plain_packets(folder: Path) -> None:
     for _, frame in records(folder / "dual-4-fragments"):
         assert len(frame) <= 1514
         assert dpkt.dpkt.in_cksum(frame[14:34]) == 0
-        source, ip_id = frame[26:30], int.from_bytes(frame[18:20], "big")
+        source = frame[26:30]
+        ip_id = int.from_bytes(frame[18:20], "big")
         offset = (int.from_bytes(frame[20:22], "big") & 0x1FFF) * 8
         data = joined.setdefault((source, ip_id), bytearray(8456))
         data[offset : offset + len(frame) - 34] = frame[34:]
@@ -104,7 +105,8 @@ def test_fragments_join_to_the_plain_packets(folder: Path) -> None:
     # 8456 bytes in fragments of 1480.
     assert set(counts.values()) == {6}
     for _, frame in records(folder / "dual-4"):
-        source, ip_id = frame[26:30], int.from_bytes(frame[18:20], "big")
+        source = frame[26:30]
+        ip_id = int.from_bytes(frame[18:20], "big")
         assert joined.pop((source, ip_id)) == frame[34:]
     assert not joined
 
@@ -149,7 +151,7 @@ def test_a_conversion_accepts_every_packet(folder: Path, tmp_path: Path, name: s
     place = folder / name
     report = tmp_path / "report.json"
     done = command(
-        *("convert", place / CAPTURE, "--rig", place / RIG, "--dry-run", "--report", report)
+        "convert", place / CAPTURE, "--rig", place / RIG, "--dry-run", "--report", report
     )
     assert (done.code, done.err) == (0, "")
     report_document = json.loads(report.read_text(encoding="utf-8"))

@@ -189,10 +189,13 @@ def test_an_earlier_document_is_read_back(tmp_path: Path) -> None:
         ("", "expected the output of `mlbatch bench --json`"),
         ("[]", "expected the output of `mlbatch bench --json`"),
         ("{}", "KeyError"),
-        ('{"schema": "mlbatch.bench/9", "rows": []}', "expected schema mlbatch.bench/1, found"),
+        (
+            '{"schema": "mlbatch.bench/9", "rows": []}',
+            "expected schema mlbatch.bench/1, found mlbatch.bench/9; measure again with this",
+        ),
         ('{"schema": "mlbatch.bench/1", "rows": [1]}', "TypeError"),
         ('{"schema": "mlbatch.bench/1", "rows": [{"case": "a"}]}', "KeyError"),
-        (None, "expected an earlier result, found No such file"),
+        (None, "expected an earlier result, found No such file or directory; check the path"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, text: str | None, message: str) -> None:

@@ -60,7 +60,7 @@ TEXTS: dict[str, tuple[str, dict[str, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A message as a recorder gets it; type: package/Type."""
+    """A message as it is recorded; type: package/Type."""
 
     topic: str
     type: str
@@ -137,7 +137,7 @@ def imu_message(encoding: str, stamp_ns: int, frame: str, up: float) -> bytes:
 
 
 def definition(type_name: str, encoding: str) -> str:
-    """The text that a recorder stores with a type, "" for those that are not listed here."""
+    """The definition that recording tools store with a type; "" for types not in TEXTS."""
     main, needed = TEXTS.get(type_name.rpartition("/")[2], ("", {}))
     parts = dict(needed)
     if "Header header" in main + "".join(needed.values()):
@@ -152,7 +152,7 @@ def definition(type_name: str, encoding: str) -> str:
 
 @lru_cache(maxsize=1)
 def fixture_packets() -> tuple[tuple[str, int, bytes], ...]:
-    """(topic, arrival, payload) of every lidar and IMU packet of the two lidars."""
+    """(topic, receive time in ns, payload) of every lidar and IMU packet of the two lidars."""
     names = {"10.5.5.87": LEFT.name, "10.5.5.88": RIGHT.name}
     tails = {7502: "lidar_packets", 7503: "imu_packets"}
     table = StreamTable()

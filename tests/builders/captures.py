@@ -11,8 +11,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ETHERNET, NULL, LOOP, RAW, SLL, SLL2 = 1, 0, 108, 101, 113, 276
-ENHANCED, SIMPLE, OLD_PACKET = 6, 3, 2
+ETHERNET = 1
+NULL = 0
+LOOP = 108
+RAW = 101
+SLL = 113
+SLL2 = 276
+ENHANCED = 6
+SIMPLE = 3
+OLD_PACKET = 2
 _UDP = 17
 _FRAGMENT_HEADER = 44
 _ETHERTYPE = {4: 0x0800, 6: 0x86DD}
@@ -203,7 +210,7 @@ class Other:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A pcapng section; interfaces may also stand among the blocks."""
+    """A pcapng section; interface blocks may also be among the others."""
 
     blocks: Sequence[Packet | Other | Interface] = ()
     interfaces: Sequence[Interface] = field(default_factory=lambda: [Interface()])

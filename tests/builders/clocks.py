@@ -1,4 +1,4 @@
-"""Clocks of sensors and recorders, simulated: stamps and receive times whose truth is known."""
+"""Simulated clocks of sensors and capture hosts: timestamps and receive times of known errors."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Clock:
         drifted_ns = since_ns * (self.drift_ppm * 1e-6)
         ppm, period_s = self.wander
         if ppm:
-            turn_ns = period_s * NS_PER_S / (2 * np.pi)
-            drifted_ns += ppm * 1e-6 * turn_ns * (1 - np.cos(since_ns / turn_ns))
+            angular_ns = period_s * NS_PER_S / (2 * np.pi)
+            drifted_ns += ppm * 1e-6 * angular_ns * (1 - np.cos(since_ns / angular_ns))
         error: I64Array = np.rint(drifted_ns).astype(np.int64)
         error += self.offset_ns
         for after_s, by_ns in self.steps:
@@ -60,8 +60,8 @@ class Clock:
 class Way:
     """From a sensor to the capture host: shortest delay, mean of the exponential rest, bursts.
 
-    bursts_hz: how often a queue holds everything back for up to `burst_ms`; lost: share of packets;
-    pauses: (after s, for s) while the capture host stands still.
+    bursts_hz: how often a queue delays all packets by up to `burst_ms`; lost: share of packets;
+    pauses: (after s, for s) in which the capture host receives nothing.
     """
 
     least_us: float = 60.0
@@ -109,11 +109,11 @@ def hear(
         kept &= (since_s < from_s) | (since_s >= to_s)
     true_ns = true_ns[kept]
     since_s = since_s[kept]
-    arrival_ns = true_ns + np.rint(_way_ns(rng, way, since_s)).astype(np.int64)
-    host_ns = host.read(np.maximum.accumulate(arrival_ns))
+    true_receive_ns = true_ns + np.rint(_way_ns(rng, way, since_s)).astype(np.int64)
+    host_ns = host.read(np.maximum.accumulate(true_receive_ns))
     stamp_ns = clock.read(true_ns)
     if clock.past_hour:
-        stamp_ns = _hours_from_arrival(stamp_ns % HOUR_NS, host_ns)
+        stamp_ns = _hours_from_receive_time(stamp_ns % HOUR_NS, host_ns)
     return Heard(true_ns, stamp_ns, host_ns)
 
 
@@ -123,7 +123,7 @@ def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
     first_s = float(since_s[0])
     last_s = float(since_s[-1])
     number = rng.poisson(way.bursts_hz * (last_s - first_s))
-    holds = [
+    delays = [
         (float(begin), float(length))
         for begin, length in zip(
             rng.uniform(first_s, last_s, number),
@@ -131,14 +131,14 @@ def _way_ns(rng: np.random.Generator, way: Way, since_s: F64Array) -> F64Array:
             strict=True,
         )
     ]
-    for begin_s, length_s in (*holds, *way.pauses):
+    for begin_s, length_s in (*delays, *way.pauses):
         held = slice(*np.searchsorted(since_s, [begin_s, begin_s + length_s]).tolist())
         rest_ns = (begin_s + length_s - since_s[held]) * NS_PER_S
         delay_ns[held] = np.maximum(delay_ns[held], rest_ns + way.least_us * NS_PER_US)
     return delay_ns
 
 
-def _hours_from_arrival(past_hour_ns: I64Array, host_ns: I64Array) -> I64Array:
+def _hours_from_receive_time(past_hour_ns: I64Array, host_ns: I64Array) -> I64Array:
     """Stamps whose hour is guessed once, from the first receive time, and kept."""
     first_ns = int(past_hour_ns[0]) - int(host_ns[0])
     offset_ns = (first_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2

@@ -13,7 +13,7 @@ from tests.builders.traffic import Datagram, Records
 from tests.builders.two_lidars import COLUMNS_PER_PACKET
 
 SHARE = 0.1
-# How far a network or a recorder may swap what it carries.
+# How far a network or a capture host may swap packets.
 REACH = 20
 
 Kind: TypeAlias = Callable[[random.Random, bytes], Sequence[bytes]]
@@ -61,7 +61,7 @@ def _reordered(rng: random.Random, parts: list[list[bytes]]) -> list[list[bytes]
 
 
 def damaged_frames(rng: random.Random, records: Sequence[tuple[int, bytes]], name: str) -> Records:
-    """Frames on their way to the recorder; arrival times stay in order."""
+    """Frames on their way to the capture host; receive times stay in order."""
     parts = damaged(rng, [frame for _, frame in records], name)
     return [
         (host_ns, frame)
@@ -78,14 +78,15 @@ def damaged_payloads(rng: random.Random, sent: Sequence[Datagram], name: str) ->
     return [replace(one, host_ns=host_ns, payload=data).frame() for host_ns, one, data in parts]
 
 
-# Stamps at the ends of what is accepted, and of what 8 bytes hold.
+# Timestamps at the limits of accepted values, and of 8 bytes.
 STAMPS_NS = (0, 1, (1 << 31) * 10**9 - 1, (1 << 31) * 10**9, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 STEPS_NS = (10**6, 15 * 10**6, 10**8, 999 * 10**6, 10**9, 2 * 10**9, 10**12)
 
 
 def damaged_heads(rng: random.Random, sent: Sequence[Datagram]) -> Records:
     """Lidar packets with odd stamps, measurement ids and status words in some columns."""
-    kind, share = rng.randrange(4), rng.choice([0.02, 0.1, 0.4])
+    kind = rng.randrange(4)
+    share = rng.choice([0.02, 0.1, 0.4])
     return [
         (_odd_columns(rng, one, kind) if one.port == 7502 and rng.random() < share else one).frame()
         for one in sent
@@ -109,9 +110,10 @@ def _odd_columns(rng: random.Random, one: Datagram, kind: int) -> Datagram:
 
 
 def with_jumps(rng: random.Random, records: Records) -> Records:
-    """The same frames by a recorder's clock that jumps, for one frame or from there on."""
+    """The same frames with a clock step of the capture host, for one frame or all later ones."""
     seconds = (0.001, 0.5, 2, 40, 10**6)
-    out, shift_ns = [], 0
+    out = []
+    shift_ns = 0
     for host_ns, frame in records:
         jump_ns = int(rng.choice([-1, 1]) * rng.choice(seconds) * 10**9)
         chance = rng.random()
@@ -161,11 +163,31 @@ def damaged_text(rng: random.Random, text: str) -> str:
 
 
 Json: TypeAlias = bool | int | float | str | list["Json"] | dict[str, "Json"] | None
-# Each is a document of its own: what replaces a value may be changed in turn.
+# Each is a document of its own: a replaced value may be changed again.
 VALUES = (
-    *("null", "true", "-1", "0", "1", "3", "17", "65536", "2147483648", "1180591620717411303424"),
-    *("0.5", "1e308", "NaN", "Infinity", '""', '"x"', '"512x10"', '"LEGACY"'),
-    *("[]", "[0]", "[1, 2, 3, 4]", "{}", '{"a": 1}'),
+    "null",
+    "true",
+    "-1",
+    "0",
+    "1",
+    "3",
+    "17",
+    "65536",
+    "2147483648",
+    "1180591620717411303424",
+    "0.5",
+    "1e308",
+    "NaN",
+    "Infinity",
+    '""',
+    '"x"',
+    '"512x10"',
+    '"LEGACY"',
+    "[]",
+    "[0]",
+    "[1, 2, 3, 4]",
+    "{}",
+    '{"a": 1}',
 )
 
 

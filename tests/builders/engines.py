@@ -30,7 +30,7 @@ _CHANNELS = 128
 # Layers of space, in which every sensor has some points.
 BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
 _CUT = Job((), min_range_m=2.0, max_range_m=5.0, boxes_m=BOXES_M)
-# What may be wanted of the same columns: all layouts, extras, and reasons to leave points out.
+# Jobs on the same columns: all layouts, extras, and reasons to leave points out.
 WANTED = (
     Job((), extras=EXTRAS),
     Job((), extras=frozenset(), keep_repeated=True),
@@ -59,11 +59,13 @@ class Pair:
     """The decoders of both engines, made for the same sensors and wishes."""
 
     def __init__(self, one: Decoder, other: Decoder) -> None:
-        self.one, self.other = one, other
+        self.one = one
+        self.other = other
 
     def check(self, due: WindowColumns, label: ScanHeader) -> Scan:
         """Decode a window by both; all that they say is the same, byte by byte."""
-        one, other = self.one.scan(due, label), self.other.scan(due, label)
+        one = self.one.scan(due, label)
+        other = self.other.scan(due, label)
         assert_same(one, other)
         assert self.one.counts == self.other.counts
         return one
@@ -72,7 +74,8 @@ class Pair:
 def assert_same(one: Scan, other: Scan) -> None:
     """All fields of two scans have the same bytes."""
     for part in fields(Scan):
-        first, second = getattr(one, part.name), getattr(other, part.name)
+        first = getattr(one, part.name)
+        second = getattr(other, part.name)
         if isinstance(first, np.ndarray):
             assert (first.dtype, first.shape) == (second.dtype, second.shape), part.name
             assert first.tobytes() == second.tobytes(), part.name
@@ -81,7 +84,7 @@ def assert_same(one: Scan, other: Scan) -> None:
 
 
 def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
-    """Decode all windows of a job by both engines, in all ways that are wanted."""
+    """Decode all windows of a job by both engines, with the settings of each of `wanted`."""
     run = Conversion(job)
     pairs: list[Pair] = []
     for task in run.tasks():

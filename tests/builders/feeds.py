@@ -162,7 +162,7 @@ def _packet(
 def _arrivals(
     rng: random.Random, packets: Sequence[FeedPacket], scene: Scene
 ) -> list[tuple[int, int, FeedPacket]]:
-    """Arrival and place of each packet: after it was measured, some in bursts, none crossed."""
+    """Receive time and position of each packet: after its measurement, some in bursts, in order."""
     latency_ns = rng.randint(0, 200) * NS_PER_MS
     # More than 1 s apart clocks cannot be compared.
     offset_ns = rng.choice([0] * 120 + [-600, 600] * 3 + [-3000, 3000]) * NS_PER_MS
@@ -188,7 +188,7 @@ class _Lag:
     first: list[int | None]
 
     def follow(self, step: _Step) -> bool:
-        """Move on by an arrival; whether all sensors are still live."""
+        """Apply the next packet; whether all sensors are still live."""
         return not any([self._stalls(step[0].sensor, stamps) for stamps in step[1]])
 
     def copied(self) -> _Lag:
@@ -209,7 +209,7 @@ class _Lag:
 
 
 def interleavings(case: Case, rng: random.Random, count: int) -> list[list[FeedPacket]]:
-    """Other orders of arrival in which no sensor is ever stalled; none if one is in the feed.
+    """Other orders of receive times in which no sensor is ever stalled; none if one is in the feed.
 
     Packets of a sensor keep their order, and all packets their host time. An order that runs into
     a dead end is given up, so there may be fewer than `count`.

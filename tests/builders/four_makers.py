@@ -1,8 +1,8 @@
-"""Make `fixtures/four_makers`: a rig of four makers in the hall, recorded over the full hour.
+"""Make `fixtures/four_makers`: a rig of four vendors in the hall, recorded over the full hour.
 
     python -m tests.builders.four_makers [FOLDER]
 
-The same bytes every time; `SOURCE.md` there tells what is in them.
+The same bytes every time; `SOURCE.md` there describes them.
 """
 
 from __future__ import annotations
@@ -34,14 +34,18 @@ from tests.builders.seen import (
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "four_makers"
 HOST_IP = "192.168.1.10"
-NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
 HOUR_NS = int(datetime(2026, 5, 4, 8, 0, 0, tzinfo=timezone.utc).timestamp()) * NS_PER_S
-# The sensors are measuring from here on, each from another ms, until the recorder stops.
-START_NS, END_NS = HOUR_NS - 170 * NS_PER_MS, HOUR_NS + 130 * NS_PER_MS
+# The sensors measure from here on, each from another ms, until the recording ends.
+START_NS = HOUR_NS - 170 * NS_PER_MS
+END_NS = HOUR_NS + 130 * NS_PER_MS
 MTU = 1500
-# A switch of 1 Gbit/s; the recorder gets one frame after the other.
+# A switch of 1 Gbit/s; the capture host receives one frame after the other.
 NS_PER_BYTE = 8
-DIFOP_STEP_NS, POSITION_STEP_NS = 100 * NS_PER_MS, 100 * NS_PER_MS
+DIFOP_STEP_NS = 100 * NS_PER_MS
+POSITION_STEP_NS = 100 * NS_PER_MS
 
 Records = list[tuple[int, bytes]]
 
@@ -72,27 +76,46 @@ class Place:
 
 # In the order of the rig. The mounts keep the machine out of most of the view.
 OUSTER = Place(
-    *("left", "OS-1-32-U1", "192.168.1.87", 7502),
-    *((0.3, 0.95, 2.45), (0.4, 22.0, 80.0)),
-    *(210_000, "left.json"),
+    name="left",
+    model="OS-1-32-U1",
+    ip="192.168.1.87",
+    port=7502,
+    translation_m=(0.3, 0.95, 2.45),
+    rpy_deg=(0.4, 22.0, 80.0),
+    delay_ns=210_000,
+    metadata="left.json",
 )
 VELODYNE = Place(
-    *("roof", "VLP-16", "192.168.1.201", 2368),
-    *((-0.1, 0.05, 2.6), (0.3, 4.0, -1.5)),
-    130_000,
+    name="roof",
+    model="VLP-16",
+    ip="192.168.1.201",
+    port=2368,
+    translation_m=(-0.1, 0.05, 2.6),
+    rpy_deg=(0.3, 4.0, -1.5),
+    delay_ns=130_000,
 )
 HESAI = Place(
-    *("right", "PandarXT-16", "192.168.1.202", 2368),
-    *((0.28, -0.9, 2.4), (-20.5, 1.2, -150.0)),
-    *(260_000, "right.csv"),
+    name="right",
+    model="PandarXT-16",
+    ip="192.168.1.202",
+    port=2368,
+    translation_m=(0.28, -0.9, 2.4),
+    rpy_deg=(-20.5, 1.2, -150.0),
+    delay_ns=260_000,
+    metadata="right.csv",
 )
 ROBOSENSE = Place(
-    *("rear", "Helios 16", "192.168.1.200", 6699),
-    *((-1.5, 0.1, 2.2), (0.0, -6.0, 178.0)),
-    90_000,
+    name="rear",
+    model="Helios 16",
+    ip="192.168.1.200",
+    port=6699,
+    translation_m=(-1.5, 0.1, 2.2),
+    rpy_deg=(0.0, -6.0, 178.0),
+    delay_ns=90_000,
 )
 PLACES = (OUSTER, VELODYNE, HESAI, ROBOSENSE)
-POSITION_PORT, DIFOP_PORT = 8308, 7788
+POSITION_PORT = 8308
+DIFOP_PORT = 7788
 
 OUSTER_LIDAR = replace(
     two_lidars.RIGHT,
@@ -138,7 +161,7 @@ RIG_SENSOR = """\
 
 @functools.cache
 def seen() -> dict[str, Seen]:
-    """What each sensor sent while the recorder ran, by its name in the rig."""
+    """What each sensor sent during the recording, by its name in the rig."""
     sights = {
         OUSTER.name: ouster_sees(OUSTER_LIDAR, OUSTER.eye, HOUR_NS, 4),
         VELODYNE.name: velodyne_sees(VELODYNE_SPEC, VELODYNE.eye, 470),
@@ -149,7 +172,7 @@ def seen() -> dict[str, Seen]:
 
 
 def arrivals() -> list[tuple[int, str, int]]:
-    """Arrival (of its last frame), sensor and number of every lidar packet, as recorded."""
+    """Receive time (of its last frame), sensor and number of every lidar packet, as recorded."""
     return [(sent.last_ns, sent.name, sent.number) for sent in _network() if sent.number >= 0]
 
 
@@ -181,11 +204,13 @@ def rig_text() -> str:
 
 
 def _recorded(sight: Seen) -> Seen:
-    """Whole packets that were measured before the recorder stopped."""
+    """Whole packets that were measured before the end of the recording."""
     packets = int((sight.packet_stamps[:, -1] < END_NS).sum())
     columns = packets * sight.columns_per_packet
     if packets == len(sight.payloads):
-        raise ValueError("wanted more packets than the recorder sees")
+        raise ValueError(
+            "expected packets until the end of the recording, found fewer; encode more"
+        )
     return replace(
         sight,
         stamp_ns=sight.stamp_ns[:columns],
@@ -215,7 +240,7 @@ class _Sent:
 
     @property
     def last_ns(self) -> int:
-        """Arrival of the frame that completes it."""
+        """Receive time of the frame that completes it."""
         return self.records[-1][0]
 
 
@@ -224,7 +249,8 @@ def _network() -> tuple[_Sent, ...]:
     """All datagrams in the order in which the switch lets them through."""
     waiting = [one for place in PLACES for one in _datagrams(place)]
     waiting.sort(key=lambda one: (one.ready_ns, one.name, one.number))
-    sent, free_ns = [], 0
+    sent = []
+    free_ns = 0
     for one in waiting:
         records = []
         for frame in one.frames:
@@ -239,9 +265,10 @@ def _datagrams(place: Place) -> list[_Datagram]:
         (ready_ns, place.port, number, payload)
         for number, (ready_ns, payload) in enumerate(seen()[place.name].payloads)
     ]
-    beside = [(ready_ns, port, -1, payload) for ready_ns, port, payload in _beside(place)]
-    found, before_ns = [], 0
-    for ident, (ready_ns, port, number, payload) in enumerate(sorted(lidar + beside)):
+    others = [(ready_ns, port, -1, payload) for ready_ns, port, payload in _others(place)]
+    found = []
+    before_ns = 0
+    for ident, (ready_ns, port, number, payload) in enumerate(sorted(lidar + others)):
         # The network's delay varies by up to 0.1 ms, but packets of a sensor stay in order.
         before_ns = max(before_ns, ready_ns + place.delay_ns + ident * 37 % 11 * 10_000)
         frames = udp_frame(payload, place.ip, HOST_IP, port, port, ident=ident, mtu=MTU)
@@ -249,10 +276,11 @@ def _datagrams(place: Place) -> list[_Datagram]:
     return found
 
 
-def _beside(place: Place) -> list[tuple[int, int, bytes]]:
-    """Arrival, port and payload of what sensors send besides points."""
+def _others(place: Place) -> list[tuple[int, int, bytes]]:
+    """Receive time, port and payload of packets without points."""
     if place is VELODYNE:
-        end_us, step_us = (END_NS - START_NS) // 1000 - 5_000, 1e-3 * POSITION_STEP_NS
+        end_us = (END_NS - START_NS) // 1000 - 5_000
+        step_us = 1e-3 * POSITION_STEP_NS
         times_us = np.arange(2_000, end_us, step_us, dtype=np.float64)
         sent = velodyne.position_packets(VELODYNE_SPEC, times_us)
         rows: Payloads = [

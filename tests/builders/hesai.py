@@ -2,7 +2,7 @@
 
 Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
 (JT16); rows of the models: `hesai_models.py`, angles: `hesai_angles.py`. Column k is the k-th group
-of blocks that share an azimuth; the rotor turns evenly.
+of blocks that share an azimuth; the rotor has constant speed.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ from tests.builders.hesai_models import (
     HesaiModel,
 )
 
-SINGLE, DUAL, TRIPLE = 0x37, 0x39, 0x3D
+SINGLE = 0x37
+DUAL = 0x39
+TRIPLE = 0x3D
 _RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x3D: 3}
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-# From the last shot to the arrival of the packet.
+# From the last shot to the receive time of the packet.
 _TRAVEL_NS = 40_000
 
 
@@ -103,7 +105,8 @@ def packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
 
 def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n,) packet time and offset of the block, by section 5."""
-    row, groups = spec.row, spec.groups
+    row = spec.row
+    groups = spec.groups
     packet, group = np.divmod(np.arange(columns), groups)
     if row.counts_back:
         # (last block - b) // returns; the blocks of a group give the same.
@@ -116,7 +119,7 @@ def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
 
 
 def azimuths_deg(spec: HesaiSpec, columns: int) -> F64Array:
-    """(n,) rotor angles as the packets hold them."""
+    """(n,) rotor angles as in the packets."""
     step_deg = float(spec.row.step_ns) * spec.rpm * 6e-9
     units = np.rint((spec.start_deg + np.arange(columns) * step_deg) * spec.row.units_per_deg)
     wrapped: F64Array = units % (360 * spec.row.units_per_deg) / spec.row.units_per_deg
@@ -138,7 +141,7 @@ def offsets_ns(spec: HesaiSpec, columns: int) -> I64Array:
 def fires(spec: HesaiSpec, columns: int) -> BoolArray:
     """(n, channels) which beams fire in a column."""
     offsets = offsets_ns(spec, columns)
-    # Tables that count back never hold -1 ns.
+    # Tables that count back never contain -1 ns.
     return np.asarray(offsets != NEVER)
 
 
@@ -150,16 +153,16 @@ def firing_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
 
 
 def host_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
-    """(P,) arrival: after the packet's last shot and its time."""
+    """(P,) receive times, ns: after the packet's last shot and its time."""
     last = firing_times_ns(spec, packets * spec.groups).reshape(packets, -1).max(axis=1)
-    arrival: I64Array = np.maximum(last, packet_times_ns(spec, packets)) + _TRAVEL_NS
-    return arrival
+    receive_ns: I64Array = np.maximum(last, packet_times_ns(spec, packets)) + _TRAVEL_NS
+    return receive_ns
 
 
 def directions(spec: HesaiSpec, beams: Beams, columns: int, *, turning: bool = True) -> F64Array:
     """(n, channels, 3) unit vectors at each beam's firing, in HESAI's frame: x right, y forward.
 
-    turning: the rotor goes on while the beams of a column fire.
+    turning: the rotor moves while the beams of a column fire.
     """
     rotor = np.repeat(azimuths_deg(spec, columns)[:, None], spec.row.channels, axis=1)
     if turning:
@@ -178,7 +181,8 @@ def encode_packets(
     ranges: (n, channels, returns) in the spec's unit, 0 no return; levels: the same shape, 0..255.
     What a silent beam is given is left out.
     """
-    row, columns = spec.row, len(ranges)
+    row = spec.row
+    columns = len(ranges)
     packets = columns // spec.groups
     if packets * spec.groups != columns or ranges.shape[1:] != (row.channels, spec.returns):
         raise ValueError(f"{ranges.shape}: no whole packets of {spec.groups} columns")
@@ -190,11 +194,11 @@ def encode_packets(
     blocks[..., row.azimuth_at : row.azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
     if row.lead == 3:
         blocks[..., 2] = fine[:, None]
-    wanted = fires(spec, columns)[:, :, None]
+    fired = fires(spec, columns)[:, :, None]
     body = blocks[..., row.lead :].reshape(columns, spec.returns, row.channels, row.unit)
-    body[..., :2] = _bytes_of(np.where(wanted, ranges, 0).transpose(0, 2, 1), "<u2")
+    body[..., :2] = _bytes_of(np.where(fired, ranges, 0).transpose(0, 2, 1), "<u2")
     if levels is not None:
-        body[..., 2] = np.where(wanted, levels, 0).transpose(0, 2, 1)
+        body[..., 2] = np.where(fired, levels, 0).transpose(0, 2, 1)
     blocks[..., row.lead :] = body.reshape(columns, spec.returns, -1)
     bodies = blocks.reshape(packets, -1)
     assemble = _jt16 if spec.model == "JT16" else _assembled
@@ -213,7 +217,8 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
     row = spec.row
     head = bytearray.fromhex(row.head)
     if len(head) == 12:
-        head[8:10], head[11] = bytes([spec.returns > 1, row.unit_mm]), row.flags
+        head[8:10] = bytes([spec.returns > 1, row.unit_mm])
+        head[11] = row.flags
     elif head:
         head[4:6] = bytes([spec.returns > 1, row.unit_mm])
     parts = [bytes(head), body]
@@ -232,8 +237,10 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
 
 
 def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
-    place, tail = spec.row.tail, bytearray(spec.row.tail.size)
-    tail[place.mode], tail[place.factory] = spec.mode, 0x42
+    place = spec.row.tail
+    tail = bytearray(spec.row.tail.size)
+    tail[place.mode] = spec.mode
+    tail[place.factory] = 0x42
     # JT128 counts in 0.1 rpm.
     struct.pack_into("<h", tail, place.speed, spec.rpm * spec.row.speed_units_per_rpm)
     if place.date:
@@ -244,7 +251,8 @@ def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
     if place.operation:
         tail[place.operation] = OPERATIONS[spec.operation]
     if spec.model in STATES:
-        first, states = number * spec.groups, _states(spec)
+        first = number * spec.groups
+        states = _states(spec)
         fields = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
         state = sum(one << (14 - 2 * block) for block, one in enumerate(fields))
         struct.pack_into("<H", tail, place.state, state)
@@ -260,7 +268,7 @@ def date_field(time_ns: int, form: str) -> bytes:
     year = date.year - (1900 if form == SINCE_1900 else 2000)
     # The reader takes 70 and more as after 1900.
     if not (70 <= year < 256 if form == SINCE_1900 else 0 < year < 70):
-        raise ValueError(f"{date.year} cannot be told as {form}")
+        raise ValueError(f"expected a year that {form} can encode, found {date.year}")
     return bytes([year, date.month, date.day, date.hour, date.minute, date.second])
 
 

@@ -1,4 +1,4 @@
-"""Angles of HESAI beams and the files that hold them (docs/sources/hesai.md section 6)."""
+"""Angles of HESAI beams and the files with them (docs/sources/hesai.md section 6)."""
 
 from __future__ import annotations
 

@@ -74,14 +74,16 @@ def calibration(content: bytes, name: str = "unit.csv") -> Calibration:
 
 
 def decode(packets: U8Array, content: bytes, options: Mapping[str, str] | None = None) -> Decoded:
-    """All that packets (P, size) of one sensor hold; content: its angle file."""
+    """All columns of the packets (P, size) of one sensor; content: its angle file."""
     lidar = calibration(content).lidar(options or {}, evidence(packets))
     assert not lidar.faults(packets).any()
-    records, count = lidar.records, len(packets) * lidar.columns_per_packet
+    records = lidar.records
+    count = len(packets) * lidar.columns_per_packet
     starts = records.start + records.stride * np.arange(lidar.columns_per_packet)
     columns = packets[:, starts[:, None] + np.arange(records.size)].reshape(count, -1)
     shape = (count, lidar.channels, lidar.returns)
-    range_m, intensity = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    range_m = np.empty(shape, np.float32)
+    intensity = np.empty(shape, np.float32)
     for which in range(lidar.returns):
         plane = np.empty(shape[:2], np.float32)
         lidar.read(np.ascontiguousarray(columns), which, Pixels(plane, intensity[..., which], None))

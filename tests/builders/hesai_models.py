@@ -16,11 +16,18 @@ import numpy as np
 from mlbatch.arrays import I64Array
 from mlbatch.sensors.hesai import firing
 
-SEQUENCE, IMU, SAFETY, SIGNATURE, CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10
+SEQUENCE = 0x01
+IMU = 0x02
+SAFETY = 0x04
+SIGNATURE = 0x08
+CONFIDENCE = 0x10
 # Each adds a byte to the channels of protocol 1.4: confidence, weight factor, ambient light.
 UNIT_FLAGS = 0x70
-SINCE_1900, SINCE_2000, EPOCH = "since 1900", "since 2000", "epoch"
-HIGH, NEVER = firing.HIGH, firing.NEVER
+SINCE_1900 = "since 1900"
+SINCE_2000 = "since 2000"
+EPOCH = "epoch"
+HIGH = firing.HIGH
+NEVER = firing.NEVER
 OPERATIONS = {firing.HIGH: 0, firing.STANDARD: 2, firing.SAVING: 3}
 
 
@@ -172,7 +179,7 @@ TABLES: Mapping[str, I64Array] = {
     "JT128": firing.JT128,
     "JT16": np.zeros(16, np.int64),
 }
-# Models whose packets say which table holds, by operation mode and azimuth state.
+# Models whose packets select the firing table, by operation mode and azimuth state.
 STATES: Mapping[str, Mapping[tuple[str, int], I64Array]] = {
     "Pandar128E3X": firing.E128,
     "OT128": firing.OT128,

@@ -15,7 +15,11 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array
 
-CARTESIAN32, CARTESIAN16, SPHERICAL, DUAL, IMU = 1, 2, 3, 0x11, 0
+CARTESIAN32 = 1
+CARTESIAN16 = 2
+SPHERICAL = 3
+DUAL = 0x11
+IMU = 0
 # Three coordinates, reflectivity, tag.
 _RETURN = {CARTESIAN32: "<3iBB", CARTESIAN16: "<3hBB", SPHERICAL: "<I2HBB", DUAL: "<3iBB"}
 # x, y, z in mm; x, y, z in cm; depth in mm, theta and phi in 0.01 degrees.
@@ -64,7 +68,7 @@ def packet(
 def point_packets(
     spec: LivoxSpec, coordinates: I64Array, levels: I64Array
 ) -> list[tuple[int, bytes]]:
-    """(arrival in ns, payload) of n points, n a multiple of the points of a packet.
+    """(receive time in ns, payload) of n points, n a multiple of the points of a packet.
 
     coordinates: (n, returns, 3) raw; levels: (n, returns).
     """
@@ -81,8 +85,8 @@ def point_packets(
             frame -= counter if spec.shares_stamp else 0
         stamp_ns = spec.start_ns + frame * interval_ns
         payload = packet(spec, data, stamp_ns, counter % 65536, kind=spec.kind, points=spec.points)
-        arrival_ns = spec.start_ns + (number + 1) * interval_ns + spec.latency_ns
-        sent.append((arrival_ns, payload))
+        receive_ns = spec.start_ns + (number + 1) * interval_ns + spec.latency_ns
+        sent.append((receive_ns, payload))
     return sent
 
 

@@ -2,7 +2,7 @@
 
     python -m tests.builders.make_fixtures [FOLDER]
 
-The same bytes every time; `SOURCE.md` there tells what is in them.
+The same bytes every time; `SOURCE.md` there describes them.
 """
 
 from __future__ import annotations
@@ -29,17 +29,21 @@ from tests.builders.two_lidars import (
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "two_lidars"
-HOST_IP, OTHER_IP = "10.5.5.1", "10.5.5.20"
-NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
+HOST_IP = "10.5.5.1"
+OTHER_IP = "10.5.5.20"
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
 SECOND_NS = int(datetime(2026, 5, 4, 8, 0, 0, tzinfo=timezone.utc).timestamp()) * NS_PER_S
-# The recorder runs from 20 ms to 870 ms after the full second.
-START_NS, END_NS = SECOND_NS + 20 * NS_PER_MS, SECOND_NS + 870 * NS_PER_MS
+# The recording is from 20 ms to 870 ms after the full second.
+START_NS = SECOND_NS + 20 * NS_PER_MS
+END_NS = SECOND_NS + 870 * NS_PER_MS
 TURNS = 10
 MTU = 1500
 # A full frame takes 120 us at 100 Mbit/s.
 WIRE_NS = 120 * NS_PER_US
-# From a packet's last column to its first frame at the recorder; chosen so that the frames of the
-# two lidars interleave.
+# From a packet's last column to its first frame at the capture host; chosen so that the frames of
+# the two lidars interleave.
 LATENCY_NS = {LEFT.name: 300 * NS_PER_US, RIGHT.name: 950 * NS_PER_US}
 IMU_STEP_NS = 10 * NS_PER_MS
 # The IP identification wraps within the recording.
@@ -77,7 +81,7 @@ def main(folder: Path) -> None:
 
 
 def lidar_frames(lidar: FixtureLidar) -> Records:
-    """Arrival time and bytes of every frame that a lidar sends, lidar and IMU packets."""
+    """Receive time and bytes of every frame that a lidar sends, lidar and IMU packets."""
     stamps = column_stamps(lidar, SECOND_NS, TURNS)
     raw = packets(lidar, turn_pixels(lidar, hall()), stamps)
     bounds = stamps.reshape(-1, COLUMNS_PER_PACKET)[:, [0, -1]]

@@ -18,7 +18,9 @@ from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.make_fixtures import FOLDER
 
-NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
+NONE = CompressionType.NONE
+LZ4 = CompressionType.LZ4
+ZSTD = CompressionType.ZSTD
 OUSTER = "ouster_sensor_msgs/PacketMsg"
 OUSTER_ROS1 = "ouster_ros/PacketMsg"
 DEFINITIONS = {
@@ -45,7 +47,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a file is made; ros: 1 or 2; summary: False leaves out all that stands behind the data.
+    """How a file is made; ros: 1 or 2; summary: False omits all sections after the data.
 
     repeat: schemas and channels that the summary names as well.
     """
@@ -98,13 +100,14 @@ class Packet:
 
 @lru_cache(maxsize=1)
 def fixture_packets() -> tuple[Packet, ...]:
-    """Lidar and IMU packets of the fixture's pcap, in the order of their arrival."""
+    """Lidar and IMU packets of the fixture's pcap, in the order of their receive times."""
     streams = StreamTable()
     found = []
     for batch in open_recording(FOLDER / "two_lidars.pcap", streams).packets():
         for at in range(len(batch)):
             stream = streams.streams[int(batch.stream[at])]
-            begin, size = int(batch.start[at]), int(batch.size[at])
+            begin = int(batch.start[at])
+            size = int(batch.size[at])
             if stream.source_ip in NAMES:
                 topic = f"/{NAMES[stream.source_ip]}/{TAILS[stream.port]}"
                 payload = batch.data[begin : begin + size].tobytes()

@@ -9,7 +9,10 @@ import numpy as np
 
 from mlbatch.arrays import U8Array
 
-EE, DD, CC, BB = b"\xff\xee", b"\xff\xdd", b"\xff\xcc", b"\xff\xbb"
+EE = b"\xff\xee"
+DD = b"\xff\xdd"
+CC = b"\xff\xcc"
+BB = b"\xff\xbb"
 CDEG_PER_US = 0.36  # 600 rpm
 START_CDEG = 35000  # so that streams of a few packets pass zero
 
@@ -75,7 +78,8 @@ def robosense_packets(
     payloads = []
     for time_us, cdeg in turning(count, azimuths, row_us):
         micro = 59_998_500 + round(time_us)  # it passes a full minute
-        second, rest = micro // 1_000_000, micro % 1_000_000
+        second = micro // 1_000_000
+        rest = micro % 1_000_000
         form = bytes((21, 12, 7, 3, 6 + second // 60, second % 60))
         time = (
             form + struct.pack(">HH", rest // 1000, rest % 1000)

@@ -45,7 +45,7 @@ IMU_MM = [1.0, 0.0, 0.0, 6.253, 0.0, 1.0, 0.0, -11.775, 0.0, 0.0, 1.0, 7.645, 0.
 
 @dataclass(frozen=True)
 class OusterSpec:
-    """A sensor to imitate; angles default to an even fan, window to the whole turn."""
+    """A sensor to imitate; angles default to an even fan, window to the whole revolution."""
 
     profile: str = "RNG15_RFL8_NIR8"
     beams: int = 128
@@ -146,7 +146,7 @@ def _data_format(spec: OusterSpec) -> JsonObject:
 
 
 def flat_json(spec: OusterSpec) -> JsonObject:
-    """The same sensor as firmware 2.2 and 2.3 tells of it: all keys at the top."""
+    """The metadata of the same sensor as of firmware 2.2 and 2.3: all keys at the top."""
     nested = metadata_json(spec)
     document: JsonObject = {
         "lidar_mode": nested["config_params"]["lidar_mode"],
@@ -173,13 +173,15 @@ def encode_packets(
     of the profile's table, RANGE in mm; what is left out is 0. A packet takes the frame id of its
     first column.
     """
-    layout, count = spec.layout, len(stamps_ns)
+    layout = spec.layout
+    count = len(stamps_ns)
     packets = count // layout.columns
     if packets * layout.columns != count:
         raise ValueError(f"{count} columns are no whole packets of {layout.columns}")
     measured = np.ones(count, np.bool_) if valid is None else valid
     head = np.zeros(count, LEGACY_COLUMN if layout.legacy else COLUMN)
-    head["stamp_ns"], head["measurement_id"] = stamps_ns, mids
+    head["stamp_ns"] = stamps_ns
+    head["measurement_id"] = mids
     records = np.zeros((count, layout.record_size), np.uint8)
     if layout.legacy:
         head["frame_id"] = frame_ids
@@ -201,7 +203,7 @@ def encode_packets(
 def encode_frame(
     spec: OusterSpec, first_stamp_ns: int, frame_id: int, ranges_mm: IntLike
 ) -> list[bytes]:
-    """A whole turn of evenly timed columns; ranges_mm: (columns per frame, beams, returns)."""
+    """A revolution of evenly timed columns; ranges_mm: (columns per frame, beams, returns)."""
     columns = spec.columns_per_frame
     mids = np.arange(columns)
     names = ("RANGE", "RANGE2")[: ranges_mm.shape[2]]
@@ -225,14 +227,17 @@ def imu_packet(
     if spec.imu_profile != ACCEL32:
         old = np.zeros(1, LEGACY_IMU)
         old["gyroscope_ns"] = stamps_ns
-        old["system_ns"], old["acceleration_ns"] = old["gyroscope_ns"] + 2, old["gyroscope_ns"] - 1
+        old["system_ns"] = old["gyroscope_ns"] + 2
+        old["acceleration_ns"] = old["gyroscope_ns"] - 1
         old["acceleration_g"] = acceleration / STANDARD_GRAVITY
         old["angular_velocity_deg"] = angular_velocity / RAD_PER_DEG
         return old.tobytes()
     samples = np.zeros(len(stamps_ns), SAMPLE)
-    samples["stamp_ns"], samples["measurement_id"] = stamps_ns, np.arange(len(stamps_ns))
+    samples["stamp_ns"] = stamps_ns
+    samples["measurement_id"] = np.arange(len(stamps_ns))
     samples["status"] = 1 if valid is None else valid
-    samples["acceleration"], samples["angular_velocity"] = acceleration, angular_velocity
+    samples["acceleration"] = acceleration
+    samples["angular_velocity"] = angular_velocity
     payload = np.zeros((1, imu_size(len(samples))), np.uint8)
     payload[0, SAMPLES_START : SAMPLES_START + samples.nbytes] = samples.view(np.uint8)
     _write_headers(spec, payload, IMU_PACKET, np.zeros(1, np.int64))
@@ -263,6 +268,6 @@ def _write_headers(spec: OusterSpec, payloads: U8Array, kind: int, frame_ids: In
     ):
         for byte in range(size):
             payloads[:, first + byte] = (values >> (8 * byte)) & 0xFF
-    # FUSA footers hold no checksum.
+    # FUSA footers have no checksum.
     if spec.with_crc and spec.header_type != FUSA:
         payloads[:, -8:] = crc64(payloads[:, :-8]).astype("<u8").view(np.uint8).reshape(-1, 8)

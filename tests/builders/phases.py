@@ -1,9 +1,9 @@
-"""Recordings of two lidars whose rotors stand in a known phase: what joining turns makes of them.
+"""Recordings of two lidars with a known phase of their rotors, and the sets of joined sweeps.
 
     python -m tests.builders.phases FOLDER
 
 writes the recordings of all `CASES`. Stamps matter, pixels do not: there are four beams and no
-echoes. A packet arrives with the stamp of its last column, as if the way took no time.
+returns. The receive time of a packet is the timestamp of its last column: no transport time.
 """
 
 from __future__ import annotations
@@ -19,23 +19,25 @@ import numpy as np
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
-NS_PER_S, NS_PER_MS = 10**9, 10**6
+NS_PER_S = 10**9
+NS_PER_MS = 10**6
 # A whole number of periods of 10 Hz and of 20 Hz; the rotors pass zero some time after it.
 EPOCH_NS = 1_800_000_000 * NS_PER_S
-BEAMS, COLUMNS = 4, 512
-TURN_NS = 100 * NS_PER_MS
+BEAMS = 4
+COLUMNS = 512
+REVOLUTION_NS = 100 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """A lidar that first passes zero `zero_ms` after the epoch, and then every `turn_ns`.
+    """A lidar that first passes zero `zero_ms` after the epoch, and then every `revolution_ns`.
 
     silent_s: from when to when its packets are lost, seconds after the epoch.
     """
 
     serial: int
     zero_ms: int = 20
-    turn_ns: int = TURN_NS
+    revolution_ns: int = REVOLUTION_NS
     silent_s: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -44,19 +46,20 @@ class Rotor:
         return OusterSpec(
             beams=BEAMS,
             columns_per_frame=COLUMNS,
-            rate_hz=round(NS_PER_S / self.turn_ns),
+            rate_hz=round(NS_PER_S / self.revolution_ns),
             serial=self.serial,
             init_id=self.serial,
             with_crc=False,
         )
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
-        """(arrival, payload) of all packets of the whole turns that end in the time given."""
+        """(receive time in ns, payload) of all packets of the whole revolutions in `seconds`."""
         begin_ns = EPOCH_NS + self.zero_ms * NS_PER_MS
-        turns = int((seconds * NS_PER_S - self.zero_ms * NS_PER_MS) // self.turn_ns)
-        column = np.arange(turns * COLUMNS)
-        stamp_ns = begin_ns + column * self.turn_ns // COLUMNS
-        mids, frames = column % COLUMNS, column // COLUMNS
+        revolutions = int((seconds * NS_PER_S - self.zero_ms * NS_PER_MS) // self.revolution_ns)
+        column = np.arange(revolutions * COLUMNS)
+        stamp_ns = begin_ns + column * self.revolution_ns // COLUMNS
+        mids = column % COLUMNS
+        frames = column // COLUMNS
         payloads = encode_packets(self.spec, stamp_ns, mids, frames, {})
         size = self.spec.columns_per_packet
         silent_ns = [EPOCH_NS + round(at * NS_PER_S) for at in self.silent_s]
@@ -77,19 +80,20 @@ class Case:
     seconds: float = 10.0
 
 
-LEFT, RIGHT = 1001, 1002
+LEFT = 1001
+RIGHT = 1002
 CASES: dict[str, Case] = {
     "10 Hz, in phase": Case(Rotor(LEFT), Rotor(RIGHT)),
     "10 Hz, 37 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 57)),
     "10 Hz, 63 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 83)),
-    "10 Hz with 20 Hz": Case(Rotor(LEFT), Rotor(RIGHT, turn_ns=TURN_NS // 2)),
-    "10.00 Hz with 9.95 Hz": Case(Rotor(LEFT), Rotor(RIGHT, turn_ns=100_502_513), 60.0),
+    "10 Hz with 20 Hz": Case(Rotor(LEFT), Rotor(RIGHT, revolution_ns=REVOLUTION_NS // 2)),
+    "10.00 Hz with 9.95 Hz": Case(Rotor(LEFT), Rotor(RIGHT, revolution_ns=100_502_513), 60.0),
     "10 Hz, one silent from 5 s to 8 s": Case(Rotor(LEFT), Rotor(RIGHT, silent_s=(5.0, 8.0))),
 }
 
 
 def write_case(folder: Path, case: Case) -> Path:
-    """A capture of the case in `folder`, metadata beside it."""
+    """A capture of the case in `folder`, with its metadata file."""
     folder.mkdir(parents=True, exist_ok=True)
     records = []
     for number, rotor in enumerate((case.left, case.right), 1):

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from mlbatch.arrays import U8Array
 from tests.builders.bags import Body, Recorded
 
-CLOUD, CUSTOM, CUSTOM2 = (
-    "sensor_msgs/PointCloud2",
-    "livox_ros_driver/CustomMsg",
-    "livox_ros_driver2/CustomMsg",
-)
+CLOUD = "sensor_msgs/PointCloud2"
+CUSTOM = "livox_ros_driver/CustomMsg"
+CUSTOM2 = "livox_ros_driver2/CustomMsg"
 # Number and code of `struct` of the types of a PointField.
 TYPES = {
     "int8": (1, "b"),
@@ -107,7 +105,7 @@ def custom_message(
 def write_points(
     topic: str, messages: Sequence[bytes], kind: str = CLOUD, step_ns: int = 100_000_000
 ) -> list[Recorded]:
-    """Messages of a topic as a recorder gets them, each `step_ns` after the one before."""
+    """Recorded messages of a topic, each `step_ns` after the one before."""
     return [
         Recorded(topic, kind, STAMP_NS + (number + 1) * step_ns, data)
         for number, data in enumerate(messages)
@@ -138,7 +136,7 @@ class Column:
 
 
 def read_packets(packets: U8Array) -> list[Column]:
-    """What packets (P, size) hold, by the layout that `_cloud_packets` states."""
+    """Contents of packets (P, size), by the layout that `_cloud_packets` states."""
     found = []
     for packet in packets:
         data = packet.tobytes()
@@ -151,9 +149,20 @@ def read_packets(packets: U8Array) -> list[Column]:
         rest = data[HEAD_BYTES + 18 * slots :]
         found.append(
             Column(
-                *(magic, version, kind, slots, stamp_ns, number, count),
-                *(planes[0], planes[1], planes[2], planes[3], ring),
-                *(rest[:slots], rest[slots : 2 * slots]),
+                magic,
+                version,
+                kind,
+                slots,
+                stamp_ns,
+                number,
+                count,
+                planes[0],
+                planes[1],
+                planes[2],
+                planes[3],
+                ring,
+                rest[:slots],
+                rest[slots : 2 * slots],
             )
         )
     return found

@@ -60,7 +60,7 @@ def read(recording: CaptureRecording) -> list[Seen]:
 
 
 def assert_balanced(recording: Recording) -> None:
-    """The law of the capture ledger, and that it holds only known reasons."""
+    """The law of the capture ledger, and only known reasons."""
     counts = recording.counts
     assert counts.frames == counts.datagrams + sum(counts.skipped.values())
     assert min(counts.skipped.values(), default=1) > 0

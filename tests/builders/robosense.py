@@ -1,9 +1,9 @@
-"""Encoder of ROBOSENSE packets: what a turning lidar would send, from plain raw values.
+"""Encoder of ROBOSENSE packets: packets of a spinning lidar from plain raw values.
 
-Source: docs/sources/robosense.md sections 1 to 7. A rotor that turns evenly fires a round of all
-channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + what the
-rotor turns meanwhile. Rounds inside the field of view are columns. Nothing here is shared with a
-decoder.
+Source: docs/sources/robosense.md sections 1 to 7. A rotor of constant speed fires a round of all
+channels again and again: round n begins at `start_ns` + n rounds, at azimuth `start_deg` + the
+rotation of the rotor meanwhile. Rounds inside the field of view are columns. Nothing here is shared
+with a decoder.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class RobosenseSpec:
 
     model: a name of MODELS; mode: strongest, last, nearest or dual; start_deg: azimuth of round 0;
     view_deg: where it measures, clockwise from the first to the second; is_reversed: the rotor
-    turns the other way (Bpearl: its packets then count 360 - azimuth); mount: of an Airy.
+    rotates the other way (Bpearl: its packets then count 360 - azimuth); mount: of an Airy.
     """
 
     model: str
@@ -98,7 +98,8 @@ class Angles:
 
 def fan(spec: RobosenseSpec) -> Angles:
     """An uneven fan of whole counts of the DIFOP; RS-16 has no azimuths of its own."""
-    row, unit = spec.row, spec.row.angles.unit_deg
+    row = spec.row
+    unit = spec.row.angles.unit_deg
     even = np.linspace(*row.span_deg, row.channels)
     counts = np.rint(even / unit) + np.arange(row.channels) * 5 % 7
     pattern = (np.arange(row.channels) * 3 % 8 - 3.5) * 1.04 if row.angles.azimuth_at else 0.0
@@ -119,9 +120,9 @@ def rounds(spec: RobosenseSpec, columns: I64Array) -> I64Array:
 
 
 def firing_times_ns(spec: RobosenseSpec, columns: I64Array) -> I64Array:
-    """(n, channels) of all firings, as far as packets tell: their time is cut to whole us.
+    """(n, channels) of all firings, as in the packets: their time is cut to whole us.
 
-    The second return of a column that two packets share may be told 1 us apart.
+    The second return of a column that two packets share may differ by 1 us.
     """
     own = rounds(spec, columns)
     first = rounds(spec, _first_columns(spec, columns))
@@ -147,13 +148,14 @@ def directions(spec: RobosenseSpec, angles: Angles, columns: I64Array) -> F64Arr
 
 def origins(spec: RobosenseSpec, columns: I64Array) -> F64Array:
     """(n, channels, 3) places of the lens at each firing, metres, sensor frame."""
-    azimuth, (radius, height) = np.radians(azimuths_deg(spec, columns)), spec.row.lens_m
+    azimuth = np.radians(azimuths_deg(spec, columns))
+    radius, height = spec.row.lens_m
     parts = (radius * np.cos(azimuth), -radius * np.sin(azimuth), np.full_like(azimuth, height))
     return np.stack(parts, axis=-1)
 
 
 def msop(spec: RobosenseSpec, ranges: I64Array, levels: I64Array) -> list[tuple[int, bytes]]:
-    """(arrival in ns, payload) of the packets that hold these columns, in their order.
+    """(receive time in ns, payload) of the packets of these columns, in their order.
 
     ranges, levels: (columns, channels, returns) raw, as on the wire (Airy: with the flag bits);
     columns have to fill whole packets.
@@ -188,7 +190,8 @@ def difop(
     parts: Mapping[int, bytes] | None = None,
 ) -> bytes:
     """A device packet; sync: mode and state (gPTP, locked by PTP); parts: bytes to put in last."""
-    row, layout = spec.row, spec.row.angles
+    row = spec.row
+    layout = spec.row.angles
     view = (round(degrees * 100) % 36001 for degrees in spec.view_deg)
     fields = {
         0: DIFOP_MAGIC,
@@ -216,13 +219,13 @@ def difop(
 
 
 def angles_csv(angles: Angles) -> str:
-    """The maker's file of angles: a line a channel, elevation and azimuth in degrees."""
+    """The vendor's file of angles: a line a channel, elevation and azimuth in degrees."""
     pairs = np.stack([angles.elevation_deg, angles.azimuth_deg], axis=1).tolist()
     return "".join(f"{up:.4f},{aside:.4f}\n" for up, aside in pairs)
 
 
 def _step_deg(spec: RobosenseSpec) -> float:
-    """What the rotor turns in a round; a minute has 6e10 ns."""
+    """Rotation in a round; a minute has 6e10 ns."""
     return spec.rpm * 360.0 * spec.round_ns / 6e10
 
 
@@ -258,10 +261,12 @@ def _block_azimuths(spec: RobosenseSpec, blocks: int) -> I64Array:
 
 def _sent(spec: RobosenseSpec, payloads: U8Array) -> list[tuple[int, bytes]]:
     """Add the headers; a packet arrives after the round of its last block."""
-    row, sent = spec.row, []
+    row = spec.row
+    sent = []
     step = spec.columns_per_packet
     for number, payload in enumerate(payloads):
-        first, after = int(number * step), int(np.ceil((number + 1) * step))
+        first = int(number * step)
+        after = int(np.ceil((number + 1) * step))
         first_round, last_round = rounds(spec, np.array([first, after - 1])).tolist()
         fields = {
             **row.marks,

@@ -9,11 +9,13 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
+FIRST = bytes.fromhex("55aa050a5aa550a0")
+SECOND = bytes.fromhex("55aa055a")
 # 2021-12-07 03:06:24.765698 UTC: 18968 days, 3 hours, 6 minutes, 24 s.
 CALENDAR = bytes((21, 12, 7, 3, 6, 24)) + struct.pack(">HH", 765, 698)
 CALENDAR_NS = (((18968 * 24 + 3) * 60 + 6) * 60 + 24) * 10**9 + 765_698_000
-SECONDS, SECONDS_NS = struct.pack(">HII", 0, 1_700_000_000, 355_991), 1_700_000_000_355_991_000
+SECONDS = struct.pack(">HII", 0, 1_700_000_000, 355_991)
+SECONDS_NS = 1_700_000_000_355_991_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ class Case:
     extra: Mapping[int, bytes] = field(default_factory=dict)
 
 
-CENTI, FIRST_CDEG = 0.01, 12_345
+CENTI = 0.01
+FIRST_CDEG = 12_345
 RS16 = {0: FIRST, 30: b"\x01", 20: CALENDAR}
 RS32 = {0: FIRST, 30: b"\x02", 20: CALENDAR}
 BPEARL_3 = {0: FIRST, 30: b"\x03", 20: CALENDAR}
@@ -66,7 +69,8 @@ HELIOS_16 = {0: SECOND, 17: b"\x01", 31: b"\x06\x03", 20: SECONDS}
 AIRY = {0: SECOND, 31: b"\x31\x02", 20: SECONDS}
 RUBY = {0: SECOND, 7: b"\x01", 31: b"\x04", 10: SECONDS}
 PLUS = {0: SECOND, 7: b"\x01", 31: b"\x05", 10: SECONDS}
-FIRST_80, FIRST_48 = (80, 244, 4), (80, 148, 8)
+FIRST_80 = (80, 244, 4)
+FIRST_48 = (80, 148, 8)
 CASES = (
     Case(
         "RS-LiDAR-16",
@@ -191,7 +195,8 @@ CASES = (
             Probe(42 + 4 + 48, 1, 0, 55.56 + 27.68, 40 * 83.24 / 111.12),
             Probe(
                 1142 + 4 + 93,
-                *(23, 15),
+                23,
+                15,
                 11 * 111.12 + 55.56 + 27.68 + 25.95,
                 440 + 40 * (55.56 + 53.63) / 111.12,
             ),
@@ -237,7 +242,9 @@ CASES = (
             Probe(42 + 4, 0, 0, 0.0, 0.0),
             Probe(42 + 3 * 148 + 4 + 3, 0, 49, 41.888, 40 * 41.888 / 111.08, which=1),
             Probe(
-                *(42 + 7 * 148 + 145, 1, 95),
+                42 + 7 * 148 + 145,
+                1,
+                95,
                 111.08 + 93.296,
                 40 + 40 * 93.296 / 111.08,
                 which=1,

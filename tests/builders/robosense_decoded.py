@@ -15,7 +15,8 @@ from mlbatch.types import Pixels, Stream
 from tests.builders.others import rows
 
 SOURCE = "192.168.1.200"
-MSOP, DIFOP = Stream(SOURCE, 6699), Stream(SOURCE, 7788)
+MSOP = Stream(SOURCE, 6699)
+DIFOP = Stream(SOURCE, 7788)
 
 
 def evidence_of(
@@ -24,12 +25,12 @@ def evidence_of(
     """Point packets on port 6699, device packets on port 7788 of one source."""
     sample = rows(points)
     receive_ns = np.arange(len(points)) * 1_000_000 if host_ns is None else host_ns
-    beside = tuple(
+    neighbours = tuple(
         NeighbourStream(DIFOP, len(difop), rows([difop]), receive_ns[:1]) for difop in difops[:1]
     )
     if len(difops) > 1:
-        beside = (NeighbourStream(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
-    return Evidence(MSOP, sample.shape[1], sample, receive_ns, beside)
+        neighbours = (NeighbourStream(DIFOP, len(difops[0]), rows(difops), np.arange(len(difops))),)
+    return Evidence(MSOP, sample.shape[1], sample, receive_ns, neighbours)
 
 
 def built_in(evidence: Evidence) -> robosense.DifopCalibration:
@@ -66,14 +67,16 @@ def decoded(lidar: Lidar, packets: U8Array) -> Decoded:
     headers = lidar.column_headers(packets, np.zeros(len(packets), np.int64))
     records = records_of(lidar, packets)
     shape = (len(records), lidar.channels, lidar.returns)
-    range_m, intensity = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    range_m = np.zeros(shape, np.float32)
+    intensity = np.zeros(shape, np.float32)
     for which in range(lidar.returns):
         plane = np.zeros(shape[:2], np.float32)
         lidar.read(records, which, Pixels(plane, intensity[..., which], None))
         range_m[..., which] = plane
     rotor_rad, rad_per_ns, _ = read_rotor_words(headers.encoder.reshape(-1))
     angle_rad = rotor_rad[:, None] + rad_per_ns[:, None] * lidar.firing_ns[0]
-    cosine, sine = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    cosine = np.cos(angle_rad)[..., None]
+    sine = np.sin(angle_rad)[..., None]
     towards, origin = (
         cosine * one[0] + sine * one[1] + one[2]
         for one in (lidar.beams.direction, lidar.beams.origin)

@@ -1,7 +1,7 @@
 """ROBOSENSE models as rows: where their bytes lie, when their channels fire.
 
 Source: docs/sources/robosense.md sections 1 to 6; the firing times of 80- and 48-line models, for
-which it names the files of the maker's driver: `decoder_RS80`, `RS48`, `RSP80`, `RSP48.hpp` of
+which it names the files of the vendor's driver: `decoder_RS80`, `RS48`, `RSP80`, `RSP48.hpp` of
 rs_driver.
 """
 
@@ -10,13 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
-STRONGEST, LAST, NEAREST, DUAL = "strongest", "last", "nearest", "dual"
+FIRST = bytes.fromhex("55aa050a5aa550a0")
+SECOND = bytes.fromhex("55aa055a")
+STRONGEST = "strongest"
+LAST = "last"
+NEAREST = "nearest"
+DUAL = "dual"
 
 
 @dataclass(frozen=True, slots=True)
 class AngleLayout:
-    """Where a DIFOP holds angles, and degrees per count; `azimuth_at` 0: nowhere.
+    """Where a DIFOP has angles, and degrees per count; `azimuth_at` 0: nowhere.
 
     sign_bytes: without them elevations are three-byte numbers, negative in the lower half.
     """
@@ -32,11 +36,11 @@ class AngleLayout:
 class RobosenseModel:
     """A model.
 
-    marks: bytes that all its MSOP packets hold; counter_at, range_step_at: 0 where there is none;
+    marks: bytes of all its MSOP packets; counter_at, range_step_at: 0 where there is none;
     block_id: one byte, followed by the return number, or two; slots: readings of a block;
     channels: of a column; firing_us: after the column begins; lens_m: radius and height;
-    modes: DIFOP byte 300; wave_modes: a place in MSOP packets, and what single and dual ones hold
-    there; span_deg: elevations of a made-up unit.
+    modes: DIFOP byte 300; wave_modes: offset in MSOP packets, and the values of single and dual
+    ones there; span_deg: elevations of a made-up unit.
     """
 
     name: str

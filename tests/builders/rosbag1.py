@@ -11,7 +11,9 @@ from rosbags.rosbag1 import Writer
 from tests.builders.bags import Recorded, definition
 
 # Field names and values of headers are free; rosbags never makes these.
-MESSAGE, CONNECTION, CHUNK = 2, 7, 5
+MESSAGE = 2
+CONNECTION = 7
+CHUNK = 5
 
 
 def write_rosbag1(
@@ -22,17 +24,17 @@ def write_rosbag1(
     chunk_bytes: int = 100_000,
     callers: int = 1,
 ) -> Path:
-    """A bag; callers: publishers that take turns on every topic."""
+    """A bag; callers: publishers that alternate on every topic."""
     writer = Writer(path)
     if compression != "none":
         writer.set_compression(Writer.CompressionFormat[compression.upper()])
     writer.chunk_threshold = chunk_bytes
     connections = {}
-    turns: dict[str, int] = {}
+    written: dict[str, int] = {}
     with writer:
         for message in messages:
-            turn = turns[message.topic] = turns.get(message.topic, -1) + 1
-            key = message.topic, turn % callers
+            number = written[message.topic] = written.get(message.topic, -1) + 1
+            key = message.topic, number % callers
             if key not in connections:
                 package, name = message.type.split("/")
                 connections[key] = writer.add_connection(
@@ -66,7 +68,8 @@ def open_chunk(bag: bytes) -> bytes:
 
 def last_chunk(bag: bytes) -> int:
     """Where the record of the last chunk begins."""
-    at, found = len(b"#ROSBAG V2.0\n"), 0
+    at = len(b"#ROSBAG V2.0\n")
+    found = 0
     while at < len(bag):
         head = struct.unpack_from("<I", bag, at)[0]
         fields = bag[at + 4 : at + 4 + head]

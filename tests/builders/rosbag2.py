@@ -91,7 +91,11 @@ def _tables(connection: sqlite3.Connection, form: Form) -> None:
 def _topic(connection: sqlite3.Connection, number: int, message: Recorded, form: Form) -> None:
     name = message.type.replace("/", "/msg/")
     row: tuple[object, ...] = (
-        *(number, message.topic, name, form.serialization, QOS[message.latched]),
+        number,
+        message.topic,
+        name,
+        form.serialization,
+        QOS[message.latched],
     )
     if form.schema == 4:
         row = (*row, "RIHS01_0")

@@ -18,7 +18,8 @@ CHANNELS = 4
 
 def pose(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> F64Array:
     """Return a (4, 4) rotation about z with a translation."""
-    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+    cosine = math.cos(yaw_rad)
+    sine = math.sin(yaw_rad)
     return np.array(
         [[cosine, -sine, 0, x_m], [sine, cosine, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], float
     )

@@ -2,7 +2,7 @@
 
 Body frame of the machine, metres: x forward, y left, z up, floor at z = 0. All surfaces are
 rectangles or upright cylinders, so a ray meets them in closed form (plane and quadratic equation);
-nothing is sampled. The law for tests: a measured point lies within the sensor's range resolution
+nothing is sampled. The law for tests: a measured point is within the sensor's range resolution
 of a surface (`distance_to_surfaces`).
 """
 
@@ -49,7 +49,8 @@ class Rectangle:
 
     def cast(self, origins: F64Array, directions: F64Array) -> F64Array:
         """Where the ray meets the plane, if that is within both edges."""
-        along, across = np.array(self.along), np.array(self.across)
+        along = np.array(self.along)
+        across = np.array(self.across)
         normal = np.cross(along, across)
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = ((np.array(self.corner) - origins) @ normal) / (directions @ normal)
@@ -58,7 +59,8 @@ class Rectangle:
 
     def distance(self, points: F64Array) -> F64Array:
         """From the nearest point of the rectangle."""
-        along, across = np.array(self.along), np.array(self.across)
+        along = np.array(self.along)
+        across = np.array(self.across)
         local = points - np.array(self.corner)
         nearest = np.zeros_like(local)
         for edge in (along, across):
@@ -68,7 +70,7 @@ class Rectangle:
 
 @dataclass(frozen=True, slots=True)
 class Pillar:
-    """The mantle of an upright cylinder that stands on the floor."""
+    """The mantle of an upright cylinder on the floor."""
 
     x: float
     y: float
@@ -77,7 +79,7 @@ class Pillar:
     reflectivity: int
 
     def cast(self, origins: F64Array, directions: F64Array) -> F64Array:
-        """The nearer root of the quadratic equation, if it lies between floor and top."""
+        """The nearer root of the quadratic equation, if it is between floor and top."""
         away = origins[:, :2] - (self.x, self.y)
         flat = directions[:, :2]
         a = (flat**2).sum(axis=1)
@@ -85,7 +87,8 @@ class Pillar:
         c = (away**2).sum(axis=1) - self.radius**2
         with np.errstate(divide="ignore", invalid="ignore"):
             root = np.sqrt(half_b**2 - a * c)
-            near, far = (-half_b - root) / a, (-half_b + root) / a
+            near = (-half_b - root) / a
+            far = (-half_b + root) / a
         return np.minimum(
             self._within_height(near, origins, directions),
             self._within_height(far, origins, directions),
@@ -107,7 +110,7 @@ class Pillar:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Surfaces that stand still."""
+    """Static surfaces."""
 
     surfaces: tuple[Surface, ...]
 
@@ -132,8 +135,11 @@ class Scene:
 
 def box(low: Vector, high: Vector, reflectivity: int) -> tuple[Rectangle, ...]:
     """The four sides and the top of a box with edges along the axes."""
-    (x0, y0, z0), (x1, y1, z1) = low, high
-    dx, dy, dz = (x1 - x0, 0.0, 0.0), (0.0, y1 - y0, 0.0), (0.0, 0.0, z1 - z0)
+    x0, y0, z0 = low
+    x1, y1, z1 = high
+    dx = (x1 - x0, 0.0, 0.0)
+    dy = (0.0, y1 - y0, 0.0)
+    dz = (0.0, 0.0, z1 - z0)
     return (
         Rectangle((x0, y0, z0), dx, dz, reflectivity),
         Rectangle((x0, y1, z0), dx, dz, reflectivity),

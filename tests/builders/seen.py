@@ -1,7 +1,7 @@
-"""What lidars of all makers see of a scene: their packets, and what a conversion must make of them.
+"""Packets of lidars of all vendors in a scene, and the expected points of their conversion.
 
 The encoders (`velodyne.py`, `hesai.py`, `robosense.py`, `two_lidars.py`) lay out bytes; here their
-rays meet the scene, and times are what their packets tell. Nothing of a decoder is used.
+rays meet the scene, and times are those of their packets. Nothing of a decoder is used.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from tests.builders import hesai, robosense, two_lidars, velodyne
 from tests.builders.hesai_angles import Beams
 from tests.builders.scene import Scene
 
-# Arrival in ns, and payload.
+# Receive time in ns, and payload.
 Payloads: TypeAlias = list[tuple[int, bytes]]
 # Behind a near surface every third column sees another one, as a beam does that an edge cuts.
-_EDGE_EVERY, _EDGE_M = 3, 7.0
+_EDGE_EVERY = 3
+_EDGE_M = 7.0
 _PAST_M = 1e-6
 _HOUR_NS = 3_600_000_000_000
 # Packets count the azimuth in 0.01 degrees. Half of that is its own rounding; as much again may be
-# what the few azimuths of a packet get wrong of the speed at which the rotor goes on from there.
+# the error of the rotor speed that the few azimuths of a packet give.
 ASIDE_PER_M = 1.75e-4
 _AIRY_FLAG = 0x4000
 
@@ -34,7 +35,7 @@ class Seen:
 
     stamp_ns: (n,) of its columns, in their order; firing_ns: (n, channels), as `stamp_ns` by the
     sensor's clock; counts, level: (n, channels, returns), counts of `unit_m`, 0 where nothing came
-    back; xyz_m: (n, channels, returns, 3), where those counts lie on the rays, body frame. Channels
+    back; xyz_m: (n, channels, returns, 3), those counts on the rays, body frame. Channels
     are in the order of the output.
     """
 
@@ -84,7 +85,8 @@ class Eye:
         first_m, level = self._cast(start, ray)
         if returns == 1:
             return first_m.reshape(*shape, 1), level.reshape(*shape, 1)
-        last_m, last_level = first_m.copy(), level.copy()
+        last_m = first_m.copy()
+        last_level = level.copy()
         column = np.arange(len(ray)) // shape[1]
         cut = np.flatnonzero((column % _EDGE_EVERY == 0) & (first_m < _EDGE_M))
         reached_m = first_m[cut] + _PAST_M
@@ -116,18 +118,21 @@ def pose(
     """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (docs/rig.md)."""
     matrix = np.eye(4)
     for (one, other), angle in zip(((1, 2), (2, 0), (0, 1)), np.radians(rpy_deg), strict=True):
-        turn = np.eye(4)
-        turn[one, one] = turn[other, other] = np.cos(angle)
-        turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
-        matrix = turn @ matrix
+        rotation = np.eye(4)
+        rotation[one, one] = rotation[other, other] = np.cos(angle)
+        rotation[other, one] = np.sin(angle)
+        rotation[one, other] = -np.sin(angle)
+        matrix = rotation @ matrix
     matrix[:3, 3] = translation_m
     return matrix
 
 
 def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     """A Velodyne's stamps are whole us, each of the first firing of a packet (sheet, section 2)."""
-    table, columns = spec.table, np.arange(packets * spec.columns_per_packet)
-    origin, direction = velodyne.origins(spec, columns), velodyne.directions(spec, columns)
+    table = spec.table
+    columns = np.arange(packets * spec.columns_per_packet)
+    origin = velodyne.origins(spec, columns)
+    direction = velodyne.directions(spec, columns)
     distance_m, bright = eye.look(origin, direction, spec.returns)
     reach_m = np.array(table.dist_m)[:, None]
     counts, level = _counted(distance_m - reach_m, bright, table.unit_m)
@@ -156,7 +161,8 @@ def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
 
 def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> Seen:
     """A HESAI's beams leave from the axis unless the optical centre is asked for."""
-    columns, unit_m = packets * spec.groups, spec.row.unit_mm / 1000
+    columns = packets * spec.groups
+    unit_m = spec.row.unit_mm / 1000
     direction = hesai.directions(spec, beams, columns)
     origin = np.zeros_like(direction)
     counts, level = _counted(*eye.look(origin, direction, spec.returns), unit_m)
@@ -166,7 +172,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
     fires_ns = hesai.firing_times_ns(spec, columns)
     never = np.iinfo(np.int64).max
     payloads = hesai.encode_packets(spec, counts, level)
-    arrivals = hesai.host_times_ns(spec, packets).tolist()
+    receive_ns = hesai.host_times_ns(spec, packets).tolist()
     return Seen(
         np.where(fires, fires_ns, never).min(axis=1),
         fires_ns,
@@ -174,7 +180,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
         level,
         eye.points(origin, direction, np.multiply(counts, unit_m, dtype=np.float64)),
         unit_m,
-        list(zip(arrivals, payloads, strict=True)),
+        list(zip(receive_ns, payloads, strict=True)),
         spec.groups,
     )
 
@@ -212,7 +218,8 @@ def ouster_sees(lidar: two_lidars.FixtureLidar, eye: Eye, first_ns: int, turns: 
     raw = two_lidars.packets(lidar, pixels, stamps)
     column = np.arange(len(stamps)) % two_lidars.COLUMNS_PER_TURN
     last_ns = stamps.reshape(-1, two_lidars.COLUMNS_PER_PACKET)[:, -1]
-    counts, unit_m = pixels["range"].astype(np.int64), lidar.range_step_mm / 1000
+    counts = pixels["range"].astype(np.int64)
+    unit_m = lidar.range_step_mm / 1000
     # Ranges count from the rotor's axis, along the beam.
     origin, direction = two_lidars.rays(lidar)
     reached_m = counts.reshape(-1, 1) * unit_m - lidar.offset_mm / 1000
@@ -241,7 +248,7 @@ def _counted(distance_m: F64Array, level: F64Array, unit_m: float) -> tuple[I64A
 def _split(spec: robosense.RobosenseSpec, seen: Seen) -> Seen:
     """Three blocks do not divide by two: each return is a column of its own.
 
-    The second may lie in the next packet; there it has that packet's time, cut to whole us anew.
+    The second may be in the next packet; there it has that packet's time, cut to whole us anew.
     """
     blocks = np.arange(seen.counts.shape[0] * spec.returns)
     rounds = robosense.rounds(spec, blocks // spec.returns)

@@ -1,4 +1,4 @@
-"""The points that scans must hold, made from what encoders sent (`seen.py`), not from a decoder."""
+"""Expected points of scans, from the data of the encoders (`seen.py`), not by a decoder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.seen import Seen
 
 # docs/sources/outputs.md section 3.
-STRONGEST_FIRST, STRONGEST_LAST, WEAK_FIRST, WEAK_LAST, ONLY = 3, 4, 5, 6, 7
+STRONGEST_FIRST = 3
+STRONGEST_LAST = 4
+WEAK_FIRST = 5
+WEAK_LAST = 6
+ONLY = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +49,14 @@ class Expected:
     """Makes the points of scans of these sensors, in the order of `lidar_id`."""
 
     def __init__(self, seen: Sequence[Seen], *, keep_repeated: bool = False) -> None:
-        self._sensors, ring_base = [], 0
+        self._sensors = []
+        ring_base = 0
         for sight in seen:
             self._sensors.append(_sorted(sight, ring_base, keep_repeated))
             ring_base += sight.channels
 
     def points(self, sensor: I64Array, column: I64Array) -> Points:
-        """Points of a scan that holds these columns: (n,), number of each in its sensor's own."""
+        """Points of a scan of these columns: (n,), number of each among those of its sensor."""
         parts = []
         for number, slots in enumerate(self._sensors):
             rows = np.flatnonzero(sensor == number)
@@ -87,7 +92,7 @@ def repeated(counts: I64Array) -> BoolArray:
 
 
 def pair_types(counts: I64Array, level: I64Array) -> npt.NDArray[np.uint8]:
-    """(n, channels, 2) types of two returns that are told by their ranges and levels."""
+    """(n, channels, 2) types of two returns, by their ranges and levels."""
     near_first = counts[..., 0] <= counts[..., 1]
     first_strong = level[..., 0] >= level[..., 1]
     one = np.where(

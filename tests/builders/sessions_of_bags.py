@@ -1,6 +1,6 @@
 """Sessions as they are recorded: the two lidars of the fixture in every container, or in several.
 
-Messages: bags.py; what the drivers publish beside packets: docs/sources/messages.md, sections 2 and
+Messages: bags.py; other messages of the drivers: docs/sources/messages.md, sections 2 and
 6.
 """
 
@@ -205,8 +205,10 @@ def description(text: str, host_ns: int) -> Recorded:
 
 def unit_messages(unit: Unit, place: str) -> list[Recorded]:
     """A unit's metadata, then its packets, as its driver publishes them."""
-    kind, text = "ouster_sensor_msgs/PacketMsg", json.dumps(metadata_json(unit.spec))
-    data, topic = Body("cdr").text(text).done(), f"/{place}/ouster"
+    kind = "ouster_sensor_msgs/PacketMsg"
+    text = json.dumps(metadata_json(unit.spec))
+    data = Body("cdr").text(text).done()
+    topic = f"/{place}/ouster"
     first_ns = unit.payloads[0][0]
     return [
         Recorded(f"{topic}/metadata", "std_msgs/String", first_ns, data, latched=True),

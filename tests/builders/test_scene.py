@@ -8,7 +8,6 @@ import math
 import struct
 import subprocess
 import sys
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ import dpkt
 import numpy as np
 import pytest
 import yaml
+from matplotlib.image import imread
 
 from tests.builders.make_fixtures import FOLDER, main
 from tests.builders.scene import Pillar, Rectangle, Scene, Vector, box, hall
@@ -35,7 +35,7 @@ def cast_one(scene: Scene, origin: Vector, direction: Vector) -> float:
 
 
 @pytest.mark.parametrize(
-    ("scene", "origin", "direction", "wanted"),
+    ("scene", "origin", "direction", "expected"),
     [
         pytest.param(SHIELD, (0, 0, 0), (1, 0, 0), 4.0, id="square on"),
         pytest.param(SHIELD, (0, 0, 0), (4, 0.75, 0), math.hypot(4, 0.75), id="aslant"),
@@ -57,7 +57,7 @@ def cast_one(scene: Scene, origin: Vector, direction: Vector) -> float:
         pytest.param(hall(), (-3, 0, 2), (0, 0, 1), 3.0, id="closed ceiling"),
         pytest.param(hall(), (0, 0, 2.5), (0, 0, -1), 0.7, id="roof of the machine"),
         pytest.param(hall(), (3, 0, 2.5), (0, 0, -1), 2.5, id="floor"),
-        # The pillar at (6.5, 4.5) stands 2 m before the wall at y = 7.
+        # The pillar at (6.5, 4.5) is 2 m before the wall at y = 7.
         pytest.param(hall(), (6.5, 0, 2), (0, 1, 0), 4.1, id="left front pillar"),
         # 2 m along the ramp's foot it is 2 * 1.5 / 4 = 0.75 m high.
         pytest.param(hall(), (9, 0, 3), (0, 0, -1), 2.25, id="ramp"),
@@ -66,9 +66,9 @@ def cast_one(scene: Scene, origin: Vector, direction: Vector) -> float:
     ],
 )
 def test_ray_meets_what_geometry_says(
-    scene: Scene, origin: Vector, direction: Vector, wanted: float
+    scene: Scene, origin: Vector, direction: Vector, expected: float
 ) -> None:
-    assert cast_one(scene, origin, direction) == pytest.approx(wanted, abs=1e-12)
+    assert cast_one(scene, origin, direction) == pytest.approx(expected, abs=1e-12)
 
 
 def test_rays_are_cast_each_for_itself() -> None:
@@ -80,7 +80,7 @@ def test_rays_are_cast_each_for_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scene", "point", "wanted"),
+    ("scene", "point", "expected"),
     [
         pytest.param(SHIELD, (4.25, 0.5, 0.5), 0.25, id="before the square"),
         # 3 m beyond one edge and 4 m off the plane.
@@ -92,8 +92,8 @@ def test_rays_are_cast_each_for_itself() -> None:
         pytest.param(PILLAR, (9, 0, 6), 5.0, id="above the pillar"),
     ],
 )
-def test_distance_to_a_surface(scene: Scene, point: Vector, wanted: float) -> None:
-    assert scene.distance_to_surfaces(np.array([point])).tolist() == pytest.approx([wanted])
+def test_distance_to_a_surface(scene: Scene, point: Vector, expected: float) -> None:
+    assert scene.distance_to_surfaces(np.array([point])).tolist() == pytest.approx([expected])
 
 
 def test_box_is_closed_but_for_its_bottom() -> None:
@@ -103,11 +103,11 @@ def test_box_is_closed_but_for_its_bottom() -> None:
     assert crate.cast(inside, axes).tolist() == [1.5, 2.5, 3.5, 0.5, 1.5, math.inf]
 
 
-def test_every_hit_lies_on_a_surface() -> None:
-    turn = np.linspace(0.0, 2.0 * math.pi, 500, endpoint=False)
+def test_every_hit_is_on_a_surface() -> None:
+    azimuth = np.linspace(0.0, 2.0 * math.pi, 500, endpoint=False)
     rise = np.linspace(-1.5, 1.5, 500)
     directions = np.stack(
-        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=1
+        [np.cos(rise) * np.cos(azimuth), np.cos(rise) * np.sin(azimuth), np.sin(rise)], axis=1
     )
     origins = np.tile([0.2, 0.9, 2.4], (500, 1))
     distance = hall().cast(origins, directions)
@@ -154,11 +154,11 @@ def datagrams() -> Iterator[tuple[int, int, bytes]]:
     assert not parts
 
 
-def test_capture_holds_what_its_source_file_says() -> None:
+def test_capture_contains_what_its_source_file_lists() -> None:
     seen: dict[tuple[int, int, int], int] = defaultdict(int)
     for host, port, payload in datagrams():
         seen[host, port, len(payload)] += 1
-    # 0.85 s hold 272 packets of 3.125 ms; the one that both ends cut into is not sent.
+    # 0.85 s contain 272 packets of 3.125 ms; the one that both ends cut is not sent.
     # Sizes by docs/sources/ouster.md section 2: 32 beams x 12 or 4 bytes.
     assert dict(seen) == {
         (87, 7502, 32 + 16 * (12 + 32 * 12) + 32): 271,
@@ -174,7 +174,7 @@ def test_rotors_pass_zero_37_ms_apart() -> None:
     for host, _, payload in datagrams():
         if len(payload) > 1000 and struct.unpack_from("<H", payload, 32 + 8)[0] == 0:
             zeros[host].append(struct.unpack_from("<q", payload, 32)[0])
-    # 2026-05-04T08:00:00 UTC and -87 ms + 2 turns of 99.99 ms; the zero before is not recorded.
+    # 2026-05-04T08:00:00 UTC and -87 ms + 2 revolutions of 99.99 ms; the zero before is missing.
     assert zeros[87][0] == 1_777_881_600_000_000_000 + 112_980_000
     # The first zero of `right` comes 63 ms before that one.
     apart = [right - left for left, right in zip(zeros[87], zeros[88][1:], strict=True)]
@@ -239,12 +239,13 @@ def test_rig_names_both_lidars_by_serial() -> None:
     assert rig["sensors"][0]["extrinsics"]["rotation_rpy_deg"] == list(LEFT.rpy_deg)
 
 
-def test_extrinsics_turn_about_fixed_axes() -> None:
-    # Pitch 22 degrees lowers the x axis, then yaw 80 degrees turns it to the left.
+def test_extrinsics_rotate_about_fixed_axes() -> None:
+    # Pitch 22 degrees lowers the x axis, then yaw 80 degrees rotates it to the left.
     forward = body_from_sensor(LEFT)[:3, 0]
-    down, left = math.radians(22.0), math.radians(80.0)
-    wanted = (math.cos(left) * math.cos(down), math.sin(left) * math.cos(down), -math.sin(down))
-    assert forward.tolist() == pytest.approx(wanted)
+    down = math.radians(22.0)
+    left = math.radians(80.0)
+    expected = (math.cos(left) * math.cos(down), math.sin(left) * math.cos(down), -math.sin(down))
+    assert forward.tolist() == pytest.approx(expected)
 
 
 def run(script: str, *arguments: Path) -> subprocess.CompletedProcess[str]:
@@ -269,20 +270,16 @@ def test_picture_shows_each_lidar_in_its_colour(tmp_path: Path) -> None:
         end_ns=100_000_000,
     )
     assert run("picture.py", tmp_path, tmp_path / "out.png").returncode == 0
-    raw = (tmp_path / "out.png").read_bytes()
-    assert raw[:8] == b"\x89PNG\r\n\x1a\n"
-    width, height = struct.unpack_from(">II", raw, 16)
-    (length,) = struct.unpack_from(">I", raw, 33)
-    assert struct.unpack_from(">I", raw, 41 + length)[0] == zlib.crc32(raw[37 : 41 + length])
-    rows = np.frombuffer(zlib.decompress(raw[41 : 41 + length]), np.uint8)
-    pixels = rows.reshape(height, 1 + 3 * width)[:, 1:].reshape(-1, 3)
+    assert (tmp_path / "out.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    # Red, green, blue and opacity from 0 to 1.
+    pixels = imread(tmp_path / "out.png").reshape(-1, 4)
     # Orange has more red than blue, cyan more blue than red.
-    assert (pixels[:, 0] > pixels[:, 2] + 80).any()
-    assert (pixels[:, 2] > pixels[:, 0] + 80).any()
+    assert (pixels[:, 0] > pixels[:, 2] + 80 / 255).any()
+    assert (pixels[:, 2] > pixels[:, 0] + 80 / 255).any()
 
 
 def test_picture_of_nothing_is_refused_in_one_line(tmp_path: Path) -> None:
     done = run("picture.py", tmp_path, tmp_path / "out.png")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "wanted a folder with npz scans" in done.stderr
+    assert "expected a folder of npz scans, found none; convert" in done.stderr

@@ -14,12 +14,15 @@ from tests.builders.run import FIXTURE
 
 Records = list[tuple[int, bytes]]
 
-_IPV4, _UDP = b"\x08\x00", 17
+_IPV4 = b"\x08\x00"
+_UDP = 17
 
 
 def read_pcap(path: Path) -> Records:
     """(host_ns, frame) of all records of a little-endian pcap in us, as the fixture is."""
-    data, at, records = path.read_bytes(), 24, []
+    data = path.read_bytes()
+    at = 24
+    records = []
     while at < len(data):
         seconds, us, captured, _ = struct.unpack_from("<4I", data, at)
         records.append((seconds * 10**9 + us * 1000, data[at + 16 : at + 16 + captured]))
@@ -41,7 +44,7 @@ def source(frame: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Datagram:
-    """A UDP datagram and the arrival of the frame that completed it."""
+    """A UDP datagram and the receive time of the frame that completed it."""
 
     host_ns: int
     source: str
@@ -51,7 +54,7 @@ class Datagram:
     payload: bytes
 
     def frame(self, link: int = ETHERNET) -> tuple[int, bytes]:
-        """The record of one frame that holds all of it."""
+        """The record of one frame with all of it."""
         frames = udp_frame(
             self.payload, self.source, self.target, self.source_port, self.port, link=link
         )
@@ -66,7 +69,7 @@ def datagrams(length_ns: int) -> tuple[Datagram, ...]:
     for host_ns, frame in frames(length_ns):
         if frame[12:14] != _IPV4 or frame[23] != _UDP:
             continue
-        # Identification and both addresses tell the fragments of a datagram.
+        # Identification and both addresses identify the fragments of a datagram.
         key = frame[18:20] + frame[26:34]
         parts[key] = parts.get(key, b"") + frame[34:]
         if struct.unpack_from(">H", frame, 20)[0] & 0x2000:

@@ -1,7 +1,7 @@
 """The two lidars of `fixtures/two_lidars`: geometry, metadata and packet bytes.
 
 Source: docs/sources/ouster.md sections 1 (metadata), 2 and 3 (packets), 6 (range to xyz), 8 (IMU).
-The bytes are laid out here once more, apart from the package, so that the fixture can judge it.
+The bytes are laid out here once more, apart from the package, so that the fixture can check it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import numpy.typing as npt
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from tests.builders.scene import Scene
 
-COLUMNS_PER_TURN, COLUMNS_PER_PACKET, BEAMS = 512, 16, 32
+COLUMNS_PER_TURN = 512
+COLUMNS_PER_PACKET = 16
+BEAMS = 32
 PACKETS_PER_TURN = COLUMNS_PER_TURN // COLUMNS_PER_PACKET
 MM_PER_M = 1000.0
 
@@ -36,11 +38,11 @@ FULL_PIXEL = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class FixtureLidar:
-    """One lidar: who it is, how it sits on the machine, how it measures.
+    """One lidar: its identity, its pose on the machine, and its measurements.
 
     altitude_span_deg: of the top beam, the lowest has the same below; offset_mm: distance of the
     beams' origin from the rotor's axis; lift_mm: of the lidar above the sensor frame; range_step_mm
-    and near_ir_step: what one count in the packets means; zero_ms: when the first turn begins,
+    and near_ir_step: what one count in the packets means; zero_ms: begin of the first revolution,
     after a full second; translation_m, rpy_deg: body_from_sensor.
     """
 
@@ -63,8 +65,8 @@ class FixtureLidar:
     rpy_deg: tuple[float, float, float]
 
 
-# The rotors pass zero 37 ms apart and turn at slightly different speeds, as real ones do. The frame
-# ids of `right` wrap within the recording.
+# The rotors pass zero 37 ms apart and rotate at slightly different speeds, as real ones do. The
+# frame ids of `right` wrap within the recording.
 LEFT = FixtureLidar(
     name="left",
     product="OS-0-32-U1",
@@ -134,7 +136,7 @@ def body_from_sensor(lidar: FixtureLidar) -> F64Array:
 
 
 def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
-    """Origins and unit directions (turn x beams, 3) of a turn, metres, body frame (section 6)."""
+    """Origins, unit directions (columns x beams, 3) of a revolution, m, body frame; section 6."""
     theta = 2 * math.pi * (1 - np.arange(COLUMNS_PER_TURN)[:, None] / COLUMNS_PER_TURN)
     turned = theta - np.radians(azimuth_deg(lidar))
     altitude = np.radians(altitude_deg(lidar))
@@ -146,23 +148,26 @@ def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
         ],
         axis=-1,
     )
-    # Lidar to sensor frame: half a turn about z, and the lift.
-    half_turn = np.array([-1.0, -1.0, 1.0])
-    offset_m, lift_m = lidar.offset_mm / MM_PER_M, lidar.lift_mm / MM_PER_M
+    # Lidar to sensor frame: half a revolution about z, and the lift.
+    half_revolution = np.array([-1.0, -1.0, 1.0])
+    offset_m = lidar.offset_mm / MM_PER_M
+    lift_m = lidar.lift_mm / MM_PER_M
     origin = np.zeros_like(direction)
-    origin[..., 0], origin[..., 1] = offset_m * np.cos(theta), offset_m * np.sin(theta)
+    origin[..., 0] = offset_m * np.cos(theta)
+    origin[..., 1] = offset_m * np.sin(theta)
     pose = body_from_sensor(lidar)
-    sensor_origin = origin * half_turn + (0.0, 0.0, lift_m)
+    sensor_origin = origin * half_revolution + (0.0, 0.0, lift_m)
     return (
         (sensor_origin @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3),
-        (direction * half_turn @ pose[:3, :3].T).reshape(-1, 3),
+        (direction * half_revolution @ pose[:3, :3].T).reshape(-1, 3),
     )
 
 
 def turn_pixels(lidar: FixtureLidar, scene: Scene) -> npt.NDArray[np.void]:
-    """Pixels (columns, beams) of any turn, since nothing moves; range 0 where nothing is hit."""
+    """Pixels (columns, beams) of any revolution, as nothing moves; range 0 where nothing is hit."""
     origins, directions = rays(lidar)
-    distance_m, surface = scene.cast(origins, directions), scene.surface_hit(origins, directions)
+    distance_m = scene.cast(origins, directions)
+    surface = scene.surface_hit(origins, directions)
     hit = surface >= 0
     brightness = np.array([surface.reflectivity for surface in scene.surfaces] + [0])[surface]
     # The sensor counts the range from the rotor's axis, along the beam.
@@ -178,7 +183,7 @@ def turn_pixels(lidar: FixtureLidar, scene: Scene) -> npt.NDArray[np.void]:
 
 
 def column_stamps(lidar: FixtureLidar, second_ns: int, turns: int) -> I64Array:
-    """Stamps (turns x columns,) ns, of turns from `zero_ms` after a full second on; 10 ns steps."""
+    """Timestamps (turns x columns,), ns, from `zero_ms` after a full second; steps of 10 ns."""
     column = np.arange(turns * COLUMNS_PER_TURN, dtype=np.int64)
     stamps = second_ns + lidar.zero_ms * 1_000_000 + column * lidar.turn_ns // COLUMNS_PER_TURN
     return stamps // 10 * 10
@@ -194,7 +199,9 @@ def packets(lidar: FixtureLidar, pixels: npt.NDArray[np.void], stamp_ns: I64Arra
     )
     mid = np.arange(len(stamp_ns)) % COLUMNS_PER_TURN
     columns = np.zeros(len(stamp_ns), column)
-    columns["stamp_ns"], columns["mid"], columns["status"] = stamp_ns, mid, 1
+    columns["stamp_ns"] = stamp_ns
+    columns["mid"] = mid
+    columns["status"] = 1
     columns["pixel"] = pixels[mid]
     out = np.zeros(len(stamp_ns) // COLUMNS_PER_PACKET, packet)
     out["column"] = columns.reshape(-1, COLUMNS_PER_PACKET)

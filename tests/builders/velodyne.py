@@ -18,7 +18,8 @@ from mlbatch.arrays import F64Array, I64Array, U8Array
 from tests.builders.velodyne_tables import MODELS, Table
 
 HOUR_US = 3_600_000_000
-NMEA_AT, NMEA_SIZE = 206, 128
+NMEA_AT = 206
+NMEA_SIZE = 128
 _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _READING = np.dtype([("distance", "<u2"), ("level", "u1")])
 _BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("reading", _READING, 32)])
@@ -34,7 +35,7 @@ class VelodyneSpec:
     start_us: first firing of column 0, us past the hour number `hour` (since 1970); blind_deg:
     azimuths [from, to) in which it does not measure (from > to: through zero); product: byte 1205,
     if not the model's; sequence_us: time of a sequence, if not the model's; stamps_end: the packet
-    is stamped at its end (HDL-32E, section 2); host_ahead_ns: recorder's clock minus the sensor's.
+    is stamped at its end (HDL-32E, section 2); host_ahead_ns: host clock minus sensor clock.
     """
 
     model: str
@@ -61,7 +62,7 @@ class VelodyneSpec:
 
     @property
     def row_us(self) -> float:
-        """From one azimuth to the next, where no blind sector lies between."""
+        """From one azimuth to the next, without a blind sector between them."""
         return (self.sequence_us or self.table.sequence_us) * self.table.columns_per_row
 
     @property
@@ -84,7 +85,7 @@ class VelodyneSpec:
 
 @dataclass(frozen=True)
 class Sent:
-    """Payloads (P, size) and their arrival (P,)."""
+    """Payloads (P, size) and their receive times (P,), ns."""
 
     payloads: U8Array
     host_ns: I64Array
@@ -107,11 +108,12 @@ class Rays:
 
 def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
     """Packets with these counts of distance and levels, each (columns, lasers, returns)."""
-    table, rows_per_packet = spec.table, spec.rows_per_packet
+    table = spec.table
+    rows_per_packet = spec.rows_per_packet
     rows = len(distance) // table.columns_per_row
     count = rows // rows_per_packet
     if len(distance) != count * spec.columns_per_packet:
-        raise ValueError(f"wanted whole packets of {spec.columns_per_packet} columns")
+        raise ValueError(f"expected whole packets of {spec.columns_per_packet} columns")
     blocks = len(table.flags) * spec.returns
     packets = np.zeros(count, _PACKET)
     row_us = _row_us(spec, rows)
@@ -127,7 +129,7 @@ def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
     packets["stamp_us"] = stamp_us % HOUR_US
     packets["factory"] = _factory(spec, count)
     payloads = packets.view(np.uint8).reshape(count, _PACKET.itemsize)
-    return Sent(payloads, _arrival_ns(spec, row_us.reshape(count, -1)[:, -1] + spec.row_us))
+    return Sent(payloads, _receive_ns(spec, row_us.reshape(count, -1)[:, -1] + spec.row_us))
 
 
 def observe(
@@ -169,7 +171,8 @@ def firing_times_ns(spec: VelodyneSpec, columns: I64Array) -> I64Array:
 
 def directions(spec: VelodyneSpec, columns: I64Array) -> F64Array:
     """(n, lasers, 3) unit vectors at each laser's own firing, sensor frame."""
-    alpha, elevation = _alpha_rad(spec, columns), np.deg2rad(spec.table.elevation_deg)
+    alpha = _alpha_rad(spec, columns)
+    elevation = np.deg2rad(spec.table.elevation_deg)
     flat = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), alpha.shape)
     return np.stack((flat * np.cos(alpha), -flat * np.sin(alpha), up), axis=-1)
@@ -177,7 +180,8 @@ def directions(spec: VelodyneSpec, columns: I64Array) -> F64Array:
 
 def origins(spec: VelodyneSpec, columns: I64Array) -> F64Array:
     """(n, lasers, 3) where the rays begin, m, sensor frame; section 10 with cx = cy = 0."""
-    alpha, aside_m = _alpha_rad(spec, columns), np.array(spec.table.horizontal_m)
+    alpha = _alpha_rad(spec, columns)
+    aside_m = np.array(spec.table.horizontal_m)
     up = np.broadcast_to(np.array(spec.table.vertical_m), alpha.shape)
     return np.stack((aside_m * np.sin(alpha), aside_m * np.cos(alpha), up), axis=-1)
 
@@ -197,7 +201,7 @@ def position_packets(
             )
             sentence = gprmc(utc, valid).ljust(NMEA_SIZE, b"\0")
             payload[NMEA_AT : NMEA_AT + NMEA_SIZE] = np.frombuffer(sentence, np.uint8)
-    return Sent(payloads, _arrival_ns(spec, np.asarray(times_us, np.float64)))
+    return Sent(payloads, _receive_ns(spec, np.asarray(times_us, np.float64)))
 
 
 def gprmc(utc: datetime, valid: bool = True) -> bytes:
@@ -246,8 +250,8 @@ def _epoch_ns(spec: VelodyneSpec, past_hour_us: F64Array) -> I64Array:
     return np.rint(past_hour_us * 1000).astype(np.int64) + spec.hour * HOUR_US * 1000
 
 
-def _arrival_ns(spec: VelodyneSpec, after_start_us: F64Array) -> I64Array:
-    """Arrival of packets sent so long after the start: 0.1 ms on the way."""
+def _receive_ns(spec: VelodyneSpec, after_start_us: F64Array) -> I64Array:
+    """Receive times of packets sent so long after the start: 0.1 ms of transport."""
     return _epoch_ns(spec, spec.start_us + after_start_us) + 100_000 + spec.host_ahead_ns
 
 

@@ -20,7 +20,8 @@ PLAIN = ("VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "VLS-128")
 MODES = ("strongest", "last", "dual")
 STREAM = Stream("192.168.1.201", 2368)
 # Stamps are whole us; azimuths whole hundredths of a degree.
-TIME_NS, ANGLE_DEG = 800, 0.012
+TIME_NS = 800
+ANGLE_DEG = 0.012
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def pixels(lidar: VelodyneLidar, packets: U8Array) -> tuple[F32Array, F32Array]:
     """Ranges and levels, (columns, lasers, returns)."""
     records = records_of(lidar, packets)
     shape = (len(records), lidar.channels, lidar.returns)
-    ranges, levels = np.full(shape, -1, np.float32), np.full(shape, -1, np.float32)
+    ranges = np.full(shape, -1, np.float32)
+    levels = np.full(shape, -1, np.float32)
     for which in range(lidar.returns):
         plane = np.full(shape[:2], -1, np.float32)
         lidar.read(records, which, Pixels(plane, levels[..., which], None))
@@ -101,7 +103,8 @@ def fired(lidar: VelodyneLidar, sent: Sent) -> tuple[I64Array, F64Array]:
 
 def pointing(lidar: VelodyneLidar, angle: F64Array) -> tuple[F64Array, F64Array]:
     """Directions and origins of beams at these angles, (columns, lasers, 3), in float64."""
-    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    cosine = np.cos(angle)[..., None]
+    sine = np.sin(angle)[..., None]
     direction, origin = (
         cosine * vectors[0] + sine * vectors[1] + vectors[2]
         for vectors in (lidar.beams.direction, lidar.beams.origin)

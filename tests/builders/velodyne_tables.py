@@ -10,14 +10,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-EE, DD, CC, BB = 0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF
+EE = 0xEEFF
+DD = 0xDDFF
+CC = 0xCCFF
+BB = 0xBBFF
 
 
 @dataclass(frozen=True)
 class Table:
     """A model; tuples are by laser id.
 
-    product: byte 1205, None where the bytes hold a status; firing_us: after the first firing of
+    product: byte 1205, None if the bytes are a status; firing_us: after the first firing of
     the sequence; time_scales: it changes with the time of the sequence; columns_per_row:
     sequences of one azimuth; flags: of the blocks of an azimuth, one return; returns_apart: all
     blocks of one return come first; azimuth_deg: clockwise, the manual's "azimuth offset".

@@ -17,7 +17,9 @@ def _sweep(sensor: int, first_ms: int) -> Sweep:
 
 def test_figures() -> None:
     statistics = SetStatistics("some", 2, 100 * NS_PER_MS)
-    first, second, third = _sweep(0, 0), _sweep(0, 100), _sweep(0, 400)
+    first = _sweep(0, 0)
+    second = _sweep(0, 100)
+    third = _sweep(0, 400)
     late = _sweep(1, 40)
     for joined in ((first, late), (second, late), (third, late), (third, None)):
         statistics.add(joined)

@@ -89,7 +89,8 @@ def test_sensors_without_a_rotor_are_cut_every_100_ms() -> None:
 
 @given(cuts=st.lists(st.integers(0, 40), max_size=5), start=st.integers(0, 15))
 def test_sweeps_do_not_depend_on_how_columns_are_grouped(cuts: list[int], start: int) -> None:
-    stamps, ids = _stamps(500, 7, 40), (start + np.arange(40)) % 16
+    stamps = _stamps(500, 7, 40)
+    ids = (start + np.arange(40)) % 16
     whole = SweepCutter(0, 16).push(stamps, ids)
     cutter = SweepCutter(0, 16)
     parts = zip(np.split(stamps, sorted(cuts)), np.split(ids, sorted(cuts)), strict=True)

@@ -1,4 +1,4 @@
-"""Column statistics by hand, and by the kernel: equal to those of numpy for any columns."""
+"""Column statistics by the kernel equal those by numpy, for any columns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def columns(seed: int, count: int, most: int) -> WindowColumns:
-    """Rotors that go on by chance, with rotor words of any speed and table."""
+    """Rotor positions at random, with rotor words of any speed and table."""
     rng = np.random.default_rng(seed)
     sensor = rng.integers(0, len(POSITIONS), count)
     stamp_ns = 1_700_000_000_000_000_000 + np.sort(rng.integers(0, 100_000_000, count))
@@ -36,15 +36,17 @@ def columns(seed: int, count: int, most: int) -> WindowColumns:
 
 @pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_kernel_equals_numpy(seed: int, count: int) -> None:
-    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
+def test_column_statistics_equal_those_of_numpy(seed: int, count: int) -> None:
+    compiled = CompiledColumnStatistics(POSITIONS)
+    plain = ColumnStatistics(POSITIONS)
     for again in range(3):
         due = columns(seed * 10 + again, count, 500)
         assert compiled.measure(due) == plain.measure(due)
 
 
-def test_positions_beyond_the_turn_are_left_to_numpy() -> None:
-    compiled, plain = CompiledColumnStatistics(POSITIONS), ColumnStatistics(POSITIONS)
+def test_numpy_measures_positions_beyond_the_revolution() -> None:
+    compiled = CompiledColumnStatistics(POSITIONS)
+    plain = ColumnStatistics(POSITIONS)
     due = columns(1, 5000, 2000)
     assert (due.encoder[due.sensor == 2] >= 512).any()
     assert compiled.measure(due) == plain.measure(due)
@@ -53,7 +55,7 @@ def test_positions_beyond_the_turn_are_left_to_numpy() -> None:
 
 
 @pytest.mark.parametrize("statistics", [ColumnStatistics, CompiledColumnStatistics])
-def test_statistics_by_hand(statistics: type[ColumnStatistics]) -> None:
+def test_column_statistics_by_hand(statistics: type[ColumnStatistics]) -> None:
     # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
     stamp_ns = np.array([0, 10, 40, 45, 50, 51])
     encoder = np.array([0, 2, 3, 1, 1 << 31, 359])

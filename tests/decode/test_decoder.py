@@ -1,4 +1,4 @@
-"""Columns to points: places, labels and counts by hand, and laws on what tiles and buffers do."""
+"""Columns to points: positions, labels and counts by hand, and laws of tiles and buffers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.builders.ouster import IntLike, OusterSpec, encode_packets
 from tests.builders.sessions import write_metadata
 
 START_NS = 1_800_000_000_100_000_000
-TURN = 512
-# Beam 0 looks 30 degrees up, beam 1 is turned by 90 degrees, the others look along the column's
+COLUMNS = 512
+# Beam 0 looks 30 degrees up, beam 1 is rotated by 90 degrees, the others look along the column's
 # angle; no offset of the beams from the axis, and no lift.
 FLAT = OusterSpec(
     beams=16,
-    columns_per_frame=TURN,
+    columns_per_frame=COLUMNS,
     altitude_deg=(30.0, *[0.0] * 15),
     azimuth_deg=(0.0, 90.0, *[0.0] * 14),
     beam_offset_mm=(0.0, 0.0),
@@ -38,7 +38,7 @@ DUAL = replace(FLAT, profile="RNG19_RFL8_SIG16_NIR16_DUAL")
 
 @dataclass
 class StoredSensor:
-    """A sensor whose whole turn lies in its ring; ranges_mm: (columns, beams) by field name."""
+    """A sensor with a whole revolution in its ring; ranges_mm: (columns, beams) by field name."""
 
     folder: Path
     spec: OusterSpec
@@ -54,8 +54,8 @@ class StoredSensor:
         calibration = read_calibration(write_metadata(self.folder / "lidar.json", self.spec))
         assert calibration is not None
         lidar = calibration.lidar({}, None)
-        mids = np.arange(TURN)
-        payloads = encode_packets(self.spec, mids, mids, np.zeros(TURN, np.int64), self.fields)
+        mids = np.arange(COLUMNS)
+        payloads = encode_packets(self.spec, mids, mids, np.zeros(COLUMNS, np.int64), self.fields)
         data = np.frombuffer(b"".join(payloads), np.uint8)
         ring = PacketRing(lidar.packet_size, lidar.records)
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
@@ -72,8 +72,8 @@ class StoredSensor:
 
 
 def _ranges(value: int = 0, **cells: int) -> IntLike:
-    """(TURN, 16) ranges in mm; `c3_b1=4000` sets column 3, beam 1."""
-    ranges = np.full((TURN, 16), value, np.int64)
+    """(COLUMNS, 16) ranges in mm; `c3_b1=4000` sets column 3, beam 1."""
+    ranges = np.full((COLUMNS, 16), value, np.int64)
     for name, value_mm in cells.items():
         column, beam = (int(part[1:]) for part in name.split("_"))
         ranges[column, beam] = value_mm
@@ -108,30 +108,30 @@ def _xyz(scan: Scan) -> list[list[float]]:
     return [[round(float(value), 4) + 0.0 for value in point] for point in scan.xyz]
 
 
-# -- where points lie -----------------------------------------------------------------------------
+# -- positions of points --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("cell", "xyz"),
     [
-        # The lidar frame looks back, the sensor frame forward; the rotor turns clockwise.
+        # The lidar frame looks back, the sensor frame forward; the rotor rotates clockwise.
         ("c0_b2", [-4, 0, 0]),
         ("c128_b2", [0, 4, 0]),
         ("c256_b2", [4, 0, 0]),
         ("c384_b2", [0, -4, 0]),
         # sin 30 degrees is a half.
         ("c256_b0", [4 * math.cos(math.pi / 6), 0, 2]),
-        # Azimuth offsets turn against the encoder: 90 degrees on from mid 128 is mid 256.
+        # Azimuth offsets run against the encoder: 90 degrees after mid 128 is mid 256.
         ("c128_b1", [4, 0, 0]),
     ],
 )
 def test_a_point_at_four_metres(tmp_path: Path, cell: str, xyz: list[float]) -> None:
     one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(**{cell: 4000})})
-    scan = _scan(_decoder(one), [one], [(0, mid) for mid in range(TURN)])
+    scan = _scan(_decoder(one), [one], [(0, mid) for mid in range(COLUMNS)])
     assert _xyz(scan) == [[round(value, 4) for value in xyz]]
 
 
-def test_extrinsics_turn_then_move(tmp_path: Path) -> None:
+def test_extrinsics_rotate_then_translate(tmp_path: Path) -> None:
     pose = from_rpy_deg((10.0, 20.0, 30.0), (0.0, 0.0, 90.0))
     one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(c256_b2=4000)}, pose)
     scan = _scan(_decoder(one), [one], [(0, 256)])
@@ -141,7 +141,7 @@ def test_extrinsics_turn_then_move(tmp_path: Path) -> None:
     assert scan.range_m.tolist() == [4.0]
 
 
-def test_beams_start_off_the_axis(tmp_path: Path) -> None:
+def test_beams_begin_at_their_distance_from_the_axis(tmp_path: Path) -> None:
     """n = 15.8 mm: (r - n) along the beam, plus n along the column's angle (section 6)."""
     spec = replace(FLAT, beam_offset_mm=(16.0, 0.0))
     ranges = _ranges(c256_b2=4000, c256_b1=4000)
@@ -150,10 +150,10 @@ def test_beams_start_off_the_axis(tmp_path: Path) -> None:
     assert _xyz(scan) == [[0.016, -3.984, 0], [4, 0, 0]]
 
 
-# -- what points are called -----------------------------------------------------------------------
+# -- labels of points -----------------------------------------------------------------------------
 
 
-def test_points_lie_by_column_then_channel(tmp_path: Path) -> None:
+def test_points_are_sorted_by_column_then_channel(tmp_path: Path) -> None:
     ranges = _ranges(c7_b3=1000, c7_b5=2000, c2_b9=3000)
     one = StoredSensor(tmp_path, FLAT, {"RANGE": ranges}, ring_base=40)
     scan = _scan(_decoder(one), [one], [(0, 7), (0, 0), (0, 2)])
@@ -166,7 +166,7 @@ def test_points_lie_by_column_then_channel(tmp_path: Path) -> None:
     assert (scan.index, scan.start_ns, scan.complete) == (3, START_NS, True)
 
 
-def test_two_returns_share_a_ring_and_say_which_is_nearer(tmp_path: Path) -> None:
+def test_two_returns_share_a_ring_and_are_typed_by_range(tmp_path: Path) -> None:
     """Numbering of docs/sources/outputs.md section 3; the strongest comes first."""
     strong = _ranges(c0_b0=1000, c0_b1=5000, c0_b2=3000)
     weak = _ranges(c0_b0=4000, c0_b1=2000)
@@ -179,7 +179,7 @@ def test_two_returns_share_a_ring_and_say_which_is_nearer(tmp_path: Path) -> Non
     assert scan.return_type.tolist() == [3, 6, 4, 5, 7]
 
 
-def test_sensors_lie_between_each_other(tmp_path: Path) -> None:
+def test_columns_of_sensors_are_merged_by_timestamp(tmp_path: Path) -> None:
     first = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000)})
     second = StoredSensor(tmp_path, DUAL, {"RANGE": _ranges(2000)}, ring_base=16)
     order = [(1, 0), (0, 5), (0, 6), (1, 1), (0, 7)]
@@ -192,7 +192,7 @@ def test_sensors_lie_between_each_other(tmp_path: Path) -> None:
     assert (scan.columns_per_sensor, scan.max_gap_ns) == ((3, 2), (200_000, 300_000))
 
 
-# -- what is left out -----------------------------------------------------------------------------
+# -- slots without a point ------------------------------------------------------------------------
 
 
 def test_every_slot_is_written_or_counted(tmp_path: Path) -> None:
@@ -257,15 +257,17 @@ def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
 def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
-    """A scan of many tiles is that of its columns, one after the other."""
+    """A scan of many tiles equals the scans of its columns, one after the other."""
     rng = np.random.default_rng(4)
     first, second = (
         StoredSensor(
             tmp_path,
             spec,
             {
-                "RANGE": rng.integers(0, 900, (TURN, 16)) * 8 * rng.integers(0, 2, (TURN, 16)),
-                "REFLECTIVITY": rng.integers(0, 256, (TURN, 16)),
+                "RANGE": rng.integers(0, 900, (COLUMNS, 16))
+                * 8
+                * rng.integers(0, 2, (COLUMNS, 16)),
+                "REFLECTIVITY": rng.integers(0, 256, (COLUMNS, 16)),
             },
             ring_base=base,
         )
@@ -273,7 +275,7 @@ def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
     )
     stored = [first, second]
     count = 2 * tile_columns(32) + 100
-    columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, TURN], (count, 2))]
+    columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, COLUMNS], (count, 2))]
     whole = _scan(_decoder(*stored, layout=layout), stored, columns)
     decoder = _decoder(*stored, layout=layout)
     singles = [_arrays(_scan(decoder, stored, [column])) for column in columns]
@@ -287,7 +289,7 @@ def _arrays(scan: Scan) -> list[npt.NDArray[np.generic]]:
     return [a.copy() for a in (scan.xyz, scan.ring, scan.lidar_id, scan.reflectivity)]
 
 
-def test_a_smaller_scan_after_a_larger_one_holds_nothing_of_it(tmp_path: Path) -> None:
+def test_a_smaller_scan_after_a_larger_one_has_no_stale_points(tmp_path: Path) -> None:
     one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000, c9_b4=0)})
     decoder = _decoder(one)
     assert _scan(decoder, [one], [(0, mid) for mid in range(100)]).points == 1599
@@ -296,21 +298,21 @@ def test_a_smaller_scan_after_a_larger_one_holds_nothing_of_it(tmp_path: Path) -
     assert decoder.counts[0].written == 1599 + 15
 
 
-# -- how much of a turn a scan saw ---------------------------------------------------------------
+# -- coverage of a revolution --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("mids", "coverage", "overlap"),
     [
-        (range(TURN), 1.0, 0.0),
-        (range(TURN // 2), 0.5, 0.0),
-        # A turn and a quarter: the first quarter was passed twice.
-        ([*range(TURN), *range(TURN // 4)], 1.0, 0.25),
-        ([*range(TURN), *range(TURN), *range(TURN)], 1.0, 1.0),
+        (range(COLUMNS), 1.0, 0.0),
+        (range(COLUMNS // 2), 0.5, 0.0),
+        # A revolution and a quarter: the first quarter is covered twice.
+        ([*range(COLUMNS), *range(COLUMNS // 4)], 1.0, 0.25),
+        ([*range(COLUMNS), *range(COLUMNS), *range(COLUMNS)], 1.0, 1.0),
         ([5], 1 / 120, 0.0),
     ],
 )
-def test_how_much_of_a_turn_was_seen(
+def test_coverage_and_overlap_of_a_revolution(
     tmp_path: Path, mids: Sequence[int], coverage: float, overlap: float
 ) -> None:
     for name in ("1", "2"):

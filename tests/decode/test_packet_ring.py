@@ -1,4 +1,4 @@
-"""Packet ring: records stay at their places while they are needed."""
+"""The ring of raw packets: stored columns are found at their ring index while they are needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mlbatch.lidar.interface import Records
 
 @dataclass
 class Stored:
-    """A ring, and a dictionary of the expected record at each place."""
+    """A ring, and the expected column of each ring index in a dictionary."""
 
     packet_size: int
     record_start: int
@@ -32,7 +32,7 @@ class Stored:
         )
 
     def store(self, count: int, gap: int = 0) -> U8Array:
-        """Store packets that lie `gap` bytes apart in a batch; give what the ring shows of them."""
+        """Store packets that are `gap` bytes apart in a batch; return the view of the ring."""
         rng = np.random.default_rng(self.count)
         stride = self.packet_size + gap
         data = rng.integers(0, 256, max(1, count * stride), np.uint8)
@@ -91,7 +91,8 @@ def test_a_ring_that_is_emptied_does_not_grow() -> None:
 
 
 def test_places_never_come_twice() -> None:
-    ring, seen = PacketRing(36, Records(0, 12, 12)), set[int]()
+    ring = PacketRing(36, Records(0, 12, 12))
+    seen = set[int]()
     for count in (3, 64, 1, 70, 5, 64):
         data = np.zeros(count * 36, np.uint8)
         _, place = ring.store(data, np.arange(count, dtype=np.int64) * 36, None)

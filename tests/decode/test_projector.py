@@ -1,4 +1,4 @@
-"""Sensors with rotor words that one projector decodes: points equal those of each sensor alone."""
+"""Sensors with rotor words decoded together give the same points as each one alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NONE = np.empty((0, 6))
 
 @dataclass
 class Sensor:
-    """A sensor whose columns lie in its ring."""
+    """A sensor with its columns in its ring."""
 
     source: Source
     stamp_ns: I64Array
@@ -31,7 +31,8 @@ class Sensor:
 
 
 def _sensor(number: int, seen: Seen) -> Sensor:
-    lidar, sent = seen.lidar, seen.sent
+    lidar = seen.lidar
+    sent = seen.sent
     ring = PacketRing(lidar.packet_size, lidar.records)
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
     _, first = ring.store(sent.payloads.reshape(-1).copy(), start, None)

@@ -17,11 +17,13 @@ from mlbatch.arrays import I64Array
 from mlbatch.faults import Fault, FaultReplay, parse_fault
 from mlbatch.types import PacketBatch
 
-MS, S = 10**6, 10**9
+MS = 10**6
+S = 10**9
 BEGIN_NS = 1_700_000_000 * S
 NAMES = ["left", "right", "top"]
 # Constants of SplitMix64.
-WORD, GOLDEN = 2**64 - 1, 0x9E3779B97F4A7C15
+WORD = 2**64 - 1
+GOLDEN = 0x9E3779B97F4A7C15
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class One:
 
 def packets(rng: random.Random, count: int) -> list[One]:
     """Packets of three sensors and of none; the clock of the capture host sometimes steps back."""
-    at, found = BEGIN_NS, []
+    at = BEGIN_NS
+    found = []
     for number in range(count):
         at += rng.choice([0, 0, 1, 1, 2, 5, -3, 40]) * MS
         size = rng.choice([0, 1, 2, 8, 8, 8, 24])
@@ -68,7 +71,8 @@ def owner(batch: PacketBatch) -> I64Array:
 
 def grouped(rng: random.Random, total: int) -> list[int]:
     """Sizes of batches, some of them empty."""
-    largest, sizes = rng.choice([1, 3, 20, total]), [0]
+    largest = rng.choice([1, 3, 20, total])
+    sizes = [0]
     while sum(sizes) < total:
         sizes.append(min(rng.randint(0, largest), total - sum(sizes)))
     return sizes
@@ -136,7 +140,8 @@ def reference(faults: Sequence[Fault], seed: int, session: Sequence[One]) -> lis
         ]
 
     numbers: Counter[tuple[int, int]] = Counter()
-    left, newest = [], 0
+    left = []
+    newest = 0
     for place, one in enumerate(session):
         newest = max(newest, one.host_ns)
         group = one.sensor, len(one.payload)
@@ -214,7 +219,8 @@ def drawn_faults(rng: random.Random, session: Sequence[One]) -> list[Fault]:
 def test_faults_equal_the_plain_loops(rng: random.Random, length: int) -> None:
     """For every grouping, with equal counts."""
     session = packets(rng, length)
-    faults, seed = drawn_faults(rng, session), rng.choice([0, 1, 2**64 - 1])
+    faults = drawn_faults(rng, session)
+    seed = rng.choice([0, 1, 2**64 - 1])
     expected = reference(faults, seed, session)
     replay = FaultReplay(faults, seed, NAMES)
     counts = set()
@@ -274,7 +280,8 @@ def steady(count: int, sensors: int = 1) -> list[One]:
 @pytest.mark.parametrize("percent", [1, 5, 50])
 def test_shares(kind: str, percent: int) -> None:
     """Within five standard deviations of the binomial distribution, over three sensors."""
-    count, share = 20_000, percent / 100
+    count = 20_000
+    share = percent / 100
     replay = FaultReplay([parse_fault(f"{kind}:*:{percent}%")], 0, NAMES)
     total = sum(len(batch) for batch in replay.batches(batches_of(steady(count, 3)), owner))
     expected = share / (1 + share) if kind == "reorder" else share
@@ -325,13 +332,16 @@ def test_packets_of_other_sizes_do_not_matter() -> None:
         assert Counter(alone) <= Counter(together)
 
 
-def test_a_delay_holds_the_packets_of_its_length() -> None:
+def test_a_delay_keeps_the_packets_of_its_length_in_memory() -> None:
     """25 of 1000 packets wait, one per millisecond."""
     replay = FaultReplay([parse_fault("delay:left:25ms")], 0, NAMES)
-    most, read, given_packets = 0, 0, 0
+    most = 0
+    read = 0
+    given_packets = 0
     source = batches(steady(1000), [10] * 100)
     for batch in replay.batches(source, owner):
-        read, given_packets = replay.ledgers[0].read, given_packets + len(batch)
+        read = replay.ledgers[0].read
+        given_packets = given_packets + len(batch)
         most = max(most, read - given_packets)
     assert most == 25
     assert given_packets == 1000

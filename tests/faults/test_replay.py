@@ -12,7 +12,8 @@ from mlbatch.errors import UsageError
 from mlbatch.faults import FaultCount, FaultLedger, FaultReplay, parse_fault
 from mlbatch.types import Message, PacketBatch, Topic
 
-MS, S = 10**6, 10**9
+MS = 10**6
+S = 10**9
 BEGIN_NS = 1_700_000_000 * S
 NAMES = ["left", "right"]
 

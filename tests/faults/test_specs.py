@@ -10,7 +10,8 @@ import pytest
 from mlbatch.errors import UsageError
 from mlbatch.faults import KINDS, parse_fault
 
-MS, S = 10**6, 10**9
+MS = 10**6
+S = 10**9
 
 
 @pytest.mark.parametrize(

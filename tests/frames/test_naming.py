@@ -1,4 +1,4 @@
-"""Frames that drivers and people name, and topics of one driver."""
+"""Frame names of drivers and of people, and topics of one driver."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ LIDAR = from_rpy_deg((0.0, 0.0, 0.03618), (0.0, 0.0, 180.0))
 LEFT = "/left/ouster/lidar_packets"
 
 
-def _found(maker: str, places: Sequence[str], alone: bool, frame: str) -> str:
+def _found(vendor: str, places: Sequence[str], alone: bool, frame: str) -> str:
     """What kind of candidate a frame is: `points`, `lidar`, `whole`, or `` for none."""
-    for one in candidates(maker, places, alone=alone, sensor_from_lidar=LIDAR):
+    for one in candidates(vendor, places, alone=alone, sensor_from_lidar=LIDAR):
         if one.frame == frame:
             if one.sensor_from_frame is not None:
                 return "lidar"
@@ -24,7 +24,7 @@ def _found(maker: str, places: Sequence[str], alone: bool, frame: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("maker", "place", "alone", "frame", "kind"),
+    ("vendor", "place", "alone", "frame", "kind"),
     [
         ("Ouster", LEFT, False, "left/os_sensor", "points"),
         ("Ouster", LEFT, False, "left_os_sensor", "points"),
@@ -36,7 +36,7 @@ def _found(maker: str, places: Sequence[str], alone: bool, frame: str) -> str:
         ("Ouster", LEFT, False, "os_left", "whole"),
         ("Ouster", LEFT, False, "ouster_left", "whole"),
         ("Ouster", LEFT, False, "left", "whole"),
-        # Plain names say which sensor only where there is one.
+        # Plain names identify the sensor only if it is the only one.
         ("Ouster", LEFT, False, "os_sensor", ""),
         ("Ouster", LEFT, True, "os_sensor", "points"),
         ("Ouster", LEFT, True, "os_lidar", "lidar"),
@@ -60,11 +60,11 @@ def _found(maker: str, places: Sequence[str], alone: bool, frame: str) -> str:
         ("Someone", "/top/packets", False, "top_lidar", "points"),
     ],
 )
-def test_table_of_candidates(maker: str, place: str, alone: bool, frame: str, kind: str) -> None:
-    assert _found(maker, [place], alone, frame) == kind
+def test_table_of_candidates(vendor: str, place: str, alone: bool, frame: str, kind: str) -> None:
+    assert _found(vendor, [place], alone, frame) == kind
 
 
-def test_candidates_come_with_the_surest_first() -> None:
+def test_the_most_certain_candidate_is_first() -> None:
     found = candidates("Ouster", [LEFT], alone=True, frame_id="/mine", sensor_from_lidar=LIDAR)
     order = [one.frame for one in found]
     frames = ["mine", "left/ouster/os_sensor", "left/os_sensor", "os_sensor", "left/os_lidar"]
@@ -74,14 +74,14 @@ def test_candidates_come_with_the_surest_first() -> None:
     assert len(set(order)) == len(order)
 
 
-def test_spellings_of_one_place_are_equally_sure() -> None:
+def test_spellings_of_one_place_have_equal_ranks() -> None:
     found = {one.frame: one.rank for one in candidates("Ouster", [LEFT], alone=False)}
     assert found["left/os_sensor"] == found["left_os_sensor"] == found["os_sensor_left"]
     assert not any("os_lidar" in frame for frame in found)
 
 
 @pytest.mark.parametrize("frame", ["os_left/os_lidar", "/sensors/os_lidar", "os_lidar_1"])
-def test_a_lidar_frame_that_the_rig_names_is_turned_back(frame: str) -> None:
+def test_a_lidar_frame_of_the_rig_is_corrected(frame: str) -> None:
     among = candidates("Ouster", [LEFT], alone=False, sensor_from_lidar=LIDAR)
     assert named_frame(frame, among).sensor_from_frame is LIDAR
     assert named_frame(frame.replace("lidar", "sensor"), among).sensor_from_frame is None

@@ -30,7 +30,7 @@ TRANSFORMS = st.builds(from_rpy_deg, st.tuples(*[LENGTHS] * 3), st.tuples(*[ANGL
 
 
 def _turned(matrix: F64Array, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Where the matrix puts a point, in plain arithmetic."""
+    """Transform a point in plain arithmetic."""
     rows = matrix.tolist()
     a, b, c = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows[:3])
     return a, b, c
@@ -39,21 +39,21 @@ def _turned(matrix: F64Array, x: float, y: float, z: float) -> tuple[float, floa
 @pytest.mark.parametrize(
     ("rpy", "x_goes_to", "y_goes_to", "z_goes_to"),
     [
-        # Right-handed quarter turns: y to z, z to x, x to y.
+        # Right-handed rotations by 90 degrees: y to z, z to x, x to y.
         ((90.0, 0.0, 0.0), (1, 0, 0), (0, 0, 1), (0, -1, 0)),
         ((0.0, 90.0, 0.0), (0, 0, -1), (0, 1, 0), (1, 0, 0)),
         ((0.0, 0.0, 90.0), (0, 1, 0), (-1, 0, 0), (0, 0, 1)),
         ((0.0, 0.0, 180.0), (-1, 0, 0), (0, -1, 0), (0, 0, 1)),
         ((0.0, 0.0, 270.0), (0, -1, 0), (1, 0, 0), (0, 0, 1)),
         # About the fixed axes in the order x, y, z: first roll, y goes to z; then pitch, z to x;
-        # then yaw, x to y. Axes that turned along would give another result.
+        # then yaw, x to y. Axes that rotate along would give another result.
         ((90.0, 90.0, 0.0), (0, 0, -1), (1, 0, 0), (0, -1, 0)),
         ((90.0, 0.0, 90.0), (0, 1, 0), (0, 0, 1), (1, 0, 0)),
         ((0.0, 90.0, 90.0), (0, 0, -1), (-1, 0, 0), (0, 1, 0)),
         ((90.0, 90.0, 90.0), (0, 0, -1), (0, 1, 0), (1, 0, 0)),
     ],
 )
-def test_quarter_turns_are_exact(
+def test_rotations_by_90_degrees_are_exact(
     rpy: tuple[float, float, float],
     x_goes_to: tuple[int, int, int],
     y_goes_to: tuple[int, int, int],
@@ -83,7 +83,7 @@ def test_urdf_origin_by_hand() -> None:
         ((0.0, 0.0, HALF, HALF), (0.0, 0.0, 90.0)),
         ((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 180.0)),
         ((1.0, 0.0, 0.0, 0.0), (180.0, 0.0, 0.0)),
-        # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
+        # A rotation by 120 degrees about (1, 1, 1) takes x to y, y to z, z to x.
         ((0.5, 0.5, 0.5, 0.5), (90.0, 0.0, 90.0)),
     ],
 )
@@ -118,7 +118,10 @@ def _matrix(*rows: tuple[float, ...]) -> F64Array:
     return np.array(rows, dtype=np.float64)
 
 
-X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+X = (1, 0, 0, 0)
+Y = (0, 1, 0, 0)
+Z = (0, 0, 1, 0)
+W = (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +144,7 @@ X, Y, Z, W = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
         (_matrix((-1, 0, 0, 0), Y, Z), "expected a rotation (determinant 1), found a mirror image"),
     ],
 )
-def test_what_is_not_rigid_is_refused(matrix: F64Array, message: str) -> None:
+def test_matrices_that_are_not_rigid_are_refused(matrix: F64Array, message: str) -> None:
     with pytest.raises(RigError) as caught:
         rigid(matrix)
     assert str(caught.value).startswith(message)
@@ -188,7 +191,7 @@ def test_rotations_stay_as_they_are(matrix: F64Array) -> None:
 
 
 @given(TRANSFORMS, TRANSFORMS, st.tuples(LENGTHS, LENGTHS, LENGTHS))
-def test_composed_is_one_after_the_other(
+def test_composition_applies_both_transforms(
     outer: F64Array, inner: F64Array, point: tuple[float, float, float]
 ) -> None:
     expected = _turned(outer, *_turned(inner, *point))
@@ -202,7 +205,7 @@ def test_inverse_undoes(matrix: F64Array) -> None:
 
 
 def test_inverse_by_hand() -> None:
-    # The sensor sits at (1, 2, 3) and looks along y; the body origin lies 2 m behind it,
+    # The sensor is at (1, 2, 3) and looks along y; the body origin is 2 m behind it,
     # 1 m to its left and 3 m below.
     sensor_from_body = inverse(from_rpy_deg((1.0, 2.0, 3.0), (0.0, 0.0, 90.0)))
     assert _turned(sensor_from_body, 0, 0, 0) == (-2, 1, -3)

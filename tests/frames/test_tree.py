@@ -1,4 +1,4 @@
-"""Chains of transforms by hand and by their laws; frames that drivers and people give names to."""
+"""Chains of transforms by hand, and their laws."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mlbatch.errors import RigError
 from mlbatch.frames.transforms import compose, from_rpy_deg
 from mlbatch.frames.tree import Edge, FrameTree, difference, edge_of
 
-NO_TURN = (0.0, 0.0, 0.0, 1.0)
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 HALF = math.sqrt(0.5)
 QUARTER_YAW = (0.0, 0.0, HALF, HALF)
 QUARTER_ROLL = (HALF, 0.0, 0.0, HALF)
@@ -32,14 +32,14 @@ def _edge(
     parent: str,
     child: str,
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    turn: Sequence[float] = NO_TURN,
+    xyzw: Sequence[float] = NO_ROTATION,
     source: str = "tf_static",
 ) -> Edge:
-    return edge_of(parent, child, xyz, turn, source)
+    return edge_of(parent, child, xyz, xyzw, source)
 
 
 def _moved(tree: FrameTree, a: str, b: str, point: tuple[float, float, float]) -> list[float]:
-    """Where a point given in frame b lies in frame a."""
+    """Coordinates in frame a of a point in frame b."""
     chain = tree.chain(a, b)
     assert chain is not None
     rows = chain.matrix.tolist()
@@ -47,8 +47,8 @@ def _moved(tree: FrameTree, a: str, b: str, point: tuple[float, float, float]) -
 
 
 def test_chain_of_three_by_hand() -> None:
-    # base 1 m below the roof; the roof turned left by 90 degrees, so its x is base's y; the lidar
-    # 2 m along the roof's x, rolled by 90 degrees, so its y is up.
+    # base is 1 m below the roof; the roof is rotated left by 90 degrees, so its x is base's y; the
+    # lidar is 2 m along the roof's x, rolled by 90 degrees, so its y is up.
     tree = _tree(
         _edge("base", "roof", (0.0, 0.0, 1.0), QUARTER_YAW),
         _edge("roof", "lidar", (2.0, 0.0, 0.0), QUARTER_ROLL),
@@ -62,7 +62,7 @@ def test_chain_of_three_by_hand() -> None:
 
 
 def test_chain_over_a_common_ancestor() -> None:
-    # Looking the same way, the right one sits 2 m to the right (y = -2) of the left one.
+    # With equal orientation, the right one is 2 m to the right (y = -2) of the left one.
     tree = _tree(
         _edge("base", "mast", (0.0, 0.0, 3.0)),
         _edge("mast", "left", (0.0, 1.0, 0.0)),
@@ -102,7 +102,7 @@ def test_frames_that_nothing_connects() -> None:
     assert tree.top("d") == ("c", "")
 
 
-def test_a_missing_frame_names_the_nearest() -> None:
+def test_the_error_for_a_missing_frame_names_the_nearest() -> None:
     with pytest.raises(RigError) as caught:
         _tree(_edge("base_link", "os_left")).chain("base_link", "os_lefft")
     assert str(caught.value) == (
@@ -125,7 +125,7 @@ def test_two_parents_are_refused_where_they_matter() -> None:
         "tf_static: frame lidar: expected one parent, found base and os_sensor; "
         "give the extrinsics in a rig file (--rig)"
     )
-    # Below that frame nothing is unclear.
+    # Frames below that one are unambiguous.
     assert _moved(tree, "lidar", "imu", (1, 2, 3)) == [1, 2, 3]
     assert tree.top("imu")[0] == "lidar"
 
@@ -146,7 +146,7 @@ def test_circles_are_refused_in_any_order(first: int) -> None:
         tree.chain("a", "b")
     with pytest.raises(RigError, match="circle"):
         tree.chain("a", "lidar")
-    # What hangs on the circle is still well placed relative to where it hangs.
+    # Frames below the circle keep their transforms up to it.
     assert _moved(tree, "c", "lidar", (0, 0, 0)) == [1, 0, 0]
 
 
@@ -161,24 +161,24 @@ def test_the_text_of_a_circle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parent", "child", "xyz", "turn", "expected"),
+    ("parent", "child", "xyz", "xyzw", "expected"),
     [
-        ("a", "b", (0, math.nan, 0), NO_TURN, "expected 3 finite metres, found 0, nan, 0"),
-        ("a", "b", (math.inf, 0, 0), NO_TURN, "expected 3 finite metres, found inf, 0, 0"),
-        ("a", "b", (0, 0), NO_TURN, "expected 3 finite metres, found 0, 0"),
+        ("a", "b", (0, math.nan, 0), NO_ROTATION, "expected 3 finite metres, found 0, nan, 0"),
+        ("a", "b", (math.inf, 0, 0), NO_ROTATION, "expected 3 finite metres, found inf, 0, 0"),
+        ("a", "b", (0, 0), NO_ROTATION, "expected 3 finite metres, found 0, 0"),
         ("a", "b", (0, 0, 0), (0, 0, 0, 0), "expected a quaternion of norm 1 within 0.001, found"),
         ("a", "b", (0, 0, 0), (0, 0, 0, 1.002), "norm 1.002"),
         ("a", "b", (0, 0, 0), (0, 0, math.nan, 1), "norm nan"),
-        ("a", "/a", (0, 0, 0), NO_TURN, "expected two frames, found the same twice"),
-        ("/", "b", (0, 0, 0), NO_TURN, "expected two frames, found an empty name"),
-        ("a", " ", (0, 0, 0), NO_TURN, "expected two frames, found an empty name"),
+        ("a", "/a", (0, 0, 0), NO_ROTATION, "expected two frames, found the same twice"),
+        ("/", "b", (0, 0, 0), NO_ROTATION, "expected two frames, found an empty name"),
+        ("a", " ", (0, 0, 0), NO_ROTATION, "expected two frames, found an empty name"),
     ],
 )
 def test_edges_that_are_none(
-    parent: str, child: str, xyz: Sequence[float], turn: Sequence[float], expected: str
+    parent: str, child: str, xyz: Sequence[float], xyzw: Sequence[float], expected: str
 ) -> None:
     with pytest.raises(RigError) as caught:
-        FrameTree().add(edge_of(parent, child, xyz, turn, "tf_static"))
+        FrameTree().add(edge_of(parent, child, xyz, xyzw, "tf_static"))
     text = str(caught.value)
     assert text.startswith("tf_static: transform ")
     assert expected in text
@@ -186,7 +186,7 @@ def test_edges_that_are_none(
 
 
 def test_a_quaternion_is_normalised_within_a_thousandth() -> None:
-    edge = _edge("a", "b", turn=(0.0, 0.0, 0.0, 1.0009))
+    edge = _edge("a", "b", xyzw=(0.0, 0.0, 0.0, 1.0009))
     assert np.array_equal(edge.matrix, np.eye(4))
 
 
@@ -224,7 +224,7 @@ def test_difference_by_hand() -> None:
     moved = from_rpy_deg((1.003, 2.004, 3.0), (10.0, 20.0, 30.0))
     # 3 mm and 4 mm at a right angle are 5 mm.
     assert difference(first, moved) == pytest.approx((0.005, 0.0), abs=1e-9)
-    # Half a turn about any axis: nothing beyond it.
+    # Half a revolution about any axis is the largest angle.
     half = from_rpy_deg((0.0, 0.0, 0.0), (180.0, 0.0, 0.0))
     assert difference(np.eye(4), half) == pytest.approx((0.0, math.pi))
 
@@ -254,7 +254,7 @@ def _matrix(tree: FrameTree, a: str, b: str) -> F64Array:
 
 
 @given(_trees(), st.data())
-def test_chains_compose_and_turn_round(tree: FrameTree, data: st.DataObject) -> None:
+def test_chains_compose_and_invert(tree: FrameTree, data: st.DataObject) -> None:
     a, b, c = (data.draw(st.sampled_from(tree.frames)) for _ in range(3))
     a_from_c = _matrix(tree, a, c)
     assert np.allclose(_matrix(tree, a, b) @ _matrix(tree, b, c), a_from_c, atol=1e-9)
@@ -270,7 +270,7 @@ def test_chains_keep_distances(tree: FrameTree, data: st.DataObject) -> None:
 
 
 @given(_trees(), st.data())
-def test_all_frames_hang_on_their_ancestor(tree: FrameTree, data: st.DataObject) -> None:
+def test_all_frames_have_their_common_ancestor(tree: FrameTree, data: st.DataObject) -> None:
     frames = data.draw(st.lists(st.sampled_from(tree.frames), min_size=1, max_size=4))
     ancestor = tree.ancestor(frames)
     assert ancestor is not None

@@ -47,7 +47,7 @@ def test_roll_comes_before_pitch_and_yaw() -> None:
         ('<origin xyz=" 1e-1\n2\t-3.5 "/>', [0.1, 2, -3.5]),
     ],
 )
-def test_what_is_left_out_of_an_origin_is_zero(origin: str, place: list[float]) -> None:
+def test_missing_parts_of_an_origin_are_zero(origin: str, place: list[float]) -> None:
     matrix = joints(_robot(_joint(LINKS + origin)))[0].matrix
     assert matrix[:3, 3].tolist() == place
     assert matrix[:3, :3].tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -123,13 +123,13 @@ def test_descriptions_that_cannot_be_used(text: str, message: str) -> None:
     assert str(caught.value) == f"robot_description (URDF){message}{REMEDY}"
 
 
-def test_surrogates_give_one_line() -> None:
+def test_errors_for_halves_of_characters_are_one_line() -> None:
     with pytest.raises(RigError, match="expected an XML document") as caught:
         joints("<robot name='\ud800'/>")
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_too_large_is_not_even_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_documents_are_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(urdf, "MAX_BYTES", 20)
     assert joints("<robot name='1234'/>") == []
     with pytest.raises(RigError, match="expected at most 20 bytes, found more"):

@@ -1,4 +1,4 @@
-"""Geometry: the fast vectors against plain trigonometry of one point, and laws of rotor words."""
+"""Geometry: the vectors against plain trigonometry of one point, and laws of rotor words."""
 
 from __future__ import annotations
 
@@ -50,26 +50,26 @@ def _by_hand(axis: str, beam: int, range_m: float, angle: float, lens_m: float) 
 @pytest.mark.parametrize("axis", ["x", "y"])
 @pytest.mark.parametrize("lens_m", [0.0, 0.035])
 @pytest.mark.parametrize("rotor_hz", [0.0, 10.0, -20.0])
-def test_beams_fire_while_the_rotor_goes_on(axis: str, lens_m: float, rotor_hz: float) -> None:
+def test_beams_fire_while_the_rotor_moves(axis: str, lens_m: float, rotor_hz: float) -> None:
     turning = Turning(_beams(axis, lens_m).moved(POSE), FIRING_NS, 64)
-    turns = np.linspace(-0.3, 1.4, 41, dtype=np.float64)
+    revolutions = np.linspace(-0.3, 1.4, 41, dtype=np.float64)
     table = np.arange(41) % 2
-    turning.prepare(np.zeros(41, np.int64), rotor_words(turns, np.full(41, rotor_hz), table))
+    turning.prepare(np.zeros(41, np.int64), rotor_words(revolutions, np.full(41, rotor_hz), table))
     range_m = np.linspace(0.5, 120, 41 * 4).reshape(41, 4).astype(np.float32)
     points = np.empty((41, 4, 4), np.float32)
     turning.project(range_m, points[:, :, :3])
     for column in range(41):
         for beam in range(4):
             fired_s = float(FIRING_NS[table[column], beam]) * 1e-9
-            angle = 2 * math.pi * (float(turns[column]) + rotor_hz * fired_s)
+            angle = 2 * math.pi * (float(revolutions[column]) + rotor_hz * fired_s)
             expected = _by_hand(axis, beam, float(range_m[column, beam]), angle, lens_m)
-            # float32 at 120 m, and 136 us at 20 turns a second: 8e-7 rad of the series left out.
+            # float32 at 120 m, and 136 us at 20 Hz: 8e-7 rad of the series are left out.
             allowed = 5e-5 + (1e-4 if abs(rotor_hz) > 10 else 0)
             np.testing.assert_allclose(points[column, beam, :3], expected, atol=allowed)
 
 
-def test_a_beam_to_the_right_at_a_quarter_turn() -> None:
-    """Clockwise: after a quarter of a turn forward has become right, which is -y or +x."""
+def test_a_beam_to_the_right_at_a_quarter_revolution() -> None:
+    """Clockwise: after a quarter of a revolution forward is right, which is -y or +x."""
     for axis, expected in (("x", (0.0, -2.0, 0.0)), ("y", (2.0, 0.0, 0.0))):
         table = BeamTable(
             spherical(np.zeros(1), np.zeros(1), axis), np.zeros((3, 1, 3)), np.zeros(1)
@@ -92,15 +92,14 @@ def _points(projection: Projection, member: I64Array, encoder: I64Array) -> F32A
 
 @pytest.mark.parametrize("lens_m", [0.0, 0.035])
 @pytest.mark.parametrize("members", [(0, 0, 0, 1, 1), (0, 0, 0, 0, 0), (1, 1, 1, 1, 1)])
-def test_rotors_aimed_together_are_those_aimed_alone(
-    lens_m: float, members: tuple[int, ...]
-) -> None:
-    # The second one stands as its frame does: its zeros have signs.
+def test_rotors_together_equal_each_alone(lens_m: float, members: tuple[int, ...]) -> None:
+    # The second one has the pose of its frame: its zeros have signs.
     own = _beams("y", lens_m)
     level = replace(own, direction=-own.direction, reach_m=np.zeros(4))
     tables = _beams("x", lens_m).moved(POSE), level
-    member, turns = np.array(members), np.linspace(0, 1, 5, dtype=np.float64)
-    words = rotor_words(turns, np.full(5, 10.0), np.arange(5) % 2)
+    member = np.array(members)
+    revolutions = np.linspace(0, 1, 5, dtype=np.float64)
+    words = rotor_words(revolutions, np.full(5, 10.0), np.arange(5) % 2)
     together = _points(Turning(tables[0], FIRING_NS, 5, tables[1:]), member, words)
     for number, table in enumerate(tables):
         alone = _points(Turning(table, FIRING_NS, 5), np.zeros(5, np.int64), words)
@@ -111,9 +110,9 @@ def test_rotors_aimed_together_are_those_aimed_alone(
 @pytest.mark.parametrize(
     "positions",
     [range(60), [*range(40, 64), *range(36)], [*range(0, 60, 2), *range(1, 61, 2)], [7] * 60],
-    ids=["in a row", "past the end of a turn", "each second", "one"],
+    ids=["in a row", "past the end of a revolution", "each second", "one"],
 )
-def test_positions_looked_up_in_a_row_are_those_looked_up_alone(positions: list[int]) -> None:
+def test_positions_in_a_row_equal_each_alone(positions: list[int]) -> None:
     angle_rad = np.linspace(0, 2 * np.pi, 64, endpoint=False).astype(np.float64)
     first = replace(_beams("x", 0.02), angle_rad=angle_rad)
     tables = first.moved(POSE), replace(first, reach_m=first.reach_m + 0.5)
@@ -141,14 +140,14 @@ def test_blocks_are_the_columns_of_each_sensor() -> None:
     st.floats(-25, 25, allow_subnormal=False),
     st.integers(min_value=0, max_value=100),
 )
-def test_rotor_words_keep_what_is_put_in(turns: float, rotor_hz: float, table: int) -> None:
+def test_rotor_words_are_read_back(revolutions: float, rotor_hz: float, table: int) -> None:
     angle, speed, number = read_rotor_words(
-        rotor_words(np.array([turns]), np.array([rotor_hz]), np.array([table]))
+        rotor_words(np.array([revolutions]), np.array([rotor_hz]), np.array([table]))
     )
     assert number.tolist() == [table]
-    away = (angle[0] / (2 * math.pi) - turns + 0.5) % 1 - 0.5
+    away = (angle[0] / (2 * math.pi) - revolutions + 0.5) % 1 - 0.5
     assert abs(away) < 1e-9
-    # Half a step of the word is 1.8e-15 turns a nanosecond.
+    # Half a step of the word is 1.8e-15 revolutions per nanosecond.
     assert speed[0] == pytest.approx(2 * math.pi * rotor_hz * 1e-9, abs=2e-14)
 
 

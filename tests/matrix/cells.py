@@ -1,7 +1,7 @@
 """Expected result of each fault: a table of declarations, by docs/faults.md.
 
 A declaration names the fault as a user writes it ({v}: the victim), what it leaves of the packets
-before the batching sees them, and which counts must stand in the report. `touched` is the number of
+before the batching sees them, and which counts the report must contain. `touched` is the number of
 packets that the report says the fault befell.
 """
 
@@ -111,7 +111,7 @@ def drifting(ppm: int) -> Change:
         def gaining(sent: Sent) -> Sent:
             gained_ns, rest = np.divmod((sent.host_ns - begin_ns) * ppm, 1_000_000)
             if rest.any():
-                raise ValueError("wanted gains of whole ns")
+                raise ValueError("expected gains of whole ns")
             return replace(sent, stamp_ns=sent.stamp_ns + gained_ns[:, None])
 
         return _victim(session, gaining)

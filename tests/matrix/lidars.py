@@ -24,7 +24,7 @@ NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # One reading in so many has a return.
 SPARSE = 16
-ARRIVAL_STEP_NS = 10_000
+RECEIVE_STEP_NS = 10_000
 
 OUSTER = OusterSpec(beams=16, columns_per_frame=512, serial=111)
 OUSTER_STEP_NS = 100 * NS_PER_MS // OUSTER.columns_per_frame
@@ -92,8 +92,8 @@ def _sent(
     """A packet is received 0.3 ms after its last column."""
     shape = len(payloads), -1
     stamps = stamp_ns.reshape(shape)
-    arrival = stamps[:, -1] + 300_000 + spell.ahead_ns
-    host_ns = -(-arrival // ARRIVAL_STEP_NS) * ARRIVAL_STEP_NS
+    receive_ns = stamps[:, -1] + 300_000 + spell.ahead_ns
+    host_ns = -(-receive_ns // RECEIVE_STEP_NS) * RECEIVE_STEP_NS
     points = np.count_nonzero(ranges.reshape(len(stamp_ns), -1), axis=1).reshape(shape)
     return Sent(vendor, tuple(payloads), host_ns, stamps, points)
 
@@ -163,8 +163,8 @@ def robosense_helios16(spell: Spell) -> Sent:
 class Vendor:
     """A lidar of the matrix.
 
-    begin_ns: its first turn after the others'; wrap: its own count of packets at the begin of a
-    spell of 0.25 s in which it wraps, 0: it has none.
+    begin_ns: begin of its first revolution after that of the others; wrap: its own count of packets
+    at the begin of a spell of 0.25 s in which it wraps, 0: it has none.
     """
 
     send: Callable[[Spell], Sent]
@@ -178,17 +178,38 @@ class Vendor:
 
 VENDORS: Mapping[str, Vendor] = {
     "ouster": Vendor(
-        *(ouster, "10.0.0.1", 7502, "/front/ouster/lidar_packets", "front.json"),
-        *(0, 2**16 - 1),
+        send=ouster,
+        ip="10.0.0.1",
+        port=7502,
+        topic="/front/ouster/lidar_packets",
+        metadata="front.json",
+        begin_ns=0,
+        wrap=2**16 - 1,
     ),
-    "velodyne": Vendor(velodyne_vlp16, "10.0.0.2", 2368, "/velodyne_packets", "", 3_100_000),
+    "velodyne": Vendor(
+        send=velodyne_vlp16,
+        ip="10.0.0.2",
+        port=2368,
+        topic="/velodyne_packets",
+        metadata="",
+        begin_ns=3_100_000,
+    ),
     "hesai": Vendor(
-        *(hesai_xt16, "10.0.0.3", 2368, "/pandar_packets", "unit.csv"),
-        *(5_700_000, 2**32 - 100),
+        send=hesai_xt16,
+        ip="10.0.0.3",
+        port=2368,
+        topic="/pandar_packets",
+        metadata="unit.csv",
+        begin_ns=5_700_000,
+        wrap=2**32 - 100,
     ),
     "robosense": Vendor(
-        *(robosense_helios16, "10.0.0.4", 6699, "/rslidar_packets", "angles.csv"),
-        7_300_000,
+        send=robosense_helios16,
+        ip="10.0.0.4",
+        port=6699,
+        topic="/rslidar_packets",
+        metadata="angles.csv",
+        begin_ns=7_300_000,
     ),
 }
 

@@ -66,7 +66,7 @@ class Cell:
 
     @property
     def victim(self) -> str:
-        """Whom the fault befalls."""
+        """Sensors that the fault affects."""
         return self.session[-1].vendor
 
     @property
@@ -91,9 +91,7 @@ class Cell:
         target = self.folder / output
         fault = self.kind.fault.format(v=self.victim)
         faults = ["--fault", fault] if fault and faulty else []
-        return command(
-            *("convert", recording, "-o", target, "--rig", rig, "--quiet"), *faults, *words
-        )
+        return command("convert", recording, "-o", target, "--rig", rig, "--quiet", *faults, *words)
 
 
 # -- checks of every output -----------------------------------------------------------------------
@@ -132,23 +130,23 @@ def check_proof(folder: Path) -> Report:
 
 def check_law(folder: Path, session: Session, wait_ns: int, report: Report) -> None:
     """Exactly these columns in these windows, and everything else counted by its reason."""
-    wanted = law(session, wait_ns)
+    expected = law(session, wait_ns)
     files = scan_files(folder)
-    assert [int(path.stem) for path in files] == list(wanted.windows)
-    for path, window in zip(files, wanted.windows.values(), strict=True):
+    assert [int(path.stem) for path in files] == list(expected.windows)
+    for path, window in zip(files, expected.windows.values(), strict=True):
         scan = load(path)
         assert int(scan["start_ns"]) == window.start_ns
         assert bool(scan["complete"]) == window.complete, path.name
         assert np.array_equal(scan["column_stamp_ns"], window.stamp_ns)
         assert np.array_equal(scan["column_lidar_id"], window.sensor)
         assert len(scan["xyz"]) == window.points
-    assert int(report["grid"]["t_init_ns"]) == wanted.t_init_ns
-    assert [one["columns"]["dropped"] for one in report["sensors"]] == list(wanted.dropped)
+    assert int(report["grid"]["t_init_ns"]) == expected.t_init_ns
+    assert [one["columns"]["dropped"] for one in report["sensors"]] == list(expected.dropped)
     scans = report["scans"]
     assert (scans["written"], scans["incomplete"], scans["empty"]) == (
-        len(wanted.windows),
-        wanted.incomplete,
-        wanted.empty,
+        len(expected.windows),
+        expected.incomplete,
+        expected.empty,
     )
 
 
@@ -170,7 +168,7 @@ def check_counts(cell: Cell, report: Report) -> None:
             assert low <= found.get(name, 0) <= high, name
 
 
-# -- what a run leaves, and what others leave -----------------------------------------------------
+# -- equal results of runs ------------------------------------------------------------------------
 
 
 def prints(folder: Path) -> Print:
@@ -199,8 +197,8 @@ def faultless(name: str, size: int) -> Print:
     with tempfile.TemporaryDirectory() as folder:
         cell = Cell(name, size, "pcap", Path(folder))
         cell.prepare(cell.session)
-        told = cell.convert(faulty=False)
-        assert (told.code, told.err) == (0, "")
+        done = cell.convert(faulty=False)
+        assert (done.code, done.err) == (0, "")
         return scans_of(cell.folder / "out")
 
 
@@ -235,9 +233,9 @@ def check_merged(cell: Cell) -> None:
     """One output of all sensors."""
     kind = cell.kind
     out = cell.folder / "out"
-    told = cell.convert(*kind.words)
-    assert told.code == 0, told.err
-    for line in told.err.splitlines():
+    done = cell.convert(*kind.words)
+    assert done.code == 0, done.err
+    for line in done.err.splitlines():
         assert line.startswith(WARNING)
         assert line.removeprefix(WARNING).split(":")[0] in kind.warnings, line
     report = check_proof(out)
@@ -253,11 +251,12 @@ def check_merged(cell: Cell) -> None:
 
 def check_subset(cell: Cell, report: Report) -> None:
     """Packets are missing or damaged, the others are where they belong."""
-    wanted, (fault,) = law(cell.session), report["faults"]
+    expected = law(cell.session)
+    (fault,) = report["faults"]
     files = scan_files(cell.folder / "out")
-    assert [int(path.stem) for path in files] == list(wanted.windows)
+    assert [int(path.stem) for path in files] == list(expected.windows)
     astray = 0
-    for path, window in zip(files, wanted.windows.values(), strict=True):
+    for path, window in zip(files, expected.windows.values(), strict=True):
         scan = load(path)
         last = cell.size - 1
         assert bool(scan["complete"]) == window.complete
@@ -272,12 +271,12 @@ def check_subset(cell: Cell, report: Report) -> None:
 
 def check_refused(cell: Cell, words: Sequence[str], *, faulty: bool = True) -> None:
     """One line on stderr, and nothing written."""
-    told = cell.convert(faulty=faulty)
-    assert told.code == 1
-    assert told.err.startswith("mlbatch: error: ")
-    assert told.err.count("\n") == 1
+    done = cell.convert(faulty=faulty)
+    assert done.code == 1
+    assert done.err.startswith("mlbatch: error: ")
+    assert done.err.count("\n") == 1
     for word in words:
-        assert word in told.err
+        assert word in done.err
 
 
 def check_remedied(cell: Cell, send: Callable[[str], Sent], clock: str) -> None:
@@ -287,8 +286,8 @@ def check_remedied(cell: Cell, send: Callable[[str], Sent], clock: str) -> None:
     if cell.size > 1:
         check_refused(cell, cell.kind.refused_together, faulty=False)
     cell.prepare(session, clock)
-    told = cell.convert(faulty=False, output="remedied")
-    assert (told.code, told.err) == (0, "")
+    done = cell.convert(faulty=False, output="remedied")
+    assert (done.code, done.err) == (0, "")
     check_proof(cell.folder / "remedied")
     assert scans_of(cell.folder / "remedied") == faultless(cell.name, cell.size)
 
@@ -299,8 +298,8 @@ def check_split(cell: Cell) -> None:
     assert kind.pieces is not None
     check_refused(cell, kind.error)
     assert not outputs(cell.folder)
-    told = cell.convert("--on-jump", "split")
-    assert told.code == 0, told.err
+    done = cell.convert("--on-jump", "split")
+    assert done.code == 0, done.err
     pieces = kind.pieces(cell.session, cell.begin_ns)
     folders = outputs(cell.folder)
     assert [path.name for path in folders] == [f"out.seg{n + 1}" for n in range(len(pieces))]

@@ -1,4 +1,4 @@
-"""Mistakes in rig files, each with its exact one-line error."""
+"""The exact one-line error of each mistake in a rig file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ exclude_boxes_m: [[-3, -2, -1, 1, 2, 4]]
 
 
 def _answer(file: Path) -> str:
-    """Return the error of the file, empty if it is valid."""
+    """The error of the file; empty if it has none."""
     try:
         read_rig(file)
     except RigError as err:
@@ -88,7 +88,7 @@ MISTAKES: list[tuple[str, str]] = [
      "2: expected one document, found a second one; remove what follows `---`"),
     (one("? [a]\n    : b"),
      f"3: {S}: expected a word as key, found brackets; put the brackets after the colon"),
-    # What YAML can do and a rig must not.
+    # Features of YAML that rigs refuse.
     ("sensors: &all\n- name: a\n",
      "1: sensors: expected plain values, found an anchor or alias; write the value out"),
     (one("decode: {a: *b}"),
@@ -227,12 +227,12 @@ MISTAKES: list[tuple[str, str]] = [
 
 
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
-def test_mistakes_have_exact_errors(tmp_path: Path, text: str, message: str) -> None:
+def test_errors_of_mistakes(tmp_path: Path, text: str, message: str) -> None:
     expected = f"{tmp_path / 'rig.yaml'}:{message}".replace("FOLDER", str(tmp_path))
     assert _fault(tmp_path, text) == expected
 
 
-def test_unreadable_files(tmp_path: Path) -> None:
+def test_errors_of_files_without_text(tmp_path: Path) -> None:
     file = tmp_path / "rig.yaml"
     with pytest.raises(RigError) as caught:
         read_rig(file)
@@ -265,7 +265,7 @@ def test_deep_nesting_ends_in_an_error(tmp_path: Path, text: str) -> None:
 
 
 @given(st.text(max_size=60), st.integers(min_value=0, max_value=len(VALID)))
-def test_any_text_is_read_or_gives_one_line(
+def test_any_text_is_read_or_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, text: str, position: int
 ) -> None:
     file = tmp_path_factory.getbasetemp() / "noise.yaml"

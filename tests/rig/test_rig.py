@@ -1,4 +1,4 @@
-"""Rig files: meaning of every key, and that a written rig reads back equal."""
+"""Rig files: meaning of their keys; written files are read back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ body_frame: base_link
 rate_hz: 29.97
 sensors:
   - name: left
-    model: auto                  # found out from the packets
+    model: auto                  # found from the packets
     stream: {source_ip: 10.5.5.87, port: 7502}
     metadata: calibration/left.json
     extrinsics: {translation_m: [0.1, 0.9, 2.8], rotation_rpy_deg: [0, 0, 90]}
@@ -80,7 +80,7 @@ def test_everything_is_read(full: Rig, tmp_path: Path) -> None:
     assert (left.clock, left.offset_ns) == ("host", -1_000_000_001)
     assert (right.clock, right.offset_ns) == (None, 37_000_000_000)
     assert (left.min_range_m, left.max_range_m, left.optional) == (0.5, 120.0, True)
-    # `on` is a word here, whatever other readers of YAML make of it.
+    # `on` is a word here, unlike in YAML 1.1.
     assert left.decode == {"firing_azimuth": "on", "crc": "check"}
     assert top.extrinsics == "velodyne_top"
     expected = [[0, -1, 0, 0.1], [1, 0, 0, 0.9], [0, 0, 1, 2.8], [0, 0, 0, 1]]
@@ -91,13 +91,16 @@ def test_everything_is_read(full: Rig, tmp_path: Path) -> None:
     np.testing.assert_array_equal(rear.extrinsics, expected)
 
 
-def test_what_is_left_out_is_left_to_the_recording(tmp_path: Path) -> None:
+def test_missing_keys_are_taken_from_the_recording(tmp_path: Path) -> None:
     rig = _read(tmp_path, "sensors:\n- name: a\n")
     (sensor,) = rig.sensors
     assert (rig.body_frame, rig.rate, rig.exclude_boxes_m.shape) == ("base_link", None, (0, 6))
     assert (sensor.model, sensor.stream, sensor.metadata, sensor.extrinsics) == (None,) * 4
     assert (sensor.clock, sensor.offset_ns, sensor.min_range_m, sensor.max_range_m) == (
-        *(None, 0, None, None),
+        None,
+        0,
+        None,
+        None,
     )
     assert (sensor.optional, sensor.decode) == (False, {})
 
@@ -193,7 +196,7 @@ RIGS = st.builds(
 
 
 def _facts(rig: Rig) -> list[object]:
-    """All that a rig says, comparable to the last bit."""
+    """All fields of a rig, comparable to the last bit."""
     facts: list[object] = [rig.body_frame, rig.rate, rig.exclude_boxes_m.tobytes()]
     for s in rig.sensors:
         pose = s.extrinsics.tobytes() if isinstance(s.extrinsics, np.ndarray) else s.extrinsics
@@ -203,7 +206,7 @@ def _facts(rig: Rig) -> list[object]:
 
 
 @given(RIGS, st.text(max_size=30))
-def test_what_is_written_is_read_again(
+def test_written_rigs_are_read_back(
     tmp_path_factory: pytest.TempPathFactory, rig: Rig, note: str
 ) -> None:
     folder = tmp_path_factory.getbasetemp()

@@ -1,4 +1,4 @@
-"""A small kernel to test with, and where such tests are skipped."""
+"""A small kernel for tests, and the marker that skips such tests without numba."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ needs_numba = pytest.mark.skipif(
 
 
 def total(values: list[int], times: int) -> int:
-    """What the kernel of SUMS makes of numbers."""
+    """Result of the kernel of SUMS for some numbers."""
     numbers = np.array(values, np.int64)
     frame = np.array([numbers.ctypes.data, len(numbers)], np.int64)
     return native.load(SUMS, times)(frame)

@@ -16,7 +16,7 @@ def _sum(values: Pointer, count: int) -> int:
 
 
 def build(times: int) -> Callable[[Pointer], int]:
-    """times: what the sum is multiplied by."""
+    """times: factor of the sum."""
 
     def kernel(frame: Pointer) -> int:
         kept = i8_scratch(4)

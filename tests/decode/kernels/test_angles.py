@@ -1,4 +1,4 @@
-"""Angles of rotor words by the kernel: those of numpy to the last bit."""
+"""Angles of rotor words by the kernel equal those of numpy to the last bit."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from tests.builders.engines import few_kernels, needs_numba
 
 pytestmark = needs_numba
 
-TURN = 1 << 32
-HUNDREDTHS = np.rint(np.arange(36_000) * (TURN / 36_000)).astype(np.int64)
-# Where cosine or sine is next to zero, and where the quarters of a turn meet.
-NEAR_AXES = np.concatenate([np.arange(-3_000, 3_000) + eighth * (TURN // 8) for eighth in range(8)])
+REVOLUTION = 1 << 32
+HUNDREDTHS = np.rint(np.arange(36_000) * (REVOLUTION / 36_000)).astype(np.int64)
+# Where cosine or sine is next to zero, and where the quarters of a revolution meet.
+NEAR_AXES = np.concatenate(
+    [np.arange(-3_000, 3_000) + eighth * (REVOLUTION // 8) for eighth in range(8)]
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -34,13 +36,13 @@ def random_words() -> I64Array:
 
 
 @pytest.mark.parametrize("words", [random_words(), HUNDREDTHS, NEAR_AXES, HUNDREDTHS[:0]])
-def test_angles_are_those_of_numpy(words: I64Array) -> None:
+def test_angles_equal_those_of_numpy(words: I64Array) -> None:
     for one, other in zip(rotor_angles(words), compiled_angles(words), strict=True):
         assert one.dtype == other.dtype
         assert one.tobytes() == other.tobytes()
 
 
-def test_numpy_is_asked_where_the_last_bit_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numpy_computes_angles_whose_last_bit_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[I64Array] = []
 
     def noted(words: I64Array) -> tuple[object, object]:

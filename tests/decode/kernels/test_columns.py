@@ -1,4 +1,4 @@
-"""Decoding kernels on pixels of any bytes: the same as numpy, and nothing else is written to."""
+"""Decoding kernels on pixels of any bytes: equal to numpy, and no writes beyond the arrays."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from tests.golden import test_every_model as models
 
 pytestmark = needs_numba
 
-START_NS, END_NS = 1_800_000_000_000_000_000, 1_800_000_000_100_000_000
+START_NS = 1_800_000_000_000_000_000
+END_NS = 1_800_000_000_100_000_000
 # Tilted, level, and where the vehicle is: sensors that are decoded together differ in these.
 POSES = (
     from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0)),
@@ -43,7 +44,8 @@ POSES = (
     np.eye(4),
 )
 NAMES = tuple(name for name in PROFILES if name != "OFF")
-GUARD_ROWS, GUARD = 64, 0xA5
+GUARD_ROWS = 64
+GUARD = 0xA5
 # Of kinds that kernels decode, and of two that only numpy does.
 OTHERS = (
     (models.velodyne_sent, ("VLP-16", "dual")),
@@ -72,7 +74,7 @@ def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
-    """Lidars of other makers."""
+    """Lidars of other vendors."""
     found = []
     for make, words in OTHERS:
         job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
@@ -83,7 +85,7 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is drawn: everything else follows from the seed."""
+    """Drawn values; everything else follows from the seed."""
 
     seed: int
     columns: int
@@ -105,7 +107,7 @@ cases = st.builds(
 
 
 class Guarded(ScanBuffer):
-    """A buffer amid memory that nobody may touch."""
+    """A scan buffer between guard rows that nothing may write to."""
 
     def __init__(self, rows: int, slots: int | None) -> None:
         super().__init__(rows, slots)
@@ -114,7 +116,8 @@ class Guarded(ScanBuffer):
             array = getattr(self, name)
             row = array.itemsize * int(np.prod(array.shape[1:]))
             whole = np.full((len(array) + 2 * GUARD_ROWS) * row, GUARD, np.uint8)
-            begin, end = GUARD_ROWS * row, (GUARD_ROWS + len(array)) * row
+            begin = GUARD_ROWS * row
+            end = (GUARD_ROWS + len(array)) * row
             self._guards += [whole[:begin], whole[end:]]
             setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
 
@@ -133,7 +136,7 @@ def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArra
 
 
 def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array]:
-    """A ring that was gone around, and the places of columns that it still holds."""
+    """A ring that has wrapped, and the ring indexes of the columns that it contains."""
     ring = PacketRing(lidar.packet_size, lidar.records)
     places: I64Array = np.empty(0, np.int64)
     for _ in range(4):
@@ -158,7 +161,9 @@ def check(lidars: list[Lidar], case: Case) -> None:
     rng = np.random.default_rng(case.seed)
     rings = [filled(lidar, rng) for lidar in lidars]
     boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
-    infos, sources, base = [], [], 0
+    infos = []
+    sources = []
+    base = 0
     for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
         pose = POSES[(case.seed + number) % len(POSES)]
         low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
@@ -226,7 +231,8 @@ def test_nothing_is_written_beyond_the_arrays(
 
 
 def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    lidar, rng = ouster("RNG15_RFL8_NIR8", 16), np.random.default_rng(0)
+    lidar = ouster("RNG15_RFL8_NIR8", 16)
+    rng = np.random.default_rng(0)
     ring, places = filled(lidar, rng)
     before = weakref.ref(ring.pieces)
 
@@ -247,7 +253,8 @@ def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> No
     run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
     sources = [Source(lidar, ring, POSES[0], 0)]
     decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine="numba")
-    stamp_ns, nothing = np.full(len(places), START_NS), np.zeros(len(places), np.int64)
+    stamp_ns = np.full(len(places), START_NS)
+    nothing = np.zeros(len(places), np.int64)
     due = WindowColumns(stamp_ns, nothing, places, nothing)
     assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
 

@@ -1,4 +1,4 @@
-"""Kernels are compiled once, kept, and compiled again where what is kept is of no use."""
+"""Kernels are compiled once and cached, and compiled again if the cache entry is not usable."""
 
 from __future__ import annotations
 
