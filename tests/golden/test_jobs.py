@@ -184,7 +184,8 @@ def test_the_earliest_failed_scan_is_reported(
 
 SLOW = """
 import sys, time
-from mlbatch import cli, resume
+from mlbatch import cli
+from mlbatch.pipeline import resume
 from mlbatch.writers.formats import npz
 resume.INTERVAL_S = 0.0
 encode = npz.NpzEncoder.encode
@@ -197,7 +198,7 @@ cli.main()
 
 
 @pytest.mark.parametrize("jobs", JOBS)
-def test_an_interrupt_ends_the_run_and_it_goes_on(
+def test_an_interrupted_run_is_resumed(
     recordings: Path, jobs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = _place(recordings, f"interrupt {jobs} whole")
@@ -219,8 +220,8 @@ def test_an_interrupt_ends_the_run_and_it_goes_on(
         _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     assert said.endswith(
-        "mlbatch: error: interrupted; what was written stays under .partial, where --resume goes "
-        "on\n"
+        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
+        "--resume continues\n"
     )
     assert said.count("\n") == 1
     monkeypatch.chdir(place)

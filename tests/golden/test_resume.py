@@ -21,7 +21,8 @@ SEED = 3
 LIMITED = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
-from mlbatch import cli, resume
+from mlbatch import cli
+from mlbatch.pipeline import resume
 resume.INTERVAL_S = 0.0
 cli.main()
 """
