@@ -121,7 +121,7 @@ def convert(
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
-        typer.Option(help="Decoder: auto, numpy, or numba (needs mlbatch[fast])."),
+        typer.Option(help="Decoder: auto, numpy, or native (compiled)."),
     ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
@@ -140,8 +140,8 @@ def convert(
     """Turn raw lidar packets into merged scans at an exact rate."""
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
-    from mlbatch.decode.kernels import ENGINES
     from mlbatch.discovery.discover import SensorSelection
+    from mlbatch.native import ALIASES, ENGINES
     from mlbatch.pipeline.job import Job
 
     options.choices(
@@ -149,7 +149,7 @@ def convert(
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
-        engine=(engine, ENGINES),
+        engine=(engine, (*ENGINES, *ALIASES)),
     )
     options.output(output, dry_run=dry_run)
     options.slices(slices)

@@ -1,0 +1,535 @@
+/* Columns of a window to points of a scan: every pixel is read once and written to its final row.
+
+   The same float32 operations as `decode/projector.py` and `lidar/geometry.py`, column by column.
+   A column is decoded to planes, one value a beam, which fit into the first cache; an element is
+   `return * width + beam`. Beams beyond those of the lidar have no return. */
+#include <string.h>
+
+#include "native.h"
+
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
+#define MOST_ELEMENTS (MOST_BEAMS * MOST_RETURNS)
+#define TYPE_BIT 48
+#define LIDAR_ID_BIT 56
+/* Rotor words: `lidar/geometry.py`. */
+#define SPEED_BIT 32
+#define SPEED_SIGN (INT64_C(1) << 23)
+#define TABLE_BIT 56
+
+/* Planes of one column. */
+typedef struct {
+    _Alignas(64) float range_m[MOST_ELEMENTS];
+    _Alignas(64) float level[MOST_ELEMENTS];
+    _Alignas(64) float x[MOST_ELEMENTS];
+    _Alignas(64) float y[MOST_ELEMENTS];
+    _Alignas(64) float z[MOST_ELEMENTS];
+    _Alignas(64) int64_t label[MOST_ELEMENTS];
+    _Alignas(64) uint32_t words[MOST_WORDS][MOST_BEAMS];
+    _Alignas(64) uint16_t reflectivity[MOST_ELEMENTS];
+    _Alignas(64) uint8_t keep[MOST_ELEMENTS];
+} Planes;
+
+/* -- pixels ------------------------------------------------------------------------------------ */
+
+/* Words of pixels that are `step` bytes apart. Words of short pixels reach up to 3 bytes beyond
+   them; rings have that much room behind their last column. */
+static inline void gather_every(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
+{
+    for (int64_t pixel = 0; pixel < count; pixel++)
+        memcpy(out + pixel, from + pixel * step, 4);
+}
+
+static void gather(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
+{
+    /* With constant steps the compiler vectorises. */
+    switch (step) {
+    case 3: gather_every(from, 3, count, out); break;
+    case 4: gather_every(from, 4, count, out); break;
+    case 8: gather_every(from, 8, count, out); break;
+    case 12: gather_every(from, 12, count, out); break;
+    case 16: gather_every(from, 16, count, out); break;
+    default: gather_every(from, step, count, out);
+    }
+}
+
+static inline uint32_t swapped(uint32_t value)
+{
+    return (value & 0xFF) << 8 | (value >> 8 & 0xFF);
+}
+
+/* Range, level and reflectivity of one return of a column. */
+static void read_return(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+{
+    const int64_t width = group->width;
+    const int64_t *run = group->runs + which * group->run_count * 3;
+    for (int64_t number = 0; number < group->run_count; number++, run += 3)
+        for (int64_t word = 0; word < group->word_count; word++)
+            gather(record + run[0] + group->word_bytes[word], group->step, run[2],
+                   planes->words[word] + run[1]);
+
+    const Field *fields = group->fields + which * FIELDS;
+    const Field distance = fields[DISTANCE], level = fields[INTENSITY];
+    const float factor = group->scale[0], divisor = group->scale[1];
+    const int32_t silent = (int32_t)group->silent;
+    uint32_t *restrict words = planes->words[distance.word];
+    const uint32_t mask = (uint32_t)distance.mask;
+    const int shift = (int)distance.shift;
+    float *restrict range_m = planes->range_m + which * width;
+    if (distance.is_big) {
+        for (int64_t beam = 0; beam < width; beam++) {
+            const int32_t value = (int32_t)(swapped(words[beam] >> shift) & mask);
+            range_m[beam] = value > silent ? (float)value * factor / divisor : 0.0f;
+        }
+    } else {
+        for (int64_t beam = 0; beam < width; beam++) {
+            const int32_t value = (int32_t)(words[beam] >> shift & mask);
+            range_m[beam] = value > silent ? (float)value * factor / divisor : 0.0f;
+        }
+    }
+    for (int64_t number = 0; number < group->dark_count; number++)
+        range_m[group->dark[number]] = 0.0f;
+
+    words = planes->words[level.word];
+    const uint32_t level_mask = (uint32_t)level.mask;
+    const int level_shift = (int)level.shift;
+    float *restrict levels = planes->level + which * width;
+    for (int64_t beam = 0; beam < width; beam++)
+        levels[beam] = (float)(int32_t)(words[beam] >> level_shift & level_mask);
+
+    if (group->has_reflectivity) {
+        const Field other = fields[REFLECTIVITY];
+        words = planes->words[other.word];
+        uint16_t *restrict out = planes->reflectivity + which * width;
+        for (int64_t beam = 0; beam < width; beam++)
+            out[beam] = (uint16_t)(words[beam] >> (int)other.shift & (uint32_t)other.mask);
+    }
+}
+
+/* -- points ------------------------------------------------------------------------------------ */
+
+/* Tabled: (r + reach) * direction + origin, of a row of the table. */
+static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
+{
+    const int64_t width = group->width;
+    int64_t row = encoder + group->first_row[member];
+    row = row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
+    const float *restrict direction = group->direction + row * 3 * width;
+    const float *origin = group->origin + row * 3;
+    const float *restrict reach = group->reach + member * width;
+    const float ox = origin[0], oy = origin[1], oz = origin[2];
+    for (int64_t which = 0; which < group->returns; which++) {
+        const float *restrict range_m = planes->range_m + which * width;
+        float *restrict x = planes->x + which * width;
+        float *restrict y = planes->y + which * width;
+        float *restrict z = planes->z + which * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            const float reached_m = range_m[beam] + reach[beam];
+            x[beam] = reached_m * direction[beam] + ox;
+            y[beam] = reached_m * direction[width + beam] + oy;
+            z[beam] = reached_m * direction[2 * width + beam] + oz;
+        }
+    }
+}
+
+/* cos * V1 + sin * V2 + V3 of one axis; as in numpy, vectors that are zero are left out. */
+static void combine(const float *restrict vectors, int64_t width, int64_t used,
+                    const float *restrict cosine, const float *restrict sine, float *restrict out)
+{
+    const float *restrict first = vectors;
+    const float *restrict second = vectors + 3 * width;
+    const float *restrict third = vectors + 6 * width;
+    const int rotates = used & 1, is_constant = used >> 3 & 1;
+    if (!rotates) {
+        memcpy(out, third, (size_t)width * sizeof *out);
+    } else if (!is_constant) {
+        for (int64_t beam = 0; beam < width; beam++)
+            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam];
+    } else {
+        for (int64_t beam = 0; beam < width; beam++)
+            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam] + third[beam];
+    }
+}
+
+/* Turning: each beam fires at its own angle of the rotor. */
+static void project_turning(const Group *group, int64_t member, int64_t encoder, int64_t table,
+                            int64_t column, Planes *planes)
+{
+    _Alignas(64) float cosine[MOST_BEAMS], sine[MOST_BEAMS];
+    _Alignas(64) float direction[3][MOST_BEAMS], origin[3][MOST_BEAMS];
+    const int64_t width = group->width;
+    const int64_t field = encoder >> SPEED_BIT & (2 * SPEED_SIGN - 1);
+    /* Radians in a ns; the constant is 2 pi / 2**48 as Python computes it. */
+    const float speed =
+        (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
+    for (int64_t beam = 0; beam < width; beam++) {
+        cosine[beam] = group->cosine[column];
+        sine[beam] = group->sine[column];
+    }
+    if (group->firing_ns && speed != 0.0f) {
+        const float *restrict firing_ns = group->firing_ns + table * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            const float before = cosine[beam], across = sine[beam];
+            const float turned = speed * firing_ns[beam];
+            const float half = turned * 0.5f;
+            cosine[beam] = before - (half * before + across) * turned;
+            sine[beam] = across + (before - half * across) * turned;
+        }
+    }
+    const float *directions = group->direction + member * 9 * width;
+    const float *origins = group->origin + member * 9 * width;
+    const int64_t used = group->used[member];
+    for (int64_t axis = 0; axis < 3; axis++) {
+        combine(directions + axis * width, width, used >> axis, cosine, sine, direction[axis]);
+        combine(origins + axis * width, width, used >> (6 + axis), cosine, sine, origin[axis]);
+    }
+    for (int64_t which = 0; which < group->returns; which++) {
+        const float *restrict range_m = planes->range_m + which * width;
+        if (group->reach) {
+            const float *restrict reach = group->reach + member * width;
+            for (int64_t beam = 0; beam < width; beam++)
+                cosine[beam] = range_m[beam] + reach[beam];
+            range_m = cosine;
+        }
+        float *restrict x = planes->x + which * width;
+        float *restrict y = planes->y + which * width;
+        float *restrict z = planes->z + which * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            x[beam] = range_m[beam] * direction[0][beam] + origin[0][beam];
+            y[beam] = range_m[beam] * direction[1][beam] + origin[1][beam];
+            z[beam] = range_m[beam] * direction[2][beam] + origin[2][beam];
+        }
+    }
+}
+
+/* -- which slots become points ----------------------------------------------------------------- */
+
+static int64_t count_kept(const uint8_t *keep, int64_t elements)
+{
+    int64_t total = 0;
+    for (int64_t element = 0; element < elements; element++)
+        total += keep[element];
+    return total;
+}
+
+/* Mark the elements to keep; count those left after each step. */
+static void mark(const Scan *scan, const Group *group, int64_t member, Planes *planes)
+{
+    const int64_t width = group->width, elements = group->returns * width;
+    const float *restrict range_m = planes->range_m;
+    uint8_t *restrict keep = planes->keep;
+    int64_t *counts = group->counts + member * COUNTS;
+    for (int64_t element = 0; element < elements; element++)
+        keep[element] = range_m[element] > 0.0f;
+    int64_t left = count_kept(keep, elements);
+    counts[FOUND] += left;
+    if (group->drops_repeated) {
+        for (int64_t which = 1; which < group->returns; which++)
+            for (int64_t earlier = 0; earlier < which; earlier++)
+                for (int64_t beam = 0; beam < width; beam++)
+                    keep[which * width + beam] &=
+                        range_m[which * width + beam] != range_m[earlier * width + beam];
+        left = count_kept(keep, elements);
+    }
+    counts[DISTINCT] += left;
+    if (group->limits_m) {
+        const float low = group->limits_m[2 * member], high = group->limits_m[2 * member + 1];
+        for (int64_t element = 0; element < elements; element++)
+            keep[element] &= (range_m[element] >= low) & (range_m[element] <= high);
+        left = count_kept(keep, elements);
+    }
+    counts[IN_RANGE] += left;
+    for (int64_t number = 0; number < scan->box_count; number++) {
+        const float *box = scan->boxes_m + 6 * number;
+        const float *restrict x = planes->x;
+        const float *restrict y = planes->y;
+        const float *restrict z = planes->z;
+        for (int64_t element = 0; element < elements; element++) {
+            const int inside = (x[element] >= box[0]) & (x[element] <= box[3])
+                & (y[element] >= box[1]) & (y[element] <= box[4])
+                & (z[element] >= box[2]) & (z[element] <= box[5]);
+            keep[element] &= (uint8_t)!inside;
+        }
+    }
+    if (scan->box_count)
+        left = count_kept(keep, elements);
+    counts[OUTSIDE_BOXES] += left;
+}
+
+/* Labels of all elements; types of dual returns: docs/sources/outputs.md section 3. */
+static void label(const Group *group, int64_t row, int64_t offset_ns, Planes *planes)
+{
+    enum { FIRST_STRONG = 3, SINGLE = 7, SUM_OF_TYPES = 9 };
+    const int64_t width = group->width, elements = group->returns * width;
+    const int64_t *restrict words = group->labels + row * elements;
+    int64_t *restrict labels = planes->label;
+    for (int64_t element = 0; element < elements; element++)
+        labels[element] = words[element] + offset_ns;
+    if (group->typed == NOT_TYPED)
+        return;
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float first_m = planes->range_m[beam], second_m = planes->range_m[width + beam];
+        int64_t kind = FIRST_STRONG + (first_m > second_m);
+        if (group->typed == TYPED_BY_LEVEL)
+            kind += 2 * (planes->level[beam] < planes->level[width + beam]);
+        int is_single = (first_m == 0.0f) | (second_m == 0.0f);
+        if (group->sends_twice)
+            is_single |= first_m == second_m;
+        const int64_t single = is_single ? SINGLE : 0;
+        labels[beam] |= (kind | single) << TYPE_BIT;
+        labels[width + beam] |= ((SUM_OF_TYPES - kind) | single) << TYPE_BIT;
+    }
+}
+
+/* -- rows -------------------------------------------------------------------------------------- */
+
+static inline void put_point(float *point, const Planes *planes, int64_t element)
+{
+    point[0] = planes->x[element];
+    point[1] = planes->y[element];
+    point[2] = planes->z[element];
+    point[3] = planes->level[element];
+}
+
+/* The usual case: one return, slots in wire order, nothing to filter; labels are made on the way.
+   Elements that are not kept are overwritten by the next point. Returns the next row. */
+static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *words,
+                          int64_t offset_ns, int64_t row, const Planes *planes)
+{
+    int64_t beam = 0;
+#if defined(__SSE2__)
+    const __m128i offsets = _mm_set1_epi64x(offset_ns);
+    for (; beam + 4 <= group->slots; beam += 4) {
+        const int kept = _mm_movemask_ps(
+            _mm_cmpgt_ps(_mm_load_ps(planes->range_m + beam), _mm_setzero_ps()));
+        if (!kept)
+            continue;
+        __m128 p0 = _mm_load_ps(planes->x + beam), p1 = _mm_load_ps(planes->y + beam);
+        __m128 p2 = _mm_load_ps(planes->z + beam), p3 = _mm_load_ps(planes->level + beam);
+        _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
+        const __m128i low =
+            _mm_add_epi64(_mm_loadu_si128((const __m128i *)(words + beam)), offsets);
+        const __m128i high =
+            _mm_add_epi64(_mm_loadu_si128((const __m128i *)(words + beam + 2)), offsets);
+        float *point = scan->point + 4 * row;
+        int64_t *labels = scan->label + row;
+        if (kept == 15) {
+            _mm_storeu_ps(point, p0);
+            _mm_storeu_ps(point + 4, p1);
+            _mm_storeu_ps(point + 8, p2);
+            _mm_storeu_ps(point + 12, p3);
+            _mm_storeu_si128((__m128i *)labels, low);
+            _mm_storeu_si128((__m128i *)(labels + 2), high);
+            row += 4;
+            continue;
+        }
+        _mm_storeu_ps(point, p0);
+        _mm_storel_epi64((__m128i *)labels, low);
+        int64_t next = kept & 1;
+        _mm_storeu_ps(point + 4 * next, p1);
+        _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(low, low));
+        next += kept >> 1 & 1;
+        _mm_storeu_ps(point + 4 * next, p2);
+        _mm_storel_epi64((__m128i *)(labels + next), high);
+        next += kept >> 2 & 1;
+        _mm_storeu_ps(point + 4 * next, p3);
+        _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(high, high));
+        row += next + (kept >> 3);
+    }
+#endif
+    for (; beam < group->slots; beam++) {
+        put_point(scan->point + 4 * row, planes, beam);
+        scan->label[row] = words[beam] + offset_ns;
+        row += planes->range_m[beam] > 0.0f;
+    }
+    return row;
+}
+
+/* Kept elements in order of output. Returns the next row. */
+static int64_t emit_ordered(const Scan *scan, const Group *group, const int64_t *order,
+                            int64_t first_row, const Planes *planes)
+{
+    int64_t row = first_row;
+    for (int64_t number = 0; number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        put_point(scan->point + 4 * row, planes, element);
+        scan->label[row] = planes->label[element];
+        row += planes->keep[element];
+    }
+    return row;
+}
+
+/* Ranges and reflectivities of the kept elements, in order of output. */
+static void emit_extras(const Scan *scan, const Group *group, const int64_t *order,
+                        int64_t first_row, const Planes *planes)
+{
+    int64_t row = first_row;
+    for (int64_t number = 0; scan->range_m && number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        scan->range_m[row] = planes->range_m[element];
+        row += planes->keep[element];
+    }
+    row = first_row;
+    for (int64_t number = 0; scan->reflectivity && number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        scan->reflectivity[row] = planes->reflectivity[element];
+        row += planes->keep[element];
+    }
+}
+
+/* A row of an organized scan: every kept element to its slot, the others empty. */
+static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
+                              const Planes *planes)
+{
+    const uint32_t nan_bits = 0x7FC00000;
+    float nan;
+    memcpy(&nan, &nan_bits, sizeof nan);
+    const int64_t row = number * scan->row_slots, width = group->width;
+    float *point = scan->point + 4 * row, *range_m = scan->range_m + row;
+    int64_t *labels = scan->label + row;
+    uint16_t *reflectivity = scan->reflectivity + row;
+    const int64_t lidar_id =
+        (int64_t)((uint64_t)planes->label[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+    for (int64_t slot = 0; slot < scan->row_slots; slot++) {
+        for (int64_t axis = 0; axis < 4; axis++)
+            point[4 * slot + axis] = nan;
+        labels[slot] = lidar_id;
+        range_m[slot] = nan;
+        reflectivity[slot] = 0;
+    }
+    int64_t count = 0;
+    for (int64_t which = 0; which < group->returns; which++)
+        for (int64_t element = which * width; element < which * width + group->beams; element++)
+            if (planes->keep[element]) {
+                const int64_t slot = group->slot[element];
+                put_point(point + 4 * slot, planes, element);
+                labels[slot] = planes->label[element];
+                range_m[slot] = planes->range_m[element];
+                reflectivity[slot] = planes->reflectivity[element];
+                count++;
+            }
+    return count;
+}
+
+/* -- columns ----------------------------------------------------------------------------------- */
+
+static const uint8_t *record_of(const Scan *scan, int64_t column)
+{
+    const int64_t sensor = scan->sensor[column];
+    const int64_t number = scan->group_of[sensor];
+    if (number < 0 || scan->groups[number].kind == COPIED)
+        return 0;
+    const Ring *ring = scan->groups[number].rings + scan->member_of[sensor];
+    const int64_t index = scan->ring_index[column];
+    const int64_t row = index / ring->per_row;
+    return ring->first + row % ring->rows * ring->row_bytes
+        + (index - row * ring->per_row) * ring->column_bytes;
+}
+
+/* Ask for a record that is read soon: neighbours in a scan are far apart in memory. */
+static void prefetch(const uint8_t *record, int64_t bytes)
+{
+#if defined(__SSE2__)
+    for (int64_t byte = 0; record && byte < bytes; byte += 64)
+        _mm_prefetch((const char *)(record + byte), _MM_HINT_T0);
+#else
+    (void)record;
+    (void)bytes;
+#endif
+}
+
+/* Copy the points that numpy decoded of a column. Return the next row. */
+static int64_t copy_column(const Scan *scan, const Group *group, int64_t column, int64_t row)
+{
+    const int64_t from = *group->cursor;
+    const size_t count = (size_t)group->points[column];
+    memcpy(scan->point + 4 * row, group->copied_point + 4 * from, 16 * count);
+    memcpy(scan->label + row, group->copied_label + from, 8 * count);
+    if (scan->range_m)
+        memcpy(scan->range_m + row, group->copied_range + from, 4 * count);
+    if (scan->reflectivity)
+        memcpy(scan->reflectivity + row, group->copied_reflectivity + from, 2 * count);
+    *group->cursor += group->points[column];
+    return row + group->points[column];
+}
+
+static int64_t decode_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                             const uint8_t *record, int64_t row, Planes *planes)
+{
+    const int64_t encoder = scan->encoder[column];
+    int64_t table = encoder >> TABLE_BIT;
+    table = table < 0 ? 0 : table >= group->tables ? group->tables - 1 : table;
+    const int64_t known = member * group->tables + table;
+    for (int64_t which = 0; which < group->returns; which++)
+        read_return(group, record, which, planes);
+    if (group->kind == TABLED)
+        project_tabled(group, member, encoder, planes);
+    else
+        project_turning(group, member, encoder, known, column, planes);
+    const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
+    int64_t *counts = group->counts + member * COUNTS;
+    counts[COLUMNS]++;
+    const int is_plain = !group->order && !group->limits_m && !scan->box_count && !scan->row_slots;
+    if (is_plain) {
+        const int64_t *words = group->labels + known * group->width;
+        const int64_t next = emit_plain(scan, group, words, offset_ns, row, planes);
+        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
+            counts[step] += next - row;
+        if (scan->range_m || scan->reflectivity) {
+            for (int64_t beam = 0; beam < group->width; beam++)
+                planes->keep[beam] = planes->range_m[beam] > 0.0f;
+            emit_extras(scan, group, 0, row, planes);
+        }
+        return next;
+    }
+    mark(scan, group, member, planes);
+    label(group, known, offset_ns, planes);
+    if (scan->row_slots)
+        return row + emit_organized(scan, group, scan->first_number + column, planes);
+    const int64_t *order = group->order ? group->order + table * group->order_step : 0;
+    emit_extras(scan, group, order, row, planes);
+    return emit_ordered(scan, group, order, row, planes);
+}
+
+/* Decode all columns of a scan, in their order; return the row after the last point (organized:
+   the number of points). Sensors of no group are skipped. */
+EXPORT int64_t mlbatch_decode(const Scan *scan)
+{
+    enum { AHEAD = 2 };
+    Planes planes;
+    memset(planes.words, 0, sizeof planes.words);
+    memset(planes.reflectivity, 0, sizeof planes.reflectivity);
+    int64_t row = scan->first_row, last_group = -1;
+    for (int64_t column = 0; column < scan->columns; column++) {
+        if (column + AHEAD < scan->columns) {
+            const int64_t next = scan->group_of[scan->sensor[column + AHEAD]];
+            if (next >= 0)
+                prefetch(record_of(scan, column + AHEAD),
+                         scan->groups[next].step * scan->groups[next].beams);
+        }
+        const int64_t sensor = scan->sensor[column];
+        const int64_t number = scan->group_of[sensor];
+        if (number < 0)
+            continue;
+        const Group *group = scan->groups + number;
+        const int64_t first = row;
+        if (group->kind == COPIED) {
+            row = copy_column(scan, group, column, row);
+        } else {
+            if (number != last_group && last_group >= 0) {
+                /* What another group left in beams that this one does not have. */
+                memset(planes.words, 0, sizeof planes.words);
+                memset(planes.reflectivity, 0, sizeof planes.reflectivity);
+            }
+            last_group = number;
+            row = decode_column(scan, group, scan->member_of[sensor], column,
+                                record_of(scan, column), row, &planes);
+        }
+        if (scan->column)
+            for (int64_t place = first; place < row; place++)
+                scan->column[place] = (uint32_t)(scan->first_number + column);
+    }
+    return row;
+}
