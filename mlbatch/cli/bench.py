@@ -26,7 +26,8 @@ def bench(
         list[str] | None, typer.Option(help="Measure this case only; repeatable. [default: all]")
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="all (that are installed), numpy, native, or auto: convert's choice.")
+        str,
+        typer.Option(help="all (installed), numpy, native, or auto: the choice of convert."),
     ] = "all",
     peer_python: Annotated[
         list[Path] | None,

@@ -141,7 +141,6 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.native import ALIASES, ENGINES
     from mlbatch.pipeline.job import Job
 
     options.choices(
@@ -149,8 +148,8 @@ def convert(
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
-        engine=(engine, (*ENGINES, *ALIASES)),
     )
+    engine = options.engine(engine)
     options.output(output, dry_run=dry_run)
     options.slices(slices)
     options.ranges_m(min_range, max_range)

@@ -202,7 +202,7 @@ class _DecodedGroup:
         pieces = [ring.pieces for ring in self._rings]
         # Arrays of columns (rows, columns of a row).
         rings = (Ring * len(pieces))(
-            *((one.ctypes.data, *one.shape, *one.strides) for one in pieces)
+            *(Ring(one.ctypes.data, *one.shape, *one.strides) for one in pieces)
         )
         self.struct.rings = ctypes.addressof(rings)
         self._counts[:] = 0
@@ -356,7 +356,9 @@ class NativeColumnStatistics(ColumnStatistics):
             *map(address, arrays),
             len(self._figures),
             SECTORS,
-            *map(address, (self._position_counts, self._entered, self._figures)),
+            address(self._position_counts),
+            address(self._entered),
+            address(self._figures),
         ):
             return super().measure(columns)
         return [
@@ -369,7 +371,7 @@ def native_angles(words: I64Array) -> tuple[F32Array, F32Array]:
     """Return the result of `rotor_angles` for rotor words (n,), equal to the last bit."""
     words = np.ascontiguousarray(words)
     cosine, sine = np.empty((2, len(words)), np.float32)
-    if library().mlbatch_angles(len(words), *map(address, (words, cosine, sine))):
+    if library().mlbatch_angles(len(words), address(words), address(cosine), address(sine)):
         unsure = cosine == _UNSURE
         cosine[unsure], sine[unsure] = rotor_angles(words[unsure])
     return cosine, sine

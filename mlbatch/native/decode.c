@@ -55,9 +55,47 @@ static void gather(const uint8_t *from, int64_t step, int64_t count, uint32_t *o
     }
 }
 
-static inline uint32_t swapped(uint32_t value)
+/* Swap the two bytes of a big-endian field; other bits of the words stay. */
+static void swap_bytes(uint32_t *words, const Field *field, int64_t width)
 {
-    return (value & 0xFF) << 8 | (value >> 8 & 0xFF);
+    const int shift = (int)field->shift;
+    const uint32_t others = ~(UINT32_C(0xFFFF) << shift);
+    for (int64_t beam = 0; beam < width; beam++) {
+        const uint32_t value = words[beam] >> shift;
+        const uint32_t swapped = (value & 0xFF) << 8 | (value >> 8 & 0xFF);
+        words[beam] = (words[beam] & others) | swapped << shift;
+    }
+}
+
+static void to_ranges(const uint32_t *restrict words, const Field *field, int32_t silent,
+                      const float *scale, int64_t width, float *restrict range_m)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    const float factor = scale[0], divisor = scale[1];
+    for (int64_t beam = 0; beam < width; beam++) {
+        const int32_t value = (int32_t)(words[beam] >> shift & mask);
+        /* A mask instead of a branch, which would not be vectorised; 0 gives exactly 0 m. */
+        range_m[beam] = (float)(value & -(int32_t)(value > silent)) * factor / divisor;
+    }
+}
+
+static void to_levels(const uint32_t *restrict words, const Field *field, int64_t width,
+                      float *restrict levels)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    for (int64_t beam = 0; beam < width; beam++)
+        levels[beam] = (float)(int32_t)(words[beam] >> shift & mask);
+}
+
+static void to_reflectivities(const uint32_t *restrict words, const Field *field, int64_t width,
+                              uint16_t *restrict reflectivity)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    for (int64_t beam = 0; beam < width; beam++)
+        reflectivity[beam] = (uint16_t)(words[beam] >> shift & mask);
 }
 
 /* Range, level and reflectivity of one return of a column. */
@@ -71,51 +109,34 @@ static void read_return(const Group *group, const uint8_t *record, int64_t which
                    planes->words[word] + run[1]);
 
     const Field *fields = group->fields + which * FIELDS;
-    const Field distance = fields[DISTANCE], level = fields[INTENSITY];
-    const float factor = group->scale[0], divisor = group->scale[1];
-    const int32_t silent = (int32_t)group->silent;
-    uint32_t *restrict words = planes->words[distance.word];
-    const uint32_t mask = (uint32_t)distance.mask;
-    const int shift = (int)distance.shift;
-    float *restrict range_m = planes->range_m + which * width;
-    if (distance.is_big) {
-        for (int64_t beam = 0; beam < width; beam++) {
-            const int32_t value = (int32_t)(swapped(words[beam] >> shift) & mask);
-            range_m[beam] = value > silent ? (float)value * factor / divisor : 0.0f;
-        }
-    } else {
-        for (int64_t beam = 0; beam < width; beam++) {
-            const int32_t value = (int32_t)(words[beam] >> shift & mask);
-            range_m[beam] = value > silent ? (float)value * factor / divisor : 0.0f;
-        }
-    }
+    float *range_m = planes->range_m + which * width;
+    uint32_t *words = planes->words[fields[DISTANCE].word];
+    if (fields[DISTANCE].is_big)
+        swap_bytes(words, fields + DISTANCE, width);
+    to_ranges(words, fields + DISTANCE, (int32_t)group->silent, group->scale, width, range_m);
     for (int64_t number = 0; number < group->dark_count; number++)
         range_m[group->dark[number]] = 0.0f;
-
-    words = planes->words[level.word];
-    const uint32_t level_mask = (uint32_t)level.mask;
-    const int level_shift = (int)level.shift;
-    float *restrict levels = planes->level + which * width;
-    for (int64_t beam = 0; beam < width; beam++)
-        levels[beam] = (float)(int32_t)(words[beam] >> level_shift & level_mask);
-
-    if (group->has_reflectivity) {
-        const Field other = fields[REFLECTIVITY];
-        words = planes->words[other.word];
-        uint16_t *restrict out = planes->reflectivity + which * width;
-        for (int64_t beam = 0; beam < width; beam++)
-            out[beam] = (uint16_t)(words[beam] >> (int)other.shift & (uint32_t)other.mask);
-    }
+    to_levels(planes->words[fields[INTENSITY].word], fields + INTENSITY, width,
+              planes->level + which * width);
+    if (group->has_reflectivity)
+        to_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY, width,
+                          planes->reflectivity + which * width);
 }
 
 /* -- points ------------------------------------------------------------------------------------ */
+
+/* Row of the table of a TABLED group. */
+static int64_t table_row(const Group *group, int64_t member, int64_t encoder)
+{
+    const int64_t row = encoder + group->first_row[member];
+    return row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
+}
 
 /* Tabled: (r + reach) * direction + origin, of a row of the table. */
 static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
 {
     const int64_t width = group->width;
-    int64_t row = encoder + group->first_row[member];
-    row = row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
+    const int64_t row = table_row(group, member, encoder);
     const float *restrict direction = group->direction + row * 3 * width;
     const float *origin = group->origin + row * 3;
     const float *restrict reach = group->reach + member * width;
@@ -415,29 +436,41 @@ static int64_t emit_organized(const Scan *scan, const Group *group, int64_t numb
 
 /* -- columns ----------------------------------------------------------------------------------- */
 
-static const uint8_t *record_of(const Scan *scan, int64_t column)
+static const uint8_t *record_of(const Scan *scan, const Group *group, int64_t column)
 {
-    const int64_t sensor = scan->sensor[column];
-    const int64_t number = scan->group_of[sensor];
-    if (number < 0 || scan->groups[number].kind == COPIED)
-        return 0;
-    const Ring *ring = scan->groups[number].rings + scan->member_of[sensor];
+    const Ring *ring = group->rings + scan->member_of[scan->sensor[column]];
     const int64_t index = scan->ring_index[column];
     const int64_t row = index / ring->per_row;
     return ring->first + row % ring->rows * ring->row_bytes
         + (index - row * ring->per_row) * ring->column_bytes;
 }
 
-/* Ask for a record that is read soon: neighbours in a scan are far apart in memory. */
-static void prefetch(const uint8_t *record, int64_t bytes)
+static inline void prefetch(const void *from, int64_t bytes)
 {
 #if defined(__SSE2__)
-    for (int64_t byte = 0; record && byte < bytes; byte += 64)
-        _mm_prefetch((const char *)(record + byte), _MM_HINT_T0);
+    for (int64_t byte = 0; byte < bytes; byte += 64)
+        _mm_prefetch((const char *)from + byte, _MM_HINT_T0);
 #else
-    (void)record;
+    (void)from;
     (void)bytes;
 #endif
+}
+
+/* Ask for what a later column needs: neighbours in a scan are far apart in memory. */
+static void prefetch_column(const Scan *scan, int64_t column)
+{
+    if (column >= scan->columns)
+        return;
+    const int64_t number = scan->group_of[scan->sensor[column]];
+    if (number < 0 || scan->groups[number].kind == COPIED)
+        return;
+    const Group *group = scan->groups + number;
+    prefetch(record_of(scan, group, column), group->step * group->beams);
+    if (group->kind == TABLED) {
+        const int64_t member = scan->member_of[scan->sensor[column]];
+        const int64_t row = table_row(group, member, scan->encoder[column]);
+        prefetch(group->direction + row * 3 * group->width, 12 * group->width);
+    }
 }
 
 /* Copy the points that numpy decoded of a column. Return the next row. */
@@ -503,12 +536,7 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
     memset(planes.reflectivity, 0, sizeof planes.reflectivity);
     int64_t row = scan->first_row, last_group = -1;
     for (int64_t column = 0; column < scan->columns; column++) {
-        if (column + AHEAD < scan->columns) {
-            const int64_t next = scan->group_of[scan->sensor[column + AHEAD]];
-            if (next >= 0)
-                prefetch(record_of(scan, column + AHEAD),
-                         scan->groups[next].step * scan->groups[next].beams);
-        }
+        prefetch_column(scan, column + AHEAD);
         const int64_t sensor = scan->sensor[column];
         const int64_t number = scan->group_of[sensor];
         if (number < 0)
@@ -525,7 +553,7 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
             }
             last_group = number;
             row = decode_column(scan, group, scan->member_of[sensor], column,
-                                record_of(scan, column), row, &planes);
+                                record_of(scan, group, column), row, &planes);
         }
         if (scan->column)
             for (int64_t place = first; place < row; place++)

@@ -157,5 +157,3 @@ def trouble() -> str:
     except (OSError, AttributeError) as err:
         return " ".join(str(err).split())
     return ""
-
-
