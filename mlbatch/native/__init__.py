@@ -29,20 +29,20 @@ def library_path() -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def choose_engine(wanted: str) -> str:
-    """`numpy` or `native`; wanted: one of ENGINES, `auto` for native where it is installed.
+def choose_engine(name: str) -> str:
+    """`numpy` or `native`; name: one of ENGINES, `auto` for native where it is installed.
 
-    Raises UsageError if native is wanted and cannot be loaded.
+    Raises UsageError if native is name and cannot be loaded.
     """
-    wanted = ALIASES.get(wanted, wanted)
-    if wanted == "numpy":
-        return wanted
+    name = ALIASES.get(name, name)
+    if name == "numpy":
+        return name
     from mlbatch.native.library import trouble
 
     why = trouble()
     if not why:
         return "native"
-    if wanted == "auto":
+    if name == "auto":
         return "numpy"
     raise UsageError(
         f"--engine native: expected its compiled library, found {why}; reinstall mlbatch where a C "

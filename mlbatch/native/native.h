@@ -125,7 +125,7 @@ typedef struct {
     int64_t box_count;
     const float *boxes_m; /* (box_count, 6) */
     int64_t row_slots;    /* organized: slots of a row; 0: dense */
-    /* Outputs, as in `decode/scan_buffer.py`; NULL: not wanted. A dense scan has room for all
+    /* Outputs, as in `decode/scan_buffer.py`; NULL: none. A dense scan has room for all
        slots of its columns. */
     float *point;
     int64_t *label;

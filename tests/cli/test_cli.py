@@ -65,7 +65,7 @@ def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
     assert first.startswith("left: OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16, calibration ")
     assert first.endswith("left.json, extrinsics from rig")
     assert second.startswith("right: OS-1-32-U1 512x10 RNG15_RFL8_NIR8, calibration ")
-    assert third == "decoded by numpy"
+    assert third == "decoded by native"
 
 
 def test_warnings_go_to_stderr_and_into_the_report(shell: Shell) -> None:

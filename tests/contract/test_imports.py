@@ -19,7 +19,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("decode", "batching"),
     ("report", "rig", "clocks"),
     ("lidar", "frames", "ros"),
-    ("types",),
+    ("types", "native"),
     ("arrays", "units"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", ""),
