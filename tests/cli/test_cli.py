@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import mlbatch
+from mlbatch.native import choose_engine
 from tests.builders.sessions import FIXTURE, REPOSITORY, Report, Shell, names, report_of
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
