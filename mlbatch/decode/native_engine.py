@@ -130,7 +130,8 @@ class NativeEngine:
         if self._turning is not None:
             angles = self._angles(arrays[1], arrays[3])
             for group in self._groups:
-                group.struct.cosine, group.struct.sine = map(address, angles)
+                if group.struct.kind == _TURNING:
+                    group.struct.cosine, group.struct.sine = map(address, angles)
             arrays += angles
         return arrays
 
@@ -257,10 +258,12 @@ class _DecodedGroup:
         shape = (len(projector.sources), projector.lidar.channels)
         struct = self.struct
         struct.kind = _TABLED
-        struct.direction = self._kept(_padded(projection.direction, width))
+        struct.direction = self._kept(_padded(projection.vectors, width))
+        struct.cosine = self._kept(projection.cosine)
+        struct.sine = self._kept(projection.sine)
         struct.origin = self._kept(projection.origin)
         struct.first_row = self._kept(projection.first_position)
-        struct.rows = len(projection.direction)
+        struct.rows = len(projection.cosine)
         reach_m = np.broadcast_to(projection.reaches_m, shape)
         struct.reach = self._kept(_padded(reach_m, width))
         struct.tables = 1

@@ -98,29 +98,36 @@ static void to_reflectivities(const uint32_t *restrict words, const Field *field
         reflectivity[beam] = (uint16_t)(words[beam] >> shift & mask);
 }
 
-/* Range, level and reflectivity of one return of a column. */
-static void read_return(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+/* Words of the pixels of one return, of all channels; distances in little-endian order, 0 for
+   channels without returns. */
+static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
 {
-    const int64_t width = group->width;
     const int64_t *run = group->runs + which * group->run_count * 3;
     for (int64_t number = 0; number < group->run_count; number++, run += 3)
         for (int64_t word = 0; word < group->word_count; word++)
             gather(record + run[0] + group->word_bytes[word], group->step, run[2],
                    planes->words[word] + run[1]);
-
-    const Field *fields = group->fields + which * FIELDS;
-    float *range_m = planes->range_m + which * width;
-    uint32_t *words = planes->words[fields[DISTANCE].word];
-    if (fields[DISTANCE].is_big)
-        swap_bytes(words, fields + DISTANCE, width);
-    to_ranges(words, fields + DISTANCE, (int32_t)group->silent, group->scale, width, range_m);
+    const Field *distance = group->fields + which * FIELDS + DISTANCE;
+    uint32_t *words = planes->words[distance->word];
+    if (distance->is_big)
+        swap_bytes(words, distance, group->width);
     for (int64_t number = 0; number < group->dark_count; number++)
-        range_m[group->dark[number]] = 0.0f;
+        words[group->dark[number]] &= ~((uint32_t)distance->mask << (int)distance->shift);
+}
+
+/* Range, level and reflectivity of one return of a column. */
+static void read_return(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+{
+    const int64_t width = group->width, first = which * width;
+    const Field *fields = group->fields + which * FIELDS;
+    read_words(group, record, which, planes);
+    to_ranges(planes->words[fields[DISTANCE].word], fields + DISTANCE, (int32_t)group->silent,
+              group->scale, width, planes->range_m + first);
     to_levels(planes->words[fields[INTENSITY].word], fields + INTENSITY, width,
-              planes->level + which * width);
+              planes->level + first);
     if (group->has_reflectivity)
         to_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY, width,
-                          planes->reflectivity + which * width);
+                          planes->reflectivity + first);
 }
 
 /* -- points ------------------------------------------------------------------------------------ */
@@ -132,26 +139,34 @@ static int64_t table_row(const Group *group, int64_t member, int64_t encoder)
     return row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
 }
 
-/* Tabled: (r + reach) * direction + origin, of a row of the table. */
+/* One coordinate: (r + reach) * (cos * V1 + sin * V2 + V3) + origin. */
+static inline void place(const float *restrict range_m, const float *restrict reach,
+                         const float *restrict vectors, int64_t width, float cosine, float sine,
+                         float origin, float *restrict out)
+{
+    const float *restrict second = vectors + 3 * width;
+    const float *restrict third = vectors + 6 * width;
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float direction = cosine * vectors[beam] + sine * second[beam] + third[beam];
+        out[beam] = (range_m[beam] + reach[beam]) * direction + origin;
+    }
+}
+
+/* Tabled: all beams at the angle of a row of the table. */
 static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
 {
     const int64_t width = group->width;
     const int64_t row = table_row(group, member, encoder);
-    const float *restrict direction = group->direction + row * 3 * width;
-    const float *origin = group->origin + row * 3;
+    const float *restrict vectors = group->direction + member * 9 * width;
     const float *restrict reach = group->reach + member * width;
-    const float ox = origin[0], oy = origin[1], oz = origin[2];
+    const float *origin = group->origin + row * 3;
+    const float cosine = group->cosine[row], sine = group->sine[row];
     for (int64_t which = 0; which < group->returns; which++) {
-        const float *restrict range_m = planes->range_m + which * width;
-        float *restrict x = planes->x + which * width;
-        float *restrict y = planes->y + which * width;
-        float *restrict z = planes->z + which * width;
-        for (int64_t beam = 0; beam < width; beam++) {
-            const float reached_m = range_m[beam] + reach[beam];
-            x[beam] = reached_m * direction[beam] + ox;
-            y[beam] = reached_m * direction[width + beam] + oy;
-            z[beam] = reached_m * direction[2 * width + beam] + oz;
-        }
+        const float *range_m = planes->range_m + which * width;
+        float *planes_of[] = {planes->x, planes->y, planes->z};
+        for (int64_t axis = 0; axis < 3; axis++)
+            place(range_m, reach, vectors + axis * width, width, cosine, sine, origin[axis],
+                  planes_of[axis] + which * width);
     }
 }
 
@@ -314,8 +329,41 @@ static inline void put_point(float *point, const Planes *planes, int64_t element
     point[3] = planes->level[element];
 }
 
-/* The usual case: one return, slots in wire order, nothing to filter; labels are made on the way.
-   Elements that are not kept are overwritten by the next point. Returns the next row. */
+#if defined(__SSE2__)
+/* Store the points and labels of the lanes in `kept` to rows from `row`; others are overwritten by
+   the next point. p0 to p3: x, y, z, level of four beams. Return the next row. */
+static inline int64_t store_kept(const Scan *scan, int64_t row, int kept, __m128 p0, __m128 p1,
+                                 __m128 p2, __m128 p3, __m128i low, __m128i high)
+{
+    float *point = scan->point + 4 * row;
+    int64_t *labels = scan->label + row;
+    _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
+    if (kept == 15) {
+        _mm_storeu_ps(point, p0);
+        _mm_storeu_ps(point + 4, p1);
+        _mm_storeu_ps(point + 8, p2);
+        _mm_storeu_ps(point + 12, p3);
+        _mm_storeu_si128((__m128i *)labels, low);
+        _mm_storeu_si128((__m128i *)(labels + 2), high);
+        return row + 4;
+    }
+    _mm_storeu_ps(point, p0);
+    _mm_storel_epi64((__m128i *)labels, low);
+    int64_t next = kept & 1;
+    _mm_storeu_ps(point + 4 * next, p1);
+    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(low, low));
+    next += kept >> 1 & 1;
+    _mm_storeu_ps(point + 4 * next, p2);
+    _mm_storel_epi64((__m128i *)(labels + next), high);
+    next += kept >> 2 & 1;
+    _mm_storeu_ps(point + 4 * next, p3);
+    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(high, high));
+    return row + next + (kept >> 3);
+}
+#endif
+
+/* Points of one return in wire order without filters, whose planes are ready; labels are made on
+   the way. Return the next row. */
 static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *words,
                           int64_t offset_ns, int64_t row, const Planes *planes)
 {
@@ -327,37 +375,12 @@ static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *w
             _mm_cmpgt_ps(_mm_load_ps(planes->range_m + beam), _mm_setzero_ps()));
         if (!kept)
             continue;
-        __m128 p0 = _mm_load_ps(planes->x + beam), p1 = _mm_load_ps(planes->y + beam);
-        __m128 p2 = _mm_load_ps(planes->z + beam), p3 = _mm_load_ps(planes->level + beam);
-        _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
-        const __m128i low =
-            _mm_add_epi64(_mm_loadu_si128((const __m128i *)(words + beam)), offsets);
-        const __m128i high =
-            _mm_add_epi64(_mm_loadu_si128((const __m128i *)(words + beam + 2)), offsets);
-        float *point = scan->point + 4 * row;
-        int64_t *labels = scan->label + row;
-        if (kept == 15) {
-            _mm_storeu_ps(point, p0);
-            _mm_storeu_ps(point + 4, p1);
-            _mm_storeu_ps(point + 8, p2);
-            _mm_storeu_ps(point + 12, p3);
-            _mm_storeu_si128((__m128i *)labels, low);
-            _mm_storeu_si128((__m128i *)(labels + 2), high);
-            row += 4;
-            continue;
-        }
-        _mm_storeu_ps(point, p0);
-        _mm_storel_epi64((__m128i *)labels, low);
-        int64_t next = kept & 1;
-        _mm_storeu_ps(point + 4 * next, p1);
-        _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(low, low));
-        next += kept >> 1 & 1;
-        _mm_storeu_ps(point + 4 * next, p2);
-        _mm_storel_epi64((__m128i *)(labels + next), high);
-        next += kept >> 2 & 1;
-        _mm_storeu_ps(point + 4 * next, p3);
-        _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(high, high));
-        row += next + (kept >> 3);
+        const __m128i *own = (const __m128i *)(words + beam);
+        row = store_kept(scan, row, kept, _mm_load_ps(planes->x + beam),
+                         _mm_load_ps(planes->y + beam), _mm_load_ps(planes->z + beam),
+                         _mm_load_ps(planes->level + beam),
+                         _mm_add_epi64(_mm_loadu_si128(own), offsets),
+                         _mm_add_epi64(_mm_loadu_si128(own + 1), offsets));
     }
 #endif
     for (; beam < group->slots; beam++) {
@@ -367,6 +390,60 @@ static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *w
     }
     return row;
 }
+
+#if defined(__SSE2__)
+/* The usual case in one pass over the beams: TABLED, one return, wire order, no filters. Writes
+   ranges and reflectivities to the planes only for `emit_extras`. Return the next row. */
+static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member, int64_t encoder,
+                            const uint8_t *record, const int64_t *words, int64_t offset_ns,
+                            int64_t row, Planes *planes)
+{
+    const int64_t width = group->width, at = table_row(group, member, encoder);
+    const Field *fields = group->fields;
+    const Field distance = fields[DISTANCE], level = fields[INTENSITY];
+    read_words(group, record, 0, planes);
+    const uint32_t *distances = planes->words[distance.word], *levels = planes->words[level.word];
+    const float *vectors = group->direction + member * 9 * width;
+    const float *reach = group->reach + member * width, *origin = group->origin + at * 3;
+    const __m128i mask = _mm_set1_epi32((int32_t)distance.mask);
+    const __m128i level_mask = _mm_set1_epi32((int32_t)level.mask);
+    const __m128i shift = _mm_cvtsi32_si128((int32_t)distance.shift);
+    const __m128i level_shift = _mm_cvtsi32_si128((int32_t)level.shift);
+    const __m128i silent = _mm_set1_epi32((int32_t)group->silent);
+    const __m128 factor = _mm_set1_ps(group->scale[0]), divisor = _mm_set1_ps(group->scale[1]);
+    const __m128 cosine = _mm_set1_ps(group->cosine[at]), sine = _mm_set1_ps(group->sine[at]);
+    const __m128i offsets = _mm_set1_epi64x(offset_ns);
+    /* Padded beams have no return: whole planes are the same as the slots. */
+    for (int64_t beam = 0; beam + 4 <= group->slots; beam += 4) {
+        __m128i value = _mm_load_si128((const __m128i *)(distances + beam));
+        value = _mm_and_si128(_mm_srl_epi32(value, shift), mask);
+        const __m128i found = _mm_cmpgt_epi32(value, silent);
+        const int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
+        if (!kept)
+            continue;
+        const __m128 range_m =
+            _mm_div_ps(_mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), factor), divisor);
+        const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(reach + beam));
+        __m128 xyz[3];
+        for (int axis = 0; axis < 3; axis++) {
+            const float *own = vectors + axis * width + beam;
+            const __m128 direction = _mm_add_ps(
+                _mm_add_ps(_mm_mul_ps(cosine, _mm_loadu_ps(own)),
+                           _mm_mul_ps(sine, _mm_loadu_ps(own + 3 * width))),
+                _mm_loadu_ps(own + 6 * width));
+            xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), _mm_set1_ps(origin[axis]));
+        }
+        const __m128i signal = _mm_and_si128(
+            _mm_srl_epi32(_mm_load_si128((const __m128i *)(levels + beam)), level_shift),
+            level_mask);
+        const __m128i *own_words = (const __m128i *)(words + beam);
+        row = store_kept(scan, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(signal),
+                         _mm_add_epi64(_mm_loadu_si128(own_words), offsets),
+                         _mm_add_epi64(_mm_loadu_si128(own_words + 1), offsets));
+    }
+    return row;
+}
+#endif
 
 /* Kept elements in order of output. Returns the next row. */
 static int64_t emit_ordered(const Scan *scan, const Group *group, const int64_t *order,
@@ -466,11 +543,6 @@ static void prefetch_column(const Scan *scan, int64_t column)
         return;
     const Group *group = scan->groups + number;
     prefetch(record_of(scan, group, column), group->step * group->beams);
-    if (group->kind == TABLED) {
-        const int64_t member = scan->member_of[scan->sensor[column]];
-        const int64_t row = table_row(group, member, scan->encoder[column]);
-        prefetch(group->direction + row * 3 * group->width, 12 * group->width);
-    }
 }
 
 /* Copy the points that numpy decoded of a column. Return the next row. */
@@ -495,18 +567,29 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     int64_t table = encoder >> TABLE_BIT;
     table = table < 0 ? 0 : table >= group->tables ? group->tables - 1 : table;
     const int64_t known = member * group->tables + table;
+    const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
+    const int64_t *words = group->labels + known * group->returns * group->width;
+    const int is_plain = !group->order && !group->limits_m && !scan->box_count && !scan->row_slots;
+    int64_t *counts = group->counts + member * COUNTS;
+    counts[COLUMNS]++;
+#if defined(__SSE2__)
+    /* A distance above 0 is a range above 0, unless it is scaled to less than a float. */
+    if (is_plain && group->kind == TABLED && group->slots % 4 == 0 && !scan->range_m
+        && !scan->reflectivity) {
+        const int64_t next =
+            decode_fused(scan, group, member, encoder, record, words, offset_ns, row, planes);
+        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
+            counts[step] += next - row;
+        return next;
+    }
+#endif
     for (int64_t which = 0; which < group->returns; which++)
         read_return(group, record, which, planes);
     if (group->kind == TABLED)
         project_tabled(group, member, encoder, planes);
     else
         project_turning(group, member, encoder, known, column, planes);
-    const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
-    int64_t *counts = group->counts + member * COUNTS;
-    counts[COLUMNS]++;
-    const int is_plain = !group->order && !group->limits_m && !scan->box_count && !scan->row_slots;
     if (is_plain) {
-        const int64_t *words = group->labels + known * group->width;
         const int64_t next = emit_plain(scan, group, words, offset_ns, row, planes);
         for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
             counts[step] += next - row;

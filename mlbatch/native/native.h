@@ -73,9 +73,10 @@ typedef struct {
     const int64_t *dark; /* (dark_count,): channels without returns */
     int64_t has_reflectivity;
     const Ring *rings; /* (members,) */
-    /* TABLED: direction (rows, 3, width), origin (rows, 3), first_row (members,).
-       TURNING: direction and origin (members, 3 vectors, 3 axes, width); used (members,): bits of
-       the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from bit 3) of the direction
+    /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
+       TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
+       TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
+       of the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from bit 3) of the direction
        are not zero; from bit 6 the same of the origin. */
     const float *direction;
     const float *origin;
@@ -85,7 +86,7 @@ typedef struct {
     const float *reach;     /* (members, width) or NULL: added to ranges */
     const float *firing_ns; /* (members * T, width) or NULL */
     int64_t tables;         /* T */
-    const float *cosine;    /* (columns of the scan,), TURNING */
+    const float *cosine;
     const float *sine;
     /* Slots. */
     int64_t slots;
