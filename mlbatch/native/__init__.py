@@ -15,6 +15,7 @@ from mlbatch.errors import UsageError
 ENGINES = ("auto", "numpy", "native")
 # Names of earlier versions.
 ALIASES = {"numba": "native"}
+BUILD_ADVICE = "reinstall mlbatch where a C compiler is (Debian: apt-get install gcc)"
 _STEM = "_native"
 
 
@@ -45,6 +46,6 @@ def choose_engine(name: str) -> str:
     if name == "auto":
         return "numpy"
     raise UsageError(
-        f"--engine native: expected its compiled library, found {why}; reinstall mlbatch where a C "
-        "compiler is, or leave the option out"
+        f"--engine native: expected its compiled library, found {why}; {BUILD_ADVICE}, or leave "
+        "the option out"
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import mlbatch
 from mlbatch import native
 from mlbatch.errors import UsageError
 from mlbatch.native import choose_engine, library
@@ -126,3 +127,12 @@ def test_the_name_of_an_earlier_engine_still_works(tmp_path: Path) -> None:
     assert done.code == 0
     assert "mlbatch: --engine numba is now native" in done.err
     assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "native"
+
+
+def test_the_version_says_which_engine_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert command("--version").out == f"mlbatch {mlbatch.__version__}\n"
+    monkeypatch.setattr(library, "trouble", lambda: "")
+    assert command("--version", "-v").out.splitlines()[1] == "engine native"
+    monkeypatch.setattr(library, "trouble", lambda: "none")
+    line = command("--version", "--verbose").out.splitlines()[1]
+    assert line.startswith("engine numpy; native: none; reinstall mlbatch where a C compiler is")
