@@ -35,7 +35,7 @@ def convert(
     ] = "standard",
     compression: Annotated[
         str,
-        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 3)."),
+        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1)."),
     ] = "none",
     slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
     split: Annotated[
