@@ -11,9 +11,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
+from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
 from mlbatch.types import Scan
@@ -50,7 +50,7 @@ def scans(
     for name, value, known in (
         ("layout", layout, ("dense", "organized")),
         ("clock", clock, ("sensor", "host")),
-        ("engine", engine, ENGINES),
+        ("engine", engine, (*ENGINES, *ALIASES)),
     ):
         if value not in known:
             raise UsageError(f"{name}: expected {' or '.join(known)}, found {value!r}; choose one")

@@ -130,7 +130,7 @@ class Recording:
         raise NotImplementedError
 
     def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `numba`; ignored by containers that have one implementation."""
+        """Read by `numpy` or `native`; ignored by containers that have one implementation."""
 
 
 class WrappedRecording(Recording):

@@ -32,19 +32,28 @@ def command_line(first: str = "") -> typer.Typer:
     return app
 
 
-def _version(is_given: bool) -> None:
-    if is_given:
-        typer.echo(f"mlbatch {mlbatch.__version__}")
-        raise typer.Exit
-
-
 def root(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="With --version: the engine, too.")
     ] = False,
 ) -> None:
     """Time-consistent merged scans from raw packets of many lidars, offline."""
+    if version:
+        typer.echo(f"mlbatch {mlbatch.__version__}")
+        if verbose:
+            _print_engine()
+        raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help(), err=True)
         raise typer.Exit(2)
+
+
+def _print_engine() -> None:
+    """Print which engine `auto` chooses, and why it is not the compiled one."""
+    from mlbatch.native import BUILD_ADVICE
+    from mlbatch.native.library import trouble
+
+    why = trouble()
+    typer.echo(f"engine numpy; native: {why}; {BUILD_ADVICE}" if why else "engine native")

@@ -35,7 +35,7 @@ def convert(
     ] = "standard",
     compression: Annotated[
         str,
-        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 3)."),
+        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1)."),
     ] = "none",
     slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
     split: Annotated[
@@ -121,7 +121,7 @@ def convert(
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
-        typer.Option(help="Decoder: auto, numpy, or numba (needs mlbatch[fast])."),
+        typer.Option(help="Decoder: auto, numpy, or native (compiled)."),
     ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
@@ -140,7 +140,6 @@ def convert(
     """Turn raw lidar packets into merged scans at an exact rate."""
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
-    from mlbatch.decode.kernels import ENGINES
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
@@ -149,8 +148,8 @@ def convert(
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
-        engine=(engine, ENGINES),
     )
+    engine = options.engine(engine)
     options.output(output, dry_run=dry_run)
     options.slices(slices)
     options.ranges_m(min_range, max_range)

@@ -1,7 +1,7 @@
 """Columns of a window to the arrays of a scan; every pixel is written once, to its final row.
 
 Sensors with equal pixel layouts are decoded together, by numpy (`numpy_engine.py`) or by compiled
-loops (`numba_engine.py`); both give the same bytes.
+loops (`native_engine.py`); both give the same bytes.
 """
 
 from __future__ import annotations
@@ -50,17 +50,17 @@ class _EngineChoice(NamedTuple):
     joins_rotors: bool
 
 
-def _numba_engine(setup: EngineSetup) -> Engine:
-    # Imported on demand: numba is an optional dependency.
-    from mlbatch.decode.numba_engine import NumbaEngine
+def _native_engine(setup: EngineSetup) -> Engine:
+    # Imported on demand: the library may be missing.
+    from mlbatch.decode.native_engine import NativeEngine
 
-    return NumbaEngine(setup)
+    return NativeEngine(setup)
 
 
 _ENGINES: Mapping[str, _EngineChoice] = {
     "numpy": _EngineChoice(NumpyEngine, joins_rotors=True),
     # Its groups join what its projectors do not; a compiled loop follows one rotor.
-    "numba": _EngineChoice(_numba_engine, joins_rotors=False),
+    "native": _EngineChoice(_native_engine, joins_rotors=False),
 }
 
 
@@ -80,7 +80,7 @@ class Decoder:
         """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
 
         only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
-        whose arrays are valid at a time; engine: numpy or numba.
+        whose arrays are valid at a time; engine: numpy or native.
         """
         self._info = info
         self._only = only

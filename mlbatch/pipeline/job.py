@@ -55,7 +55,7 @@ class Job:
     passed: tuple[str, ...] = ()  # patterns of topics to forward
     extras: frozenset[str] = EXTRAS  # optional contents that the output can store
     jobs: int = 1  # scans made at the same time
-    engine: str = "auto"  # one of `decode.kernels.ENGINES`
+    engine: str = "auto"  # one of `native.ENGINES`
 
 
 def wait_ns(option: str, seconds: float, given: object) -> int | None:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.decode.kernels import choose_engine
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
 from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import DetectedSensor, Note
 from mlbatch.errors import RecordingError
+from mlbatch.native import choose_engine
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
@@ -36,7 +36,7 @@ CLOUDS = "clouds"
 class Session:
     """The recordings of a job and the sensors found in them.
 
-    engine: `numpy` or `numba`; setup: result of discovery; sensors: in the order of `lidar_id`;
+    engine: `numpy` or `native`; setup: result of discovery; sensors: in the order of `lidar_id`;
     replay: of injected faults, or None; delivered: packets given by `packets` so far; notes:
     warnings so far.
     """
@@ -48,7 +48,7 @@ class Session:
         self._received_ns: tuple[int, int] | None = None
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
-        self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
+        self.engine = choose_engine(job.engine)
         for recording in opened:
             recording.use_engine(self.engine)
         if job.segment != TimeSegment():

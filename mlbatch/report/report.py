@@ -89,7 +89,7 @@ class Timing:
     recorded_s: float  # length of the recording
     points_per_s: float
     peak_rss_mb: float
-    engine: str  # numpy or numba
+    engine: str  # numpy or native
 
     @property
     def realtime_factor(self) -> float:

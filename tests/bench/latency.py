@@ -21,8 +21,8 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.native import ENGINES
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import DecodePool
 from mlbatch.pipeline.job import Job

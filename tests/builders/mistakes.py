@@ -252,7 +252,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "engine": (
         f"{FIX} --engine cuda",
         2,
-        "--engine: expected auto or numpy or numba, found 'cuda'; choose one of them",
+        "--engine: expected auto or numpy or native, found 'cuda'; choose one of them",
     ),
     "jobs": (
         f"{FIX} --jobs 0",

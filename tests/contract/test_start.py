@@ -49,7 +49,7 @@ NEEDLESS = (
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify"),
-    *("numpy.ma", "rosbags", "rich", "numba"),
+    *("numpy.ma", "rosbags", "rich"),
 )
 
 

@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
+from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.capture import link_types
 from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
 from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
@@ -59,19 +59,19 @@ class Walker(Protocol):
 class CaptureRecording(Recording):
     """A capture file.
 
-    walker: makes the Walker of a pass, with compiled loops or None; engine: `numba` for compiled
+    walker: makes the Walker of a pass, with compiled loops or None; engine: `native` for compiled
     loops. For tests: buffer_bytes, and together (False: fragments one at a time). Results do not
     depend on engine, buffer_bytes and together.
     """
 
-    walker: Callable[[CaptureKernel | None], Walker]
+    walker: Callable[[CaptureLoops | None], Walker]
     streams: StreamTable
     buffer_bytes: int = BUFFER_BYTES
     together: bool = True
     engine: str = "numpy"
 
     def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `numba` from the next pass on."""
+        """Read by `numpy` or `native` from the next pass on."""
         self.engine = engine
 
     def packets(self) -> Generator[PacketBatch, None, None]:
@@ -93,11 +93,11 @@ class _Pass:
 
     def __init__(self, recording: CaptureRecording) -> None:
         self.recording = recording
-        self.kernel = CaptureKernel() if recording.engine == "numba" else None
-        self.walker = recording.walker(self.kernel)
+        self.loops = CaptureLoops() if recording.engine == "native" else None
+        self.walker = recording.walker(self.loops)
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
-        self.reassembler = Reassembler(recording.counts, recording.together, self.kernel)
+        self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
         self.arena_bytes = recording.buffer_bytes + _ARENA_EXTRA_BYTES
         self.unknown_link: int | None = None
         self.has_known_link = False
@@ -138,7 +138,7 @@ class _Pass:
     def _batch(self, data: U8Array, frames: Frames) -> PacketBatch:
         """The packets that these frames contain or complete; all other frames are counted."""
         self._note_links(frames.link)
-        found = dissect(data, frames, self.addresses, self.kernel)
+        found = dissect(data, frames, self.addresses, self.loops)
         counts = self.recording.counts
         counts.frames += len(frames)
         for reason, count in found.skipped.items():

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array, U32Array
-from mlbatch.decode.kernels.capture import NO_ROOM, TOO_LONG
-from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
+from mlbatch.native.capture import NO_ROOM, TOO_LONG, CaptureLoops
 from mlbatch.readers.byte_records import records
 from mlbatch.readers.capture import link_types
 from mlbatch.readers.capture.frames import Frames
@@ -72,14 +71,14 @@ class _Walker:
     """Steps from record to record."""
 
     def __init__(
-        self, order: str, unit_ns: int, link: int, kernel: CaptureKernel | None = None
+        self, order: str, unit_ns: int, link: int, loops: CaptureLoops | None = None
     ) -> None:
         names = ("seconds", "fraction", "captured", "original")
         self.layout = np.dtype([(name, order + "u4") for name in names])
         self.length = struct.Struct(order + "I")
         self.unit_ns = unit_ns
         self.link = link
-        self.kernel = kernel
+        self.loops = loops
         self.is_swapped = order == ">"
         self.skip = _FILE_HEADER_BYTES
 
@@ -87,8 +86,8 @@ class _Walker:
         """The frames in `data[begin:end]`, as far as their records are complete."""
         begin += self.skip
         self.skip = 0
-        if self.kernel is not None:
-            return self._walk_by(self.kernel, data, begin, end)
+        if self.loops is not None:
+            return self._walk_by(self.loops, data, begin, end)
         starts = self._starts(data, begin, end)
         record = records(data, self.layout, starts)
         captured = record["captured"].astype(np.int64)
@@ -111,9 +110,9 @@ class _Walker:
         more = int(captured[count]) if count < len(starts) else 0
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
-    def _walk_by(self, kernel: CaptureKernel, data: U8Array, begin: int, end: int) -> Walk:
+    def _walk_by(self, loops: CaptureLoops, data: U8Array, begin: int, end: int) -> Walk:
         """The same by compiled loops; at most as many frames as they have room for."""
-        records, place, why = kernel.walk(
+        records, place, why = loops.walk(
             data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
         )
         start, captured, original, host_ns = records

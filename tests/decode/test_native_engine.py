@@ -1,13 +1,12 @@
-"""Decoding kernels on pixels of any bytes: equal to numpy, and no writes beyond the arrays."""
+"""Compiled loops on pixels of any bytes: equal to numpy, and no writes beyond the arrays."""
 
 from __future__ import annotations
 
 import json
 import weakref
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,23 +16,23 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array
 from mlbatch.decode import decoder as decode
-from mlbatch.decode import numba_engine
+from mlbatch.decode import native_engine
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
-from mlbatch.decode.kernels import native
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
+from mlbatch.native.library import library
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.types import EXTRAS, RunInfo, SensorInfo
-from tests.builders.engines import BOXES_M, Pair, few_kernels, needs_numba
+from tests.builders.engines import BOXES_M, Pair, needs_native
 from tests.builders.ouster import OusterSpec, metadata_json
 from tests.golden import test_every_model as models
 
-pytestmark = needs_numba
+pytestmark = needs_native
 
 START_NS = 1_800_000_000_000_000_000
 END_NS = 1_800_000_000_100_000_000
@@ -46,7 +45,7 @@ POSES = (
 NAMES = tuple(name for name in PROFILES if name != "OFF")
 GUARD_ROWS = 64
 GUARD = 0xA5
-# Of kinds that kernels decode, and of two that only numpy does.
+# Of kinds that the loops decode, and of two that only numpy does.
 OTHERS = (
     (models.velodyne_sent, ("VLP-16", "dual")),
     (models.velodyne_sent, ("HDL-64E S3", "strongest")),
@@ -55,12 +54,6 @@ OTHERS = (
     (models.hesai_sent, ("Pandar128E3X", "37")),
     (models.robosense_sent, ("RS-16", "dual")),
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with few_kernels(tmp_path_factory):
-        yield
 
 
 def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
@@ -172,7 +165,7 @@ def check(lidars: list[Lidar], case: Case) -> None:
         base += lidar.channels
     info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
     pair = Pair(
-        *(Decoder(info, sources, boxes_m, case.extras, engine=name) for name in ("numpy", "numba"))
+        *(Decoder(info, sources, boxes_m, case.extras, engine=name) for name in ("numpy", "native"))
     )
     for _ in range(2):
         sensor = rng.integers(0, len(lidars), case.columns)
@@ -221,7 +214,7 @@ def test_nothing_is_written_beyond_the_arrays(
         return made[-1]
 
     monkeypatch.setattr(decode, "ScanBuffer", guarded)
-    monkeypatch.setattr(numba_engine, "ScanBuffer", guarded)
+    monkeypatch.setattr(native_engine, "ScanBuffer", guarded)
     full = [ouster("RNG15_RFL8_NIR8", 16), ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)]
     lidars = [[*others, *full][number] for number in chosen]
     for seed in range(3):
@@ -230,45 +223,38 @@ def test_nothing_is_written_beyond_the_arrays(
     assert all(buffer.is_intact for buffer in made)
 
 
-def test_records_stay_while_a_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_stay_while_the_loops_run() -> None:
     lidar = ouster("RNG15_RFL8_NIR8", 16)
     rng = np.random.default_rng(0)
     ring, places = filled(lidar, rng)
     before = weakref.ref(ring.pieces)
-
-    def load_late(*key: str | int) -> Callable[[I64Array], int]:
-        kernel = native.load(str(key[0]), *key[1:])
-
-        def call(frame: I64Array) -> int:
-            start = np.arange(1000) * lidar.packet_size
-            ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
-            assert before() is not None
-            assert before() is not ring.pieces
-            return kernel(frame)
-
-        return call
-
-    monkeypatch.setattr(numba_engine, "load", load_late)
     info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, POSES[0])
     run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
     sources = [Source(lidar, ring, POSES[0], 0)]
-    decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine="numba")
+    engine = "native"
+    decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine=engine)
+    decode_columns = library().mlbatch_decode
+    grown = []
+
+    class Late:
+        """The library, whose ring grows before it runs."""
+
+        def mlbatch_decode(self, scan: object) -> int:
+            start = np.arange(1000) * lidar.packet_size
+            ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
+            grown.append(before() is not None and before() is not ring.pieces)
+            return int(decode_columns(scan))
+
+    cast(Any, decoder)._engine._library = Late()
     stamp_ns = np.full(len(places), START_NS)
     nothing = np.zeros(len(places), np.int64)
     due = WindowColumns(stamp_ns, nothing, places, nothing)
     assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
-
-
-def test_cpus_without_wide_registers_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numba_engine, "has_features", lambda *_: False)
-    for seed, cut in enumerate((False, True)):
-        for beams in (16, 128):
-            lidar = ouster("RNG19_RFL8_SIG16_NIR16", beams)
-            check([lidar], Case(seed, 130, "dense", EXTRAS, cut, keeps_repeated=False))
+    assert grown == [True]
 
 
 def test_labels_are_words_of_eight_bytes() -> None:
-    """As the kernels take them."""
+    """As the compiled loops read them."""
     assert LABEL.itemsize == 8
     assert LABEL.fields is not None
     assert LABEL.fields["lidar_id"][1] == 7
