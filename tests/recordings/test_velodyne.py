@@ -18,13 +18,15 @@ from tests.builders.run import Cloud
 from tests.builders.traffic import read_pcap
 from tests.builders.velodyne_tables import MODELS
 from tests.recordings.references import (
+    HOUR_NS,
     US_NS,
     apart,
     assert_same_points,
     converted,
     heading_deg,
+    turned_deg,
 )
-from tests.recordings.velodyne import BELIED, CASES, DUAL, GAPS, GPS, Case
+from tests.recordings.velodyne import BELIED, CASES, DUAL, FOLDER, GAPS, GPS, Case
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder)
 
@@ -139,3 +141,30 @@ def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None
     whole = converted(case.path, tmp_path / "whole").cloud
     for number, words in enumerate((("--rate", "29.97"), ("--rate", "5", "--slices", "7"))):
         assert_same_points(converted(case.path, tmp_path / str(number), *words).cloud, whole)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+def test_an_azimuth_of_36000_costs_no_packet(engine: str, tmp_path: Path) -> None:
+    """Data packet 1750 has it; the reference has packets 1600 to 1901."""
+    folder = FOLDER / "vlp16_azimuth-36000"
+    recording = folder / "vlp-16-test-90deg-1-50-frames.pcap"
+    made = converted(recording, tmp_path / "out", "--engine", engine)
+    assert made.sensor["model"] == "VLP-16"
+    assert made.sensor["packets"]["rejected"] == {}
+    assert made.sensor["points"]["written"] == 700_400
+    ours = made.cloud
+    packet = ours.column.astype(np.int64) // 24
+    with np.load(folder / "reference.npz") as theirs:
+        wanted = {key: theirs[key] for key in theirs.files}
+    late = packet >= 1600
+    order = np.lexsort((ours.at_ns[late], packet[late]))
+    past_hour_ns = ours.at_ns[late][order] % HOUR_NS
+    assert np.array_equal(packet[late][order], wanted["data_packet"])
+    assert np.array_equal(past_hour_ns, wanted["time_past_hour_ns"])
+    assert np.array_equal(ours.ring[late][order], wanted["ring"])
+    assert np.array_equal(ours.intensity[late][order], wanted["intensity"])
+    xyz = ours.xyz[late][order]
+    turn_deg = np.abs(turned_deg(heading_deg(xyz), heading_deg(wanted["xyz_m"])))
+    # That decoder rounds to 0.01 degrees.
+    assert turn_deg.max() < 0.0051
+    assert np.abs(xyz[:, 2] - wanted["xyz_m"][:, 2]).max() < 5e-5
