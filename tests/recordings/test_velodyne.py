@@ -40,15 +40,19 @@ def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_pa
 
 @pytest.mark.parametrize("case", [DUAL, GAPS], ids=lambda case: case.folder)
 def test_every_point_with_the_file_next_to_the_bag(case: Case, tmp_path: Path) -> None:
-    """The file, found automatically, has the vendor's angles, but no heights of the origins."""
-    made = converted(case.path, tmp_path / "found")
-    assert made.sensor["calibration"] == case.file
-    check(case, made.cloud, added_m=case.heights_m)
-    built_in = converted(
-        case.alone(tmp_path), tmp_path / "alone", "--decode", "vertical_offset=off"
-    )
-    assert built_in.sensor["calibration"] == "built in"
-    assert np.abs(built_in.cloud.xyz - made.cloud.xyz).max() < 1e-4
+    """The file, found automatically, has the vendor's angles, and 0 for the heights of all lasers.
+
+    The built-in heights are kept.
+    """
+    alone = case.alone(tmp_path)
+    for words, added_m in (((), 0.0), (("--decode", "vertical_offset=off"), 1.0)):
+        made = converted(case.path, tmp_path / f"found {added_m}", *words)
+        assert made.sensor["calibration"] == case.file
+        assert ("vertical offsets of all lasers are 0" in made.err) == (not words)
+        check(case, made.cloud, added_m=added_m * case.heights_m)
+        built_in = converted(alone, tmp_path / f"alone {added_m}", *words)
+        assert built_in.sensor["calibration"] == "built in"
+        assert np.abs(built_in.cloud.xyz - made.cloud.xyz).max() < 1e-4
 
 
 def check(case: Case, ours: Cloud, added_m: F64Array) -> None:
@@ -90,10 +94,12 @@ def test_the_report(case: Case, tmp_path: Path) -> None:
     assert both["repeated"] == 0
     assert both["written"] == len(theirs.ring) + twice
     warnings = [one["message"] for one in made.report["warnings"]]
-    assert len(warnings) == made.err.count("\n") == (case is BELIED)
-    if warnings:
+    assert len(warnings) == made.err.count("\n") == (case is BELIED or case.file != "")
+    if case is BELIED:
         assert "VLP-16" in warnings[0]
         assert "product byte says HDL-32E" in warnings[0]
+    if case.file:
+        assert "vertical offsets of all lasers are 0" in warnings[0]
 
 
 @pytest.mark.parametrize("decode", ["on", "off"])

@@ -374,6 +374,39 @@ def test_its_angles_and_offsets_are_used() -> None:
     )
 
 
+@pytest.mark.parametrize("model", PLAIN)
+def test_a_file_without_heights_keeps_the_built_in_ones(model: str) -> None:
+    """ROS drivers write 0 for all lasers, or nothing."""
+    table = MODELS[model]
+    seen = evidence(made_of(VelodyneSpec(model)).sent)
+    lines = calibration_yaml(model).splitlines()
+    missing = "\n".join(one for one in lines if "vert_offset" not in one)
+    zeros = missing.replace("  dist_corr", "  vert_offset_correction: 0.0\n  dist_corr")
+    highest_mm = max(abs(value) for value in table.vertical_m) * 1000
+    for content in (missing, zeros):
+        read = velodyne.read_calibration(Path("unit.yaml"), content.encode())
+        assert read is not None
+        lidar = read.lidar({}, seen)
+        heights_m = lidar.beams.origin[2, :, 2]
+        assert np.abs(heights_m - np.array(table.vertical_m)).max() < 1e-5
+        assert lidar.notes == (
+            f"unit.yaml: the vertical offsets of all lasers are 0; those of a {model} are used, "
+            f"up to {highest_mm:.1f} mm (vertical_offset=off: none)",
+        )
+        lowered = read.lidar({"vertical_offset": "off"}, seen)
+        assert lowered.notes == ()
+        assert not lowered.beams.origin.any()
+    # A single value is the unit's own.
+    one_value = zeros.splitlines()
+    first = next(n for n, one in enumerate(one_value) if "vert_offset" in one)
+    one_value[first] = "  vert_offset_correction: 0.003"
+    read = velodyne.read_calibration(Path("unit.yaml"), "\n".join(one_value).encode())
+    assert read is not None
+    lidar = read.lidar({}, seen)
+    assert lidar.notes == ()
+    assert lidar.beams.origin[2, :, 2].tolist() == [0.003] + [0.0] * (len(table.vertical_m) - 1)
+
+
 def test_another_unit_of_range_is_named_and_not_used() -> None:
     text = calibration_yaml("VLS-128").replace("resolution: 0.004", "resolution: 0.007")
     read = velodyne.read_calibration(Path("alpha.yaml"), text.encode())
