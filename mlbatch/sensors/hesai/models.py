@@ -65,6 +65,7 @@ class Timing:
     """Firing times of blocks, ns after the packet's time: base + step * k / divisor.
 
     counts_back: k is 0 for the last firing group and negative before it; else 0 for the first.
+    azimuth_ns: when the rotor is at a block's azimuth, after the block's time.
     slower: factor of the step in each operation mode.
     """
 
@@ -72,6 +73,7 @@ class Timing:
     step_ns: int
     divisor: int = 1
     counts_back: bool = True
+    azimuth_ns: int = 0
     slower: tuple[int, ...] = (1, 1, 1, 1)
 
 
@@ -149,7 +151,9 @@ _TAIL_AT128 = Tail(32, 26, 20, mode_at=24, rpm_at=18, rpm_is_signed=True, has_cr
 _TAIL_JT16 = Tail(74, date_at=6, us_at=12, sequence_bytes=2, has_crc=True)
 
 _TO_15_DEG = (-25.0, 15.0)
-_XT_BACK = Timing(5632, 50000)
+# The SDK rotates an XT by its firing-time file, which begins at 6 us (5632 + 368 ns): the azimuth
+# of a block is that of 5632 ns before the time of the block (section 6).
+_XT_BACK = Timing(5632, 50000, azimuth_ns=-5632)
 
 PANDAR40P = Model(
     "Pandar40P",
