@@ -10,6 +10,7 @@ assigned to the model whose beams fire at the times of a Pandar40P at these elev
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -136,6 +137,14 @@ def _by_state(times: Mapping[tuple[str, int], I64Array]) -> tuple[I64Array, I64A
             used = state if (known, state) in times else state % 2
             rows[operation, state] = names.index((known, used))
     return np.stack([times[name] for name in names]), rows
+
+
+def _clockwise(point: tuple[float, float, float], angle_deg: float) -> tuple[float, float, float]:
+    """A point rotated about z, seen from above; x right, y forward."""
+    x, y, z = point
+    cosine = math.cos(math.radians(angle_deg))
+    sine = math.sin(math.radians(angle_deg))
+    return x * cosine + y * sine, y * cosine - x * sine, z
 
 
 _TAIL_40P = Tail(22, date_at=16, us_at=10, mode_at=14, rpm_at=8)
@@ -314,7 +323,8 @@ JT16 = Model(
     tail=_TAIL_JT16,
     timing=Timing(0, 0),
     firing_ns=np.zeros((1, 16), np.int64),
-    centre_mm=(-6.25, 10.955, 3.911),
+    # Its angles are 190 deg ahead of the axes of the centre (section 6).
+    centre_mm=_clockwise((-6.25, 10.955, 3.911), 190.0),
     elevation_deg=None,
     verified="one source",
     header=16,
