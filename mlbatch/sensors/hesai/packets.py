@@ -280,4 +280,4 @@ def _record_dtype(layout: Layout) -> np.dtype[np.void]:
             "itemsize": layout.stride,
         }
     )
-    return np.dtype([("block", block, layout.mode.returns)])
+    return np.dtype([("block", block, (layout.mode.returns,))])
