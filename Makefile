@@ -3,6 +3,7 @@
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
 #   make test    formatting, lint, types, all tests, branch coverage
 #   make test-quick   the tests of daily work, within a minute
+#   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
@@ -10,7 +11,10 @@
 #   make clean   remove what the others made
 
 PYTHON ?= python3
+# The oldest dependencies have no wheels for later versions.
+LOWEST_PYTHON ?= $(PYTHON)
 VENV := .venv
+LOWEST := .venv-lowest
 BIN := $(VENV)/bin
 RIG := fixtures/two_lidars
 # Of the compiled engine, which an installation builds.
@@ -18,7 +22,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick lint bench fuzz fuzz-sanitized clean
+.PHONY: help demo test test-quick test-lowest lint bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -35,6 +39,9 @@ test: lint
 
 test-quick: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n 2 -m 'not slow and not long'
+
+test-lowest: $(LOWEST)/dev.stamp
+	$(LOWEST)/bin/python -m pytest -n 2 -m 'not slow and not long'
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
@@ -62,7 +69,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
-	rm -rf $(VENV) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
 
 # The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:
@@ -82,3 +89,13 @@ $(VENV)/dev.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch and its tools into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ $(VENV)/core.stamp
+
+$(LOWEST)/dev.stamp: pyproject.toml .ci/lowest.txt
+	@$(LOWEST_PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' || { \
+		echo "make: expected Python 3.10 or 3.11, found $$($(LOWEST_PYTHON) --version 2>&1);" \
+			"choose another: make LOWEST_PYTHON=python3.11 test-lowest"; exit 1; }
+	@echo "installing the oldest dependencies into $(LOWEST)"
+	@$(LOWEST_PYTHON) -m venv --clear $(LOWEST)
+	@$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint .ci/lowest.txt --editable '.[dev]'
+	@touch $@
