@@ -25,7 +25,7 @@ from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
-from mlbatch.types import ImuSamples, Message, RunInfo, Scan
+from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
 from mlbatch.units import NS_PER_S, rate_text
 
 # Called with the bytes read so far, and with those of all recordings.
@@ -218,7 +218,13 @@ class Conversion:
             )
 
         sources = [sensor.source() for sensor in self.sensors]
-        self._pool = DecodePool(sources, decoder, workers=job.jobs, split=job.split)
+        self._pool = DecodePool(
+            sources,
+            decoder,
+            workers=job.jobs,
+            split=job.split,
+            counts_clipped=BYTE_INTENSITY in job.extras,
+        )
         return self._pool
 
     @property

@@ -111,6 +111,14 @@ def final_notes(run: Conversion) -> list[Note]:
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
+        points = sensor.ledger.points
+        if points.clipped:
+            text = (
+                f"{sensor.name}: {points.clipped} of {points.written} points "
+                f"({points.clipped / points.written:.2%}) have an intensity outside 0 to 255, "
+                "which the point layout clips; choose one with a float32 intensity"
+            )
+            notes.append(Note("clipped", sensor.name, text))
     table = run.session.setup.sampler.table
     seen = run.session.setup.sampler.kinds
     for kind in sorted(run.session.ingest.samples):
