@@ -198,7 +198,7 @@ class SensorInfo:
     returns: int
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
-    has_reflectivity: bool = False  # its points have a calibrated reflectivity beside intensity
+    has_reflectivity: bool = False  # calibrated, in addition to intensity
 
 
 @dataclass(frozen=True, slots=True)

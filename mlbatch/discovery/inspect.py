@@ -11,8 +11,9 @@ import numpy as np
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
+from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import timescale
-from mlbatch.clocks.watch import ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.discover import (
     Discovery,
@@ -192,9 +193,17 @@ def inspect(
             for sensor in discovery.sensors
             if sensor.lidar.calibration in files
         },
-        notes=tuple(_notes(discovery)),
+        notes=(*_notes(discovery), *_clock_notes(known)),
         clocks=compare(known) if known else None,
     )
+
+
+def _clock_notes(known: Sequence[tuple[str, ClockEstimate]]) -> Iterator[str]:
+    """Clocks that are off from the capture host's, one by one: they may not be comparable."""
+    for name, finding in known:
+        text = describe_off([HostOffset.measured(name, finding)])
+        if text:
+            yield text
 
 
 def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
