@@ -317,7 +317,7 @@ def _range_mm(points: Points) -> Values:
     return range_mm
 
 
-def _byte_intensity(points: Points) -> Values:
+def _byte_intensity(points: Points) -> F32Array | U16Array:
     """Return what 8-bit layouts store as intensity: reflectivity where a sensor has it.
 
     Reflectivity has the range of 8 bits; the signal of the same sensors exceeds it.
@@ -327,11 +327,13 @@ def _byte_intensity(points: Points) -> Values:
     has_reflectivity = np.array([sensor.has_reflectivity for sensor in points.sensors])
     if has_reflectivity.all():
         return points.reflectivity
-    return np.where(has_reflectivity[points.lidar_id], points.reflectivity, points.intensity)
+    reflectivity = points.reflectivity.astype(np.float32)
+    return np.where(has_reflectivity[points.lidar_id], reflectivity, points.intensity)
 
 
 def _intensity_u8(points: Points) -> Values:
-    return np.clip(np.nan_to_num(_byte_intensity(points)), 0, _MAX_U8)
+    value: Values = np.clip(np.nan_to_num(_byte_intensity(points)), 0, _MAX_U8)
+    return value
 
 
 def clipped_points(scan: Scan) -> list[int]:

@@ -16,7 +16,7 @@ from mlbatch.verify.messages import read_cloud
 from mlbatch.writers.message_writer import CloudMessage
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Points, clipped_points, points_of
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.ouster import OusterSpec, encode_packets
+from tests.builders.ouster import IntLike, OusterSpec, encode_packets
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
 from tests.builders.scans import dense_scan
 from tests.builders.sessions import (
@@ -40,7 +40,11 @@ def _ouster(folder: Path, turns: int = 4) -> None:
     stamps_ns = EPOCH_NS + 20 * NS_PER_MS + columns * COLUMN_NS
     ones = np.ones((len(columns), 16), np.int64)
     beam = np.arange(16)
-    fields = {"RANGE": 4000 * ones, "SIGNAL": ones * (300 + beam), "REFLECTIVITY": ones * 10 * beam}
+    fields: dict[str, IntLike] = {
+        "RANGE": 4000 * ones,
+        "SIGNAL": ones * (300 + beam),
+        "REFLECTIVITY": ones * 10 * beam,
+    }
     payloads = encode_packets(SPEC, stamps_ns, columns % 512, 5 + columns // 512, fields)
     records: Records = [
         (
