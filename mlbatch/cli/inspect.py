@@ -20,7 +20,8 @@ def inspect(
         typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
     ] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Loss and clocks of the whole recording, not of 10 s.")
+        bool,
+        typer.Option("--whole", help="Packets, loss and clocks of the whole recording, not 10 s."),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     write_rig: Annotated[

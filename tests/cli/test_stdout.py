@@ -69,7 +69,7 @@ def test_of_a_dry_run_as_well(shell: Shell, tmp_path: Path, more: str) -> None:
 
 def test_a_line_for_each_segment(shell: Shell, tmp_path: Path) -> None:
     write_session(tmp_path, Unit(turns=40))
-    words = f"--fault jump:ouster_111:37s@2s --on-jump split --report -"
+    words = "--fault jump:ouster_111:37s@2s --on-jump split --report -"
     outcome = shell(f"convert drive.pcap -o out {words}")
     assert outcome.code == 0, outcome.err
     reports = [json.loads(line) for line in outcome.out.splitlines()]
