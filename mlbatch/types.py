@@ -198,6 +198,7 @@ class SensorInfo:
     returns: int
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
+    has_reflectivity: bool = False  # calibrated, in addition to intensity
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +215,8 @@ class RunInfo:
 
 # Optional arrays of a scan: those that the output cannot store are not made.
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
+# Listed with EXTRAS by outputs whose intensity has 8 bits: points outside 0 to 255 are counted.
+BYTE_INTENSITY = "byte_intensity"
 # Listed with EXTRAS by outputs that store IMU samples.
 IMU = "imu"
 # Listed with EXTRAS by outputs that store recorded messages: the encodings they can store.

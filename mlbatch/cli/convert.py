@@ -117,7 +117,10 @@ def convert(
             help="Do not write; print the report (with --on-jump split a line a segment).",
         ),
     ] = False,
-    report: Annotated[Path | None, typer.Option(help="Path of the report (JSON).")] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Path of the report (JSON); -: print it instead of the summary."),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
@@ -196,7 +199,8 @@ def convert(
             point_layout=point_layout,
             compression=compression,
             dry_run=dry_run,
-            report=report,
+            report=None if options.is_stdout(report) else report,
+            prints_report=options.is_stdout(report),
             split_jumps=on_jump == "split",
             overwrite=overwrite,
             resume=options.resume(resume, dry_run=dry_run),

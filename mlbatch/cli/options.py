@@ -183,6 +183,11 @@ def jobs(number: int) -> int:
     return number
 
 
+def is_stdout(path: Path | None) -> bool:
+    """True for `-`, standard output."""
+    return path == Path("-")
+
+
 def output(path: Path | None, *, dry_run: bool) -> None:
     """`-o`, required unless it is a dry run."""
     if path is None and not dry_run:

@@ -55,6 +55,7 @@ class Target:
     compression: str
     dry_run: bool
     report: Path | None
+    prints_report: bool  # to standard output, without a summary
     split_jumps: bool
     overwrite: bool
     resume: bool
@@ -117,7 +118,7 @@ def _run_one(job: Job, target: Target) -> None:
         _say(f"warning: {note.code}: {note.message}")
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
-    elif target.dry_run and report_path is None:
+    elif target.prints_report or (target.dry_run and report_path is None):
         # One line a segment: several JSON documents in a row are no document.
         typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
         return

@@ -24,7 +24,7 @@ from mlbatch.types import EXTRAS, RunInfo, Scan
 
 __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
-# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_OUTCOMES`.
+# Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -11,8 +11,9 @@ import numpy as np
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
+from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import timescale
-from mlbatch.clocks.watch import ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.discover import (
     Discovery,
@@ -102,7 +103,7 @@ class StreamReport:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """All streams of the first 10 seconds of a session."""
+    """All streams of the first 10 seconds of a session, or of all of it."""
 
     streams: tuple[StreamReport, ...]  # one for each packet kind
     sensors: tuple[DetectedSensor, ...]
@@ -111,6 +112,7 @@ class Inspection:
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     clocks: Comparison | None = None  # None without timestamps
+    whole: bool = False  # counts, loss and clocks are those of whole recordings
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
@@ -120,6 +122,7 @@ class Inspection:
         """The JSON document of `--json`."""
         return {
             "schema": "mlbatch.inspect/1",
+            "whole": self.whole,
             "streams": [asdict(stream) for stream in self.streams],
             "notes": list(self.notes),
             "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
@@ -164,7 +167,7 @@ def inspect(
 ) -> Inspection:
     """Inspect the first 10 s of recordings, with the metadata given or in their directories.
 
-    whole: measure loss and clocks on the whole recordings.
+    whole: count packets and measure loss and clocks on the whole recordings.
     """
     table = StreamTable()
     discovery = discover(
@@ -173,6 +176,7 @@ def inspect(
         SensorSelection(metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,
     )
+    early = frozenset(discovery.sampler.kinds)
     measured = _measure(discovery, whole=whole)
     types = packet_types(discovery.recordings)
     streams = tuple(
@@ -192,9 +196,31 @@ def inspect(
             for sensor in discovery.sensors
             if sensor.lidar.calibration in files
         },
-        notes=tuple(_notes(discovery)),
+        notes=(*_notes(discovery), *_late_notes(discovery, early), *_clock_notes(known)),
         clocks=compare(known) if known else None,
+        whole=whole,
     )
+
+
+def _late_notes(discovery: Discovery, early: Collection[PacketKind]) -> Iterator[str]:
+    """Lidars that began after the first 10 s, in which sensors are detected; early: kinds then."""
+    sampler = discovery.sampler
+    owned = {kind for sensor in discovery.sensors for kind in sensor.kinds}
+    for kind in sampler.kinds:
+        what = "" if kind in early or kind in owned else describe(sampler, kind) or ""
+        if "lidar" in what:
+            yield (
+                f"{sampler.table.streams[kind.stream]}: {what}; it started after the first 10 s, "
+                "in which sensors are detected; name the sensor in a rig file (--rig)"
+            )
+
+
+def _clock_notes(known: Sequence[tuple[str, ClockEstimate]]) -> Iterator[str]:
+    """Clocks that are off from the capture host's, one by one: they may not be comparable."""
+    for name, finding in known:
+        text = describe_off([HostOffset.measured(name, finding)])
+        if text:
+            yield text
 
 
 def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
@@ -240,31 +266,49 @@ class _Measured:
         self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
         self.watch: ClockWatch = clock_watch(lidar)
         self.first: tuple[int, int] | None = None
+        # Kinds with a packet of this sensor; one that begins late may be of another.
+        self.sent: set[PacketKind] = set()
 
 
 def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Measured]:
-    """Loss and clock of each sensor, in the first seconds or the whole session."""
+    """Loss and clock of each sensor, in the first seconds or the whole session.
+
+    whole: packets of all kinds are counted again, with those that begin later.
+    """
+    sampler = discovery.sampler
+    if whole:
+        sampler.restart_counts()
+    late: set[PacketKind] = set()
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
     for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
+            if whole and sampler.count(kind, index, batch):
+                late.add(kind)
+                # It may be of one of the sensors.
+                discovery.router.route(kind, np.frombuffer(sampler.kinds[kind].payloads[0], "u1"))
             for sensor in discovery.sensors:
                 if kind not in sensor.kinds:
                     continue
                 lidar = sensor.lidar
                 one = measured[sensor]
                 packets, _ = one.ring.store(batch.data, batch.start[index], None)
-                good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
+                mine = lidar.sent_by_me(packets)
+                if mine.any():
+                    one.sent.add(kind)
+                good = mine & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
                 headers = lidar.column_headers(packets[good], host_ns)
                 one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
-                if discovery.sampler.has_receive_times(sensor):
+                if sampler.has_receive_times(sensor):
                     _, newest_ns = extremes(headers)
                     known = newest_ns > NEVER
                     one.watch.add(newest_ns[known], host_ns[known])
                 if one.first is None and headers.valid.any():
                     row, column = np.argwhere(headers.valid)[0]
                     one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
+    for sensor, one in measured.items():
+        sensor.kinds -= late - one.sent
     return measured
 
 

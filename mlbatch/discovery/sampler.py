@@ -59,18 +59,45 @@ class Sampler:
         """Sample a batch."""
         for kind, index in split_by_kind(batch):
             first_ns = int(batch.host_ns[index[0]])
-            samples = self.kinds.get(kind)
-            if samples is None:
-                source_ip = self.table.streams[kind.stream].source_ip
-                self._kinds_of_ip.setdefault(source_ip, []).append(kind)
-                samples = KindSamples([], [], 0, first_ns, 0, set())
-                self.kinds[kind] = samples
+            samples = self.kinds.get(kind) or self._new(kind, first_ns)
             for at in _rows_to_keep(samples, kind, index, batch):
                 begin = int(batch.start[at])
                 samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
                 samples.host_ns.append(int(batch.host_ns[at]))
             samples.packets += len(index)
             samples.last_host_ns = int(batch.host_ns[index[-1]])
+
+    def _new(self, kind: PacketKind, first_host_ns: int) -> KindSamples:
+        """Add a kind without packets."""
+        source_ip = self.table.streams[kind.stream].source_ip
+        self._kinds_of_ip.setdefault(source_ip, []).append(kind)
+        samples = KindSamples([], [], 0, first_host_ns, 0, set())
+        self.kinds[kind] = samples
+        return samples
+
+    def restart_counts(self) -> None:
+        """Count from zero in another pass, by `count`; samples are kept."""
+        for samples in self.kinds.values():
+            samples.packets = 0
+
+    def count(self, kind: PacketKind, index: I64Array, batch: PacketBatch) -> bool:
+        """Count the packets of a kind at `index` of a batch; True if the kind is new.
+
+        One packet of a new kind is kept: memory does not grow with the recording.
+        """
+        first_ns = int(batch.host_ns[index[0]])
+        is_new = kind not in self.kinds
+        if is_new:
+            samples = self._new(kind, first_ns)
+            begin = int(batch.start[index[0]])
+            samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
+            samples.host_ns.append(first_ns)
+        samples = self.kinds[kind]
+        if not samples.packets:
+            samples.first_host_ns = first_ns
+        samples.packets += len(index)
+        samples.last_host_ns = int(batch.host_ns[index[-1]])
+        return is_new
 
     def evidence(self, kind: PacketKind) -> Evidence:
         """Samples of a kind and of its neighbours, as vendors recognise them."""

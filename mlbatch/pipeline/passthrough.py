@@ -1,8 +1,9 @@
 """IMU samples and recorded messages: not batched, written with the scan of their time.
 
 Recorded Imu messages are written only if scans are on an epoch clock within 1 s of theirs, at their
-own timestamps; messages of other topics byte for byte at their log time. IMU samples of lidars keep
-the clock of their lidar.
+own timestamps; messages of other topics byte for byte at their log time. Topics that `--pass` names
+are refused where their clock and that of the scans are more than 1 s apart. IMU samples of lidars
+keep the clock of their lidar.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.batching.intake import STAMP_LIMIT_NS
-from mlbatch.errors import UsageError
+from mlbatch.clocks.timescale import format_difference
+from mlbatch.errors import ClockError, UsageError
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.report.ledger import DecodedCounts
@@ -209,6 +211,9 @@ class MessageQueue:
         # A heap by timestamp, then file order: recordings contain messages in any order.
         self._waiting: list[tuple[int, int, Message]] = []
         self._added = 0
+        # Clock of the scans minus that of the capture host, and remedies for a difference.
+        self._scan_offset_ns = 0
+        self._remedies = ""
 
     @property
     def waiting(self) -> int:
@@ -234,6 +239,29 @@ class MessageQueue:
                     f"--pass {pattern}: expected a topic of the recording, found none that "
                     "matches; see `mlbatch inspect`"
                 )
+
+    def check_clock(
+        self, recordings: Sequence[Recording], scan_offset_ns: int, remedies: str
+    ) -> None:
+        """Raise ClockError where `--pass` would mix times of clocks more than NEAR_NS apart.
+
+        Messages are written at their log time, IMU messages at that of their header, which is
+        checked when they are written. scan_offset_ns: clock of the scans minus receive time;
+        remedies: what brings both together.
+        """
+        self._scan_offset_ns = scan_offset_ns
+        self._remedies = remedies
+        if abs(scan_offset_ns) <= NEAR_NS:
+            return
+        for recording in recordings:
+            for topic in recording.topics:
+                is_written = topic.encoding in self._encodings and topic.name != OWN_TOPIC
+                if is_written and topic.type != IMU_TYPE and self._is_asked_for(topic):
+                    raise _other_clock(topic, "the capture host's clock", scan_offset_ns, remedies)
+
+    def _is_asked_for(self, topic: Topic) -> bool:
+        """True if `--pass` names the topic."""
+        return any(fnmatchcase(topic.name, pattern) for pattern in self._patterns)
 
     def add(self, messages: Iterable[Message]) -> None:
         """Add messages, in file order."""
@@ -282,7 +310,7 @@ class MessageQueue:
             counts = self.counts[message.topic.name]
             if high_ns is not None and stamp_ns >= high_ns:
                 counts.drop("outside_time")
-            elif message.topic.type == IMU_TYPE and not _is_near(
+            elif message.topic.type == IMU_TYPE and not self._is_near(
                 stamp_ns, message, clock_offset_ns
             ):
                 counts.drop("other_clock")
@@ -290,6 +318,30 @@ class MessageQueue:
                 counts.written += 1
                 taken.append(replace(message, host_ns=stamp_ns))
         return sorted(taken, key=lambda message: (message.host_ns, message.topic.name))
+
+    def _is_near(self, stamp_ns: int, message: Message, clock_offset_ns: int | None) -> bool:
+        """True if an IMU's clock is that of the scans, both relative to the capture host's.
+
+        ClockError if `--pass` names the topic and not even its first message is near.
+        """
+        ahead_ns = stamp_ns - message.host_ns
+        if not self._is_asked_for(message.topic):
+            return clock_offset_ns is not None and abs(ahead_ns - clock_offset_ns) <= NEAR_NS
+        apart_ns = self._scan_offset_ns - ahead_ns
+        if abs(apart_ns) <= NEAR_NS:
+            return True
+        counts = self.counts[message.topic.name]
+        if not counts.written and "other_clock" not in counts.dropped:
+            raise _other_clock(message.topic, "the clock of its header", apart_ns, self._remedies)
+        return False
+
+
+def _other_clock(topic: Topic, clock: str, apart_ns: int, remedies: str) -> ClockError:
+    return ClockError(
+        f"--pass {topic.name}: expected {clock} and that of the scans within 1 s of each other, "
+        f"since both are written at their own times, found the scans "
+        f"{format_difference(apart_ns)} from it; {remedies}, or leave the topic out"
+    )
 
 
 def header_stamp_ns(message: Message) -> int | None:
@@ -301,10 +353,3 @@ def header_stamp_ns(message: Message) -> int | None:
     if not (0 < seconds < 2**31 and nanoseconds < NS_PER_S):
         return None
     return int(seconds) * NS_PER_S + int(nanoseconds)
-
-
-def _is_near(stamp_ns: int, message: Message, clock_offset_ns: int | None) -> bool:
-    """True if an IMU's clock is that of the scans, both relative to the capture host's."""
-    if clock_offset_ns is None:
-        return False
-    return abs(stamp_ns - message.host_ns - clock_offset_ns) <= NEAR_NS

@@ -51,7 +51,7 @@ _NOT_IDENTITY = frozenset(
 )
 _DIGITS = 12
 
-# Slots of a scan by outcome, one list a sensor; see `ledger.POINT_OUTCOMES`.
+# Counts of the points of a scan, one list a sensor; see `ledger.POINT_COUNTERS`.
 Row: TypeAlias = list[list[int]]
 Line: TypeAlias = dict[str, object]
 

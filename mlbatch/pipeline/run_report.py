@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import sensors
+from mlbatch.clocks.host_offset import HostOffset, describe_off
+from mlbatch.clocks.timescale import describe_time
 from mlbatch.discovery.match import describe
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
+from mlbatch.pipeline.time_limits import text_of_range, text_of_time
 from mlbatch.report.ledger import ordered
 from mlbatch.report.report import (
     ClockReport,
@@ -64,6 +67,7 @@ def run_report(run: Conversion) -> RunReport:
         if run.session.replay is None
         else tuple(FaultReport(one.fault, one.packets) for one in run.session.replay.counts),
         repeated=_repeated(run),
+        first_scan=_first_scan(run),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
@@ -86,6 +90,39 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
                 yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
 
 
+def host_offsets(run: Conversion) -> list[HostOffset]:
+    """Clocks of the sensors, as batched, against the capture host's; none by receive times."""
+    findings = dict(run.session.clocks.findings())
+    offsets = []
+    for sensor, first in zip(run.sensors, run.batcher.firsts, strict=True):
+        if sensor.clock.by_host or first is None:
+            continue
+        lidar = sensor.lidar
+        found = findings.get(sensor.name)
+        if found is None:
+            offsets.append(
+                HostOffset.of_message(
+                    sensor.name, *first, lidar.clock_period_ns, lidar.timestamp_mode
+                )
+            )
+        else:
+            offsets.append(HostOffset.measured(sensor.name, found))
+    return offsets
+
+
+def _epoch_notes(run: Conversion) -> Iterator[Note]:
+    """Clocks that agree with each other, but not with the capture host's."""
+    offsets = host_offsets(run)
+    off = [one.sensor for one in offsets if one.is_off]
+    if not off:
+        return
+    first = next(sensor for sensor in run.sensors if sensor.name == off[0])
+    given_ns = 0 if first.rig is None else first.rig.offset_ns
+    timed = all(sensor.clock.has_receive_times for sensor in run.sensors)
+    text = describe_off(offsets, given_ns, timed=timed)
+    yield Note("clock_epoch", off[0] if len(run.sensors) == 1 else "", text)
+
+
 def final_notes(run: Conversion) -> list[Note]:
     """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
     notes = [
@@ -94,6 +131,7 @@ def final_notes(run: Conversion) -> list[Note]:
         for text in recording.notes
     ]
     notes += _cloud_notes(run)
+    notes += _epoch_notes(run)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
         # A packet captured twice is no loss.
@@ -111,6 +149,14 @@ def final_notes(run: Conversion) -> list[Note]:
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
+        points = sensor.ledger.points
+        if points.clipped:
+            text = (
+                f"{sensor.name}: {points.clipped} of {points.written} points "
+                f"({points.clipped / points.written:.2%}) have an intensity outside 0 to 255, "
+                "which the point layout clips; choose one with a float32 intensity"
+            )
+            notes.append(Note("clipped", sensor.name, text))
     table = run.session.setup.sampler.table
     seen = run.session.setup.sampler.kinds
     for kind in sorted(run.session.ingest.samples):
@@ -163,6 +209,15 @@ def why_no_scan(run: Conversion) -> str:
     )
     if all(span is None for span in run.batcher.spans_ns):
         return f"{where}: no scan: expected valid columns, found none ({'; '.join(spans)})"
+    known = [span for span in run.batcher.spans_ns if span is not None]
+    first_ns = min(span[0] for span in known)
+    last_ns = max(span[1] for span in known)
+    start_ns, _ = run.batcher.limits_ns
+    if start_ns is not None and start_ns > last_ns:
+        return (
+            f"{where}: no scan: expected --start in the recording, "
+            f"{text_of_range(first_ns, last_ns)}, found {text_of_time(start_ns)}; choose another"
+        )
     period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
     advice = (
         "write the partial ones with --keep-partial"
@@ -173,6 +228,12 @@ def why_no_scan(run: Conversion) -> str:
         f"{where}: no scan: expected a whole window of {period_ms:g} ms with all sensors, found "
         f"{'; '.join(spans)}; {advice}"
     )
+
+
+def _first_scan(run: Conversion) -> str:
+    if run.table is None or run.table.first_start_ns is None or run.info is None:
+        return ""
+    return describe_time(run.table.first_start_ns, run.info.timescale)
 
 
 def _capture(run: Conversion) -> CaptureCounts:

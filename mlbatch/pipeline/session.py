@@ -174,6 +174,7 @@ class Session:
                 sensor.lidar.returns,
                 0 if job.split else sensor.ring_base,
                 sensor.body_from_sensor,
+                sensor.lidar.has_reflectivity,
             )
             for sensor in self.sensors
         )

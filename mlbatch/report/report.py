@@ -142,6 +142,7 @@ class RunReport:
     messages: tuple[ForwardedMessages, ...] = ()
     faults: tuple[FaultReport, ...] = ()
     repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
+    first_scan: str = ""  # start of the first scan, as text
 
 
 def build_report(run: RunReport) -> Section:
@@ -222,6 +223,8 @@ def summary_lines(run: RunReport) -> list[str]:
         f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
         f"{scans.empty} empty windows), {scans.points} points, clock {run.timescale}"
     )
+    if run.first_scan:
+        lines.append(f"first scan at {run.first_scan}")
     if run.timing is not None:
         timing = run.timing
         lines.append(

@@ -58,6 +58,7 @@ class ScanTable:
         self._spans_ns = array("q")
         self._periods_ns = array("d")
         self._written = 0
+        self.first_start_ns: int | None = None  # of the first scan
         self._incomplete = 0
         self._points = 0
         names = [sensor.name for sensor in info.sensors]
@@ -71,6 +72,8 @@ class ScanTable:
     def add(self, scan: Scan) -> None:
         """Add a written scan."""
         row = _Row.of(scan)
+        if self.first_start_ns is None:
+            self.first_start_ns = scan.start_ns
         if self._open is not None and self._open.key == row.key:
             self._open = self._open.joined(row)
             return

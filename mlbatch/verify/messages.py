@@ -175,10 +175,12 @@ def stored_scan(cloud: Cloud, where: str, sensor: int | None) -> StoredScan:
     scan = StoredScan(where, cloud.stamp_ns, xyz, organized, sensor)
     scan.time_ns = time_ns
     scan.time_step_ns = step_ns
-    # An intensity of one byte has no NaN for empty slots.
-    if "intensity" in names and records.dtype["intensity"].kind == "f":
-        intensity: F32Array = records["intensity"]
-        scan.intensity = intensity
+    if "intensity" in names:
+        # An intensity of one byte has no NaN for empty slots.
+        if records.dtype["intensity"].kind == "f":
+            scan.intensity = records["intensity"]
+        else:
+            scan.byte_intensity = records["intensity"]
     if "range" in names:
         range_m: F64Array = records["range"] / 1000.0
         scan.range_m = range_m

@@ -362,9 +362,26 @@ def check_ledgers(report: Document) -> None:
         if None not in outcomes.values():
             known = {name: count or 0 for name, count in outcomes.items()}
             _check_sum(report, (*path, "slots"), (*path, _OUTCOMES[0]), known)
+        _check_clipped(report, path)
     for i in range(report.length("messages")):
         path = ("messages", i)
         _check_sum(report, (*path, "read"), (*path, "written"), report.counts(*path, "dropped"))
+
+
+def _check_clipped(report: Document, points: Keys) -> None:
+    """Clipped points of a sensor are among its written ones."""
+    clipped = _clipped(report, points)
+    written = report.number(*points, "written")
+    report.log.ok("ledger")
+    if written is not None and clipped > written:
+        name = report.name(*points, "clipped")
+        report.log.fail("ledger", name, f"at most {written} written points", clipped)
+
+
+def _clipped(report: Document, points: Keys) -> int:
+    """Clipped points of a sensor; 0 where the report is of a version that did not count them."""
+    path = (*points, "clipped")
+    return 0 if report.at(*path) is None else report.number(*path) or 0
 
 
 def _check_sum(report: Document, total: Keys, good: Keys, others: dict[str, int]) -> None:
@@ -446,6 +463,12 @@ def check_report(
         log.equal("report", f"{name}, all", totals.columns, total)
     for i in range(count):
         _check_slots(report, totals, i)
+    # A clipped intensity is a limit of its field.
+    clipped = sum(_clipped(report, ("sensors", i, "points")) for i in range(sensors))
+    log.ok("report")
+    if clipped > totals.at_limit:
+        name = report.name("sensors", "points", "clipped")
+        log.fail("report", f"{name}, all", f"at most {totals.at_limit}", clipped)
     if table is not None:
         _check_table(report, table)
         if grid is not None:

@@ -30,6 +30,8 @@ class StoredScan:
     slice: int | None = None
     complete: bool | None = None
     intensity: F32Array | None = None
+    # Instead of `intensity` in layouts that store 8 bits of it.
+    byte_intensity: U8Array | None = None
     range_m: F32Array | F64Array | None = None
     # Distance from the origin of the sensor, exact to a float32.
     distance_m: F32Array | None = None

@@ -23,6 +23,7 @@ _WORDS = {"true": True, "false": False}
 # Below and above all times.
 _EARLY_NS = -(2**62)
 _LATE_NS = 2**62
+_MAX_U8 = 255
 
 
 @dataclass(slots=True)
@@ -317,6 +318,8 @@ class OutputTotals:
         self.columns = 0
         # By sensor, (s,).
         self.points_of = np.zeros(sensors, np.int64)
+        # Points whose 8-bit intensity is 0 or 255.
+        self.at_limit = 0
         self.columns_of = np.zeros(sensors, np.int64)
         self.rings = Rings(np.full(sensors, _LATE_NS), np.full(sensors, -1))
         # What all scans of the output show.
@@ -337,6 +340,10 @@ class OutputTotals:
         self.scans += 1
         self.points += points.count
         self.knows_points &= self._add_points(scan, points)
+        if scan.byte_intensity is not None:
+            valid = ... if points.valid is None else points.valid
+            values = scan.byte_intensity[valid]
+            self.at_limit += int(np.count_nonzero((values == 0) | (values == _MAX_U8)))
         self.knows_complete &= scan.complete is not None
         self.knows_times &= points.time_ns is not None
         self.time_step_ns = max(self.time_step_ns, scan.time_step_ns)

@@ -37,7 +37,7 @@ def without_timing(report: Report) -> Report:
 def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     outcome = shell(f"convert {FIX} -o out")
     assert (outcome.code, outcome.err) == (0, "")
-    head, left, right, scans, speed, wrote = outcome.out.splitlines()
+    head, left, right, scans, first, speed, wrote = outcome.out.splitlines()
     assert head.split() == [
         "sensor",
         "model",
@@ -54,6 +54,8 @@ def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     assert scans == (
         f"7 scans at 10 Hz (0 incomplete, 0 empty windows), {7 * POINTS} points, clock utc"
     )
+    # The first bound after the first stamps (SOURCE.md).
+    assert first == "first scan at 2026-05-04T08:00:00.100Z"
     assert speed.startswith("0.8 s recorded in ")
     assert wrote == "wrote out, report out/report.json"
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.rig.rig import read_rig
+from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     FIXTURE,
     NO_RECORDINGS,
@@ -22,6 +23,7 @@ from tests.builders.sessions import (
     Shell,
     Unit,
     twin,
+    write_metadata,
     write_session,
 )
 
@@ -243,3 +245,67 @@ def test_two_real_sensors_on_one_port(shell: Shell, kind: str) -> None:
         expected |= {(*first, 48), (*second, 48)}
     assert found == expected
     assert all("same_ports" in s["calibration"] for s in streams if s["bytes"] > 48)
+
+
+# -- the whole recording ------------------------------------------------------------------------
+
+
+def _long_session(folder: Path) -> Path:
+    """12.8 s of a lidar that loses 5 packets after 11 s; others that begin after 10.5 s."""
+    unit = Unit(turns=128)
+    records = unit.records
+    begin_ns = unit.begin_ns
+    late_ns = begin_ns + 10_500 * NS_PER_MS
+    # 320 packets a second.
+    kept = [one for number, one in enumerate(records) if not 3600 <= number < 3605]
+    foreign = [
+        (late_ns + number * 100 * NS_PER_MS, udp_frame(b"x" * 100, "10.0.0.9", dport=9000)[0])
+        for number in range(11)
+    ]
+    other = twin(replace(unit, begin_ns=late_ns, turns=10), 222)
+    return write_session(folder, more=[*kept, *foreign, *other.records])
+
+
+@pytest.fixture(scope="module")
+def long_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("long")
+    write_metadata(folder / "111.json", SMALL)
+    return _long_session(folder)
+
+
+def test_all_figures_are_of_the_whole_recording(shell: Shell, long_session: Path) -> None:
+    outcome = shell(f"inspect {long_session} --whole --json")
+    document = json.loads(outcome.out)
+    assert document["whole"] is True
+    streams = {one["stream"]: one for one in document["streams"]}
+    lidar = streams["10.0.0.1 > port 7502"]
+    assert (lidar["packets"], lidar["lost"]) == (128 * 32 - 5, 5)
+    span_s = (lidar["last_host_ns"] - lidar["first_host_ns"]) / NS_PER_S
+    # From the first packet to the last of 4096, 3.125 ms apart.
+    assert span_s == pytest.approx(4095 * 0.003125, abs=1e-6)
+    assert lidar["rate_hz"] == pytest.approx((128 * 32 - 6) / span_s)
+    foreign = streams["10.0.0.9 > port 9000"]
+    assert (foreign["packets"], foreign["what"], foreign["sensor"]) == (11, "unknown", "")
+    assert foreign["rate_hz"] == pytest.approx(10)
+    other = streams["10.0.0.2 > port 7502"]
+    assert (other["packets"], other["sensor"]) == (320, "")
+    (note,) = document["notes"]
+    assert note.startswith("10.0.0.2 > port 7502: Ouster")
+    assert "it started after the first 10 s" in note
+
+
+def test_without_the_option_all_figures_are_of_ten_seconds(
+    shell: Shell, long_session: Path
+) -> None:
+    document = json.loads(shell(f"inspect {long_session} --json").out)
+    assert (document["whole"], document["notes"]) == (False, [])
+    (lidar,) = document["streams"]
+    assert lidar["lost"] == 0
+    assert 3150 < lidar["packets"] < 3250
+    assert lidar["last_host_ns"] - lidar["first_host_ns"] < 10.1 * NS_PER_S
+
+
+def test_the_whole_of_a_short_recording_is_its_first_seconds(shell: Shell) -> None:
+    ten = json.loads(shell(f"inspect {CAPTURE} --json").out)
+    whole = json.loads(shell(f"inspect {CAPTURE} --whole --json").out)
+    assert {**ten, "whole": True} == whole

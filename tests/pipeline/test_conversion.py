@@ -91,7 +91,7 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     assert [(note.code, note.message) for note in run.notes[:1]] == [
         ("timescale", "sensors differ in timescale: utc, unknown")
     ]
-    assert [note.code for note in run.notes[1:]] == ["clocks"]
+    assert [note.code for note in run.notes[1:]] == ["clock_epoch", "clocks"]
 
 
 # -- progress and report ---------------------------------------------------------------------------

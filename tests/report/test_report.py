@@ -226,7 +226,7 @@ def test_report_has_the_contract_s_form() -> None:
     }
     assert list(sensor["packets"]["rejected"]) == ["bad_size", "duplicate"]
     assert sensor["columns"] == {"decoded": 1600, "written": 1500, "dropped": {"late": 100}}
-    assert list(sensor["points"].values()) == [6000, 1000, 300, 200, 0, 4500]
+    assert list(sensor["points"].values()) == [6000, 1000, 300, 200, 0, 4500, 0]
     assert sensor["clock"]["offset_to_host_ms"] == 12.5
     assert sensor["extrinsics"] == {"source": "rig", "body_from_sensor": np.eye(4).tolist()}
     assert report["scans"]["empty"] == 3
