@@ -109,7 +109,8 @@ def _kernels() -> set[tuple[Constant, ...]]:
 
     with _few_kernels(remembering), tempfile.TemporaryDirectory() as folder:
         for seed in _compiled_seeds():
-            in_memory(replace(_job(seed, Path(folder)), engine="numba"))
+            # A short seed may have partial windows only.
+            in_memory(replace(_job(seed, Path(folder)), engine="numba", keep_partial=True))
     return known
 
 
