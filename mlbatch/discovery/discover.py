@@ -240,10 +240,18 @@ def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> No
     chosen = [kind for kind in sampler.kinds if sensor.stream.selects(streams[kind.stream])]
     texts = [describe(sampler, kind) or "" for kind in chosen]
     lidars = [text for text in texts if "lidar" in text]
-    if lidars and all(map(lacks_decoder, lidars)):
+    if lidars and all(map(lacks_decoder, lidars)) and not _is_readable(sampler, chosen, sensor):
         raise RigError(
             f"{origin}: sensor {sensor.name}: {sensor.stream} carries {lidars[0]}; {_NO_SUPPORTED}"
         )
+
+
+def _is_readable(sampler: Sampler, kinds: Sequence[PacketKind], sensor: RigSensor) -> bool:
+    """Whether packets of unknown model can be decoded as the model that the rig names."""
+    if sensor.model is None:
+        return False
+    named = [one for one in sensors.built_in() if one.model == sensor.model]
+    return any(one.match_score(sampler.evidence(kind)) for one in named for kind in kinds)
 
 
 def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:

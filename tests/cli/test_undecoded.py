@@ -57,9 +57,13 @@ def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: P
 
 
 @pytest.mark.parametrize("stream", ["{source_ip: 10.0.0.8, port: 6699}", "{port: 6699}"])
-def test_a_sensor_of_the_rig_without_decoder(shell: Shell, tmp_path: Path, stream: str) -> None:
+@pytest.mark.parametrize("model", ["", "    model: Helios 32\n"])
+def test_a_sensor_of_the_rig_without_decoder(
+    shell: Shell, tmp_path: Path, stream: str, model: str
+) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
-    (tmp_path / "rig.yaml").write_text(f"sensors:\n  - name: front\n    stream: {stream}\n")
+    text = f"sensors:\n  - name: front\n    stream: {stream}\n{model}"
+    (tmp_path / "rig.yaml").write_text(text)
     outcome = shell(f"convert {capture} --rig rig.yaml -o out")
     assert outcome.code == 1
     selector = stream[1:-1].replace(":", "")
