@@ -1,6 +1,6 @@
 """Latency from the receive time of a packet to the sub-scan that it completes.
 
-    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine numba
+    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine native
 
 Packets are pushed one by one, as from a driver on the vehicle, through the classes of a conversion:
 `Ingest.columns`, `Batcher.push`, `DecodeWorker.decode`. Garbage collection is on. CPU time of the

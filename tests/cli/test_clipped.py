@@ -29,7 +29,7 @@ from tests.builders.sessions import (
 )
 from tests.builders.sessions_of_bags import write_mcap
 
-ENGINES = ("numpy", "numba")
+ENGINES = ("numpy", "native")
 SPEC = OusterSpec(profile="RNG19_RFL8_SIG16_NIR16", beams=16, columns_per_frame=512, serial=111)
 COLUMN_NS = 100 * NS_PER_MS // 512
 

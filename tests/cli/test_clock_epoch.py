@@ -25,7 +25,7 @@ from tests.builders.sessions import (
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 
 TAI_S = 37
-ENGINES = ("numpy", "numba")
+ENGINES = ("numpy", "native")
 PTP_SPEC: OusterSpec = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")
 ZERO = "extrinsics: {translation_m: [0, 0, 0]}"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)

@@ -44,7 +44,7 @@ _HERE = Path(__file__).resolve().parent
 _REPOSITORY = _HERE.parents[1]
 _DIGESTS = _HERE / "digests.json"
 _WORDING = _HERE / "wording.json"
-_NO_NATIVE = "numba is not installed: pip install mlbatch[fast]"
+_NO_NATIVE = "the engine native is not installed: no C compiler was found"
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 
 

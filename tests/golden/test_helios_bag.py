@@ -67,7 +67,7 @@ WRITERS: Mapping[str, Callable[[Path, list[Recorded]], Path]] = {
 }
 
 
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("engine", ["numpy", "native"])
 @pytest.mark.parametrize("container", WRITERS)
 def test_a_real_helios_is_decoded(container: str, engine: str, tmp_path: Path) -> None:
     path = WRITERS[container](tmp_path, messages(payloads()))

@@ -152,7 +152,7 @@ def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None
         assert_same_points(converted(case.path, tmp_path / str(number), *words).cloud, whole)
 
 
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("engine", ["numpy", "native"])
 def test_an_azimuth_of_36000_costs_no_packet(engine: str, tmp_path: Path) -> None:
     """Data packet 1750 has it; the reference has packets 1600 to 1901."""
     folder = FOLDER / "vlp16_azimuth-36000"
