@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
 
 _KB_PER_MB = 1024
-_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, {}, 0, Spread(), Spread())
 
 
 def run_report(run: Conversion) -> RunReport:

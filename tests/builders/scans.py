@@ -63,6 +63,7 @@ def dense_scan(index: int = 0, points: int = 1000, columns: int = 50, seed: int 
         column_lidar_id=column_lidar,
         points=points,
         columns_per_sensor=per_sensor,
+        points_per_sensor=(int((lidar_id == 0).sum()), int((lidar_id == 1).sum())),
         max_gap_ns=(5, 6),
     )
 
