@@ -212,6 +212,7 @@ class RunInfo:
     timescale: str  # utc, tai, uptime or unknown
     slices: int = 1  # a window
     layout: str = "dense"  # or organized
+    sort: str = "columns"  # order of the points of a dense scan: by their columns, or `points`
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.
@@ -282,3 +283,5 @@ class Summary:
     t_init_ns: int | None  # None: no window was reached
     report_json: str  # report.json without timings and paths
     scans_csv: str  # text of scans.csv
+    # Totals of fill, as texts by name; docs/formats.md#mcap.
+    fill: dict[str, str] = field(default_factory=dict)

@@ -19,7 +19,7 @@ from mlbatch.decode.coverage import NO_COLUMNS, ColumnStats
 from mlbatch.decode.engine import Engine, EngineSetup
 from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns, by_time
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import EXTRAS, RunInfo, Scan
 
@@ -124,6 +124,8 @@ class Decoder:
         positions = [None if one is None else len(one) for one in angles]
         self._statistics = self._engine.column_statistics(positions)
         self._buffer = self._new_buffer(0)
+        # With `sort` the points before they are sorted; no scan has views of it.
+        self._unsorted = self._new_buffer(0)
         self._other_buffers = deque(self._new_buffer(0) for _ in range(buffers - 1))
 
     @property
@@ -149,6 +151,8 @@ class Decoder:
         self._reserve(len(columns))
         before = self._written()
         points = self._engine.decode(columns, header.start_ns, 0, self._buffer)
+        if self._info.sort == "points":
+            self._sort(points)
         return self._scan(columns, header, points, before)
 
     def _scan_without_points(
@@ -170,6 +174,13 @@ class Decoder:
         rows = columns if self._is_organized else columns * self._slots
         if rows > self._buffer.rows:
             self._buffer = self._new_buffer(rows)
+
+    def _sort(self, points: int) -> None:
+        """Sort the points of a dense scan by time, those of one time by column."""
+        if self._unsorted.rows < self._buffer.rows:
+            self._unsorted = self._new_buffer(self._buffer.rows)
+        self._buffer, self._unsorted = self._unsorted, self._buffer
+        by_time(self._unsorted, points, self._buffer)
 
     def _new_buffer(self, rows: int) -> ScanBuffer:
         return ScanBuffer(rows, self._slots if self._is_organized else None)

@@ -133,6 +133,7 @@ class RunReport:
     rate_hz: str
     t_init_ns: int | None  # None: no window was reached
     slices: int
+    sort: str  # as `RunInfo.sort`
     capture: CaptureCounts
     sensors: tuple[SensorReport, ...]
     scans: ScanStatistics
@@ -157,6 +158,7 @@ def build_report(run: RunReport) -> Section:
             "period_ns": str(NS_PER_S / Fraction(run.rate_hz)),
             "t_init_ns": run.t_init_ns,
             "slices": run.slices,
+            "sort": run.sort,
         },
         "capture": {
             "frames": run.capture.frames,
@@ -192,6 +194,14 @@ def report_text(run: RunReport, machine: bool = True, in_a_line: bool = False) -
     return text.encode("utf-8", "backslashreplace").decode() + "\n"
 
 
+def fill_totals(run: RunReport) -> dict[str, str]:
+    """Totals of fill as texts: sensors in JSON, underfilled scans as a number."""
+    scans = run.scans
+    by_sensor = {"fill": scans.fill, "without": scans.without}
+    texts = {key: json.dumps(value, ensure_ascii=False) for key, value in by_sensor.items()}
+    return {"underfilled": str(scans.underfilled), **texts}
+
+
 def imbalances(run: RunReport) -> list[str]:
     """Counters of a run that do not balance, a line each."""
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
@@ -218,10 +228,16 @@ def summary_lines(run: RunReport) -> list[str]:
         for row in rows
     ]
     scans = run.scans
+    left_out = scans.dropped_incomplete
+    dropped = f", {left_out} left out by --drop-incomplete" if left_out else ""
     lines.append(
         f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
-        f"{scans.empty} empty windows), {scans.points} points, clock {run.timescale}"
+        f"{scans.empty} empty windows{dropped}), {scans.points} points, clock {run.timescale}"
     )
+    for name, count in scans.underfilled_by_sensor.items():
+        none = scans.without.get(name, 0)
+        tail = f": {none} have none" if none else ""
+        lines.append(f"{count} scans lack columns of {name}{tail}")
     if run.timing is not None:
         timing = run.timing
         lines.append(

@@ -74,6 +74,7 @@ def run() -> RunReport:
         rate_hz="10",
         t_init_ns=START_NS,
         slices=1,
+        sort="columns",
         capture=capture,
         sensors=(sensor,),
         scans=table.statistics(empty=3),
