@@ -22,8 +22,8 @@ from mlbatch.units import NS_PER_S
 LEAST_EXPECTED = 2
 UNKNOWN = math.nan
 _TICKS = 2.0**32
-# A whole number less the rounding of products of it is that number.
-_ROUNDING = 1e-6
+# Relative error of an expectation: rotor positions are rounded.
+_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def _share(count: int, expected: float) -> float:
     if math.isnan(expected):
         # Whatever the rate is, there should be columns.
         return UNKNOWN if count else 0.0
-    whole = math.floor(expected + _ROUNDING)
+    whole = math.floor(expected * (1 + _ROUNDING))
     return UNKNOWN if whole < LEAST_EXPECTED else min(1.0, count / whole)
 
 
@@ -100,8 +100,8 @@ class _Expectation:
         positions = self.pace.positions
         self._seen[np.clip(sectors(encoder, positions), 0, SECTORS - 1)] = True
         self._lit_share = int(np.count_nonzero(self._seen)) / SECTORS
-        ticks = rotor_ticks(encoder) if positions is None else encoder * (int(_TICKS) // positions)
-        turned = np.diff(ticks) / _TICKS
+        ticks = rotor_ticks(encoder) if positions is None else encoder
+        turned = np.diff(ticks) / (_TICKS if positions is None else positions)
         turned -= np.rint(turned)
         passed_ns = np.diff(stamp_ns)
         moving = passed_ns > 0

@@ -126,7 +126,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         _say(f"warning: {note.code}: {note.message}")
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
-    elif target.dry_run and report_path is None:
+    if target.dry_run and report_path is None:
         # One line a segment: several JSON documents in a row are no document.
         typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
     elif not target.quiet:

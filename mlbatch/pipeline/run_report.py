@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
 
 _KB_PER_MB = 1024
-_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, {}, 0, Spread(), Spread())
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, 0, Spread(), Spread())
 
 
 def run_report(run: Conversion) -> RunReport:
@@ -254,6 +254,7 @@ def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
         stream="; ".join(streams),
         mode=sensor.lidar.mode,
         ledger=sensor.ledger,
+        fill=None if run.table is None else run.table.fill[sensor.index],
         clock=_clock(run, sensor),
         extrinsics_source=sensor.detected.pose.describe(),
         body_from_sensor=sensor.body_from_sensor,

@@ -70,6 +70,7 @@ class SensorReport:
     stream: str
     mode: str
     ledger: SensorLedger
+    fill: float | None  # mean over the scans, None: unknown
     clock: ClockReport
     extrinsics_source: str
     body_from_sensor: F64Array
@@ -197,7 +198,8 @@ def report_text(run: RunReport, machine: bool = True, in_a_line: bool = False) -
 def fill_totals(run: RunReport) -> dict[str, str]:
     """Totals of fill as texts: sensors in JSON, underfilled scans as a number."""
     scans = run.scans
-    by_sensor = {"fill": scans.fill, "without": scans.without}
+    fill = {sensor.name: sensor.fill for sensor in run.sensors}
+    by_sensor: dict[str, Json] = {"fill": fill, "without": scans.without}
     texts = {key: json.dumps(value, ensure_ascii=False) for key, value in by_sensor.items()}
     return {"underfilled": str(scans.underfilled), **texts}
 
@@ -282,6 +284,7 @@ def _sensor(sensor: SensorReport) -> Section:
             "written": columns.written,
             "dropped": ordered(columns.dropped, COLUMN_REASONS),
         },
+        "fill": sensor.fill,
         "points": asdict(sensor.ledger.points),
         "clock": asdict(sensor.clock),
         "extrinsics": {

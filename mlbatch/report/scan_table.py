@@ -49,8 +49,6 @@ class ScanStatistics:
     no_points: dict[str, int]
     # Written scans (with `--split` of any sensor) without a point.
     empty_clouds: int
-    # By sensor, mean over the scans; None: unknown.
-    fill: dict[str, float | None]
     points: int
     span_ms: Spread
     period_ms: Spread
@@ -127,11 +125,16 @@ class ScanTable:
             _counted({one.name: one.without for one in self._totals}),
             _counted({one.name: one.no_points for one in self._totals}),
             self._empty_clouds,
-            {one.name: one.mean_fill for one in self._totals},
             self._points,
             _spread(np.frombuffer(self._spans_ns, dtype=np.int64) / NS_PER_MS),
             _spread(np.frombuffer(self._periods_ns, dtype=np.float64) / NS_PER_MS),
         )
+
+    @property
+    def fill(self) -> list[float | None]:
+        """Mean fill of each sensor over the scans; None: unknown."""
+        self._close_row()
+        return [one.mean_fill for one in self._totals]
 
     def _close_row(self) -> None:
         row = self._open
@@ -281,7 +284,8 @@ class _Row:
 
 
 def _fill_cells(row: _Row) -> list[str]:
-    return ["" if math.isnan(fill) else f"{fill:.6g}" for fill in row.fill]
+    # The shortest text of a float32.
+    return ["" if math.isnan(fill) else str(np.float32(fill)) for fill in row.fill]
 
 
 def _counted(counts: dict[str, int]) -> dict[str, int]:

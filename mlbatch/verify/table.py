@@ -21,9 +21,8 @@ _COUNTS = ("points", "columns")
 _COLUMNS = "columns_"
 _GAP = "max_gap_ns_"
 _FILL = "fill_"
-# Of a fill with six digits: of its value, and relative.
+# Of a float32, relative.
 _FILL_ERROR = 1e-6
-_FILL_SHARE = 1e-5
 _WORDS = {"true": True, "false": False}
 # Below and above all times.
 _EARLY_NS = -(2**62)
@@ -255,7 +254,7 @@ class _RowChecks:
         zero &= ~np.isnan(fill)
         inside = (fill > 0) & (fill < 1)
         expected = np.divide(count, fill, out=np.zeros_like(fill), where=inside)
-        broken = inside & (np.abs(expected - np.rint(expected)) > _FILL_SHARE * expected)
+        broken = inside & (np.abs(expected - np.rint(expected)) > _FILL_ERROR * expected)
         bad: BoolArray = np.any(outside | zero | broken, axis=1)
         at = np.argmax(outside | zero | broken, axis=1)
         shown = np.take_along_axis(fill, at[:, None], axis=1)[:, 0]

@@ -86,4 +86,4 @@ def header(scan: Scan, count: int) -> str:
 
 def _share(fill: float) -> str:
     """Return a fill as text, as in scans.csv."""
-    return "unknown" if math.isnan(fill) else f"{fill:.6g}"
+    return "unknown" if math.isnan(fill) else str(np.float32(fill))
