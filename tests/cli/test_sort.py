@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,6 +83,7 @@ def test_unsorted_points_that_claim_to_be_sorted_are_found(shell: Shell) -> None
     scan = arrays("out/000002.npz")
     for key in (*POINT_KEYS, "column"):
         scan[key] = scan[key][::-1]
-    np.savez("out/000002.npz", **scan)
+    values: dict[str, Any] = scan
+    np.savez("out/000002.npz", **values)
     outcome = shell("verify out")
     assert (outcome.code, "points by time, then column, then ring" in outcome.out) == (1, True)

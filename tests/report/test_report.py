@@ -66,7 +66,9 @@ def run() -> RunReport:
     clock = ClockReport("sensor", "ptp", 12.5, None, ("notes",))
     sensor = SensorReport(
         *("left", "OS1-4", 0, "10.0.0.1 > port 7502", "1024x10"),
-        *(ledger(), 0.75, clock, "rig", np.eye(4), "left.json"),
+        ledger(),
+        0.75,
+        *(clock, "rig", np.eye(4), "left.json"),
     )
     return RunReport(
         inputs=(InputReport("/data/a.pcap", 1000, "pcap"),),

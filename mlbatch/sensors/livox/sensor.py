@@ -211,7 +211,8 @@ def _packets_per_s(packets: U8Array) -> float:
     """Packets in a second by the timestamps of consecutive ones; 0: unknown."""
     head = headers(packets)
     steps_ns = np.diff(head["stamp_ns"].astype(np.int64))
-    is_next = np.diff(head["counter"].astype(np.int64)) % _COUNTER_MODULUS == 1
+    counter: I64Array = head["counter"].astype(np.int64)
+    is_next = (counter[1:] - counter[:-1]) % _COUNTER_MODULUS == 1
     next_ns = steps_ns[is_next & (steps_ns > 0)]
     return NS_PER_S / median(next_ns) if len(next_ns) else 0.0
 
