@@ -6,6 +6,8 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
 
@@ -211,6 +213,7 @@ class RunInfo:
     timescale: str  # utc, tai, uptime or unknown
     slices: int = 1  # a window
     layout: str = "dense"  # or organized
+    sort: str = "columns"  # order of the points of a dense scan: by their columns, or `points`
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.
@@ -251,9 +254,14 @@ class Scan:
     column_lidar_id: U8Array  # (n,)
     points: int
     columns_per_sensor: tuple[int, ...]
-    max_gap_ns: tuple[int, ...]  # by sensor, widest step between columns; 0: fewer than two
+    points_per_sensor: tuple[int, ...]
+    # By sensor: widest time without a column, from the last one before the window up to its end.
+    max_gap_ns: tuple[int, ...]
     coverage: tuple[float, ...] = ()  # by sensor, share of a revolution passed at least once
     overlap: tuple[float, ...] = ()  # by sensor, share of a revolution passed more than once
+    # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    is_partial: bool = False  # the head or the tail
 
     @property
     def slices(self) -> int:
@@ -278,3 +286,5 @@ class Summary:
     t_init_ns: int | None  # None: no window was reached
     report_json: str  # report.json without timings and paths
     scans_csv: str  # text of scans.csv
+    # Totals of fill, as texts by name; docs/formats.md#mcap.
+    fill: dict[str, str] = field(default_factory=dict)

@@ -138,6 +138,9 @@ class DecodePool:
             window.end_ns,
             window.complete,
             window.ready_host_ns,
+            window.edge_gap_ns,
+            window.fill,
+            window.is_partial,
         )
         columns = WindowColumns(window.stamp_ns, window.sensor, window.ring_index, window.encoder)
         if not self._split:

@@ -19,7 +19,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
-from mlbatch.report.report import RunReport, imbalances, report_text
+from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import RunInfo, Summary
 from mlbatch.writers import ScanWriter
 
@@ -170,5 +170,6 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Ru
         if last is not None:
             last(inputs, partial)
 
-    writer.finish(Summary(run.batcher.t_init_ns, report, table), complete)
+    summary = Summary(run.batcher.t_init_ns, report, table, fill_totals(inputs))
+    writer.finish(summary, complete)
     return inputs

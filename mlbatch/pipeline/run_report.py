@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
 
 _KB_PER_MB = 1024
-_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, 0, Spread(), Spread())
 
 
 def run_report(run: Conversion) -> RunReport:
@@ -50,6 +50,7 @@ def run_report(run: Conversion) -> RunReport:
         rate_hz=rate_text(run.grid.rate),
         t_init_ns=run.batcher.t_init_ns,
         slices=run.job.slices,
+        sort=run.job.sort,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
@@ -72,6 +73,8 @@ def run_report(run: Conversion) -> RunReport:
     )
 
 
+# Share of a sensor's packets that are lost, above which there is a warning.
+LOST = 0.001
 # Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
 # calibration; one damaged timestamp in the future makes those that follow it late.
 MANY = 0.01
@@ -157,6 +160,8 @@ def final_notes(run: Conversion) -> list[Note]:
                 "which the point layout clips; choose one with a float32 intensity"
             )
             notes.append(Note("clipped", sensor.name, text))
+    notes += _loss_notes(run)
+    notes += _point_notes(run)
     table = run.session.setup.sampler.table
     seen = run.session.setup.sampler.kinds
     for kind in sorted(run.session.ingest.samples):
@@ -173,6 +178,46 @@ def final_notes(run: Conversion) -> list[Note]:
                 )
             )
     return notes
+
+
+def _loss_notes(run: Conversion) -> Iterator[Note]:
+    """Sensors that lost packets, or of which scans lack half of the columns."""
+    scans = None if run.table is None else run.table.statistics(0)
+    for sensor in run.sensors:
+        packets = sensor.ledger.packets
+        if not packets.read:
+            # Its absence is another warning.
+            continue
+        texts = []
+        sent = packets.accepted + packets.lost
+        if packets.lost > LOST * sent:
+            share = 100 * packets.lost / sent
+            texts.append(f"{packets.lost} of {sent} packets lost ({share:.3g} %)")
+        lacking = 0 if scans is None else scans.underfilled_by_sensor.get(sensor.name, 0)
+        if scans is not None and lacking:
+            without = scans.without.get(sensor.name, 0)
+            texts.append(
+                f"{lacking} of {scans.written} scans have less than half of its columns, {without} "
+                "have none; --drop-incomplete leaves them out"
+            )
+        if texts:
+            yield Note("loss", sensor.name, f"{sensor.name}: {'; '.join(texts)}")
+
+
+def _point_notes(run: Conversion) -> Iterator[Note]:
+    """Scans with columns but no points: of a sensor, and of all."""
+    if run.table is None:
+        return
+    scans = run.table.statistics(0)
+    for name, count in scans.no_points.items():
+        text = (
+            f"{name}: {count} of {scans.written} scans have its columns but none of its points: no "
+            "returns, or all excluded; check its window, --min-range and --exclude-box"
+        )
+        yield Note("no_points", name, text)
+    if scans.empty_clouds:
+        text = f"{scans.empty_clouds} clouds without a point were written"
+        yield Note("empty_cloud", "", text)
 
 
 def message_notes(run: Conversion) -> list[Note]:
@@ -270,6 +315,7 @@ def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
         stream="; ".join(streams),
         mode=sensor.lidar.mode,
         ledger=sensor.ledger,
+        fill=None if run.table is None else run.table.fill[sensor.index],
         clock=_clock(run, sensor),
         extrinsics_source=sensor.detected.pose.describe(),
         body_from_sensor=sensor.body_from_sensor,

@@ -178,7 +178,15 @@ class Session:
             )
             for sensor in self.sensors
         )
-        return RunInfo(sensors, self.setup.frame_id, rate_hz, timescale, job.slices, job.layout)
+        return RunInfo(
+            sensors,
+            self.setup.frame_id,
+            rate_hz,
+            timescale,
+            job.slices,
+            job.layout,
+            job.sort,
+        )
 
     # -- checks and warnings ------------------------------------------------------------------
 

@@ -269,6 +269,7 @@ class MessageWriter:
             "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
             "timescale": info.timescale,
             "frame_id": info.frame_id,
+            "sort": info.sort,
         }
 
 
