@@ -202,7 +202,13 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
     if sensor.lidar.carries_serial:
         return StreamSelector(serial=sensor.lidar.serial)
     stream = table.streams[min(sensor.kinds).stream]
-    return StreamSelector(stream.source_ip, stream.port, stream.topic)
+    return StreamSelector(
+        stream.source_ip,
+        stream.port,
+        stream.topic,
+        frame_id=stream.frame_id,
+        lidar_id=stream.lidar_id,
+    )
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:

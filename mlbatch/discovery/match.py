@@ -192,10 +192,15 @@ def _refuse_several_streams(
 
 def _order(
     table: StreamTable, sensor: DetectedSensor
-) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
+) -> tuple[int, int, tuple[tuple[int, int, str, str, int], ...]]:
     """Sort key: serial number, else source IP and port, else topic."""
     streams = (table.streams[kind.stream] for kind in sensor.kinds)
-    places = tuple(sorted((_ip_number(one.source_ip), one.port, one.topic) for one in streams))
+    places = tuple(
+        sorted(
+            (_ip_number(one.source_ip), one.port, one.topic, one.frame_id, one.lidar_id or 0)
+            for one in streams
+        )
+    )
     if sensor.lidar.serial.isdigit():
         return (0, int(sensor.lidar.serial), places)
     return (1, 0, places)

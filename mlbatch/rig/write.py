@@ -70,6 +70,8 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
         yield "optional: true"
     if sensor.decode:
         yield "decode: " + _braces({_text(k): _text(v) for k, v in sensor.decode.items()})
+    if sensor.points is not None:
+        yield "points: " + _braces({key: _text(v) for key, v in sensor.points.keys().items() if v})
 
 
 def _stream_text(stream: StreamSelector) -> str:
@@ -79,6 +81,8 @@ def _stream_text(stream: StreamSelector) -> str:
             "port": str(stream.port or ""),
             "topic": stream.topic and _text(stream.topic),
             "serial": stream.serial and _text(stream.serial),
+            "frame_id": stream.frame_id and _text(stream.frame_id),
+            "lidar_id": "" if stream.lidar_id is None else str(stream.lidar_id),
         }
     )
 

@@ -57,7 +57,8 @@ def two(first: str, second: str) -> str:
 S = "sensors[0]"
 X = f"{S}.extrinsics"
 SENSOR_KEYS = (
-    "name, model, stream, metadata, extrinsics, clock, min_range_m, max_range_m, optional, decode"
+    "name, model, stream, metadata, extrinsics, clock, min_range_m, max_range_m, optional, "
+    "decode, points"
 )
 X_KEYS = "translation_m, rotation_rpy_deg, rotation_xyzw, matrix, frame"
 NUMBER = "expected a finite number"
@@ -107,7 +108,7 @@ MISTAKES: list[tuple[str, str]] = [
      f"3: {X}.rotation_rpy: expected a key of {X_KEYS}, found 'rotation_rpy'; "
      "the nearest known key is rotation_rpy_deg"),
     (one("stream:\n      ip: 10.0.0.1"),
-     f"4: {S}.stream.ip: expected a key of source_ip, port, topic, serial, found 'ip'; "
+     f"4: {S}.stream.ip: expected a key of source_ip, port, topic, serial, frame_id, lidar_id, found 'ip'; "
      "the nearest known key is source_ip"),
     (one("name: right"),
      f"3: {S}.name: expected each key once, found it again (first on line 2); remove one of "
@@ -157,7 +158,7 @@ MISTAKES: list[tuple[str, str]] = [
      "with a digit, "
      f"found 'base-link'; {FIX}"),
     # Streams.
-    (one("stream: {}"), f"3: {S}.stream: expected at least one of source_ip, port, topic, serial, "
+    (one("stream: {}"), f"3: {S}.stream: expected at least one of source_ip, port, topic, serial, frame_id, lidar_id, "
                         "found none; add one of them"),
     (one("stream: {source_ip: 10.5.5}"), f"3: {S}.stream.source_ip: expected an IP address, "
                                          "found '10.5.5'; write it as 192.168.1.201"),
