@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +41,8 @@ from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
+# Of the descriptions of packets by the vendors.
+_SERIAL = re.compile(r"\bserial (\w+)")
 # Items of a list in an error.
 _SHOWN = 4
 _NO_SUPPORTED = "expected a supported lidar, found none; see `mlbatch sensors` for those that are"
@@ -50,8 +54,8 @@ class SensorSelection:
 
     rig: Path | None = None
     metadata: tuple[Path, ...] = ()
-    only: tuple[str, ...] = ()  # names or serial numbers
-    ignore: tuple[str, ...] = ()  # names or serial numbers
+    only: tuple[str, ...] = ()  # names, serial numbers, topics or ADDRESS:PORT
+    ignore: tuple[str, ...] = ()  # names, serial numbers, topics or ADDRESS:PORT
     identity_extrinsics: bool = False  # accept sensors without extrinsics
     host_clock: bool = False  # receive times replace timestamps
     aligned: bool = False  # --align-clocks: clocks need not be comparable
@@ -87,7 +91,10 @@ def discover(
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
     rig = None if selection.rig is None else read_rig(selection.rig)
-    recordings = with_clouds(recordings, table, _topics(rig))
+    recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
+    refused = {} if clouds is None else clouds.refused
+    if to_convert:
+        _refuse_clouds_of_rig(rig, refused, selection)
     sampler, collector = probe(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
@@ -102,13 +109,23 @@ def discover(
     if to_convert and not any(sensor.kinds for sensor in matched.sensors):
         examined = examined or find_calibrations(paths, selection.metadata)[1]
         names = _names(examined, recorded)
-        reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures)
+        reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures, refused)
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
-    notes: list[Note] = []
-    if rig is None:
-        notes += _unmatched(sampler, lidar_kinds, _names(examined, recorded), matched.failures)
+    chosen = _choose(sampler, recordings, matched, selection)
+    ignored = _ignored(sampler, matched, chosen, selection)
+    notes = [] if clouds is None else [Note("cloud_time", "", text) for text in clouds.warnings]
+    if not selection.only:
+        texts = [f"{topic}: {text}" for topic, text in refused.items()]
+        if rig is None:
+            left_out = [kind for kind in lidar_kinds if kind not in ignored]
+            names = _names(examined, recorded)
+            unmatched = _unmatched(sampler, matched, left_out, names)
+            texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
+            notes += [note for kind, note in unmatched if not to_convert or _is_owned(kind, chosen)]
+        if texts and to_convert:
+            raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
+    notes += [Note("no_times", "", f"{topic}: {text}") for topic, text in refused.items()]
     notes += _unused(matched.sensors, selection.metadata)
-    chosen = _choose(matched.sensors, selection)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
     if to_convert:
@@ -119,6 +136,7 @@ def discover(
         collector.extrinsics,
         table,
         rig,
+        frames={} if clouds is None else clouds.frames,
         calibration_topics=collector.calibration_topics,
         identity_extrinsics=selection.identity_extrinsics,
     )
@@ -140,7 +158,7 @@ def discover(
         rig=rig,
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),
-        ignored={kind for one in matched.sensors if one not in chosen for kind in one.kinds},
+        ignored=ignored,
     )
 
 
@@ -188,12 +206,6 @@ def _is_lidar(sampler: Sampler, kind: PacketKind) -> bool:
 
 
 # -- sensors of the rig ---------------------------------------------------------------------------
-
-
-def _topics(rig: Rig | None) -> set[str]:
-    """Topics in the rig."""
-    streams = [] if rig is None else [one.stream for one in rig.sensors if one.stream is not None]
-    return {stream.topic for stream in streams} - {""}
 
 
 def _match(
@@ -280,25 +292,86 @@ def _names(examined: Sequence[Path], recorded: Sequence[Calibration]) -> list[st
 
 def _unmatched(
     sampler: Sampler,
+    matched: Matched,
     kinds: Sequence[PacketKind],
     examined: Sequence[str],
-    failures: Mapping[PacketKind, str],
-) -> list[Note]:
-    """Warnings about lidar packets of no sensor; examined: names of calibrations."""
+) -> list[tuple[PacketKind, Note]]:
+    """Why lidar packets are of no sensor, and what to do; examined: names of calibrations."""
     notes = []
     for kind in kinds:
         what = describe(sampler, kind) or ""
         start = f"{sampler.table.streams[kind.stream]}: {what}"
-        unassigned = "its packets are counted as unassigned"
+        ignore = f"--ignore {_ignore_word(sampler, kind)}"
         if lacks_decoder(what):
-            notes.append(Note("no_decoder", "", f"{start}; {unassigned}; {_NO_SUPPORTED}"))
-        elif kind in failures:
-            notes.append(Note("no_metadata", "", f"{start}; {failures[kind]}; {unassigned}"))
+            note = Note("no_decoder", "", f"{start}; {_NO_SUPPORTED}; leave it out with {ignore}")
+        elif kind in matched.failures:
+            text = f"{start}; {matched.failures[kind]}, or leave it out with {ignore}"
+            note = Note("no_metadata", "", text)
         else:
             expected = f"expected metadata that match, found {_known(examined)}"
-            text = f"{start}; {expected}; {unassigned}; give --metadata FILE"
-            notes.append(Note("no_metadata", "", text))
+            text = f"{start}; {expected}; give --metadata FILE, or leave it out with {ignore}"
+            note = Note("no_metadata", "", text)
+        notes.append((kind, note))
     return notes
+
+
+def _some_texts(texts: Sequence[str]) -> str:
+    """The first text in full, and how many others there are."""
+    others = f" (and {len(texts) - 1} more: {'; '.join(texts[1:])})" if len(texts) > 1 else ""
+    return texts[0] + others
+
+
+def _is_owned(kind: PacketKind, found: Sequence[DetectedSensor]) -> bool:
+    """True for packets of another size on the stream of a sensor, which are rejected there."""
+    return any(kind.stream in sensor.streams for sensor in found)
+
+
+def _serial(sampler: Sampler, kind: PacketKind) -> str:
+    """Serial number in the packets of a kind, or ""."""
+    found = _SERIAL.search(describe(sampler, kind) or "")
+    return found[1] if found else ""
+
+
+def _names_of(sampler: Sampler, kind: PacketKind) -> frozenset[str]:
+    """What `--only` and `--ignore` accept for packets of no sensor."""
+    return sampler.table.streams[kind.stream].names | {_serial(sampler, kind)} - {""}
+
+
+def _ignore_word(sampler: Sampler, kind: PacketKind) -> str:
+    """How to name a kind for `--ignore`."""
+    stream = sampler.table.streams[kind.stream]
+    if stream.topic:
+        return shlex.quote(str(stream))
+    return min(name for name in stream.names if " " not in name)
+
+
+def _ignored(
+    sampler: Sampler,
+    matched: Matched,
+    chosen: Sequence[DetectedSensor],
+    selection: SensorSelection,
+) -> set[PacketKind]:
+    """Kinds that `--only` and `--ignore` leave out."""
+    ignored = {kind for one in matched.sensors if one not in chosen for kind in one.kinds}
+    if selection.only or selection.ignore:
+        words = set(selection.ignore)
+        ignored |= {
+            kind
+            for kind in matched.unknown
+            if _is_lidar(sampler, kind) and (selection.only or _names_of(sampler, kind) & words)
+        }
+    return ignored
+
+
+def _refuse_clouds_of_rig(
+    rig: Rig | None, refused: Mapping[str, str], selection: SensorSelection
+) -> None:
+    """Raise RigError for a sensor of the rig whose clouds cannot be used."""
+    for sensor in () if rig is None else rig.sensors:
+        topic = "" if sensor.stream is None else sensor.stream.topic
+        if topic in refused:
+            place = f"{selection.rig}: sensor {sensor.name}"
+            raise RigError(f"{place}: {topic}: {refused[topic]}")
 
 
 def _unused(found: Sequence[DetectedSensor], given: Sequence[Path]) -> list[Note]:
@@ -318,14 +391,17 @@ def _why_none(
     lidar_kinds: Sequence[PacketKind],
     examined: Sequence[str],
     failures: Mapping[PacketKind, str],
+    refused: Mapping[str, str],
 ) -> str:
-    """Why no sensor was found, and what to do."""
-    where = ", ".join(str(recording.path) for recording in recordings)
+    """Why no sensor was found, and what to do; refused: why clouds cannot be used, by topic."""
+    where = _paths(recordings)
     table = sampler.table
     types = packet_types(recordings)
     for kind, why in failures.items():
         others = f" (without a match: {some(examined, _SHOWN)})" if examined else ""
         return f"{where}: {table.streams[kind.stream]}: {why}{others}"
+    if refused:
+        return f"{where}: {_some_texts([f'{topic}: {text}' for topic, text in refused.items()])}"
     carried = [(table.streams[kind.stream], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
         if not lacks_decoder(what):
@@ -361,6 +437,10 @@ def _hints(
     return f" ({hints})" if hints else ""
 
 
+def _paths(recordings: Sequence[Recording]) -> str:
+    return ", ".join(str(recording.path) for recording in recordings)
+
+
 def _known(names: Sequence[str]) -> str:
     return f"only {some(names, _SHOWN)}" if names else "none in the recording's directory"
 
@@ -368,21 +448,42 @@ def _known(names: Sequence[str]) -> str:
 # -- choice and checks ----------------------------------------------------------------------------
 
 
-def _choose(found: Sequence[DetectedSensor], selection: SensorSelection) -> list[DetectedSensor]:
-    """Apply --only and --ignore; both accept names and serial numbers."""
-    known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
-    for option, words in (("--only", selection.only), ("--ignore", selection.ignore)):
+def _choose(
+    sampler: Sampler,
+    recordings: Sequence[Recording],
+    matched: Matched,
+    selection: SensorSelection,
+) -> list[DetectedSensor]:
+    """Apply --only and --ignore: names, serial numbers, topics, ADDRESS:PORT."""
+    found = matched.sensors
+    if not selection.only and not selection.ignore:
+        return list(found)
+    streams = sampler.table.streams
+    names = {
+        sensor.name: {sensor.name, sensor.lidar.serial}.union(
+            *(streams[number].names for number in sensor.streams)
+        )
+        - {""}
+        for sensor in found
+    }
+    known = set().union(*names.values())
+    others = {topic.name for recording in recordings for topic in recording.topics}
+    others = others.union(*(_names_of(sampler, kind) for kind in matched.unknown))
+    for option, words, allowed in (
+        ("--only", selection.only, known),
+        ("--ignore", selection.ignore, known | others),
+    ):
         for word in words:
-            if word not in known:
+            if word not in allowed:
                 raise UsageError(
-                    f"{option}: expected the name or serial number of a sensor, one of "
-                    f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
+                    f"{option}: expected the name, serial number, topic or ADDRESS:PORT of a "
+                    f"sensor, one of {', '.join(names)}, found {word!r}; choose one"
                 )
     chosen = [
         sensor
         for sensor in found
-        if (not selection.only or {sensor.name, sensor.lidar.serial} & set(selection.only))
-        and not {sensor.name, sensor.lidar.serial} & set(selection.ignore)
+        if (not selection.only or names[sensor.name] & set(selection.only))
+        and not names[sensor.name] & set(selection.ignore)
     ]
     if found and not chosen:
         raise UsageError(
@@ -412,4 +513,8 @@ def _refuse_incomparable_clocks(
         if offset_ns is not None:
             offset_ns += sensor.offset_ns
         offsets_ns.append((sensor.name, offset_ns))
-        refuse_incomparable(offsets_ns, len(offsets_ns) - 1)
+        refuse_incomparable(
+            offsets_ns,
+            len(offsets_ns) - 1,
+            has_receive_times=all(map(sampler.has_receive_times, chosen)),
+        )

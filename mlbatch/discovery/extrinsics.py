@@ -22,7 +22,7 @@ from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig
-from mlbatch.types import StreamTable
+from mlbatch.types import Stream, StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
 # Parent, child, translation x, y, z in metres, quaternion x, y, z, w.
@@ -174,16 +174,19 @@ def place(
     table: StreamTable,
     rig: Rig | None,
     *,
+    frames: Mapping[Stream, str] | None = None,
     calibration_topics: Collection[str] = (),
     identity_extrinsics: bool,
 ) -> Extrinsics:
     """Set the poses of all sensors; RigError if one of several sensors has no extrinsics.
 
-    calibration_topics: topics with calibrations of sensors.
+    frames: frame_id of the points of streams, where their messages name one; calibration_topics:
+    topics with calibrations of sensors.
     """
     vendors = Counter(sensor.lidar.vendor for sensor in sensors)
-    frames = {
-        sensor.name: candidates(
+    known_frames = {
+        sensor.name: _stated(table, sensor, frames or {})
+        or candidates(
             sensor.lidar.vendor,
             _places(table, sensor, calibration_topics),
             alone=vendors[sensor.lidar.vendor] == 1,
@@ -203,11 +206,19 @@ def place(
     }
     body_frame = None if rig is None else rig.body_frame
     extrinsics = sources.resolve(
-        frames, by_rig, by_metadata, body_frame, identity_extrinsics=identity_extrinsics
+        known_frames, by_rig, by_metadata, body_frame, identity_extrinsics=identity_extrinsics
     )
     for sensor in sensors:
         sensor.pose = extrinsics.poses[sensor.name]
     return extrinsics
+
+
+def _stated(
+    table: StreamTable, sensor: DetectedSensor, frames: Mapping[Stream, str]
+) -> tuple[Candidate, ...]:
+    """The frame that the messages of a sensor name, which no similar name can replace."""
+    named = {clean(frames.get(table.streams[stream], "")) for stream in sensor.streams} - {""}
+    return tuple(Candidate(frame) for frame in sorted(named))
 
 
 def _places(
@@ -308,9 +319,13 @@ class _FrameFinder:
                 found.reasons[name] = "; ".join(reasons)
             elif self.tree.frames:
                 frames = some(self.tree.frames)
+                own = self.candidates[name]
                 found.reasons[name] = (
-                    f"none of the recording's frames ({frames}) is named as its driver would name "
-                    "it"
+                    f"its points are in frame {own[0].frame}, which is none of the recording's "
+                    f"({frames})"
+                    if len(own) == 1
+                    else f"none of the recording's frames ({frames}) is named as its driver would "
+                    "name it"
                 )
             return
         best, pose = connected[0]

@@ -280,7 +280,7 @@ def checked_rule(
         usual = convention(usable[-1].kind, high)
         rule, found_unit = _inferred(name, span, spacing_ns, high, usual, rule, topic, notes)
     if found_unit is None:
-        # Each cloud is refused when it is read, with its values.
+        # Refused with its values when a cloud is read.
         return rule, notes
     share = span * found_unit.unit_ns / spacing_ns
     shown = f"{span * found_unit.unit_ns / NS_PER_MS:.3f} ms in messages {apart.strip(' ()')} apart"

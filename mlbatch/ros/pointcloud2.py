@@ -35,7 +35,7 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "ring": ("ring", "channel", "line"),
     "return_type": ("return_type",),
     "tag": ("tag",),
-    "lidar_id": ("lidar_id", "lidar_index", "sensor_id"),
+    "lidar_id": ("lidar_id",),
 }
 _CUSTOM_POINT = np.dtype(
     [
@@ -115,12 +115,7 @@ def read_cloud(message: Message, rules: Rules = by_convention) -> Cloud:
                 f"field {raw.zero.field}: expected times of the points, found one for all {count} "
                 "points of the cloud"
             )
-    ring = _whole(rows, "ring", np.uint16)
-    if rule.ring and ring is None:
-        raise FieldError(
-            f"{rule.at('ring')}expected a field of whole numbers from 0 to 65535, found others in "
-            f"{rule.ring}; name another one, or remove the key"
-        )
+    ring = _ring(rows, rule)
     return_type = _whole(rows, "return_type", np.uint8)
     tag = _whole(rows, "tag", np.uint8)
     points = Points(
@@ -153,6 +148,7 @@ def sample_cloud(message: Message, rules: Rules) -> CloudHead:
     raw = _raw(message, rules)
     rows = raw.rows[_kept(raw.rows)[2]]
     time = rows["time"]
+    _ring(rows, rules(raw.frame))
     ids = _whole(rows, "lidar_id", np.uint16)
     lidar_ids = () if ids is None else tuple(np.unique(ids).tolist())
     if raw.lidar_id is not None:
@@ -179,6 +175,17 @@ def _kept(rows: Rows) -> tuple[F32Array, BoolArray, BoolArray]:
         squared = x * x + y * y + z * z
     placed = (squared > 0) & (squared < np.inf)
     return reals, placed, placed & np.isfinite(time) if time.dtype.kind == "f" else placed
+
+
+def _ring(rows: Rows, rule: PointRule) -> U16Array | None:
+    """The ring of each point; None where there is none, FieldError where the rig names another."""
+    ring = _whole(rows, "ring", np.uint16)
+    if rule.ring and ring is None:
+        raise FieldError(
+            f"{rule.at('ring')}expected a field of whole numbers from 0 to 65535, found others in "
+            f"{rule.ring}; name another one, or remove the key"
+        )
+    return ring
 
 
 def _reals(rows: Rows) -> F32Array:

@@ -278,7 +278,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown sensor": (
         f"{FIX} --only front",
         2,
-        "--only: expected the name or serial number of a sensor, one of left, right, found "
+        "--only: expected the name, serial number, topic or ADDRESS:PORT of a sensor, one of left, right, found "
         "'front'; choose one",
     ),
     "no sensor left": (
