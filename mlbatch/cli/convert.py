@@ -96,10 +96,16 @@ def convert(
         typer.Option(help="KEY=VALUE for decoders: crc=check, firing_azimuth=off; repeatable."),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="Use this sensor (name, serial number, topic or ADDRESS:PORT); repeatable."
+        ),
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="Leave out this sensor (name, serial number, topic or ADDRESS:PORT); repeatable."
+        ),
     ] = None,
     pass_: Annotated[
         list[str] | None,

@@ -115,7 +115,7 @@ def discover(
     ignored = _ignored(sampler, matched, chosen, selection)
     notes = [] if clouds is None else [Note("cloud_time", "", text) for text in clouds.warnings]
     if not selection.only:
-        texts = [f"{topic}: {text}" for topic, text in refused.items()]
+        texts = _refusals(refused)
         if rig is None:
             left_out = [kind for kind in lidar_kinds if kind not in ignored]
             names = _names(examined, recorded)
@@ -315,6 +315,15 @@ def _unmatched(
     return notes
 
 
+def _refusals(refused: Mapping[str, str]) -> list[str]:
+    """Why clouds cannot be used, and that they may be left out."""
+    return [
+        f"{topic}: {text}"
+        + ("" if "--ignore" in text else f", or leave the topic out with --ignore {topic}")
+        for topic, text in refused.items()
+    ]
+
+
 def _some_texts(texts: Sequence[str]) -> str:
     """The first text in full, and how many others there are."""
     others = f" (and {len(texts) - 1} more: {'; '.join(texts[1:])})" if len(texts) > 1 else ""
@@ -401,7 +410,7 @@ def _why_none(
         others = f" (without a match: {some(examined, _SHOWN)})" if examined else ""
         return f"{where}: {table.streams[kind.stream]}: {why}{others}"
     if refused:
-        return f"{where}: {_some_texts([f'{topic}: {text}' for topic, text in refused.items()])}"
+        return f"{where}: {_some_texts(_refusals(refused))}"
     carried = [(table.streams[kind.stream], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
         if not lacks_decoder(what):

@@ -39,8 +39,7 @@ def convert(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Convert:
     """The report of a dry run."""
-    monkeypatch.chdir(tmp_path)
-    shell = Shell(monkeypatch, capsys)
+    shell = _shell(monkeypatch, capsys, tmp_path)
 
     def run(arguments: str) -> Report:
         outcome = shell(f"convert {arguments} --dry-run --keep-partial")
@@ -49,6 +48,20 @@ def convert(
         return report
 
     return run
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    return _shell(monkeypatch, capsys, tmp_path)
+
+
+def _shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
+) -> Shell:
+    monkeypatch.chdir(folder)
+    return Shell(monkeypatch, capsys)
 
 
 def _read(report: Report) -> dict[str, int]:
@@ -121,27 +134,27 @@ CASES = {
         ),
         {"ouster_111": 3 * PACKETS},
     ),
-    "one without metadata": Case(
-        (ONE, twin(ONE, 333)),
-        {"ouster_111": PACKETS},
-        without=(333,),
-        unassigned=(
-            (
-                "10.0.0.2 > port 7502",
-                PACKETS,
-                f"{NEEDS_METADATA.format(333)} (1280 bytes)",
+    **{
+        f"one without metadata, {option}": Case(
+            (ONE, twin(ONE, 333)),
+            {"ouster_111": PACKETS},
+            without=(333,),
+            options=option,
+            unassigned=(
+                (
+                    "10.0.0.2 > port 7502",
+                    PACKETS,
+                    f"ignored: {NEEDS_METADATA.format(333)} (1280 bytes)",
+                ),
             ),
-        ),
-        warnings=(
-            (
-                "no_metadata",
-                "",
-                f"10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected metadata that "
-                "match, found only 111.json; its packets are counted as unassigned; give "
-                "--metadata FILE",
-            ),
-        ),
-    ),
+        )
+        for option in (
+            "--ignore 10.0.0.2:7502",
+            "--ignore 333",
+            "--only 10.0.0.1:7502",
+            "--only ouster_111",
+        )
+    },
     "an unknown serial number on the stream of a lidar": Case(
         (ONE, twin(ONE, 333, ONE.ip)),
         {"ouster_111": PACKETS},
@@ -281,10 +294,35 @@ def test_the_extra_byte_of_old_drivers_is_accepted(
 def test_given_metadata_replace_the_search(convert: Convert, tmp_path: Path) -> None:
     capture = write_session(tmp_path, ONE, twin(ONE, 222))
     other = write_metadata(tmp_path / "elsewhere.json", replace(SMALL, serial=222))
-    report = convert(f"{capture} --metadata {other}")
+    report = convert(f"{capture} --metadata {other} --ignore 111")
     assert _read(report) == {"ouster_222": PACKETS}
     assert report["sensors"][0]["calibration"].endswith("elsewhere.json")
-    assert [warning["code"] for warning in report["warnings"]] == ["no_metadata"]
+    assert report["warnings"] == []
+
+
+@pytest.mark.parametrize("option", ["", "--strict"])
+def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option: str) -> None:
+    capture = write_session(tmp_path, ONE, twin(ONE, 333))
+    (tmp_path / "333.json").unlink()
+    outcome = shell(f"convert {capture} -o {tmp_path / 'out'} {option}")
+    assert outcome.code == 1
+    assert outcome.err == (
+        f"mlbatch: error: {capture}: 10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected "
+        "metadata that match, found only 111.json; give --metadata FILE, or leave it out with "
+        "--ignore 10.0.0.2:7502\n"
+    )
+    assert not (tmp_path / "out").exists()
+    # Without a conversion it is a row of the table.
+    assert "metadata" in shell(f"inspect {capture}").out
+
+
+def test_of_a_rig_other_lidars_are_counted(convert: Convert, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, ONE, twin(ONE, 333))
+    (tmp_path / "333.json").unlink()
+    rig = _rig(tmp_path, ['name: front, stream: {serial: "111"}'])
+    report = convert(f"{capture} --rig {rig}")
+    (other,) = report["unassigned"]
+    assert other["what"].startswith("not_in_rig: Ouster lidar, serial 333")
 
 
 def test_foreign_files_in_the_directory_are_ignored(convert: Convert, tmp_path: Path) -> None:
