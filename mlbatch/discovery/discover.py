@@ -5,10 +5,10 @@ from __future__ import annotations
 import difflib
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from mlbatch import sensors
 from mlbatch.clocks.compare import refuse_incomparable
@@ -40,6 +40,9 @@ from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.types import Recording, StreamTable
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.readers.bag.cloud_topics import CloudTopics
 
 # Of the descriptions of packets by the vendors.
 _SERIAL = re.compile(r"\bserial (\w+)")
@@ -113,18 +116,18 @@ def discover(
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
     chosen = _choose(sampler, recordings, matched, selection)
     ignored = _ignored(sampler, matched, chosen, selection)
-    notes = [] if clouds is None else [Note("cloud_time", "", text) for text in clouds.warnings]
-    if not selection.only:
-        texts = _refusals(refused)
-        if rig is None:
-            left_out = [kind for kind in lidar_kinds if kind not in ignored]
-            names = _names(examined, recorded)
-            unmatched = _unmatched(sampler, matched, left_out, names)
-            texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
-            notes += [note for kind, note in unmatched if not to_convert or _is_owned(kind, chosen)]
-        if texts and to_convert:
+    left_out: list[tuple[PacketKind, Note]] = []
+    if rig is None:
+        kinds = [kind for kind in lidar_kinds if kind not in ignored]
+        left_out = _unmatched(sampler, matched, kinds, _names(examined, recorded))
+    if to_convert:
+        texts = [] if selection.only else _refusals(refused)
+        texts += [note.message for kind, note in left_out if not _is_owned(kind, chosen)]
+        if texts:
             raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
-    notes += [Note("no_times", "", f"{topic}: {text}") for topic, text in refused.items()]
+    notes = [note for _, note in left_out]
+    if clouds is not None:
+        notes += _cloud_notes(table, clouds, chosen, to_convert=to_convert)
     notes += _unused(matched.sensors, selection.metadata)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
@@ -143,8 +146,8 @@ def discover(
     notes += [Note("message", "", fault) for fault in collector.faults]
     notes += extrinsics.notes
     for sensor in chosen:
-        texts = (*sensor.notes, *sensor.lidar.notes)
-        notes += [Note("calibration", sensor.name, text) for text in texts]
+        findings = (*sensor.notes, *sensor.lidar.notes)
+        notes += [Note("calibration", sensor.name, text) for text in findings]
         if not sensor.kinds:
             text = "no packet of it in the first 10 seconds"
             notes.append(Note("not_seen_yet", sensor.name, text))
@@ -322,6 +325,19 @@ def _refusals(refused: Mapping[str, str]) -> list[str]:
         + ("" if "--ignore" in text else f", or leave the topic out with --ignore {topic}")
         for topic, text in refused.items()
     ]
+
+
+def _cloud_notes(
+    table: StreamTable, clouds: CloudTopics, chosen: Sequence[DetectedSensor], *, to_convert: bool
+) -> Iterator[Note]:
+    """Warnings about the times of chosen clouds, and without a conversion of those refused."""
+    topics = {table.streams[number].topic for sensor in chosen for number in sensor.streams}
+    for topic, text in clouds.warnings:
+        if topic in topics:
+            yield Note("cloud_time", "", f"{topic}: {text}")
+    if not to_convert:
+        for topic, text in clouds.refused.items():
+            yield Note("cloud_time", "", f"{topic}: {text}")
 
 
 def _some_texts(texts: Sequence[str]) -> str:

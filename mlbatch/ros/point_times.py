@@ -52,14 +52,15 @@ class PointRule:
     """How the points of a topic are read; of the rig, or inferred.
 
     time, ring: names of fields, "": the first known one; unit_ns: ns of the unit of the times, 0:
-    by convention; origin: one of ORIGINS, "": by convention; inferred: why the unit is not the
-    conventional one; places: file, line and key of what the rig gives, by key.
+    by convention; origin: one of ORIGINS, "": by convention; longest_ns: of a sweep; inferred: why
+    the unit is not the conventional one; places: file, line and key of what the rig gives, by key.
     """
 
     time: str = ""
     unit_ns: int = 0
     origin: str = ""
     ring: str = ""
+    longest_ns: int = field(default=_LONGEST_S * NS_PER_S, compare=False)
     inferred: str = field(default="", compare=False)
     places: Mapping[str, str] = field(default_factory=dict, compare=False)
 
@@ -133,7 +134,7 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
         )
     words = "up to" if high <= 0 > low else "after"
     if rule.origin == END:
-        ns -= max(0, round(_largest(all_times, high) * unit_ns))
+        ns -= max(0, _last_ns(all_times, high, unit_ns, rule.longest_ns))
         words = "up to"
     elif rule.origin == START and low < 0:
         ns -= int(ns.min())
@@ -141,13 +142,16 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
     return zero.base_ns + ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
 
 
-def _largest(all_times: Times, high: Any) -> int | float:
+def _last_ns(all_times: Times, high: Any, unit_ns: int, longest_ns: int) -> int:
     """The last time of a sweep: also of shots without a return, unless it is impossible."""
     finite = all_times[np.isfinite(all_times)] if all_times.dtype.kind == "f" else all_times
-    last = finite.max() if len(finite) else high
+    last = finite.max()
     # Points without a return may have any time.
-    value = last if last <= high * _SWEEP[1] else high
-    return int(value) if all_times.dtype.kind != "f" else float(value)
+    if float(last) * unit_ns > longest_ns:
+        last = high
+    if all_times.dtype.kind == "f":
+        return int(_float_ns(np.array([last], np.float64), unit_ns)[0])
+    return int(last) * unit_ns
 
 
 def _float_ns(value: npt.NDArray[np.float64], unit_ns: int) -> I64Array:
@@ -273,6 +277,7 @@ def checked_rule(
     if spacing_ns is None:
         return rule, []
     high = median(np.array([one.high for one in usable]))
+    rule = replace(rule, longest_ns=round(_SWEEP[1] * spacing_ns))
     notes: list[str] = []
     if rule.unit_ns:
         found_unit: Reading | None = _by_unit(high, rule.unit_ns)
@@ -358,12 +363,14 @@ def _ahead(
 def _spacing_ns(samples: Sequence[CloudSample]) -> float | None:
     """Usual time between the messages of one lidar; None with a single one.
 
-    Over two steps: of two lidars that are stamped together every other step is short.
+    Over two steps: of two lidars that are stamped together every other step is short. The lower
+    quartile: gaps and jumps of the clock are long.
     """
     for times in ([one.stamp_ns for one in samples], [one.host_ns for one in samples]):
         known = np.unique(np.array(times, np.int64))
         if len(known) < 2:
             continue
         step = min(2, len(known) - 1)
-        return median((known[step:] - known[:-step]) / step)
+        steps = np.sort(known[step:] - known[:-step])
+        return float(steps[len(steps) // 4]) / step
     return None

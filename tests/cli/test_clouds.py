@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.builders.bags import Recorded
+from tests.builders.bags import Recorded, transforms_message
 from tests.builders.points import (
     AUTOWARE,
     CLOUD,
@@ -74,12 +74,12 @@ def _starts() -> list[int]:
     return [STAMP_NS + number * SWEEP for number in range(SWEEPS)]
 
 
-def _clouds(fields: Fields, times: Sequence[float], header: int = 0, frame: str = "lidar") -> list[bytes]:
+def _clouds(
+    fields: Fields, times: Sequence[float], header: int = 0, frame: str = "lidar"
+) -> list[bytes]:
     """Sweeps of equal times; header: its stamp after the sweep's start, ns."""
     points = _sweep(fields, times)
-    return [
-        cloud_message(fields, points, start + header, Form(frame=frame)) for start in _starts()
-    ]
+    return [cloud_message(fields, points, start + header, Form(frame=frame)) for start in _starts()]
 
 
 # Column n at n ms, in units of a field, from the start.
@@ -102,6 +102,7 @@ def _expected(shift: int = 0) -> list[int]:
 
 
 def _run(shell: Shell, messages: list[Recorded], options: str = "", rig: str = "") -> Any:
+    Path("drive.db3").unlink(missing_ok=True)
     write_rosbag2(Path("drive.db3"), sorted(messages, key=lambda one: one.log_ns))
     if rig:
         Path("rig.yaml").write_text(rig)
@@ -120,12 +121,14 @@ def _warnings(folder: str = "out") -> list[tuple[str, str]]:
     return [(one["code"], one["message"]) for one in report["warnings"]]
 
 
-# -- drivers that are read as they are --------------------------------------------------------------
+# -- drivers that are read as they are -------------------------------------------------------------
 
 
 def _hesai() -> list[bytes]:
     return [
-        cloud_message(HESAI, _sweep(HESAI, [start * 1e-9 + n * 1e-3 for n in range(COLUMNS)]), start)
+        cloud_message(
+            HESAI, _sweep(HESAI, [start * 1e-9 + n * 1e-3 for n in range(COLUMNS)]), start
+        )
         for start in _starts()
     ]
 
@@ -167,7 +170,7 @@ def test_drivers_are_read_without_a_warning(shell: Shell, tmp_path: Path, driver
     assert [code for code, _ in _warnings()] == ["clouds"]
 
 
-# -- times that are none ----------------------------------------------------------------------------
+# -- times that are none ---------------------------------------------------------------------------
 
 WAYS_OUT = (
     "name the field of the times or its unit in the rig (points: {time: FIELD, unit: ns}), or "
@@ -272,7 +275,7 @@ def test_points_of_a_topic_without_clouds(shell: Shell) -> None:
     )
 
 
-# -- units ------------------------------------------------------------------------------------------
+# -- units -----------------------------------------------------------------------------------------
 
 FLOAT = (*XYZ, ("time", "float32"))
 
@@ -324,7 +327,7 @@ def test_microseconds_since_1970(shell: Shell, tmp_path: Path) -> None:
     assert _warnings()[0][0] == "cloud_time"
 
 
-# -- the header -------------------------------------------------------------------------------------
+# -- the header ------------------------------------------------------------------------------------
 
 
 def test_headers_at_the_end_of_a_sweep(shell: Shell, tmp_path: Path) -> None:
@@ -354,7 +357,9 @@ def test_headers_at_the_end_of_a_sweep(shell: Shell, tmp_path: Path) -> None:
 def test_the_end_of_a_sweep_counts_shots_without_a_return(shell: Shell, tmp_path: Path) -> None:
     """Else sweeps would shift by the sector that looks into the sky."""
     points = [
-        _point(OUSTER, 0.0 if n > 60 else 5.0, n * MS, ring) for n in range(COLUMNS) for ring in (0, 1)
+        _point(OUSTER, 0.0 if n > 60 else 5.0, n * MS, ring)
+        for n in range(COLUMNS)
+        for ring in (0, 1)
     ]
     points = [(x, *((0, 0) if x == 0 else (1, 1)), *rest) for x, _, _, *rest in points]
     data = [cloud_message(OUSTER, points, start + LAST) for start in _starts()]
@@ -382,7 +387,7 @@ def test_absolute_times_can_be_stated(shell: Shell, tmp_path: Path) -> None:
     assert "expected times since 1970" in outcome.err
 
 
-# -- several lidars on a topic ------------------------------------------------------------------------
+# -- several lidars on a topic ---------------------------------------------------------------------
 
 
 def _two_frames(*, apart: int = 30 * MS) -> list[Recorded]:
@@ -437,7 +442,9 @@ def test_a_frame_that_comes_late_is_not_merged(shell: Shell, tmp_path: Path) -> 
     starts = [STAMP_NS + number * SWEEP for number in range(30)]
     sweep = _sweep(OUSTER, NS)
     messages = [
-        Recorded("/points", CLOUD, start + SWEEP, cloud_message(OUSTER, sweep, start, Form(frame=f)))
+        Recorded(
+            "/points", CLOUD, start + SWEEP, cloud_message(OUSTER, sweep, start, Form(frame=f))
+        )
         for start in starts
         for f in (["front"] if start < starts[20] else ["front", "rear"])
     ]
@@ -516,13 +523,14 @@ def test_sensors_in_one_namespace_have_names_of_their_own(shell: Shell, tmp_path
     assert [one["name"] for one in report["sensors"]] == ["car", "car_2"]
 
 
-# -- frames, clocks, topics left out ------------------------------------------------------------------
+# -- frames, clocks, topics left out ---------------------------------------------------------------
 
 
 def test_frames_of_headers_give_extrinsics(shell: Shell, tmp_path: Path) -> None:
     # Frames that no driver would use: 1 m ahead, and 2 m back and a quarter turn to the left.
     half = math.sqrt(0.5)
-    transforms = tf_message(
+    transforms = transforms_message(
+        "cdr",
         [
             ("base_link", "alpha", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
             ("base_link", "beta", (-2.0, 0.0, 0.0), (0.0, 0.0, half, half)),
@@ -551,7 +559,9 @@ def test_frames_of_headers_give_extrinsics(shell: Shell, tmp_path: Path) -> None
 
 
 def test_a_frame_that_no_transform_has_is_named(shell: Shell) -> None:
-    transforms = tf_message([("base_link", "one", (7.0, 7.0, 7.0), (0.0, 0.0, 0.0, 1.0))])
+    transforms = transforms_message(
+        "cdr", [("base_link", "one", (7.0, 7.0, 7.0), (0.0, 0.0, 0.0, 1.0))]
+    )
     messages = [
         Recorded("/tf_static", "tf2_msgs/TFMessage", STAMP_NS, transforms),
         *_bag(_clouds(OUSTER, NS, frame="alpha"), "/one/points"),

@@ -62,7 +62,7 @@ class CloudTopics:
     """The clouds of a session, shared by its recordings, since a topic may be spread over several.
 
     rules: by topic and frame_id; lidars: by topic; layouts: of the packets of each stream; frames:
-    frame_id of each stream; refused: why topics cannot be used; warnings: about the others.
+    frame_id of each stream; refused: why topics cannot be used; warnings: topic and text.
     """
 
     topics: tuple[Topic, ...]
@@ -72,7 +72,7 @@ class CloudTopics:
     layouts: dict[Stream, Layout] = field(default_factory=dict)
     frames: dict[Stream, str] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[tuple[str, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.lidars = {topic.name: TopicLidars() for topic in self.topics}
@@ -159,7 +159,7 @@ class CloudTopics:
         except CloudError as err:
             self.refused[name] = str(err)
             return
-        self.warnings += [f"{name}: {text}" for text in notes]
+        self.warnings += [(name, text) for text in notes]
 
 
 @dataclass(slots=True)
