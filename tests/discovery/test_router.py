@@ -57,8 +57,10 @@ def _read(report: Report) -> dict[str, int]:
 
 def _rig(folder: Path, sensors: Sequence[str]) -> Path:
     rig = folder / "rig.yaml"
-    origin = "extrinsics: {translation_m: [0, 0, 0]}"
-    lines = [f"- {{{sensor}, {origin}}}\n" for sensor in sensors]
+    lines = [
+        f"- {{{sensor}, extrinsics: {{translation_m: [{x_m}, 0, 0]}}}}\n"
+        for x_m, sensor in enumerate(sensors)
+    ]
     rig.write_text("sensors:\n" + "".join(lines))
     return rig
 
