@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NoReturn
 
+import numpy as np
+
 from mlbatch import sensors
+from mlbatch.arrays import BoolArray, U8Array
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
@@ -36,7 +40,7 @@ from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.frames.tree import some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
 # Items of a list in an error.
@@ -58,6 +62,44 @@ class SensorSelection:
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
 
 
+@dataclass(frozen=True, slots=True)
+class Ignored:
+    """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
+
+    sensors: tuple[DetectedSensor, ...] = ()
+    words: tuple[str, ...] = ()
+
+    def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
+        """Return which packets (P, size) of a kind are left out: (P,) bool."""
+        if any(_names_stream(word, stream) for word in self.words):
+            return np.ones(len(packets), np.bool_)
+        left_out = np.zeros(len(packets), np.bool_)
+        for sensor in self.sensors:
+            lidar = sensor.lidar
+            if kind.size in (lidar.packet_size, lidar.packet_size + 1):
+                if kind in sensor.kinds or lidar.carries_serial:
+                    left_out |= lidar.sent_by_me(packets[:, : lidar.packet_size])
+            elif kind in sensor.kinds:
+                left_out[:] = True
+        if self.serials and "lidar" in (sensors.describe(kind.size, packets[:1]) or ""):
+            # Several lidars may share an address.
+            for row in np.flatnonzero(~left_out).tolist():
+                what = sensors.describe(kind.size, packets[row : row + 1])
+                left_out[row] = _names_serial(self.serials, what)
+        return left_out
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Words that are no sensors, hence serial numbers of other lidars, or addresses."""
+        known = {word for one in self.sensors for word in (one.name, one.lidar.serial)}
+        return tuple(word for word in self.words if word not in known and not _is_address(word))
+
+    def names(self, stream: Stream, what: str | None) -> bool:
+        """Return whether --ignore names a stream, or the serial number in its description."""
+        by_stream = any(_names_stream(word, stream) for word in self.words)
+        return by_stream or _names_serial(self.words, what)
+
+
 @dataclass(slots=True)
 class Discovery:
     """The sensors of a session, and what they were detected from."""
@@ -71,7 +113,9 @@ class Discovery:
     rig: Rig | None = None
     notes: list[Note] = field(default_factory=list)
     not_in_rig: set[PacketKind] = field(default_factory=set)
-    ignored: set[PacketKind] = field(default_factory=set)
+    # Kinds of lidars without a sensor that `notes` name.
+    noted: set[PacketKind] = field(default_factory=set)
+    ignored: Ignored = field(default_factory=lambda: Ignored())
 
 
 def discover(
@@ -105,10 +149,18 @@ def discover(
         reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures)
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
     notes: list[Note] = []
+    chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
+    left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
+    ignored = Ignored(tuple(left_out), selection.ignore)
+    noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     if rig is None:
-        notes += _unmatched(sampler, lidar_kinds, _names(examined, recorded), matched.failures)
+        notes += _unmatched(sampler, noted, _names(examined, recorded), matched.failures)
+    else:
+        # Other packets on the stream of a sensor are not unassigned but rejected.
+        taken = {stream for sensor in chosen for stream in sensor.streams}
+        noted = [kind for kind in noted if kind.stream not in taken]
+        notes += [_not_in_rig(sampler, kind) for kind in noted]
     notes += _unused(matched.sensors, selection.metadata)
-    chosen = _choose(matched.sensors, selection)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
     if to_convert:
@@ -140,7 +192,8 @@ def discover(
         rig=rig,
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),
-        ignored={kind for one in matched.sensors if one not in chosen for kind in one.kinds},
+        noted=set(noted),
+        ignored=ignored,
     )
 
 
@@ -301,6 +354,49 @@ def _unmatched(
     return notes
 
 
+def _not_in_rig(sampler: Sampler, kind: PacketKind) -> Note:
+    """Warning about lidar packets in the first 10 s of a stream that the rig lacks."""
+    return not_in_rig(sampler.table.streams[kind.stream], describe(sampler, kind) or "")
+
+
+def not_in_rig(stream: Stream, what: str) -> Note:
+    """Warning about lidar packets of a stream that the rig lacks."""
+    text = (
+        f"{stream}: {what}; expected a sensor of the rig, found none for it; its packets are "
+        "counted as unassigned; add it to the rig, or leave it out with --ignore "
+        f"{stream.topic or stream.source_ip}"
+    )
+    return Note("not_in_rig", "", text)
+
+
+def _is_ignored(sampler: Sampler, ignored: Ignored, kind: PacketKind) -> bool:
+    return ignored.names(sampler.table.streams[kind.stream], describe(sampler, kind))
+
+
+def _names_stream(word: str, stream: Stream) -> bool:
+    """True if a word is the topic, the source IP or IP:port of a stream, or its name in reports."""
+    names = (stream.topic, stream.source_ip, f"{stream.source_ip}:{stream.port}", str(stream))
+    return word in names if word else False
+
+
+def _names_serial(words: Sequence[str], what: str | None) -> bool:
+    """True if one of the words is the serial number in a description."""
+    return any(f"serial {word}," in (what or "") for word in words)
+
+
+def _is_address(word: str) -> bool:
+    """True for a topic, an IP address or IP:port, which may begin to send later."""
+    if word.startswith("/"):
+        return True
+    for text in (word, word.rpartition(":")[0]):
+        try:
+            ipaddress.ip_address(text)
+        except ValueError:
+            continue
+        return True
+    return False
+
+
 def _unused(found: Sequence[DetectedSensor], given: Sequence[Path]) -> list[Note]:
     """Warnings about given files that match no sensor."""
     used = {sensor.lidar.calibration for sensor in found}
@@ -368,21 +464,50 @@ def _known(names: Sequence[str]) -> str:
 # -- choice and checks ----------------------------------------------------------------------------
 
 
-def _choose(found: Sequence[DetectedSensor], selection: SensorSelection) -> list[DetectedSensor]:
-    """Apply --only and --ignore; both accept names and serial numbers."""
+def _choose(
+    sampler: Sampler,
+    found: Sequence[DetectedSensor],
+    lidar_kinds: Sequence[PacketKind],
+    selection: SensorSelection,
+) -> list[DetectedSensor]:
+    """Apply --only and --ignore.
+
+    Both accept names and serial numbers; --ignore also addresses, and serial numbers of lidars that
+    are no sensors.
+    """
     known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
-    for option, words in (("--only", selection.only), ("--ignore", selection.ignore)):
-        for word in words:
-            if word not in known:
-                raise UsageError(
-                    f"{option}: expected the name or serial number of a sensor, one of "
-                    f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
-                )
+    others = Ignored(words=selection.ignore)
+    unknown = [word for word in selection.only if word not in known]
+    option = "--only"
+    if not unknown:
+        option = "--ignore"
+        unknown = [
+            word
+            for word in selection.ignore
+            if word not in known
+            and not _is_address(word)
+            and not any(
+                _is_ignored(sampler, replace(others, words=(word,)), kind) for kind in lidar_kinds
+            )
+        ]
+    for word in unknown:
+        raise UsageError(
+            f"{option}: expected the name or serial number of a sensor, one of "
+            f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
+        )
+    streams = sampler.table.streams
     chosen = [
         sensor
         for sensor in found
         if (not selection.only or {sensor.name, sensor.lidar.serial} & set(selection.only))
         and not {sensor.name, sensor.lidar.serial} & set(selection.ignore)
+        and not (
+            sensor.streams
+            and all(
+                any(_names_stream(word, streams[number]) for word in selection.ignore)
+                for number in sensor.streams
+            )
+        )
     ]
     if found and not chosen:
         raise UsageError(

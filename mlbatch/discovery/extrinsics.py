@@ -110,9 +110,9 @@ class ExtrinsicsSources:
     ) -> Extrinsics:
         """Poses of all sensors; RigError if one of several sensors has no extrinsics.
 
-        sensor_frames: by sensor, frames it may have; rig_extrinsics: those of the rig, where
-        `unknown` counts as none; metadata_extrinsics: (4, 4) body_from_sensor, m; body_frame: that of
-        the rig; identity_extrinsics: sensors without extrinsics are at the body origin.
+        sensor_frames: by sensor, frames it may have; metadata_extrinsics: (4, 4) body_from_sensor,
+        m; body_frame: that of the rig; identity_extrinsics: sensors without extrinsics are at the
+        body origin.
         """
         trees = self._trees()
         named = {name: frame for name, frame in rig_extrinsics.items() if isinstance(frame, str)}

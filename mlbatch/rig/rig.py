@@ -50,8 +50,8 @@ class RigSensor:
     """One sensor of the rig; None: taken from the recording.
 
     extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
-    unknown, which no merge accepts; clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the
-    timestamps; decode: options as for `--decode`.
+    unknown; clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added
+    to the timestamps; decode: options as for `--decode`.
     """
 
     name: str

@@ -147,7 +147,7 @@ def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
     for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
         found = _discover(capture, selection)
         assert [sensor.name for sensor in found.sensors] == ["ouster_222"]
-        assert len(found.ignored) == 1
+        assert len(found.ignored.sensors) == 1
     with pytest.raises(UsageError, match="one of ouster_111, ouster_222, found 'front'"):
         _discover(capture, SensorSelection(only=("front",)))
 

@@ -146,8 +146,8 @@ def test_extrinsics_nobody_gave_are_written_as_unknown_and_refused(shell: Shell)
     refused = shell(f"convert {CAPTURE} --rig rig.yaml -o out")
     assert (refused.code, refused.out) == (1, "")
     assert refused.err == (
-        f"mlbatch: error: rig.yaml:{places[0]}: sensors[0].extrinsics: expected the pose of {LEFT}, "
-        "required for every sensor when there are two or more, found unknown (also of "
+        f"mlbatch: error: rig.yaml:{places[0]}: sensors[0].extrinsics: expected the pose of "
+        f"{LEFT}, required for every sensor when there are two or more, found unknown (also of "
         f"{RIGHT}); measure it and give translation_m and a rotation, or accept the body origin "
         "with --identity-extrinsics\n"
     )
