@@ -12,7 +12,7 @@ from typing import NoReturn
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import BoolArray, U8Array
+from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
@@ -37,7 +37,7 @@ from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError, RigError, UsageError
-from mlbatch.frames.tree import some
+from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.types import Recording, Stream, StreamTable
@@ -115,7 +115,12 @@ class Discovery:
     not_in_rig: set[PacketKind] = field(default_factory=set)
     # Kinds of lidars without a sensor that `notes` name.
     noted: set[PacketKind] = field(default_factory=set)
+    tree: FrameTree = field(default_factory=FrameTree)  # static frames of the recording
     ignored: Ignored = field(default_factory=lambda: Ignored())
+
+    def frames(self) -> dict[str, F64Array]:
+        """Return (4, 4) body_from_frame, m, of the recording's static frames, by name."""
+        return self.tree.poses(clean(self.frame_id))
 
 
 def discover(
@@ -193,6 +198,7 @@ def discover(
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),
         noted=set(noted),
+        tree=extrinsics.tree,
         ignored=ignored,
     )
 

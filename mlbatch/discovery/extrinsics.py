@@ -40,11 +40,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsics:
-    """Poses of all sensors of a session in one body frame, and warnings."""
+    """Poses of all sensors of a session in one body frame, warnings, and all static frames."""
 
     body_frame: str
     poses: dict[str, Pose]
     notes: tuple[Note, ...]
+    tree: FrameTree
 
 
 @dataclass(slots=True)
@@ -155,7 +156,7 @@ class ExtrinsicsSources:
         body = body_frame or _body_frame(poses, found.body)
         if body_frame is None:
             notes += _assumed_frames(poses, body)
-        return Extrinsics(body, poses, tuple(notes))
+        return Extrinsics(body, poses, tuple(notes), tree)
 
     def _add_edge(self, tree: FrameTree, transform: Transform, source: str) -> None:
         try:

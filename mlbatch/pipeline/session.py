@@ -171,8 +171,11 @@ class Session:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
         return excluded_boxes_m(self.job, self.setup.rig)
 
-    def run_info(self, rate_hz: str, timescale: str) -> RunInfo:
-        """What is the same for all scans; rate_hz: exact rate as text."""
+    def run_info(self, rate_hz: str, timescale: str, *, forwards: bool = False) -> RunInfo:
+        """What is the same for all scans.
+
+        rate_hz: exact rate as text; forwards: recorded messages are written, too.
+        """
         job = self.job
         sensors = tuple(
             SensorInfo(
@@ -182,10 +185,14 @@ class Session:
                 sensor.lidar.returns,
                 0 if job.split else sensor.ring_base,
                 sensor.body_from_sensor,
+                sensor.lidar.sensor_from_imu(),
             )
             for sensor in self.sensors
         )
-        return RunInfo(sensors, self.setup.frame_id, rate_hz, timescale, job.slices, job.layout)
+        frames = tuple(self.setup.frames().items()) if forwards else ()
+        return RunInfo(
+            sensors, self.setup.frame_id, rate_hz, timescale, job.slices, job.layout, frames
+        )
 
     # -- checks and warnings ------------------------------------------------------------------
 
