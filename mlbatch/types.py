@@ -212,6 +212,7 @@ class SensorInfo:
     returns: int
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
+    sensor_from_imu: F64Array | None = None  # (4, 4) m; None: it sends no IMU data
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +225,8 @@ class RunInfo:
     timescale: str  # utc, tai, uptime or unknown
     slices: int = 1  # a window
     layout: str = "dense"  # or organized
+    # Static frames of the recording that forwarded messages may name: name, (4, 4) body_from_frame.
+    frames: tuple[tuple[str, F64Array], ...] = ()
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.

@@ -96,15 +96,12 @@ def convert(
         typer.Option(help="KEY=VALUE for decoders: crc=check, firing_azimuth=off; repeatable."),
     ] = None,
     only: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Use this sensor (name, serial number, topic or ADDRESS:PORT); repeatable."
-        ),
+        list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
     ] = None,
     ignore: Annotated[
         list[str] | None,
         typer.Option(
-            help="Leave out this sensor (name, serial number, topic or ADDRESS:PORT); repeatable."
+            help="Leave out this sensor (name, serial number, topic or IP:PORT); repeatable."
         ),
     ] = None,
     pass_: Annotated[

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import difflib
-import re
+import ipaddress
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+import numpy as np
+
 from mlbatch import sensors
+from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
@@ -35,17 +38,15 @@ from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError, RigError, UsageError
-from mlbatch.frames.tree import some
+from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.readers.bag.cloud_topics import CloudTopics
 
-# Of the descriptions of packets by the vendors.
-_SERIAL = re.compile(r"\bserial (\w+)")
 # Items of a list in an error.
 _SHOWN = 4
 _NO_SUPPORTED = "expected a supported lidar, found none; see `mlbatch sensors` for those that are"
@@ -57,12 +58,51 @@ class SensorSelection:
 
     rig: Path | None = None
     metadata: tuple[Path, ...] = ()
-    only: tuple[str, ...] = ()  # names, serial numbers, topics or ADDRESS:PORT
-    ignore: tuple[str, ...] = ()  # names, serial numbers, topics or ADDRESS:PORT
+    only: tuple[str, ...] = ()  # names or serial numbers
+    ignore: tuple[str, ...] = ()  # names, serial numbers, topics or IP:PORT
     identity_extrinsics: bool = False  # accept sensors without extrinsics
     host_clock: bool = False  # receive times replace timestamps
     aligned: bool = False  # --align-clocks: clocks need not be comparable
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
+
+
+@dataclass(frozen=True, slots=True)
+class Ignored:
+    """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
+
+    sensors: tuple[DetectedSensor, ...] = ()
+    words: tuple[str, ...] = ()
+    others: bool = False  # True if --only leaves out whatever it does not name
+
+    def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
+        """Return which packets (P, size) of a kind are left out: (P,) bool."""
+        if self.others or any(_names_stream(word, stream) for word in self.words):
+            return np.ones(len(packets), np.bool_)
+        left_out = np.zeros(len(packets), np.bool_)
+        for sensor in self.sensors:
+            lidar = sensor.lidar
+            if kind.size in (lidar.packet_size, lidar.packet_size + 1):
+                if kind in sensor.kinds or lidar.carries_serial:
+                    left_out |= lidar.sent_by_me(packets[:, : lidar.packet_size])
+            elif kind in sensor.kinds:
+                left_out[:] = True
+        if self.serials and "lidar" in (sensors.describe(kind.size, packets[:1]) or ""):
+            # Several lidars may share an address.
+            for row in np.flatnonzero(~left_out).tolist():
+                what = sensors.describe(kind.size, packets[row : row + 1])
+                left_out[row] = _names_serial(self.serials, what)
+        return left_out
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Words that are no sensors, hence serial numbers of other lidars, or addresses."""
+        known = {word for one in self.sensors for word in (one.name, one.lidar.serial)}
+        return tuple(word for word in self.words if word not in known and not _is_address(word))
+
+    def names(self, stream: Stream, what: str | None) -> bool:
+        """Return whether --ignore names a stream, or the serial number in its description."""
+        by_stream = any(_names_stream(word, stream) for word in self.words)
+        return self.others or by_stream or _names_serial(self.words, what)
 
 
 @dataclass(slots=True)
@@ -78,7 +118,14 @@ class Discovery:
     rig: Rig | None = None
     notes: list[Note] = field(default_factory=list)
     not_in_rig: set[PacketKind] = field(default_factory=set)
-    ignored: set[PacketKind] = field(default_factory=set)
+    # Kinds of lidars without a sensor that `notes` name.
+    noted: set[PacketKind] = field(default_factory=set)
+    tree: FrameTree = field(default_factory=FrameTree)  # static frames of the recording
+    ignored: Ignored = field(default_factory=lambda: Ignored())
+
+    def frames(self) -> dict[str, F64Array]:
+        """Return (4, 4) body_from_frame, m, of the recording's static frames, by name."""
+        return self.tree.poses(clean(self.frame_id))
 
 
 def discover(
@@ -114,18 +161,23 @@ def discover(
         names = _names(examined, recorded)
         reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures, refused)
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
-    chosen = _choose(sampler, recordings, matched, selection)
-    ignored = _ignored(sampler, matched, chosen, selection)
-    left_out: list[tuple[PacketKind, Note]] = []
+    chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
+    left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
+    ignored = Ignored(tuple(left_out), selection.ignore, others=bool(selection.only))
+    noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
+    notes: list[Note] = []
     if rig is None:
-        kinds = [kind for kind in lidar_kinds if kind not in ignored]
-        left_out = _unmatched(sampler, matched, kinds, _names(examined, recorded))
-    if to_convert:
-        texts = [] if selection.only else _refusals(refused)
-        texts += [note.message for kind, note in left_out if not _is_owned(kind, chosen)]
-        if texts:
-            raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
-    notes = [note for _, note in left_out]
+        unmatched = _unmatched(sampler, matched, noted, _names(examined, recorded))
+        if to_convert:
+            texts = [] if selection.only else _refusals(refused)
+            texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
+            _refuse_left_out(texts, recordings)
+        notes += [note for _, note in unmatched]
+    else:
+        # Other packets on the stream of a sensor are not unassigned but rejected.
+        taken = {stream for sensor in chosen for stream in sensor.streams}
+        noted = [kind for kind in noted if kind.stream not in taken]
+        notes += [_not_in_rig(sampler, kind) for kind in noted]
     if clouds is not None:
         notes += _cloud_notes(table, clouds, chosen, to_convert=to_convert)
     notes += _unused(matched.sensors, selection.metadata)
@@ -161,6 +213,8 @@ def discover(
         rig=rig,
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),
+        noted=set(noted),
+        tree=extrinsics.tree,
         ignored=ignored,
     )
 
@@ -304,7 +358,7 @@ def _unmatched(
     for kind in kinds:
         what = describe(sampler, kind) or ""
         start = f"{sampler.table.streams[kind.stream]}: {what}"
-        ignore = f"--ignore {_ignore_word(sampler, kind)}"
+        ignore = f"--ignore {_ignore_word(sampler.table.streams[kind.stream])}"
         if lacks_decoder(what):
             note = Note("no_decoder", "", f"{start}; {_NO_SUPPORTED}; leave it out with {ignore}")
         elif kind in matched.failures:
@@ -340,6 +394,12 @@ def _cloud_notes(
             yield Note("cloud_time", "", f"{topic}: {text}")
 
 
+def _refuse_left_out(texts: Sequence[str], recordings: Sequence[Recording]) -> None:
+    """Raise RecordingError if lidars of the session would be left out whole; texts: of each."""
+    if texts:
+        raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
+
+
 def _some_texts(texts: Sequence[str]) -> str:
     """The first text in full, and how many others there are."""
     others = f" (and {len(texts) - 1} more: {'; '.join(texts[1:])})" if len(texts) > 1 else ""
@@ -351,41 +411,11 @@ def _is_owned(kind: PacketKind, found: Sequence[DetectedSensor]) -> bool:
     return any(kind.stream in sensor.streams for sensor in found)
 
 
-def _serial(sampler: Sampler, kind: PacketKind) -> str:
-    """Serial number in the packets of a kind, or ""."""
-    found = _SERIAL.search(describe(sampler, kind) or "")
-    return found[1] if found else ""
-
-
-def _names_of(sampler: Sampler, kind: PacketKind) -> frozenset[str]:
-    """What `--only` and `--ignore` accept for packets of no sensor."""
-    return sampler.table.streams[kind.stream].names | {_serial(sampler, kind)} - {""}
-
-
-def _ignore_word(sampler: Sampler, kind: PacketKind) -> str:
-    """How to name a kind for `--ignore`."""
-    stream = sampler.table.streams[kind.stream]
+def _ignore_word(stream: Stream) -> str:
+    """How to name a stream for `--ignore`; not by its topic if that has clouds of several lidars."""
     if stream.topic:
         return shlex.quote(str(stream))
     return min(name for name in stream.names if " " not in name)
-
-
-def _ignored(
-    sampler: Sampler,
-    matched: Matched,
-    chosen: Sequence[DetectedSensor],
-    selection: SensorSelection,
-) -> set[PacketKind]:
-    """Kinds that `--only` and `--ignore` leave out."""
-    ignored = {kind for one in matched.sensors if one not in chosen for kind in one.kinds}
-    if selection.only or selection.ignore:
-        words = set(selection.ignore)
-        ignored |= {
-            kind
-            for kind in matched.unknown
-            if _is_lidar(sampler, kind) and (selection.only or _names_of(sampler, kind) & words)
-        }
-    return ignored
 
 
 def _refuse_clouds_of_rig(
@@ -397,6 +427,48 @@ def _refuse_clouds_of_rig(
         if topic in refused:
             place = f"{selection.rig}: sensor {sensor.name}"
             raise RigError(f"{place}: {topic}: {refused[topic]}")
+
+
+def _not_in_rig(sampler: Sampler, kind: PacketKind) -> Note:
+    """Warning about lidar packets in the first 10 s of a stream that the rig lacks."""
+    return not_in_rig(sampler.table.streams[kind.stream], describe(sampler, kind) or "")
+
+
+def not_in_rig(stream: Stream, what: str) -> Note:
+    """Warning about lidar packets of a stream that the rig lacks."""
+    text = (
+        f"{stream}: {what}; expected a sensor of the rig, found none for it; its packets are "
+        "counted as unassigned; add it to the rig, or leave it out with --ignore "
+        f"{_ignore_word(stream) if stream.topic else stream.source_ip}"
+    )
+    return Note("not_in_rig", "", text)
+
+
+def _is_ignored(sampler: Sampler, ignored: Ignored, kind: PacketKind) -> bool:
+    return ignored.names(sampler.table.streams[kind.stream], describe(sampler, kind))
+
+
+def _names_stream(word: str, stream: Stream) -> bool:
+    """True if a word is the topic, the source IP or IP:port of a stream, or its name in reports."""
+    return word in stream.names or (bool(word) and word == stream.source_ip)
+
+
+def _names_serial(words: Sequence[str], what: str | None) -> bool:
+    """True if one of the words is the serial number in a description."""
+    return any(f"serial {word}," in (what or "") for word in words)
+
+
+def _is_address(word: str) -> bool:
+    """True for a topic, an IP address or IP:port, which may begin to send later."""
+    if word.startswith("/"):
+        return True
+    for text in (word, word.rpartition(":")[0]):
+        try:
+            ipaddress.ip_address(text)
+        except ValueError:
+            continue
+        return True
+    return False
 
 
 def _unused(found: Sequence[DetectedSensor], given: Sequence[Path]) -> list[Note]:
@@ -475,40 +547,48 @@ def _known(names: Sequence[str]) -> str:
 
 def _choose(
     sampler: Sampler,
-    recordings: Sequence[Recording],
-    matched: Matched,
+    found: Sequence[DetectedSensor],
+    lidar_kinds: Sequence[PacketKind],
     selection: SensorSelection,
 ) -> list[DetectedSensor]:
-    """Apply --only and --ignore: names, serial numbers, topics, ADDRESS:PORT."""
-    found = matched.sensors
-    if not selection.only and not selection.ignore:
-        return list(found)
-    streams = sampler.table.streams
-    names = {
-        sensor.name: {sensor.name, sensor.lidar.serial}.union(
-            *(streams[number].names for number in sensor.streams)
+    """Apply --only and --ignore.
+
+    Both accept names and serial numbers; --ignore also addresses, and serial numbers of lidars that
+    are no sensors.
+    """
+    known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
+    others = Ignored(words=selection.ignore)
+    unknown = [word for word in selection.only if word not in known]
+    option = "--only"
+    if not unknown:
+        option = "--ignore"
+        unknown = [
+            word
+            for word in selection.ignore
+            if word not in known
+            and not _is_address(word)
+            and not any(
+                _is_ignored(sampler, replace(others, words=(word,)), kind) for kind in lidar_kinds
+            )
+        ]
+    for word in unknown:
+        raise UsageError(
+            f"{option}: expected the name or serial number of a sensor, one of "
+            f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
         )
-        - {""}
-        for sensor in found
-    }
-    known = set().union(*names.values())
-    others = {topic.name for recording in recordings for topic in recording.topics}
-    others = others.union(*(_names_of(sampler, kind) for kind in matched.unknown))
-    for option, words, allowed in (
-        ("--only", selection.only, known),
-        ("--ignore", selection.ignore, known | others),
-    ):
-        for word in words:
-            if word not in allowed:
-                raise UsageError(
-                    f"{option}: expected the name, serial number, topic or ADDRESS:PORT of a "
-                    f"sensor, one of {', '.join(names)}, found {word!r}; choose one"
-                )
+    streams = sampler.table.streams
     chosen = [
         sensor
         for sensor in found
-        if (not selection.only or names[sensor.name] & set(selection.only))
-        and not names[sensor.name] & set(selection.ignore)
+        if (not selection.only or {sensor.name, sensor.lidar.serial} & set(selection.only))
+        and not {sensor.name, sensor.lidar.serial} & set(selection.ignore)
+        and not (
+            sensor.streams
+            and all(
+                any(_names_stream(word, streams[number]) for word in selection.ignore)
+                for number in sensor.streams
+            )
+        )
     ]
     if found and not chosen:
         raise UsageError(

@@ -206,7 +206,8 @@ class Conversion:
         if len(set(names)) > 1:
             self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
         self._check_dates(shared)
-        info = self.session.run_info(rate_text(self.grid.rate), shared)
+        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        info = self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
         self.info = info
         self.table = ScanTable(info, [sensor.columns_per_s for sensor in self.sensors])
         boxes_m = self.session.boxes_m

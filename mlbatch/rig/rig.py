@@ -50,20 +50,27 @@ class StreamSelector:
         return ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
 
 
+@dataclass(frozen=True, slots=True)
+class UnknownExtrinsics:
+    """`extrinsics: unknown`; place: file, line and key path of it."""
+
+    place: str = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
     """One sensor of the rig; None: taken from the recording.
 
-    extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording; clock:
-    sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the
-    timestamps; decode: options as for `--decode`; points: how its clouds are read.
+    extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
+    unknown; clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added
+    to the timestamps; decode: options as for `--decode`; points: how its clouds are read.
     """
 
     name: str
     model: str | None = None
     stream: StreamSelector | None = None
     metadata: Path | None = None
-    extrinsics: F64Array | str | None = None
+    extrinsics: F64Array | str | UnknownExtrinsics | None = None
     clock: str | None = None
     epoch: str | None = None
     offset_ns: int = 0

@@ -19,7 +19,14 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, no_boxes
+from mlbatch.rig.rig import (
+    DEFAULT_BODY_FRAME,
+    Rig,
+    RigSensor,
+    StreamSelector,
+    UnknownExtrinsics,
+    no_boxes,
+)
 from mlbatch.rig.yaml_tree import Node
 from mlbatch.units import NS_PER_S, parse_rate
 
@@ -28,6 +35,8 @@ if TYPE_CHECKING:
 
 # `lidar_id` is a uint8.
 MAX_SENSORS = 256
+# What `inspect --write-rig` writes for extrinsics that nobody gave.
+UNKNOWN = "unknown"
 # Beyond, float32 coordinates resolve no millimetre.
 MAX_TRANSLATION_M = 10_000.0
 MAX_OFFSET_S = 2**31
@@ -153,8 +162,10 @@ def _clock(node: Node) -> Mapping[str, Node]:
     return node.fields(_CLOCK_KEYS)
 
 
-def _extrinsics(node: Node) -> F64Array | str:
-    """Return (4, 4) body_from_sensor, m, or the name of a frame of the recording."""
+def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics:
+    """Return (4, 4) body_from_sensor, m, the name of a frame of the recording, or unknown."""
+    if node.kind == "scalar" and node.text == UNKNOWN:
+        return UnknownExtrinsics(node.place)
     fields = _some_fields(node, _EXTRINSICS_KEYS)
     frame = _FRAME_OF_RECORDING.of(fields)
     if frame:
@@ -252,7 +263,7 @@ _SENSOR_NAME = Key(
 _MODEL: Key[str | None] = Key("model", _model, None)
 _STREAM: Key[StreamSelector | None] = Key("stream", _stream, None)
 _METADATA: Key[Path | None] = Key("metadata", _existing_file, None)
-_EXTRINSICS: Key[F64Array | str | None] = Key("extrinsics", _extrinsics, None)
+_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | None] = Key("extrinsics", _extrinsics, None)
 _CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {})
 _MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None)
 _MAX_RANGE: Key[float | None] = Key("max_range_m", _range_m, None)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
@@ -87,9 +87,12 @@ def _stream_text(stream: StreamSelector) -> str:
     )
 
 
-def _extrinsics_lines(extrinsics: F64Array | str | None) -> Iterator[str]:
+def _extrinsics_lines(extrinsics: F64Array | str | UnknownExtrinsics | None) -> Iterator[str]:
     if extrinsics is None:
         yield from _NO_EXTRINSICS
+        return
+    if isinstance(extrinsics, UnknownExtrinsics):
+        yield "extrinsics: unknown"
         return
     if isinstance(extrinsics, str):
         yield f"extrinsics: {{frame: {_text(extrinsics)}}}"

@@ -218,8 +218,8 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "only part": (
         "drive.mcap --only front",
         2,
-        "--only: expected the name, serial number, topic or ADDRESS:PORT of a sensor, one of "
-        "left, right, found 'front'; choose one",
+        "--only: expected the name or serial number of a sensor, one of left, right, found "
+        "'front'; choose one",
     ),
     "file of a bag that is gone": (
         "bag/bag_2.db3",

@@ -278,8 +278,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "unknown sensor": (
         f"{FIX} --only front",
         2,
-        "--only: expected the name, serial number, topic or ADDRESS:PORT of a sensor, one of "
-        "left, right, found 'front'; choose one",
+        "--only: expected the name or serial number of a sensor, one of left, right, found "
+        "'front'; choose one",
     ),
     "no sensor left": (
         f"{FIX} --ignore left --ignore 122648000456",

@@ -70,8 +70,10 @@ def _read(report: Report) -> dict[str, int]:
 
 def _rig(folder: Path, sensors: Sequence[str]) -> Path:
     rig = folder / "rig.yaml"
-    origin = "extrinsics: {translation_m: [0, 0, 0]}"
-    lines = [f"- {{{sensor}, {origin}}}\n" for sensor in sensors]
+    lines = [
+        f"- {{{sensor}, extrinsics: {{translation_m: [{x_m}, 0, 0]}}}}\n"
+        for x_m, sensor in enumerate(sensors)
+    ]
     rig.write_text("sensors:\n" + "".join(lines))
     return rig
 
@@ -151,7 +153,6 @@ CASES = {
         for option in (
             "--ignore 10.0.0.2:7502",
             "--ignore 333",
-            "--only 10.0.0.1:7502",
             "--only ouster_111",
         )
     },
@@ -160,6 +161,63 @@ CASES = {
         {"ouster_111": PACKETS},
         without=(333,),
         unassigned=(("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),),
+        warnings=(
+            (
+                "unassigned",
+                "",
+                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
+                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
+                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
+                "SERIAL",
+            ),
+        ),
+    ),
+    **{
+        f"a lidar that the user leaves out, as {word}": Case(
+            (ONE, twin(ONE, 333, ip)),
+            {"ouster_111": PACKETS},
+            without=(333,),
+            options=f"--strict --ignore {word}",
+            unassigned=((f"{ip} > port 7502", PACKETS, "ignored: Ouster lidar, serial 333"),),
+        )
+        for ip, word in (
+            (ONE.ip, "333"),
+            ("10.0.0.2", "333"),
+            ("10.0.0.2", "10.0.0.2"),
+            ("10.0.0.2", "10.0.0.2:7502"),
+        )
+    },
+    "one of two from one address is left out": Case(
+        (ONE, twin(ONE, 222, ONE.ip)),
+        {"ouster_111": PACKETS},
+        options="--strict --ignore ouster_222",
+        unassigned=(("10.0.0.1 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),),
+    ),
+    "a sensor that is left out by its address": Case(
+        (ONE, twin(ONE, 222)),
+        {"ouster_111": PACKETS},
+        options="--strict --ignore 10.0.0.2",
+        unassigned=(("10.0.0.2 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),),
+    ),
+    "three from one address, one is left out, one has no metadata": Case(
+        (ONE, twin(ONE, 222, ONE.ip), twin(ONE, 333, ONE.ip)),
+        {"ouster_111": PACKETS},
+        without=(333,),
+        options="--ignore 222",
+        unassigned=(
+            ("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),
+            ("10.0.0.1 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),
+        ),
+        warnings=(
+            (
+                "unassigned",
+                "",
+                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
+                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
+                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
+                "SERIAL",
+            ),
+        ),
     ),
     "one that begins late": Case(
         (ONE, replace(twin(ONE, 222), begin_ns=AFTER_12_S)),
@@ -218,6 +276,26 @@ CASES = {
         unassigned=(
             ("10.0.0.2 > port 7502", PACKETS, "not_in_rig: Ouster lidar, serial 222"),
             ("10.0.0.4 > port 7502", PACKETS, "not seen in the first 10 s: Ouster lidar"),
+        ),
+        warnings=tuple(
+            (
+                "not_in_rig",
+                "",
+                f"{ip} > port 7502: {NEEDS_METADATA.format(serial)}; expected a sensor of the rig, "
+                "found none for it; its packets are counted as unassigned; add it to the rig, or "
+                f"leave it out with --ignore {ip}",
+            )
+            for ip, serial in (("10.0.0.2", 222), ("10.0.0.4", 444))
+        ),
+    ),
+    "lidars that are not in the rig and left out": Case(
+        (ONE, twin(ONE, 222), replace(twin(ONE, 444, "10.0.0.4"), begin_ns=AFTER_12_S)),
+        {"front": PACKETS},
+        rig=('name: front, stream: {serial: "111"}',),
+        options="--strict --ignore 222 --ignore 10.0.0.4",
+        unassigned=(
+            ("10.0.0.2 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),
+            ("10.0.0.4 > port 7502", PACKETS, "ignored: not seen in the first 10 s: Ouster lidar"),
         ),
     ),
     **{
