@@ -15,15 +15,29 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16
 class Stream:
     """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.
 
-    Source ports are ephemeral and no part of it.
+    Source ports are ephemeral and no part of it. frame_id, lidar_id: only where a topic has decoded
+    clouds of several lidars.
     """
 
     source_ip: str = ""
     port: int = 0  # destination
     topic: str = ""
+    frame_id: str = ""
+    lidar_id: int | None = None
 
     def __str__(self) -> str:
-        return self.topic or f"{self.source_ip} > port {self.port}"
+        parts = [f"frame_id {self.frame_id}"] if self.frame_id else []
+        parts += [] if self.lidar_id is None else [f"lidar_id {self.lidar_id}"]
+        part = f" ({', '.join(parts)})" if parts else ""
+        return f"{self.topic}{part}" if self.topic else f"{self.source_ip} > port {self.port}"
+
+    @property
+    def names(self) -> frozenset[str]:
+        """What `--only` and `--ignore` accept for it."""
+        if self.topic:
+            return frozenset({str(self), self.topic})
+        address = f"[{self.source_ip}]" if ":" in self.source_ip else self.source_ip
+        return frozenset({str(self), f"{address}:{self.port}"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +215,7 @@ class SensorInfo:
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
     has_reflectivity: bool = False  # calibrated, in addition to intensity
+    sensor_from_imu: F64Array | None = None  # (4, 4) m; None: it sends no IMU data
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +229,8 @@ class RunInfo:
     slices: int = 1  # a window
     layout: str = "dense"  # or organized
     sort: str = "columns"  # order of the points of a dense scan: by their columns, or `points`
+    # Static frames of the recording that forwarded messages may name: name, (4, 4) body_from_frame.
+    frames: tuple[tuple[str, F64Array], ...] = ()
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.

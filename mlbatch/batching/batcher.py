@@ -245,7 +245,9 @@ class Batcher:
                 firsts.append((int(ranks[number][row]), number))
         for _, number in sorted(firsts):
             refuse_incomparable(
-                [(track.intake.name, track.offset_ns) for track in self._tracks], number
+                [(track.intake.name, track.offset_ns) for track in self._tracks],
+                number,
+                has_receive_times=all(track.intake.has_receive_times for track in self._tracks),
             )
 
     # -- step 2: newest stamps, eq. (1), watermark ----------------------------------------------

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
@@ -29,10 +30,15 @@ from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RigError
-from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.readers import merge, open_recording
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector
+from mlbatch.rig.rig import (
+    DEFAULT_BODY_FRAME,
+    Rig,
+    RigSensor,
+    StreamSelector,
+    UnknownExtrinsics,
+)
 from mlbatch.rig.write import write_rig
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -50,6 +56,10 @@ HEAD = (
     "calibration",
     "extrinsics",
     "missing",
+)
+_MEASURE = (
+    "extrinsics not known: measure them and replace `unknown` by "
+    "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
 )
 # Warnings that concern a conversion; the table shows missing metadata and decoders.
 _CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "calibration", "not_seen_yet"})
@@ -133,7 +143,7 @@ class Inspection:
         return [] if self.clocks is None else self.clocks.describe()
 
     def rig_text(self, folder: Path) -> str:
-        """A rig file for these sensors; unknown extrinsics are the identity, with a comment."""
+        """A rig file for these sensors; extrinsics without a source are `unknown`."""
         if not self.sensors:
             raise RigError(
                 "--write-rig: expected at least one lidar with its metadata, found none; "
@@ -142,9 +152,8 @@ class Inspection:
         sensors = []
         comments = {}
         for sensor in self.sensors:
-            # As angles, which are easier to replace than a matrix.
-            extrinsics = from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-            comments[sensor.name] = "extrinsics unknown: measure them"
+            extrinsics: F64Array | UnknownExtrinsics = UnknownExtrinsics()
+            comments[sensor.name] = _MEASURE
             if sensor.pose.is_known:
                 extrinsics = sensor.pose.body_from_sensor
                 comments[sensor.name] = f"extrinsics of {sensor.pose.describe()}"
@@ -228,7 +237,13 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
     if sensor.lidar.carries_serial:
         return StreamSelector(serial=sensor.lidar.serial)
     stream = table.streams[min(sensor.kinds).stream]
-    return StreamSelector(stream.source_ip, stream.port, stream.topic)
+    return StreamSelector(
+        stream.source_ip,
+        stream.port,
+        stream.topic,
+        frame_id=stream.frame_id,
+        lidar_id=stream.lidar_id,
+    )
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:

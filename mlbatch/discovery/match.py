@@ -7,6 +7,8 @@ shared one every stream is a sensor of its own. File names play no part.
 from __future__ import annotations
 
 import ipaddress
+import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -192,10 +194,15 @@ def _refuse_several_streams(
 
 def _order(
     table: StreamTable, sensor: DetectedSensor
-) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
+) -> tuple[int, int, tuple[tuple[int, int, str, str, int], ...]]:
     """Sort key: serial number, else source IP and port, else topic."""
     streams = (table.streams[kind.stream] for kind in sensor.kinds)
-    places = tuple(sorted((_ip_number(one.source_ip), one.port, one.topic) for one in streams))
+    places = tuple(
+        sorted(
+            (_ip_number(one.source_ip), one.port, one.topic, one.frame_id, one.lidar_id or 0)
+            for one in streams
+        )
+    )
     if sensor.lidar.serial.isdigit():
         return (0, int(sensor.lidar.serial), places)
     return (1, 0, places)
@@ -217,6 +224,29 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
             sensor.name = place
         else:
             sensor.name = f"{vendor}_{sensor.lidar.serial or counts[vendor]}"
+        sensor.name += _part(table, sensor)
+    _number_equal_names(found)
+
+
+def _part(table: StreamTable, sensor: DetectedSensor) -> str:
+    """The end of the name of a lidar whose clouds share a topic with others, else ""."""
+    stream = min((table.streams[number] for number in sensor.streams), key=str)
+    words = [stream.frame_id] if stream.frame_id else []
+    words += [] if stream.lidar_id is None else [str(stream.lidar_id)]
+    return "".join(f"_{re.sub(r'[^A-Za-z0-9]+', '_', word).strip('_')}" for word in words)
+
+
+def _number_equal_names(found: Sequence[DetectedSensor]) -> None:
+    """Give sensors on several topics of one namespace names of their own."""
+    names = Counter(sensor.name for sensor in found)
+    taken = set(names)
+    for name in [name for name, count in names.items() if count > 1]:
+        same = [sensor for sensor in found if sensor.name == name]
+        for number, sensor in enumerate(same[1:], 2):
+            while f"{name}_{number}" in taken:
+                number += 1
+            sensor.name = f"{name}_{number}"
+            taken.add(sensor.name)
 
 
 # -- with a rig -----------------------------------------------------------------------------------

@@ -217,8 +217,8 @@ class Lidar(Protocol):
         """Return the samples of IMU packets (P, size), in their order; sensor: its index."""
         ...
 
-    def sensor_from_imu(self) -> F64Array:
-        """Return the pose of the IMU in the sensor frame, (4, 4), m; identity if unknown."""
+    def sensor_from_imu(self) -> F64Array | None:
+        """Return the pose of the IMU in the sensor frame, (4, 4), m; None: no IMU packets."""
         ...
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:

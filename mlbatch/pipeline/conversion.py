@@ -204,7 +204,8 @@ class Conversion:
         self._check_dates(shared)
         self._check_limits()
         self._check_passed()
-        info = self.session.run_info(rate_text(self.grid.rate), shared)
+        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        info = self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
         self.info = info
         self.table = ScanTable(info, [sensor.columns_per_s for sensor in self.sensors])
         boxes_m = self.session.boxes_m

@@ -102,6 +102,7 @@ class Sensor:
             offset_ns=self.clock.offset_ns,
             modulus=lidar.sequence_modulus,
             packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
+            has_receive_times=self.clock.has_receive_times,
         )
 
     def pace(self) -> Pace:

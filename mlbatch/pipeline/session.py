@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mlbatch.arrays import F64Array
+from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
 from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
-from mlbatch.discovery.types import DetectedSensor, Note
+from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.native import choose_engine
 from mlbatch.pipeline.clock_monitor import ClockMonitor
@@ -65,8 +65,16 @@ class Session:
             self.clocks.align(merge(self.recordings), self.setup.router, job.align_clocks_to)
         maps_stamps = bool(job.faults or job.align_clocks_to)
         self.ingest = Ingest(
-            self.setup.router, self.sensors, self.clocks.map_stamps if maps_stamps else None
+            self.setup.router,
+            self.sensors,
+            self.clocks.map_stamps if maps_stamps else None,
+            self._is_ignored if job.selection.only or job.selection.ignore else None,
         )
+
+    def _is_ignored(self, kind: PacketKind, packets: U8Array) -> BoolArray:
+        """Return which packets (P, size) of no sensor the user left out: (P,) bool."""
+        stream = self.setup.sampler.table.streams[kind.stream]
+        return self.setup.ignored.packets(stream, kind, packets)
 
     def _sensor(self, found: DetectedSensor) -> Sensor:
         """The next sensor, with an empty ring and ledger."""
@@ -163,8 +171,11 @@ class Session:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
         return excluded_boxes_m(self.job, self.setup.rig)
 
-    def run_info(self, rate_hz: str, timescale: str) -> RunInfo:
-        """What is the same for all scans; rate_hz: exact rate as text."""
+    def run_info(self, rate_hz: str, timescale: str, *, forwards: bool = False) -> RunInfo:
+        """What is the same for all scans.
+
+        rate_hz: exact rate as text; forwards: recorded messages are written, too.
+        """
         job = self.job
         sensors = tuple(
             SensorInfo(
@@ -175,9 +186,11 @@ class Session:
                 0 if job.split else sensor.ring_base,
                 sensor.body_from_sensor,
                 sensor.lidar.has_reflectivity,
+                sensor.lidar.sensor_from_imu(),
             )
             for sensor in self.sensors
         )
+        frames = tuple(self.setup.frames().items()) if forwards else ()
         return RunInfo(
             sensors,
             self.setup.frame_id,
@@ -186,6 +199,7 @@ class Session:
             job.slices,
             job.layout,
             job.sort,
+            frames,
         )
 
     # -- checks and warnings ------------------------------------------------------------------

@@ -75,9 +75,9 @@ class BaseLidar:
         nothing = np.empty((0, 3))
         return ImuSamples(sensor, np.empty(0, np.int64), nothing, nothing)
 
-    def sensor_from_imu(self) -> F64Array:
-        """Identity: the pose is unknown."""
-        return np.eye(4)
+    def sensor_from_imu(self) -> F64Array | None:
+        """None: no IMU packets."""
+        return None
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
         """None: the beam vectors suffice."""

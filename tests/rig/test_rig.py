@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Stream
 
@@ -165,8 +165,9 @@ UNIT_QUATERNIONS = (
     .filter(lambda xyzw: math.hypot(*xyzw) > 0.01)
     .map(lambda xyzw: tuple(part / math.hypot(*xyzw) for part in xyzw))
 )
-EXTRINSICS: st.SearchStrategy[F64Array | str | None] = st.one_of(
+EXTRINSICS: st.SearchStrategy[F64Array | str | UnknownExtrinsics | None] = st.one_of(
     st.none(),
+    st.builds(UnknownExtrinsics),
     WORDS,
     st.builds(from_quaternion, COORDINATES, UNIT_QUATERNIONS),
     st.builds(from_rpy_deg, COORDINATES, st.tuples(*[st.integers(-180, 180)] * 3)),
@@ -199,7 +200,11 @@ def _facts(rig: Rig) -> list[object]:
     """All fields of a rig, comparable to the last bit."""
     facts: list[object] = [rig.body_frame, rig.rate, rig.exclude_boxes_m.tobytes()]
     for s in rig.sensors:
-        pose = s.extrinsics.tobytes() if isinstance(s.extrinsics, np.ndarray) else s.extrinsics
+        pose: object = s.extrinsics
+        if isinstance(s.extrinsics, np.ndarray):
+            pose = s.extrinsics.tobytes()
+        elif isinstance(s.extrinsics, UnknownExtrinsics):
+            pose = UnknownExtrinsics
         facts += [s.name, s.model, s.stream, s.metadata, pose, s.clock, s.offset_ns]
         facts += [s.min_range_m, s.max_range_m, s.optional, s.decode]
     return facts

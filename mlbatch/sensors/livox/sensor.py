@@ -166,6 +166,10 @@ class LivoxLidar(BaseLidar):
         """Samples of IMU packets (P, size)."""
         return read_imu(payloads, sensor)
 
+    def sensor_from_imu(self) -> F64Array:
+        """Identity: livox_ros_driver2 publishes points and IMU data in one frame."""
+        return np.eye(4)
+
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
         """Transform of the last points read into the body frame."""
         return MovedPoints(self, body_from_sensor)
