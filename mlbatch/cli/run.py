@@ -41,6 +41,7 @@ from mlbatch.writers import (
     extras,
     open_writer,
     report_paths,
+    sync_entries,
     write_text,
 )
 
@@ -58,6 +59,7 @@ class Target:
     split_jumps: bool
     overwrite: bool
     resume: bool
+    fsync: bool
     quiet: bool
     verbose: bool
 
@@ -88,7 +90,11 @@ def _run_one(job: Job, target: Target) -> None:
     # A dry run without an output decodes what a .mcap of this point layout would contain.
     name = choose_format(target.output or Path("scans.mcap"), target.format)
     options = WriterOptions(
-        target.point_layout, target.overwrite, job.split, compression=target.compression
+        target.point_layout,
+        target.overwrite,
+        job.split,
+        compression=target.compression,
+        fsync=target.fsync,
     )
     check_compression(name, options)
     job = replace(job, extras=extras(name, options))
@@ -164,7 +170,10 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
         if report_path is None or target.output is None:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
-        write_text(partial / report_path.name if is_inside else report_path, report_text(inputs))
+        path = partial / report_path.name if is_inside else report_path
+        write_text(path, report_text(inputs), target.fsync)
+        if target.fsync and path.parent.absolute() != target.output.parent.absolute():
+            sync_entries(path.parent)
 
     return write
 
@@ -263,7 +272,7 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM as an interrupt from the keyboard."""
+    """Treat SIGTERM and SIGHUP (the terminal was closed) as an interrupt from the keyboard."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -271,11 +280,16 @@ def _terminated_as_interrupt() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    # One that is ignored remains so: nohup is to outlive its terminal.
+    caught = {number: one for number, one in before.items() if one is not signal.SIG_IGN}
     try:
+        for number in caught:
+            signal.signal(number, interrupt)
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, one in caught.items():
+            signal.signal(number, one)
 
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:
@@ -293,10 +307,13 @@ def _resume_log(
     job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
 ) -> ResumeLog:
     """Progress of an output: that of the interrupted run, or from the start."""
-    state = resume.find(output).state
+    earlier = resume.find(output)
+    state = earlier.state
+    if earlier.damage and resumes:
+        _say(earlier.damage)
     if state is not None and not resumes:
         _say(
-            f"warning: interrupted: {output}.partial with {len(state.rows)} finished scans is "
+            f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
             "discarded; --resume would continue after them"
         )
     log = ResumeLog(output, job, name, options, state if resumes else None)

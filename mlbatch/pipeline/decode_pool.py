@@ -13,6 +13,7 @@ from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Scan
+from mlbatch.writers.output_file import crc32
 
 # Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_OUTCOMES`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
@@ -99,6 +100,7 @@ class DecodePool:
 
         Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
+        self._rings = [source.ring for source in sources]
         self._split = split
         self._open: list[DecodeTask] = []
         self.workers = [
@@ -141,6 +143,20 @@ class DecodePool:
         task = DecodeTask(columns, label, only, next(earlier, None))
         self._open.append(task)
         return task
+
+    def content(self, task: DecodeTask, before: int) -> int:
+        """Checksum of the packets and columns of a task, and of what precedes it (`before`)."""
+        columns = task.columns
+        sums = np.empty(len(columns), np.uint64)
+        for sensor, ring in enumerate(self._rings):
+            if task.only is None:
+                own = columns.sensor == sensor
+                sums[own] = ring.sums(columns.ring_index[own])
+            elif task.only == sensor:
+                sums[:] = ring.sums(columns.ring_index)
+        for values in (columns.stamp_ns, columns.sensor, columns.encoder, sums):
+            before = crc32(np.ascontiguousarray(values).view(np.uint8).data, before)
+        return before
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor that a task still needs; None: none."""
