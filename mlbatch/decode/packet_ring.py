@@ -30,6 +30,8 @@ class PacketRing:
         self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
+        # Of all packets, and up to the packet in each slot.
+        self._sum = np.uint64(0)
         self._sums: U64Array = np.zeros(_FIRST_PACKETS, np.uint64)
         self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
 
@@ -70,17 +72,20 @@ class PacketRing:
             for begin in start.tolist():
                 target[at : at + size] = source[begin : begin + size]
                 at += stride
-        self._sums[slot % self._capacity :][:count] = _sums(packets)
+        if count:
+            sums = self._sums[slot % self._capacity :][:count]
+            np.cumsum(_sums(packets), out=sums)
+            sums += self._sum
+            self._sum = sums[-1]
         self._next = slot + count
         return packets, np.arange(slot, slot + count) * self._places
 
-    def sums(self, ring_index: I64Array) -> U64Array:
-        """Return the checksum of the packet of each column at `ring_index` (n,): (n,) uint64.
+    def sum_until(self, ring_index: int) -> int:
+        """Return the sum of all packets ever stored, up to that of a column still needed.
 
-        Only for the thread that stores packets.
+        See `_sums`. Only for the thread that stores packets.
         """
-        sums: U64Array = self._sums[ring_index // self._places % self._capacity]
-        return sums
+        return int(self._sums[ring_index // self._places % self._capacity])
 
     def gather(self, ring_index: I64Array, out: U8Array) -> None:
         """Copy the columns at `ring_index` (n,) to the rows of `out` (n, records.size)."""

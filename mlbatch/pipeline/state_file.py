@@ -35,7 +35,7 @@ Record: TypeAlias = dict[str, object]
 class FinishedScan(NamedTuple):
     """A scan that the `.partial` contains.
 
-    content: checksum of all that was written up to it was made from, see `ResumeLog.take`;
+    content: checksum of what was read for it and before it, see `ResumeLog.take`;
     outcomes: slots by outcome, one list a sensor; see `ledger.POINT_OUTCOMES`.
     """
 
