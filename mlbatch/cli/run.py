@@ -5,6 +5,7 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import signal
 import sys
@@ -44,6 +45,9 @@ from mlbatch.writers import (
     sync_entries,
     write_text,
 )
+
+# An interrupt that got lost is raised again after this time.
+_REPEAT_S = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -286,10 +290,38 @@ def _terminated_as_interrupt() -> Iterator[None]:
     try:
         for number in caught:
             signal.signal(number, interrupt)
-        yield
+        with _interrupts_repeated():
+            yield
     finally:
         for number, one in caught.items():
             signal.signal(number, one)
+
+
+@contextlib.contextmanager
+def _interrupts_repeated() -> Iterator[None]:
+    """Repeat an interrupt that was raised where Python ignores exceptions.
+
+    It is raised between any two instructions of the first thread, also in a finalizer or the
+    callback of a weak reference, which would end with a traceback while the run continues.
+    """
+    before = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def repeat(ignored: sys.UnraisableHookArgs) -> None:
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            # Later: here it would be ignored again.
+            timers.append(threading.Timer(_REPEAT_S, _thread.interrupt_main))
+            timers[-1].start()
+        else:
+            before(ignored)
+
+    sys.unraisablehook = repeat
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+        for timer in timers:
+            timer.cancel()
 
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import random
+import re
+import shutil
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -22,9 +24,10 @@ from mlbatch.decode.kernels.native import Constant, Kernel, load
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
+from mlbatch.verify import verify
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.run import in_memory, prints
-from tests.fuzz.framing import mutated_parts, parts_of
+from tests.builders.run import command, in_memory, prints
+from tests.fuzz.framing import joined, mutated_parts, parts_of
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds
 from tests.fuzz.packets import CALIBRATION, NAMES, seeds_of
@@ -71,6 +74,52 @@ def _convert(data: bytes, folder: Path) -> None:
     result = in_memory(replace(_job(data, folder), engine="numpy"))
     check_ledgers(result.report)
     check_output(result)
+
+
+# -- verified -------------------------------------------------------------------------------------
+
+# From what a lidar can be to what none is.
+_SIZES = (
+    *("0", "0.05", "0.4", "0.6", "0.99", "1.01", "1.6", "2", "5", "15", "45", "89", "91", "180"),
+    *("361", "500", "999", "1001", "1e4", "99999", "1e6", "6e15", "1e19", "1e100", "1e308", "nan"),
+)
+_WRITTEN = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?([eE][-+]?\d+)?(?![\w.])")
+
+
+def _mutated_geometry(rng: random.Random, seeds: Seeds) -> bytes:
+    """Change numbers of a calibration file or device packets; else as other sessions."""
+    parts = parts_of(rng.choice(seeds))
+    at = next((at for at, part in enumerate(parts) if part.kind == CALIBRATION), None)
+    if at is None or rng.random() < 0.1:
+        return mutated_parts(rng, seeds)
+    data = parts[at].data
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        found = list(_WRITTEN.finditer(data))
+        if not found:
+            return mutated_parts(rng, seeds)
+        # Long tables have most numbers: some keys of their own are chosen as often.
+        one = rng.choice(found if rng.random() < 0.5 else [*found[:20], *found[-60:]])
+        number = rng.choice(("", "-")) + rng.choice(_SIZES)
+        data = data[: one.start()] + number.encode() + data[one.end() :]
+    parts[at] = replace(parts[at], data=data)
+    return joined(parts)
+
+
+def _verified(data: bytes, folder: Path) -> None:
+    """What `convert` writes without an error is without fault for `verify`."""
+    job = _job(data, folder)
+    output = folder / "out"
+    shutil.rmtree(output, ignore_errors=True)
+    words: list[str | Path] = ["convert", *job.recordings, "-o", output, "--keep-partial"]
+    for path in job.selection.metadata:
+        words += ["--metadata", path]
+    run = command(*words, "--no-fsync", "--quiet", "--engine", "numpy")
+    if run.code:
+        raise MlbatchError(run.err.splitlines()[-1])
+    verdict = verify(output)
+    if not verdict.ok:
+        shown = "; ".join(map(str, verdict.violations[:3]))
+        raise BrokenLaw(f"a run without an error, but not for verify: {shown}")
 
 
 # -- others that must do the same -----------------------------------------------------------------
@@ -154,6 +203,7 @@ _LAST_NS = ((1 << 32) - 1) * 10**9
 
 TARGETS: Sequence[Target] = (
     Target("sessions", _seeds, _convert, mutated_parts, 2),
+    Target("sessions, verified", _seeds, _verified, _mutated_geometry, 2),
     Target("sessions of two jobs", _seeds, _share, mutated_parts, 2),
     *(
         (Target("sessions, compiled", _warm_seeds, _compile, mutated_parts, 2),)

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -138,6 +139,35 @@ def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 0
     assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
+
+
+class _Ending:
+    """Receives a signal in its finalizer, where Python prints and ignores exceptions."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_an_interrupt_in_a_finalizer_is_not_lost(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take = resume.ResumeLog.take
+    calls = 0
+
+    def ending(log: resume.ResumeLog, *given: Any) -> bool:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            _Ending()
+        if calls == 3:
+            time.sleep(0.2)
+        return take(log, *given)
+
+    monkeypatch.setattr(resume.ResumeLog, "take", ending)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert outcome.code == 130
+    assert outcome.err.startswith("mlbatch: error: interrupted")
+    assert calls == 3
 
 
 def test_nothing_to_resume_is_reported(shell: Shell) -> None:
