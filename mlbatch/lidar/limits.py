@@ -13,5 +13,6 @@ MAX_ORIGIN_M = 1.0
 MAX_BEAM_M = 0.5
 # Between largest and smallest range correction of a sensor's beams, and the offset of a beam.
 MAX_SPREAD_M = 1.0
-# Of a sensor from the body, in a calibration.
-MAX_TRANSLATION_M = 100.0
+# Of a sensor from the body, in a calibration, and by any source: float32 resolves 1 mm there.
+MAX_POSE_M = 100.0
+MAX_TRANSLATION_M = 10_000.0

@@ -5,7 +5,7 @@ again, but skips what is slow: decoding and writing scans that the `.partial` al
 counters of their points come from the state file (`state_file.py`); all else is computed again.
 
 Each scan in the state file has a checksum of what was read for it and before it. A resumed run
-computes the same and refuses to go on where they differ: the recording has changed.
+computes the same; where they differ, the recording has changed, which is an error.
 """
 
 from __future__ import annotations

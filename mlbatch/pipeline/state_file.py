@@ -57,7 +57,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class FoundState:
-    """What a state file tells; damage: one line on records that do not count, or ""."""
+    """Content of a state file; damage: one line on records that do not count, or ""."""
 
     state: State | None = None
     damage: str = ""

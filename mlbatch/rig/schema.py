@@ -19,14 +19,13 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
+from mlbatch.lidar.limits import MAX_TRANSLATION_M
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, no_boxes
 from mlbatch.rig.yaml_tree import Node
 from mlbatch.units import NS_PER_S, parse_rate
 
 # `lidar_id` is a uint8.
 MAX_SENSORS = 256
-# Beyond, float32 coordinates resolve no millimetre.
-MAX_TRANSLATION_M = 10_000.0
 MAX_OFFSET_S = 2**31
 
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)

@@ -52,6 +52,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--strict": "error",
         "--overwrite": "existing",
         "--resume": "interrupted.*OUTPUT",
+        "--no-fsync": "on the disk",
         "--quiet": "progress",
         "--verbose": "chosen",
     },

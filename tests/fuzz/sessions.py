@@ -30,7 +30,7 @@ from tests.builders.run import command, in_memory, prints
 from tests.fuzz.framing import joined, mutated_parts, parts_of
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds
-from tests.fuzz.packets import CALIBRATION, NAMES, seeds_of
+from tests.fuzz.packets import CALIBRATION, DEVICE_PORT, NAMES, seeds_of
 from tests.fuzz.readers import kernels_kept
 from tests.property.test_damage import check_ledgers, check_output
 
@@ -86,23 +86,42 @@ _SIZES = (
 _WRITTEN = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?([eE][-+]?\d+)?(?![\w.])")
 
 
+@lru_cache(maxsize=1)
+def _described_seeds() -> Seeds:
+    """Those with a calibration file, or with device packets that contain angles."""
+    kinds = {CALIBRATION, DEVICE_PORT}
+    return tuple(seed for seed in _seeds() if kinds & {part.kind for part in parts_of(seed)})
+
+
 def _mutated_geometry(rng: random.Random, seeds: Seeds) -> bytes:
-    """Change numbers of a calibration file or device packets; else as other sessions."""
+    """Change numbers of a calibration file, or bytes of all device packets; no points."""
     parts = parts_of(rng.choice(seeds))
-    at = next((at for at, part in enumerate(parts) if part.kind == CALIBRATION), None)
-    if at is None or rng.random() < 0.1:
-        return mutated_parts(rng, seeds)
-    data = parts[at].data
+    change = rng.random()
+    for at, part in enumerate(parts):
+        if part.kind == CALIBRATION:
+            parts[at] = replace(part, data=_with_numbers(random.Random(change), part.data))
+        elif part.kind == DEVICE_PORT:
+            parts[at] = replace(part, data=_with_bytes(random.Random(change), part.data))
+    return joined(parts)
+
+
+def _with_numbers(rng: random.Random, data: bytes) -> bytes:
     for _ in range(rng.choice((1, 1, 2, 5))):
         found = list(_WRITTEN.finditer(data))
         if not found:
-            return mutated_parts(rng, seeds)
-        # Long tables have most numbers: some keys of their own are chosen as often.
+            return _with_bytes(rng, data)
+        # Long tables have most numbers: those at the ends of a file are chosen as often.
         one = rng.choice(found if rng.random() < 0.5 else [*found[:20], *found[-60:]])
         number = rng.choice(("", "-")) + rng.choice(_SIZES)
         data = data[: one.start()] + number.encode() + data[one.end() :]
-    parts[at] = replace(parts[at], data=data)
-    return joined(parts)
+    return data
+
+
+def _with_bytes(rng: random.Random, data: bytes) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 3, 20))):
+        changed[rng.randrange(len(changed))] = rng.choice((0, 1, 0x7F, 0xFF, rng.randrange(256)))
+    return bytes(changed)
 
 
 def _verified(data: bytes, folder: Path) -> None:
@@ -203,7 +222,7 @@ _LAST_NS = ((1 << 32) - 1) * 10**9
 
 TARGETS: Sequence[Target] = (
     Target("sessions", _seeds, _convert, mutated_parts, 2),
-    Target("sessions, verified", _seeds, _verified, _mutated_geometry, 2),
+    Target("sessions, verified", _described_seeds, _verified, _mutated_geometry, 2),
     Target("sessions of two jobs", _seeds, _share, mutated_parts, 2),
     *(
         (Target("sessions, compiled", _warm_seeds, _compile, mutated_parts, 2),)

@@ -20,7 +20,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
-from mlbatch.lidar.limits import MAX_BEAM_M, MAX_ORIGIN_M, MAX_TRANSLATION_M
+from mlbatch.lidar.limits import MAX_BEAM_M, MAX_ORIGIN_M, MAX_POSE_M
 from mlbatch.sensors.ouster.profiles import (
     HEADER_TYPES,
     LEGACY,
@@ -393,7 +393,7 @@ def _default_offset_mm(document: Document) -> float:
 
 def _extrinsics(document: Document) -> F64Array | None:
     """Pose in the body frame; None for the identity, which tools write if they know no pose."""
-    pose = document.pose("extrinsic", MAX_TRANSLATION_M, "m")
+    pose = document.pose("extrinsic", MAX_POSE_M, "m")
     return None if pose is None or np.array_equal(pose, np.eye(4)) else pose
 
 
