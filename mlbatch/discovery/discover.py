@@ -106,7 +106,9 @@ def discover(
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
     notes: list[Note] = []
     if rig is None:
-        notes += _unmatched(sampler, lidar_kinds, _names(examined, recorded), matched.failures)
+        notes += _unmatched(
+            sampler, lidar_kinds, examined, _names(examined, recorded), matched.failures
+        )
     notes += _unused(matched.sensors, selection.metadata)
     chosen = _choose(matched.sensors, selection)
     for sensor in chosen:
@@ -281,11 +283,14 @@ def _names(examined: Sequence[Path], recorded: Sequence[Calibration]) -> list[st
 def _unmatched(
     sampler: Sampler,
     kinds: Sequence[PacketKind],
-    examined: Sequence[str],
+    examined: Sequence[Path],
+    names: Sequence[str],
     failures: Mapping[PacketKind, str],
 ) -> list[Note]:
-    """Warnings about lidar packets of no sensor; examined: names of calibrations."""
+    """Warnings about lidar packets of no sensor; examined, names: of possible calibrations."""
     notes = []
+    # A file that cannot be used may be the one that is missing.
+    faults = some([*filter(None, map(fault_of, examined))], _SHOWN) if kinds else ""
     for kind in kinds:
         what = describe(sampler, kind) or ""
         start = f"{sampler.table.streams[kind.stream]}: {what}"
@@ -295,8 +300,9 @@ def _unmatched(
         elif kind in failures:
             notes.append(Note("no_metadata", "", f"{start}; {failures[kind]}; {unassigned}"))
         else:
-            expected = f"expected metadata that match, found {_known(examined)}"
+            expected = f"expected metadata that match, found {_known(names)}"
             text = f"{start}; {expected}; {unassigned}; give --metadata FILE"
+            text += f" ({faults})" if faults else ""
             notes.append(Note("no_metadata", "", text))
     return notes
 
