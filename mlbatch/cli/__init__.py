@@ -27,9 +27,9 @@ def main() -> None:
     """Run the command line; exit codes: docs/commands.md."""
     gc.set_threshold(_BETWEEN_COLLECTIONS)
     atexit.register(gc.freeze)
-    from mlbatch.cli.app import command_line
-
     try:
+        from mlbatch.cli.app import command_line
+
         code = command_line(*sys.argv[1:2])(standalone_mode=False)
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt

@@ -149,6 +149,9 @@ def convert(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run to the same OUTPUT.")
     ] = False,
+    no_fsync: Annotated[
+        bool, typer.Option("--no-fsync", help="Do not wait until the output is on the disk.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary, no progress.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also print what was found and chosen.")
@@ -221,6 +224,7 @@ def convert(
             limits=parse_limits(fail_on or ()),
             overwrite=overwrite,
             resume=options.resume(resume, dry_run=dry_run),
+            fsync=not no_fsync,
             quiet=quiet,
             verbose=verbose,
         ),

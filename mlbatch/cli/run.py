@@ -5,6 +5,7 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import json
 import signal
@@ -44,8 +45,12 @@ from mlbatch.writers import (
     extras,
     open_writer,
     report_paths,
+    sync_entries,
     write_text,
 )
+
+# An interrupt that got lost is raised again after this time.
+_REPEAT_S = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +68,7 @@ class Target:
     limits: tuple[Limit, ...]  # of `--fail-on`
     overwrite: bool
     resume: bool
+    fsync: bool
     quiet: bool
     verbose: bool
 
@@ -98,7 +104,11 @@ def _run_one(job: Job, target: Target) -> list[str]:
     # A dry run without an output decodes what a .mcap of this point layout would contain.
     name = choose_format(target.output or Path("scans.mcap"), target.format)
     options = WriterOptions(
-        target.point_layout, target.overwrite, job.split, compression=target.compression
+        target.point_layout,
+        target.overwrite,
+        job.split,
+        compression=target.compression,
+        fsync=target.fsync,
     )
     check_compression(name, options)
     job = replace(job, extras=extras(name, options))
@@ -193,7 +203,10 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
         if report_path is None or target.output is None:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
-        write_text(partial / report_path.name if is_inside else report_path, report_text(inputs))
+        path = partial / report_path.name if is_inside else report_path
+        write_text(path, report_text(inputs), target.fsync)
+        if target.fsync and path.parent.absolute() != target.output.parent.absolute():
+            sync_entries(path.parent)
 
     return write
 
@@ -307,7 +320,7 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM as an interrupt from the keyboard."""
+    """Treat SIGTERM and SIGHUP (the terminal was closed) as an interrupt from the keyboard."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -315,11 +328,44 @@ def _terminated_as_interrupt() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    # One that is ignored remains so: nohup is to outlive its terminal.
+    caught = {number: one for number, one in before.items() if one is not signal.SIG_IGN}
+    try:
+        for number in caught:
+            signal.signal(number, interrupt)
+        with _interrupts_repeated():
+            yield
+    finally:
+        for number, one in caught.items():
+            signal.signal(number, one)
+
+
+@contextlib.contextmanager
+def _interrupts_repeated() -> Iterator[None]:
+    """Repeat an interrupt that was raised where Python ignores exceptions.
+
+    It is raised between any two instructions of the first thread, also in a finalizer or the
+    callback of a weak reference, which would end with a traceback while the run continues.
+    """
+    before = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def repeat(ignored: sys.UnraisableHookArgs) -> None:
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            # Later: here it would be ignored again.
+            timers.append(threading.Timer(_REPEAT_S, _thread.interrupt_main))
+            timers[-1].start()
+        else:
+            before(ignored)
+
+    sys.unraisablehook = repeat
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = before
+        for timer in timers:
+            timer.cancel()
 
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:
@@ -337,10 +383,13 @@ def _resume_log(
     job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
 ) -> ResumeLog:
     """Progress of an output: that of the interrupted run, or from the start."""
-    state = resume.find(output).state
+    earlier = resume.find(output)
+    state = earlier.state
+    if earlier.damage and resumes:
+        _say(earlier.damage)
     if state is not None and not resumes:
         _say(
-            f"warning: interrupted: {output}.partial with {len(state.rows)} finished scans is "
+            f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
             "discarded; --resume would continue after them"
         )
     log = ResumeLog(output, job, name, options, state if resumes else None)

@@ -167,7 +167,7 @@ def discover(
     noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     notes: list[Note] = []
     if rig is None:
-        unmatched = _unmatched(sampler, matched, noted, _names(examined, recorded))
+        unmatched = _unmatched(sampler, matched, noted, examined, _names(examined, recorded))
         if to_convert:
             texts = [] if selection.only else _refusals(refused)
             texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
@@ -359,10 +359,16 @@ def _unmatched(
     sampler: Sampler,
     matched: Matched,
     kinds: Sequence[PacketKind],
-    examined: Sequence[str],
+    examined: Sequence[Path],
+    names: Sequence[str],
 ) -> list[tuple[PacketKind, Note]]:
-    """Why lidar packets are of no sensor, and what to do; examined: names of calibrations."""
+    """Why lidar packets are of no sensor, and what to do.
+
+    examined, names: of possible calibrations.
+    """
     notes = []
+    # A file that cannot be used may be the one that is missing.
+    faults = some([*filter(None, map(fault_of, examined))], _SHOWN) if kinds else ""
     for kind in kinds:
         what = describe(sampler, kind) or ""
         start = f"{sampler.table.streams[kind.stream]}: {what}"
@@ -373,8 +379,9 @@ def _unmatched(
             text = f"{start}; {matched.failures[kind]}, or leave it out with {ignore}"
             note = Note("no_metadata", "", text)
         else:
-            expected = f"expected metadata that match, found {_known(examined)}"
+            expected = f"expected metadata that match, found {_known(names)}"
             text = f"{start}; {expected}; give --metadata FILE, or leave it out with {ignore}"
+            text += f" ({faults})" if faults else ""
             note = Note("no_metadata", "", text)
         notes.append((kind, note))
     return notes

@@ -21,6 +21,7 @@ from mlbatch.errors import RigError
 from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
+from mlbatch.lidar.limits import MAX_TRANSLATION_M
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, UnknownExtrinsics
 from mlbatch.types import Stream, StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
@@ -132,6 +133,7 @@ class ExtrinsicsSources:
         for name in sensor_frames:
             answers = _answers(name, rig_extrinsics, found, metadata_extrinsics)
             poses[name] = answers[0] if answers else Pose.identity()
+            _refuse_far(name, poses[name])
             if answers:
                 others = [*answers[1:], *_poses_by_source(name, found, trees)]
                 notes += dict.fromkeys(_contradictions(name, poses[name], others))
@@ -494,6 +496,17 @@ def _refuse_unknown_in_rig(unknown: Mapping[str, str], poses: Mapping[str, Pose]
         f"more, found unknown{also}; {remedy}, or accept the body origin with "
         "--identity-extrinsics"
     )
+
+
+def _refuse_far(name: str, pose: Pose) -> None:
+    """Raise RigError for a sensor too far from the body: its float32 coordinates would be wrong."""
+    away_m = float(np.abs(pose.body_from_sensor[:3, 3]).max())
+    if not away_m <= MAX_TRANSLATION_M:
+        raise RigError(
+            f"sensor {name}: extrinsics of {pose.describe()}: expected at most "
+            f"{MAX_TRANSLATION_M:g} m from the body origin, found {away_m:g} m; give metres in the "
+            "body frame in a rig file (--rig)"
+        )
 
 
 def _refuse_unknown(missing: Sequence[str], reasons: Mapping[str, str]) -> NoReturn:

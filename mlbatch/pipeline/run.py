@@ -81,7 +81,6 @@ class _Output:
         self._resume_log = resume_log
         self._idle: list[DecodeWorker] = []
         self._is_begun = False
-        self._scans = 0
 
     def make(self, progress: Progress | None) -> None:
         """Decode and write all scans."""
@@ -112,10 +111,7 @@ class _Output:
         if task is None and not before:
             return None
         self._begin()
-        is_kept = False
-        if task is not None:
-            is_kept = self._resume_log is not None and self._scans < self._resume_log.done
-            self._scans += 1
+        is_kept = self._resume_log is not None and self._resume_log.take(before, task)
         return ScanTask(
             self._run,
             task,

@@ -19,6 +19,7 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
+from mlbatch.lidar.limits import MAX_TRANSLATION_M
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 MAX_SENSORS = 256
 # What `inspect --write-rig` writes for extrinsics that nobody gave.
 UNKNOWN = "unknown"
-# Beyond, float32 coordinates resolve no millimetre.
-MAX_TRANSLATION_M = 10_000.0
 MAX_OFFSET_S = 2**31
 
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)

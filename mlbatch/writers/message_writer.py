@@ -122,7 +122,7 @@ class MessageWriter:
         self._layout = _layout_of(options)
         _refuse_same_frames(target, info)
         keep = options.kept_bytes is not None
-        self._output = prepare(target, options.overwrite, folder, keep)
+        self._output = prepare(target, options.overwrite, folder, keep, options.fsync)
         self._info = info
         self._wire = wire
         self.idle: list[CloudMessage] = []  # buffers that no job uses
@@ -182,12 +182,13 @@ class MessageWriter:
         with export_errors(output.partial):
             self._begin(summary.t_init_ns)
             self._file.finish(summary, self._grid(summary))
+        output.sync()
         if last is not None:
             last(output.partial)
         # Only after all that may fail: until now the table of an older output is in place.
         inside = output.partial.is_dir()
         table = output.partial / SCANS_CSV if inside else side_path(output.target, SCANS_CSV)
-        write_text(table, summary.scans_csv)
+        write_text(table, summary.scans_csv, output.fsync)
         output.publish()
 
     def abandon(self) -> None:

@@ -631,10 +631,9 @@ def test_a_topic_without_times_is_an_error_unless_ignored(shell: Shell, tmp_path
     assert "/map/points: expected the time of each point" in text
 
 
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("engine", ["numpy", "native"])
 @pytest.mark.parametrize("jobs", [1, 3])
 def test_engines_and_jobs_agree(shell: Shell, tmp_path: Path, engine: str, jobs: int) -> None:
-    pytest.importorskip("numba")
     options = f"--identity-extrinsics --engine {engine} --jobs {jobs}"
     assert _run(shell, _two_frames(), options).code == 0
     found = [dict(np.load(path)) for path in scan_files(tmp_path / "out")]

@@ -54,6 +54,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--fail-on": r"3.*loss>0\.1%.*repeatable",
         "--overwrite": "existing",
         "--resume": "interrupted.*OUTPUT",
+        "--no-fsync": "on the disk",
         "--quiet": "progress",
         "--verbose": "chosen",
     },

@@ -588,3 +588,23 @@ def test_refusals(name: str) -> None:
         assert all(part in text for part in expected.split("..."))
     else:
         assert text == expected
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        Given(static=(_at("base_link", "left/os_sensor", 0, 1e4 + 1, 2), SIDES[1])),
+        Given(frames=SINGLE, urdf=[_urdf("base_link", "os_sensor", "6e8 0 0")]),
+        Given(metadata={"left": _shifted(-2e4), "right": _shifted(1.0)}),
+    ],
+    ids=["tf_static", "urdf", "metadata"],
+)
+def test_a_sensor_far_from_the_body_is_refused(given: Given) -> None:
+    """float32 coordinates would be off by millimetres, or by more than verify accepts."""
+    with pytest.raises(RigError, match=r"expected at most 10000 m from the body origin, found"):
+        given.resolve()
+
+
+def test_a_sensor_10_km_from_the_body_is_accepted() -> None:
+    given = Given(static=(_at("base_link", "left/os_sensor", 0, 1e4, 2), SIDES[1]))
+    assert given.resolve().poses["left"].body_from_sensor[1, 3] == 1e4
