@@ -68,6 +68,7 @@ class Ignored:
 
     sensors: tuple[DetectedSensor, ...] = ()
     words: tuple[str, ...] = ()
+    all_others: bool = False  # --only: the user asked for the sensors alone
 
     def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of a kind are left out: (P,) bool."""
@@ -137,6 +138,9 @@ def discover(
     """
     rig = None if selection.rig is None else read_rig(selection.rig)
     recordings = with_clouds(recordings, table, _topics(rig))
+    apart = _why_apart(recordings, selection, rig)
+    if apart and to_convert:
+        raise RecordingError(apart)
     sampler, collector = probe(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
@@ -156,7 +160,7 @@ def discover(
     notes: list[Note] = []
     chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
     left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
-    ignored = Ignored(tuple(left_out), selection.ignore)
+    ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
     noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     if rig is None:
         notes += _unmatched(sampler, noted, _names(examined, recorded), matched.failures)
@@ -179,6 +183,8 @@ def discover(
         calibration_topics=collector.calibration_topics,
         identity_extrinsics=selection.identity_extrinsics,
     )
+    if apart:
+        notes.append(Note("no_overlap", "", apart))
     notes += [Note("message", "", fault) for fault in collector.faults]
     notes += extrinsics.notes
     for sensor in chosen:
@@ -247,6 +253,35 @@ def _is_lidar(sampler: Sampler, kind: PacketKind) -> bool:
 
 
 # -- sensors of the rig ---------------------------------------------------------------------------
+
+
+def _why_apart(recordings: Sequence[Recording], selection: SensorSelection, rig: Rig | None) -> str:
+    """Why captures are no session, as far as their first and last packets show; else ""."""
+    if len(recordings) < 2 or selection.only:
+        return ""
+    # Not loaded for single recordings.
+    from mlbatch.discovery.overlap import problem, spans_of_captures
+
+    ignored = Ignored(words=selection.ignore)
+
+    def is_wanted(stream: Stream, what: str) -> bool:
+        if ignored.names(stream, what):
+            return False
+        return rig is None or any(
+            not sensor.optional and _may_be(sensor, stream, what) for sensor in rig.sensors
+        )
+
+    text, _ = problem(spans_of_captures(recordings, is_wanted))
+    return text
+
+
+def _may_be(sensor: RigSensor, stream: Stream, what: str) -> bool:
+    """True if packets of a stream may be those of a sensor of the rig."""
+    selector = sensor.stream
+    if selector is None:
+        return True
+    is_other = selector.serial and "serial" in what and not _names_serial([selector.serial], what)
+    return selector.selects(stream) and not is_other
 
 
 def _topics(rig: Rig | None) -> set[str]:
