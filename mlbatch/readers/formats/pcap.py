@@ -93,7 +93,7 @@ def _first_record(order: str, unit_ns: int, tail: U8Array, is_all: bool) -> int 
     )
     is_record = (captured >= _LEAST_FRAME) & (captured <= original)
     is_record &= (original <= MAX_FRAME_BYTES) & (fraction < NS_PER_S // unit_ns)
-    # From the end: where the chain goes on from each start that reaches the end of the file.
+    # From the end: the next start in the chain, for each start that reaches the end of the file.
     after = {len(tail): len(tail)}
     first = len(tail)
     for start in np.flatnonzero(is_record)[::-1].tolist():
