@@ -72,11 +72,12 @@ class Ignored:
 
     sensors: tuple[DetectedSensor, ...] = ()
     words: tuple[str, ...] = ()
-    others: bool = False  # True if --only leaves out whatever it does not name
+    others: bool = False  # True if --only leaves out all lidars that it does not name
 
     def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of a kind are left out: (P,) bool."""
-        if self.others or any(_names_stream(word, stream) for word in self.words):
+        is_lidar = "lidar" in (sensors.describe(kind.size, packets[:1]) or "")
+        if (self.others and is_lidar) or any(_names_stream(word, stream) for word in self.words):
             return np.ones(len(packets), np.bool_)
         left_out = np.zeros(len(packets), np.bool_)
         for sensor in self.sensors:
@@ -86,7 +87,7 @@ class Ignored:
                     left_out |= lidar.sent_by_me(packets[:, : lidar.packet_size])
             elif kind in sensor.kinds:
                 left_out[:] = True
-        if self.serials and "lidar" in (sensors.describe(kind.size, packets[:1]) or ""):
+        if self.serials and is_lidar:
             # Several lidars may share an address.
             for row in np.flatnonzero(~left_out).tolist():
                 what = sensors.describe(kind.size, packets[row : row + 1])
@@ -412,7 +413,7 @@ def _is_owned(kind: PacketKind, found: Sequence[DetectedSensor]) -> bool:
 
 
 def _ignore_word(stream: Stream) -> str:
-    """How to name a stream for `--ignore`; not by its topic if that has clouds of several lidars."""
+    """How to name a stream for `--ignore`; its topic alone may have clouds of several lidars."""
     if stream.topic:
         return shlex.quote(str(stream))
     return min(name for name in stream.names if " " not in name)
