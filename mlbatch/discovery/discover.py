@@ -72,11 +72,13 @@ class Ignored:
 
     sensors: tuple[DetectedSensor, ...] = ()
     words: tuple[str, ...] = ()
-    all_others: bool = False  # --only: the user asked for the sensors alone
+    all_others: bool = False  # True if --only leaves out all lidars that it does not name
 
     def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of a kind are left out: (P,) bool."""
-        if self.all_others or any(_names_stream(word, stream) for word in self.words):
+        is_lidar = "lidar" in (sensors.describe(kind.size, packets[:1]) or "")
+        is_named = any(_names_stream(word, stream) for word in self.words)
+        if is_named or (self.all_others and is_lidar):
             return np.ones(len(packets), np.bool_)
         left_out = np.zeros(len(packets), np.bool_)
         for sensor in self.sensors:
@@ -86,7 +88,7 @@ class Ignored:
                     left_out |= lidar.sent_by_me(packets[:, : lidar.packet_size])
             elif kind in sensor.kinds:
                 left_out[:] = True
-        if self.serials and "lidar" in (sensors.describe(kind.size, packets[:1]) or ""):
+        if self.serials and is_lidar:
             # Several lidars may share an address.
             for row in np.flatnonzero(~left_out).tolist():
                 what = sensors.describe(kind.size, packets[row : row + 1])

@@ -254,7 +254,7 @@ def checked_rule(
 ) -> tuple[PointRule, list[str]]:
     """The rule by which a topic can be read, and warnings; CloudError if there is none.
 
-    samples: of messages of one lidar, as far as one can tell; rule: of the rig, or CONVENTION.
+    samples: of messages of one lidar, as far as their ids say; rule: of the rig, or CONVENTION.
     """
     usable = [one for one in samples if one.points > 1]
     if not usable:

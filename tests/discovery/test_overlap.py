@@ -62,7 +62,7 @@ def test_different_lidars_at_different_times_are_refused(
 ) -> None:
     left = pack(_capture(tmp_path / "left.pcap", ONE.records, [ONE]))
     right = pack(_capture(tmp_path / "right.pcap", LATER.records, [LATER]))
-    for jobs, words in ((1, ["--engine", "numpy"]), (3, ["--engine", "numba"])):
+    for jobs, words in ((1, ["--engine", "numpy"]), (3, ["--engine", "native"])):
         done = shell(
             "convert", *[left, right][::order], "-o", "out", IDENTITY, "--jobs", str(jobs), *words
         )
@@ -134,7 +134,10 @@ ACCEPTED = {
         },
         IDENTITY,
     ),
-    "one that ends with the first part": Parts({"part_0": BOTH, "part_1": [NEXT]}, IDENTITY),
+    # Its columns are missing from the scans of the second part.
+    "one that ends with the first part": Parts(
+        {"part_0": BOTH, "part_1": [NEXT]}, IDENTITY, warnings=["loss"]
+    ),
     "one that moves to another address": Parts(
         {"part_0": [ONE], "part_1": [replace(NEXT, ip="10.0.0.9")]}
     ),
@@ -150,7 +153,7 @@ ACCEPTED = {
         rig='- {name: left, stream: {serial: "111"}, extrinsics: {translation_m: [0, 0, 1]}}\n'
         '- {name: right, stream: {serial: "222"}, extrinsics: {translation_m: [0, 0, 2]}, '
         "optional: true}\n",
-        warnings=["no_overlap"],
+        warnings=["no_overlap", "loss"],
     ),
 }
 

@@ -344,7 +344,8 @@ def test_packets_are_assigned(convert: Convert, tmp_path: Path, name: str) -> No
         assert found["what"].startswith(start)
     noted = [(one["code"], one["sensor"], one["message"]) for one in report["warnings"]]
     # Rejected packets are asserted by their counts.
-    assert [one for one in noted if one[0] != "rejected"] == list(case.warnings)
+    # Lidars of which packets are missing have a warning of their own.
+    assert [one for one in noted if one[0] not in ("rejected", "loss")] == list(case.warnings)
     for sensor in sensors:
         assert (sensor["columns"]["written"] > 0) == (sensor["packets"]["read"] > 0)
 

@@ -1,7 +1,7 @@
 """Clouds of a session by their first messages: which lidars share a topic, how times are read.
 
 The first messages of every topic are read once before all others, since neither unit nor zero of
-times can be told from one message, nor whether several lidars send on the topic.
+times follows from one message, nor whether several lidars send on the topic.
 """
 
 from __future__ import annotations
