@@ -57,7 +57,7 @@ def _bag_chunk(word: bytes, said: int, packed: bytes) -> bytes:
 
 
 def _examined(data: bytes, run: Callable[[bytes, Path], None]) -> Tally:
-    """One input within 5 s and 500 MB; the errors of mlbatch are as good as its answers."""
+    """One input within LONGEST_S and 500 MB; the errors of mlbatch are as good as its answers."""
     return campaign(Target("bomb", lambda: (data,), run), range(1))
 
 
