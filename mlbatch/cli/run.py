@@ -184,12 +184,12 @@ def _converted(
     except (ExportError, RecordingError) as err:
         # A subclass has another cause than the disk.
         is_disk = isinstance(err.__cause__, OSError) and type(err) in (ExportError, RecordingError)
-        if resume_log is None or not resume_log.recorded or not is_disk:
+        if resume_log is None or not resume_log.is_resumable or not is_disk:
             raise
         advice = f"then --resume continues after the {resume_log.recorded} scans that are safe"
         raise type(err)(f"{err}; {advice}") from err
     except KeyboardInterrupt as err:
-        if resume_log is None or not resume_log.recorded:
+        if resume_log is None or not resume_log.is_resumable:
             raise
         raise Interrupted(
             "interrupted; finished scans are kept in .partial, from where --resume continues"

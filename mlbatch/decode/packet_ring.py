@@ -173,11 +173,9 @@ def _sums(packets: U8Array) -> U64Array:
     sum; words that change places do not.
     """
     size = packets.shape[1]
-    if size < _WORD:
-        return packets.sum(axis=1, dtype=np.uint64)
-    words = packets[:, : size // _WORD * _WORD].view(np.uint64)
+    words = packets if size < _WORD else packets[:, : size // _WORD * _WORD].view(np.uint64)
     sums: U64Array = words.sum(axis=1, dtype=np.uint64)
-    if size % _WORD:
+    if size > _WORD and size % _WORD:
         # The last word overlaps the one before.
         sums += packets[:, size - _WORD :].view(np.uint64)[:, 0]
     return sums

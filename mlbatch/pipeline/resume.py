@@ -121,6 +121,11 @@ class ResumeLog:
         return 0 if self._state is None else len(self._state.scans)
 
     @property
+    def is_resumable(self) -> bool:
+        """Whether the `.partial` of this run has scans that another run can continue after."""
+        return bool(self.recorded) and partial_path(self._target).exists()
+
+    @property
     def kept_bytes(self) -> int | None:
         """Bytes of the output's file to keep; None: nothing to resume."""
         return None if self._state is None else self._state.kept_bytes

@@ -11,7 +11,7 @@ from mlbatch.verify import verify
 from tests.builders.run import command
 from tests.builders.sessions import Unit, twin, write_session
 
-TRANSFORM = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+TRANSFORM: list[float] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 # Length in mm; True where a lidar can have it.
 LENGTHS = [(400.0, True), (-400.0, True), (501.0, False), (1500.0, False), (6e18, False)]
 

@@ -141,6 +141,19 @@ def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPat
     assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
 
 
+def test_an_interrupt_after_the_last_rename_leaves_the_output_alone(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ending(log: resume.ResumeLog) -> None:
+        raise KeyboardInterrupt
+
+    whole = _whole(shell)
+    monkeypatch.setattr(resume.ResumeLog, "remove", ending)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert (outcome.code, outcome.err) == (130, "mlbatch: error: interrupted\n")
+    assert contents(Path()) == whole
+
+
 class _Ending:
     """Receives a signal in its finalizer, where Python prints and ignores exceptions."""
 
