@@ -99,7 +99,8 @@ def convert(
         list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
+        list[str] | None,
+        typer.Option(help="Leave out this sensor, serial number or IP address; repeatable."),
     ] = None,
     pass_: Annotated[
         list[str] | None,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch import sensors
 from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
@@ -182,7 +183,8 @@ def inspect(
         SensorSelection(metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,
     )
-    measured = _measure(discovery, whole=whole)
+    others: dict[PacketKind, _OtherPackets] = {}
+    measured = _measure(discovery, others, whole=whole)
     types = packet_types(discovery.recordings)
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
@@ -201,7 +203,7 @@ def inspect(
             for sensor in discovery.sensors
             if sensor.lidar.calibration in files
         },
-        notes=tuple(_notes(discovery)),
+        notes=(*_notes(discovery), *_other_lidars(discovery, others)),
         clocks=compare(known) if known else None,
     )
 
@@ -251,19 +253,47 @@ class _Measured:
         self.first: tuple[int, int] | None = None
 
 
-def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Measured]:
-    """Loss and clock of each sensor, in the first seconds or the whole session."""
+@dataclass(slots=True)
+class _OtherPackets:
+    """Packets of no sensor among those of a sensor's kind; what: a lidar's description, or ""."""
+
+    packets: int = 0
+    what: str = ""
+
+
+def _other_lidars(
+    discovery: Discovery, others: Mapping[PacketKind, _OtherPackets]
+) -> Iterator[str]:
+    """Lidars that share the address of a sensor."""
+    for kind, one in sorted(others.items()):
+        if one.what:
+            stream = discovery.sampler.table.streams[kind.stream]
+            yield (
+                f"{stream}: {one.what} as well; {one.packets} packets are of no sensor; "
+                "give its --metadata"
+            )
+
+
+def _measure(
+    discovery: Discovery, others: dict[PacketKind, _OtherPackets], *, whole: bool
+) -> dict[DetectedSensor, _Measured]:
+    """Loss and clock of each sensor, in the first seconds or the whole session.
+
+    others: gets the packets of no sensor.
+    """
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
     for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
-            for sensor in discovery.sensors:
-                if kind not in sensor.kinds:
-                    continue
+            owned = np.zeros(len(index), np.bool_)
+            owners = [sensor for sensor in discovery.sensors if kind in sensor.kinds]
+            for sensor in owners:
                 lidar = sensor.lidar
                 one = measured[sensor]
                 packets, _ = one.ring.store(batch.data, batch.start[index], None)
-                good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
+                own = lidar.sent_by_me(packets)
+                owned |= own
+                good = own & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
                 headers = lidar.column_headers(packets[good], host_ns)
                 one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
@@ -274,6 +304,14 @@ def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Meas
                 if one.first is None and headers.valid.any():
                     row, column = np.argwhere(headers.valid)[0]
                     one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
+            if owners and not owned.all():
+                left = index[~owned]
+                other = others.setdefault(kind, _OtherPackets())
+                other.packets += len(left)
+                row_bytes = batch.data[batch.start[left[0]] + np.arange(kind.size)]
+                what = "" if other.what else sensors.describe(kind.size, row_bytes[None]) or ""
+                if "lidar" in what:
+                    other.what = what
     return measured
 
 
