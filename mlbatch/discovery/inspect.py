@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch import sensors
 from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
@@ -186,7 +187,8 @@ def inspect(
         to_convert=False,
     )
     early = frozenset(discovery.sampler.kinds)
-    measured = _measure(discovery, whole=whole)
+    others: dict[PacketKind, _OtherPackets] = {}
+    measured = _measure(discovery, others, whole=whole)
     types = packet_types(discovery.recordings)
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
@@ -205,7 +207,12 @@ def inspect(
             for sensor in discovery.sensors
             if sensor.lidar.calibration in files
         },
-        notes=(*_notes(discovery), *_late_notes(discovery, early), *_clock_notes(known)),
+        notes=(
+            *_notes(discovery),
+            *_late_notes(discovery, early),
+            *_other_lidars(discovery, others),
+            *_clock_notes(known),
+        ),
         clocks=compare(known) if known else None,
         whole=whole,
     )
@@ -285,10 +292,34 @@ class _Measured:
         self.sent: set[PacketKind] = set()
 
 
-def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Measured]:
+@dataclass(slots=True)
+class _OtherPackets:
+    """Packets of no sensor among those of a sensor's kind; what: a lidar's description, or ""."""
+
+    packets: int = 0
+    what: str = ""
+
+
+def _other_lidars(
+    discovery: Discovery, others: Mapping[PacketKind, _OtherPackets]
+) -> Iterator[str]:
+    """Lidars that share the address of a sensor."""
+    for kind, one in sorted(others.items()):
+        if one.what:
+            stream = discovery.sampler.table.streams[kind.stream]
+            yield (
+                f"{stream}: {one.what} as well; {one.packets} packets are of no sensor; "
+                "give its --metadata"
+            )
+
+
+def _measure(
+    discovery: Discovery, others: dict[PacketKind, _OtherPackets], *, whole: bool
+) -> dict[DetectedSensor, _Measured]:
     """Loss and clock of each sensor, in the first seconds or the whole session.
 
-    whole: packets of all kinds are counted again, with those that begin later.
+    others: gets the packets of no sensor; whole: packets of all kinds are counted again, with those
+    that begin later.
     """
     sampler = discovery.sampler
     if whole:
@@ -302,16 +333,17 @@ def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Meas
                 late.add(kind)
                 # It may be of one of the sensors.
                 discovery.router.route(kind, np.frombuffer(sampler.kinds[kind].payloads[0], "u1"))
-            for sensor in discovery.sensors:
-                if kind not in sensor.kinds:
-                    continue
+            owned = np.zeros(len(index), np.bool_)
+            owners = [sensor for sensor in discovery.sensors if kind in sensor.kinds]
+            for sensor in owners:
                 lidar = sensor.lidar
                 one = measured[sensor]
                 packets, _ = one.ring.store(batch.data, batch.start[index], None)
-                mine = lidar.sent_by_me(packets)
-                if mine.any():
+                own = lidar.sent_by_me(packets)
+                owned |= own
+                if own.any():
                     one.sent.add(kind)
-                good = mine & (lidar.faults(packets) == 0)
+                good = own & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
                 headers = lidar.column_headers(packets[good], host_ns)
                 one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
@@ -322,6 +354,14 @@ def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Meas
                 if one.first is None and headers.valid.any():
                     row, column = np.argwhere(headers.valid)[0]
                     one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
+            if owners and not owned.all():
+                left = index[~owned]
+                other = others.setdefault(kind, _OtherPackets())
+                other.packets += len(left)
+                row_bytes = batch.data[batch.start[left[0]] + np.arange(kind.size)]
+                what = "" if other.what else sensors.describe(kind.size, row_bytes[None]) or ""
+                if "lidar" in what:
+                    other.what = what
     for sensor, one in measured.items():
         sensor.kinds -= late - one.sent
     return measured

@@ -106,6 +106,16 @@ def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
     )
 
 
+def test_a_second_lidar_at_one_address_is_noted(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), twin(Unit(), 333, Unit().ip))
+    (tmp_path / "333.json").unlink()
+    outcome = shell(f"inspect {capture}")
+    assert outcome.out.splitlines()[-1] == (
+        "note: 10.0.0.1 > port 7502: Ouster lidar, serial 333, 1280 bytes: needs its metadata as "
+        "well; 96 packets are of no sensor; give its --metadata"
+    )
+
+
 def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     capture.write_bytes(capture.read_bytes()[:-100])
