@@ -143,6 +143,13 @@ class Recording:
         """
         raise NotImplementedError
 
+    def last_packets(self, streams: StreamTable) -> PacketBatch | None:
+        """Return packets at the end, without reading those before; None where that is impossible.
+
+        streams: numbers their streams. The batch stays valid.
+        """
+        return None
+
     def use_engine(self, engine: str) -> None:
         """Read by `numpy` or `numba`; ignored by containers that have one implementation."""
 

@@ -72,12 +72,14 @@ class Ignored:
 
     sensors: tuple[DetectedSensor, ...] = ()
     words: tuple[str, ...] = ()
-    others: bool = False  # True if --only leaves out all lidars that it does not name
+    all_others: bool = False  # --only: the user asked for the sensors alone
 
     def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of a kind are left out: (P,) bool."""
         is_lidar = "lidar" in (sensors.describe(kind.size, packets[:1]) or "")
-        if (self.others and is_lidar) or any(_names_stream(word, stream) for word in self.words):
+        if (self.all_others and is_lidar) or any(
+            _names_stream(word, stream) for word in self.words
+        ):
             return np.ones(len(packets), np.bool_)
         left_out = np.zeros(len(packets), np.bool_)
         for sensor in self.sensors:
@@ -103,7 +105,7 @@ class Ignored:
     def names(self, stream: Stream, what: str | None) -> bool:
         """Return whether --ignore names a stream, or the serial number in its description."""
         by_stream = any(_names_stream(word, stream) for word in self.words)
-        return self.others or by_stream or _names_serial(self.words, what)
+        return self.all_others or by_stream or _names_serial(self.words, what)
 
 
 @dataclass(slots=True)
@@ -142,6 +144,9 @@ def discover(
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
     rig = None if selection.rig is None else read_rig(selection.rig)
+    apart = _why_apart(recordings, selection, rig)
+    if apart and to_convert:
+        raise RecordingError(apart)
     recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
     refused = {} if clouds is None else clouds.refused
     if to_convert:
@@ -164,7 +169,7 @@ def discover(
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
     chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
     left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
-    ignored = Ignored(tuple(left_out), selection.ignore, others=bool(selection.only))
+    ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
     noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     notes: list[Note] = []
     if rig is None:
@@ -196,6 +201,8 @@ def discover(
         calibration_topics=collector.calibration_topics,
         identity_extrinsics=selection.identity_extrinsics,
     )
+    if apart:
+        notes.append(Note("no_overlap", "", apart))
     notes += [Note("message", "", fault) for fault in collector.faults]
     notes += extrinsics.notes
     for sensor in chosen:
@@ -264,6 +271,35 @@ def _is_lidar(sampler: Sampler, kind: PacketKind) -> bool:
 
 
 # -- sensors of the rig ---------------------------------------------------------------------------
+
+
+def _why_apart(recordings: Sequence[Recording], selection: SensorSelection, rig: Rig | None) -> str:
+    """Why captures are no session, as far as their first and last packets show; else ""."""
+    if len(recordings) < 2 or selection.only:
+        return ""
+    # Not loaded for single recordings.
+    from mlbatch.discovery.overlap import problem, spans_of_captures
+
+    ignored = Ignored(words=selection.ignore)
+
+    def is_wanted(stream: Stream, what: str) -> bool:
+        if ignored.names(stream, what):
+            return False
+        return rig is None or any(
+            not sensor.optional and _may_be(sensor, stream, what) for sensor in rig.sensors
+        )
+
+    text, _ = problem(spans_of_captures(recordings, is_wanted))
+    return text
+
+
+def _may_be(sensor: RigSensor, stream: Stream, what: str) -> bool:
+    """True if packets of a stream may be those of a sensor of the rig."""
+    selector = sensor.stream
+    if selector is None:
+        return True
+    is_other = selector.serial and "serial" in what and not _names_serial([selector.serial], what)
+    return selector.selects(stream) and not is_other
 
 
 def _match(

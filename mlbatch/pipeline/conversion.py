@@ -134,6 +134,7 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes)
                 if self.batcher.past_end:
                     break
+        self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
 

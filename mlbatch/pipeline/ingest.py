@@ -60,7 +60,8 @@ class UnassignedPackets:
 
 def _words(head: U8Array) -> I64Array:
     """(n,) numbers of the first bytes (n, up to 4) of packets."""
-    return head @ (np.int64(1) << 8 * np.arange(head.shape[1]))
+    weights = np.int64(1) << 8 * np.arange(head.shape[1])
+    return np.asarray(head @ weights, np.int64)
 
 
 # By kind, and whether the user left them out.

@@ -28,6 +28,7 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.faults import FaultReplay
+    from mlbatch.pipeline.overlap import RunOverlap
 
 # A note for the user, no warning: how the times of decoded clouds were read.
 CLOUDS = "clouds"
@@ -46,6 +47,7 @@ class Session:
         self.delivered = 0
         self.notes: list[Note] = []
         self._received_ns: tuple[int, int] | None = None
+        self._overlap: RunOverlap | None = None
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
         self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
@@ -118,7 +120,14 @@ class Session:
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets in receive order, with injected faults."""
         # Also after an error, files are closed here, by the thread that opened them.
-        with contextlib.closing(merge(self.recordings, is_without_packets)) as merged:
+        # Only for several recordings: it costs a sort of every batch.
+        if len(self.recordings) > 1:
+            # Not loaded for single recordings.
+            from mlbatch.pipeline.overlap import RunOverlap
+
+            self._overlap = RunOverlap(self.recordings, self.setup)
+        seen = None if self._overlap is None else self._overlap.add
+        with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:
             batches: Iterator[PacketBatch] = merged
             if self.replay is not None:
                 batches = self.replay.batches(batches, self.ingest.owners)
@@ -209,6 +218,12 @@ class Session:
         for sensor in self.sensors:
             if sensor.is_required and not sensor.ledger.packets.read:
                 refuse_absent(sensor.detected, self.job.selection.rig)
+
+    def refuse_apart(self) -> None:
+        """Raise RecordingError if recordings do not overlap; a warning for optional sensors."""
+        text = "" if self._overlap is None else self._overlap.finish()
+        if text:
+            self.warn(Note("no_overlap", "", text))
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""

@@ -122,10 +122,10 @@ def test_frames_of_forwarded_messages_are_those_of_the_recording(tmp_path: Path)
         data = [m.data for _, c, m in make_reader(file).iter_messages(["/tf_static"])]
     assert len(data) == 1
     edges = ros.decode_transforms(Topic("/tf_static", "tf2_msgs/TFMessage", "cdr"), data[0])
-    places = {child: (parent, list(xyz)) for parent, child, xyz, _ in edges}
-    assert places["imu"] == ("base_link", pytest.approx([0.0, 0.0, 0.1]))
-    assert places["gps"] == ("base_link", pytest.approx([-0.5, 0.0, 1.6]))
-    assert places["left/os_sensor"][0] == "base_link"
+    places = {child: list(xyz) for parent, child, xyz, _ in edges if parent == "base_link"}
+    assert places["imu"] == pytest.approx([0.0, 0.0, 0.1])
+    assert places["gps"] == pytest.approx([-0.5, 0.0, 1.6])
+    assert "left/os_sensor" in places
     # Nothing connects it with the body.
     assert "arm" not in places
     verdict = verify(target)
