@@ -143,13 +143,13 @@ def discover(
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
     rig = None if selection.rig is None else read_rig(selection.rig)
+    apart = _why_apart(recordings, selection, rig)
+    if apart and to_convert:
+        raise RecordingError(apart)
     recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
     refused = {} if clouds is None else clouds.refused
     if to_convert:
         _refuse_clouds_of_rig(rig, refused, selection)
-    apart = _why_apart(recordings, selection, rig)
-    if apart and to_convert:
-        raise RecordingError(apart)
     sampler, collector = probe(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []

@@ -364,6 +364,9 @@ def _measure(
                     other.what = what
     for sensor, one in measured.items():
         sensor.kinds -= late - one.sent
+    # Late packets of no sensor are a stream of their own, not others among those of a sensor.
+    for kind in late.difference(*(sensor.kinds for sensor in discovery.sensors)):
+        others.pop(kind, None)
     return measured
 
 

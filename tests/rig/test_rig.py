@@ -15,6 +15,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
+from mlbatch.ros.point_times import PointRule
 from mlbatch.types import Stream
 
 FULL = """\
@@ -250,3 +251,28 @@ sensors:
     # extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}
 """
     )
+
+
+def test_points_and_lidars_of_a_topic_are_read_back(tmp_path: Path) -> None:
+    text = """\
+sensors:
+  - name: front
+    stream: {topic: /points, frame_id: /lidar_front}
+    points: {time: t, unit: us, from: end, ring: line}
+  - name: rear
+    stream: {topic: /points, lidar_id: 0}
+    points: {from: absolute}
+"""
+    rig = _read(tmp_path, text)
+    front, rear = rig.sensors
+    assert front.stream == StreamSelector(topic="/points", frame_id="lidar_front")
+    assert rear.stream == StreamSelector(topic="/points", lidar_id=0)
+    assert str(rear.stream) == "topic /points, lidar_id 0"
+    assert front.points == PointRule(time="t", unit_ns=1000, origin="end", ring="line")
+    assert rear.points == PointRule(origin="absolute")
+    assert rear.stream.selects(Stream(topic="/points", lidar_id=0))
+    assert not rear.stream.selects(Stream(topic="/points", lidar_id=1))
+    again = _read(tmp_path, write_rig(rig, tmp_path))
+    assert [(one.stream, one.points) for one in again.sensors] == [
+        (one.stream, one.points) for one in rig.sensors
+    ]

@@ -324,3 +324,10 @@ def test_no_cut_and_no_wrong_byte_is_more_than_a_line(kind: str, encoding: str) 
     for data in damaged:
         outcome = _outcome(data, kind, encoding)
         assert outcome in range(4) if isinstance(outcome, int) else "\n" not in outcome
+
+
+def test_one_time_for_more_points_than_a_column_has_is_refused() -> None:
+    points = [(1, 2, 3, 9, 5, 4)] * 1025
+    with pytest.raises(CloudError, match="expected times of the points, found one for all 1025"):
+        _read(cloud_message(OUSTER, points))
+    assert len(_read(cloud_message(OUSTER, points[:1024])).points) == 1024

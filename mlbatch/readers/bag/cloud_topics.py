@@ -21,7 +21,7 @@ from mlbatch.types import Message, Recording, Stream, Topic
 from mlbatch.units import NS_PER_S
 
 # Messages of a topic that are examined, and for how long others are waited for.
-_EXAMINED = 16
+_EXAMINED = 8
 _EXAMINED_NS = 10 * NS_PER_S
 # A stream needs a word for an empty frame_id.
 _NO_FRAME = "(empty)"
