@@ -222,7 +222,8 @@ class SensorInfo:
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
     has_reflectivity: bool = False  # calibrated, in addition to intensity
-    sensor_from_imu: F64Array | None = None  # (4, 4) m; None: it sends no IMU data
+    # (4, 4) m; None: it sends no IMU data.
+    sensor_from_imu: F64Array | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
