@@ -348,6 +348,33 @@ def test_another_byte_of_a_calibration_is_refused(shell: Shell, tmp_path: Path) 
     assert "found calibration of ouster_111 '" in shell(f"convert {capture} -o out --resume").err
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("translation_m: [", "translation_m: [1"),
+        ("sensors:", "exclude_boxes_m: [[9, 9, 9, 10, 10, 10]]\nsensors:"),
+    ],
+)
+def test_another_rig_of_the_same_time_is_refused(
+    shell: Shell, tmp_path: Path, before: str, after: str
+) -> None:
+    shutil.copytree(FIXTURE, tmp_path / "in")
+    rig = tmp_path / "in" / "rig.yaml"
+    words = f"{tmp_path / 'in' / 'two_lidars.pcap'} --rig {rig} -o out"
+    _interrupt(shell, words)
+    times = rig.stat()
+    sound = rig.read_text()
+    rig.write_text(sound.replace(before, after, 1))
+    os.utime(rig, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert rig.read_text() != sound
+    outcome = shell(f"convert {words} --resume")
+    assert outcome.code == 2
+    assert "expected the job of the interrupted run, found " in outcome.err
+    # Comments have no influence.
+    rig.write_text(f"# The rig.\n{sound}")
+    assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
+
+
 def test_a_lost_scan_is_refused(shell: Shell) -> None:
     _interrupt(shell)
     Path("out.partial/000001.npz").unlink()
