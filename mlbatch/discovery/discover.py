@@ -12,6 +12,7 @@ from mlbatch import sensors
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
+from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import (
     ExpectedSensor,
     Matched,
@@ -19,7 +20,6 @@ from mlbatch.discovery.match import (
     is_model,
     match,
     match_rig,
-    shared_address,
 )
 from mlbatch.discovery.probe import (
     MetadataCollector,
