@@ -17,6 +17,7 @@ from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
+from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import (
     ExpectedSensor,
     Matched,
@@ -24,7 +25,6 @@ from mlbatch.discovery.match import (
     is_model,
     match,
     match_rig,
-    shared_address,
 )
 from mlbatch.discovery.probe import (
     MetadataCollector,

@@ -25,7 +25,8 @@ from mlbatch.discovery.discover import (
     name_kind,
     packet_types,
 )
-from mlbatch.discovery.match import describe, shared_address
+from mlbatch.discovery.interleaved import shared_address
+from mlbatch.discovery.match import describe
 from mlbatch.discovery.probe import first_seconds
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind

@@ -195,7 +195,10 @@ class _Walker:
     def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
         """Places of the next records as long as their frames have this length; none to many."""
         step = _RECORD_BYTES + length
-        count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
+        if begin > end - _RECORD_BYTES:
+            # The last record ends behind the buffer, perhaps behind its array as well.
+            return np.zeros(0, np.int64)
+        count = (end - _RECORD_BYTES - begin) // step + 1
         at = begin + _LENGTH_AT
         lengths: U32Array = np.ndarray(count, self.layout["captured"], data.data, at, (step,))
         others = (lengths != length).nonzero()[0]
