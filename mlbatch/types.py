@@ -62,9 +62,17 @@ class Message:
     data: bytes
 
 
+# All further streams are this one: addresses may be invented without end.
+OTHER_STREAMS = Stream(topic="(other streams)")
+MOST_STREAMS = 1 << 16
+
+
 @dataclass(slots=True)
 class StreamTable:
-    """Numbers the streams of a session; all its readers share one table."""
+    """Numbers the streams of a session; all its readers share one table.
+
+    After MOST_STREAMS all streams have the number of OTHER_STREAMS.
+    """
 
     streams: list[Stream] = field(default_factory=list)
     # Streams whose packets have no receive time of their own: `host_ns` is the log time of a
@@ -76,10 +84,17 @@ class StreamTable:
         """Number of `stream`, given at its first packet."""
         found = self._numbers.get(stream)
         if found is None:
+            if self.is_full and stream != OTHER_STREAMS:
+                return self.number(OTHER_STREAMS)
             found = len(self.streams)
             self._numbers[stream] = found
             self.streams.append(stream)
         return found
+
+    @property
+    def is_full(self) -> bool:
+        """True if further streams are OTHER_STREAMS."""
+        return len(self.streams) >= MOST_STREAMS
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import (
     Discovery,
     SensorSelection,
@@ -269,6 +270,12 @@ def _notes(discovery: Discovery) -> Iterator[str]:
         problem = shared_address(discovery.sampler, sensor)
         if problem:
             yield problem
+    crowd = discovery.sampler.crowd
+    if crowd.packets:
+        yield (
+            f"{crowd.packets} packets of at least {crowd.kinds} other streams or sizes are not "
+            f"listed: only the first {MOST_KINDS} are, and those that a vendor recognises"
+        )
     if not discovery.sampler.kinds:
         yield "no UDP packet in the first 10 seconds"
     elif not discovery.sensors:
@@ -329,7 +336,8 @@ def _measure(
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
     for batch in merge(recordings) if whole else first_seconds(recordings):
-        for kind, index in split_by_kind(batch):
+        parts = split_by_kind(batch)
+        for kind, index in sampler.crowd.followed(batch, parts) if whole else parts:
             if whole and sampler.count(kind, index, batch):
                 late.add(kind)
                 # It may be of one of the sensors.

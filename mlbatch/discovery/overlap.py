@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch import sensors
+from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.errors import MlbatchError
 from mlbatch.readers import open_recording
@@ -198,7 +199,7 @@ def _lidars(
     batch: PacketBatch, table: StreamTable, is_wanted: Callable[[Stream, str], bool]
 ) -> Iterator[str]:
     """Lidars whose packets are in a batch."""
-    for kind, index in split_by_kind(batch):
+    for kind, index in Crowd().followed(batch, split_by_kind(batch)):
         stream = table.streams[kind.stream]
         packets = batch.data[batch.start[index[:_CHECKED], None] + np.arange(kind.size)]
         what = sensors.describe(kind.size, packets)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mlbatch import readers, ros, sensors
+from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.extrinsics import ExtrinsicsSources
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
@@ -131,10 +132,11 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
     A capture may start long before the lidars do. The end does not depend on the size of batches.
     """
     end_ns: int | None = None
+    crowd = Crowd()
     with contextlib.closing(merge(recordings)) as batches:
         for batch in batches:
             if end_ns is None:
-                begin_ns = _first_lidar_host_ns(batch)
+                begin_ns = _first_lidar_host_ns(batch, crowd)
                 end_ns = None if begin_ns is None else begin_ns + PROBE_NS
             if end_ns is None:
                 yield batch
@@ -146,13 +148,13 @@ def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
             yield batch
 
 
-def _first_lidar_host_ns(batch: PacketBatch) -> int | None:
+def _first_lidar_host_ns(batch: PacketBatch, crowd: Crowd) -> int | None:
     """Receive time of the first packet of a kind that is described as a lidar's.
 
     Several packets are checked: device packets may come first on the same topic.
     """
     begins_ns = []
-    for kind, index in split_by_kind(batch):
+    for kind, index in crowd.followed(batch, split_by_kind(batch)):
         checked = batch.start[index[:_CHECKED], None] + np.arange(kind.size)
         text = sensors.describe(kind.size, batch.data[checked])
         if text is not None and "lidar" in text:

@@ -34,6 +34,11 @@ class Route:
     sensors: tuple[int, ...] = ()  # indices of those that may have sent them
 
 
+_UNASSIGNED = Route(Role.UNASSIGNED)
+# Kinds of no sensor are forgotten beyond this number: it may grow without end.
+_MOST_ROUTES = 1 << 16
+
+
 class Router:
     """Decides which sensors the packets of a kind may come from, once for each kind.
 
@@ -53,8 +58,16 @@ class Router:
         known = self._routes.get(kind)
         if known is None:
             known = self._decide(kind, payload)
+            if known == _UNASSIGNED and len(self._routes) >= _MOST_ROUTES:
+                self._forget_unassigned()
             self._routes[kind] = known
         return known
+
+    def _forget_unassigned(self) -> None:
+        """Let kinds of no sensor be decided again, by their next packets."""
+        self._routes = {
+            kind: route for kind, route in self._routes.items() if route.role is not Role.UNASSIGNED
+        }
 
     def _decide(self, kind: PacketKind, payload: U8Array) -> Route:
         stream = self._table.streams[kind.stream]
@@ -73,7 +86,7 @@ class Router:
         for number, sensor in enumerate(self._sensors):
             if kind.stream in sensor.streams:
                 return Route(Role.BAD_SIZE, (number,))
-        return Route(Role.UNASSIGNED)
+        return _UNASSIGNED
 
     def _join(self, kind: PacketKind, owners: Sequence[int]) -> None:
         """Add a kind to its sensors; unassigned neighbours may then be their IMU packets."""
@@ -81,11 +94,7 @@ class Router:
             kinds = self._sensors[number].kinds
             if kind not in kinds:
                 kinds.add(kind)
-                self._routes = {
-                    other: route
-                    for other, route in self._routes.items()
-                    if route.role is not Role.UNASSIGNED
-                }
+                self._forget_unassigned()
 
     def _may_own(
         self, sensor: DetectedSensor, kind: PacketKind, stream: Stream, payload: U8Array

@@ -9,6 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.clocks.watch import ClockWatch
+from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.frames.naming import same_namespace
 from mlbatch.lidar.interface import Evidence, Lidar, NeighbourStream
@@ -51,16 +52,20 @@ class KindSamples:
 
 @dataclass(slots=True)
 class Sampler:
-    """Keeps the first packets of every kind and some later ones, and counts them all."""
+    """Keeps the first packets of every kind and some later ones, and counts them all.
+
+    crowd: decides which kinds, where there are very many.
+    """
 
     table: StreamTable
     # Samples of each kind, in receive order of their first packets.
     kinds: dict[PacketKind, KindSamples] = field(default_factory=dict)
+    crowd: Crowd = field(default_factory=Crowd)
     _kinds_of_ip: dict[str, list[PacketKind]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
         """Sample a batch."""
-        for kind, index in split_by_kind(batch):
+        for kind, index in self.crowd.followed(batch, split_by_kind(batch)):
             first_ns = int(batch.host_ns[index[0]])
             samples = self.kinds.get(kind) or self._new(kind, first_ns)
             for row in _rows_to_keep(samples, kind, index, batch):
@@ -84,6 +89,7 @@ class Sampler:
         """Count from zero in another pass, by `count`; samples are kept."""
         for samples in self.kinds.values():
             samples.packets = 0
+        self.crowd.packets = 0
 
     def count(self, kind: PacketKind, index: I64Array, batch: PacketBatch) -> bool:
         """Count the packets of a kind at `index` of a batch; True if the kind is new.

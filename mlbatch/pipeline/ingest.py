@@ -9,6 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Arrival
+from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
 from mlbatch.discovery.types import PacketKind
@@ -42,6 +43,7 @@ class UnassignedPackets:
 
     sample: U8Array
     packets: int = 0
+    what: str | None = None  # description, once it was asked for
 
     def add(self, batch: PacketBatch, index: I64Array) -> None:
         """Count packets of a batch, and keep some."""
@@ -56,6 +58,7 @@ class UnassignedPackets:
         chosen = np.flatnonzero(is_new)[: SAMPLES_PER_KIND - kept]
         rows = batch.data[batch.start[index[chosen], None] + np.arange(size)]
         self.sample = np.concatenate([self.sample, rows])
+        self.what = None
 
 
 def _words(head: U8Array) -> I64Array:
@@ -73,7 +76,7 @@ IsIgnored = Callable[[PacketKind, U8Array], BoolArray]
 class Ingest:
     """Assigns packets to sensors and reads their column headers; pixels stay raw.
 
-    unassigned: packets of no sensor.
+    unassigned: packets of no sensor; crowd: decides which kinds of them are listed.
     """
 
     def __init__(
@@ -85,6 +88,7 @@ class Ingest:
     ) -> None:
         """stamp_map: applied to timestamps before they are batched; None: unchanged."""
         self.unassigned: dict[UnassignedKey, UnassignedPackets] = {}
+        self.crowd = Crowd()
         self._is_ignored = is_ignored
         self._router = router
         self._sensors = list(sensors)
@@ -100,6 +104,7 @@ class Ingest:
         ingested = Ingested([None] * len(self._sensors), [])
         owned = np.zeros(len(batch), bool)
         shared: list[tuple[PacketKind, I64Array]] = []
+        unassigned: list[tuple[PacketKind, I64Array]] = []
         for kind, index in split_by_kind(batch):
             route = self._router.route(kind, _payload(batch, int(index[0]), kind))
             if route.role is Role.LIDAR:
@@ -113,7 +118,7 @@ class Ingest:
                 packets.read += len(index)
                 packets.reject("bad_size", len(index))
             else:
-                self._unassign(kind, batch, index)
+                unassigned.append((kind, index))
         for sensor, parts, oldest_ring_index in zip(
             self._sensors, own, oldest_ring_indexes, strict=True
         ):
@@ -122,8 +127,10 @@ class Ingest:
                 arrival = self._arrive(sensor, batch, index, owned, oldest_ring_index)
                 ingested.arrivals[sensor.index] = arrival
         if not owned.all():
-            for kind, index in shared:
-                self._unassign(kind, batch, index[~owned[index]])
+            unassigned += [(kind, index[~owned[index]]) for kind, index in shared]
+        left = [(kind, index) for kind, index in unassigned if len(index)]
+        for kind, index in self.crowd.followed(batch, left):
+            self._unassign(kind, batch, index)
         return ingested
 
     def owners(self, batch: PacketBatch) -> I64Array:
@@ -142,8 +149,6 @@ class Ingest:
         return owner
 
     def _unassign(self, kind: PacketKind, batch: PacketBatch, index: I64Array) -> None:
-        if not len(index):
-            return
         if self._is_ignored is None:
             self._count(kind, False, batch, index)
             return

@@ -8,6 +8,7 @@ import numpy as np
 
 from mlbatch import sensors
 from mlbatch.arrays import U8Array
+from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.discover import Discovery
 from mlbatch.discovery.overlap import LidarSpan, lidar_name, problem
 from mlbatch.discovery.probe import PROBE_NS
@@ -24,6 +25,7 @@ class RunOverlap:
     def __init__(self, recordings: Sequence[Recording], setup: Discovery) -> None:
         self._setup = setup
         self._spans = {id(one): LidarSpan(one.path) for one in recordings}
+        self._crowds = {id(one): Crowd() for one in recordings}
         # By recording and kind, as lidars of several recordings may have one address.
         self._lidars: dict[tuple[int, PacketKind], list[str]] = {}
         self._begun_ns: int | None = None
@@ -36,7 +38,8 @@ class RunOverlap:
             span.is_whole = True
             return
         is_new = span.first_ns is None
-        for kind, index in split_by_kind(batch):
+        parts = split_by_kind(batch)
+        for kind, index in self._crowds[id(recording)].followed(batch, parts):
             key = id(recording), kind
             names = self._lidars.get(key)
             if names is None:

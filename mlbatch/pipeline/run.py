@@ -32,7 +32,7 @@ _AHEAD = 2
 # Tasks that wait for several threads.
 _WAITING = 2
 # Messages that are taken from their queue and written at a time.
-_PORTION_BYTES = 1 << 20
+_PORTION_BYTES = 1 << 18
 
 
 def convert(

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import sensors
+from mlbatch.arrays import U8Array
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import describe_time
+from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe
 from mlbatch.discovery.types import Note, PacketKind
@@ -385,12 +387,22 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
             what = f"not_in_rig: {what}"
         count = run.session.ingest.unassigned[kind, ignored].packets
         rows.append(Unassigned(str(streams[kind.stream]), count, f"{what} ({kind.size} bytes)"))
+    crowd = run.session.ingest.crowd
+    if crowd.packets:
+        what = f"unknown: at least {crowd.kinds} streams or sizes after the first {MOST_KINDS}"
+        rows.append(Unassigned("other streams", crowd.packets, what))
     return tuple(rows)
 
 
 def _what(run: Conversion, kind: PacketKind, ignored: bool) -> str:
     """Description of unassigned packets: by some of them, else by those sampled by discovery."""
-    sample = run.session.ingest.unassigned[kind, ignored].sample
+    packets = run.session.ingest.unassigned[kind, ignored]
+    if packets.what is None:
+        packets.what = _described(run, kind, packets.sample)
+    return packets.what
+
+
+def _described(run: Conversion, kind: PacketKind, sample: U8Array) -> str:
     texts = [sensors.describe(kind.size, row[None]) for row in sample]
     known = [text for text in texts if text]
     # A damaged packet may be the first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -187,3 +188,29 @@ def test_a_target_must_run_without_jumps() -> None:
         fit([ClockWatch(), good], TO_FIRST)
     maps = fit([good, ClockWatch(), jumping], TO_FIRST)
     assert [one is None for one in maps] == [False, True, False]
+
+
+def _measured(packets: int) -> tuple[int, ClockMap | None]:
+    """Peak memory of a watch and its map, with a hundredth of the timestamps damaged; the map."""
+    rng = np.random.default_rng(1)
+    watch = ClockWatch()
+    tracemalloc.start()
+    try:
+        for begin in range(0, packets, 1000):
+            true_ns = BEGIN_NS + (begin + np.arange(1000)) * 400 * NS_PER_US
+            stamp_ns = np.where(rng.random(1000) < 0.01, rng.integers(0, 2**62, 1000), true_ns)
+            watch.add(stamp_ns, true_ns + rng.integers(NS_PER_US, NS_PER_MS, 1000))
+        [found] = fit([watch])
+        return tracemalloc.get_traced_memory()[1], found
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_of_a_map_does_not_grow_with_the_packets() -> None:
+    few_bytes, few = _measured(60_000)
+    many_bytes, many = _measured(1_010_000)
+    assert many_bytes - few_bytes < 3_000_000
+    assert few is not None
+    assert many is not None
+    # One knot every 10 s of 24 and 404 s.
+    assert (few.knots, many.knots) == (2, 40)

@@ -8,7 +8,7 @@ length, and Ethernet pads short frames.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,7 @@ from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import Records, records
 from mlbatch.readers.capture import ipv6, link_types
-from mlbatch.types import Stream, StreamTable
+from mlbatch.types import OTHER_STREAMS, Stream, StreamTable
 
 IPV4 = np.dtype(
     [
@@ -374,8 +374,8 @@ class StreamNumbers:
         key = source << _PORT_BITS | port
         at = self._find(key)
         if at is None:
-            self._learn(sorted(set(key.tolist()).difference(self._known.tolist())), key)
-            at = np.searchsorted(self._known, key)
+            self._learn(set(key.tolist()).difference(self._known.tolist()), key)
+            return self._numbers_of_some(key)
         return self._numbers[at]
 
     def _find(self, key: I64Array) -> I64Array | None:
@@ -384,11 +384,30 @@ class StreamNumbers:
         at = np.minimum(np.searchsorted(self._known, key), len(self._known) - 1)
         return at if np.array_equal(self._known[at], key) else None
 
-    def _learn(self, new: Sequence[int], key: I64Array) -> None:
-        for one in sorted(new, key=lambda one: int(np.argmax(key == one))):
+    def _numbers_of_some(self, key: I64Array) -> I64Array:
+        """(n,) numbers where the table may have been full for some of the streams."""
+        if not len(key):
+            return np.zeros(0, np.int64)
+        if not len(self._known):
+            return np.full(len(key), self.table.number(OTHER_STREAMS))
+        at = np.minimum(np.searchsorted(self._known, key), len(self._known) - 1)
+        is_known = self._known[at] == key
+        if is_known.all():
+            return self._numbers[at]
+        return np.where(is_known, self._numbers[at], self.table.number(OTHER_STREAMS))
+
+    def _learn(self, new: Collection[int], key: I64Array) -> None:
+        """Number streams in the order of their first packets, as far as the table has room."""
+        learned = []
+        numbers = []
+        # In the order of `key`.
+        for one in dict.fromkeys(key.tolist()):
+            if one not in new or self.table.is_full:
+                continue
             stream = Stream(self.addresses.text(one >> _PORT_BITS), one & (1 << _PORT_BITS) - 1)
-            self._known = np.append(self._known, one)
-            self._numbers = np.append(self._numbers, self.table.number(stream))
-        order = np.argsort(self._known)
-        self._known = self._known[order]
-        self._numbers = self._numbers[order]
+            learned.append(one)
+            numbers.append(self.table.number(stream))
+        known = np.concatenate([self._known, np.array(learned, np.int64)])
+        order = np.argsort(known)
+        self._known = known[order]
+        self._numbers = np.concatenate([self._numbers, np.array(numbers, np.int64)])[order]
