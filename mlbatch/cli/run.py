@@ -6,6 +6,7 @@ Apart from `convert.py`, whose options are described without loading any of this
 from __future__ import annotations
 
 import contextlib
+import shlex
 import signal
 import sys
 import threading
@@ -56,6 +57,7 @@ class Target:
     dry_run: bool
     report: Path | None
     prints_report: bool  # to standard output, without a summary
+    html: Path | None  # page of the run
     split_jumps: bool
     overwrite: bool
     resume: bool
@@ -110,12 +112,15 @@ def _run_one(job: Job, target: Target) -> None:
         open_output = _opener(name, output, options)
         report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
+    _check_page(target, report_path)
     with _progress(target.quiet) as progress:
         conversion, inputs = _converted(
             job, open_output, progress, resume_log, _report_writer(target, report_path)
         )
+    inputs = replace(inputs, command=_command())
     for note in conversion.notes:
         _say(f"warning: {note.code}: {note.message}")
+    _write_page(conversion, inputs, target)
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
     elif target.prints_report or (target.dry_run and report_path is None):
@@ -165,9 +170,47 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
         if report_path is None or target.output is None:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
-        write_text(partial / report_path.name if is_inside else report_path, report_text(inputs))
+        text = report_text(replace(inputs, command=_command()))
+        write_text(partial / report_path.name if is_inside else report_path, text)
 
     return write
+
+
+def _command() -> str:
+    """The command line, as typed into a shell."""
+    return shlex.join(["mlbatch", *sys.argv[1:]])
+
+
+def _check_page(target: Target, report_path: Path | None) -> None:
+    """Refuse a page that cannot be written, before the run."""
+    if target.html is None:
+        return
+    from mlbatch.page import check_page
+
+    page = target.html.absolute()
+    if target.written is not None and target.written.absolute() in (page, *page.parents):
+        raise ExportError(
+            f"{target.html}: expected a page outside the output, found one in {target.written}; "
+            "choose another name"
+        )
+    if report_path is not None and report_path.absolute() == page:
+        raise ExportError(
+            f"{target.html}: expected a page apart from the report, found the same name; choose "
+            "another"
+        )
+    check_page(target.html, overwrite=target.overwrite or target.resume)
+
+
+def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> None:
+    if target.html is None:
+        return
+    # Not loaded for runs without a page.
+    from mlbatch.page import write_page
+    from mlbatch.page.source import Source, read_report
+
+    report = read_report(target.html, report_text(inputs))
+    table = None if conversion.table is None else conversion.table.text()
+    write_page(target.html, Source(report, table, target.written, target.html))
 
 
 def _opener(name: str, output: Path, options: WriterOptions) -> OpenWriter:
@@ -258,6 +301,7 @@ def _numbered(target: Target, number: int) -> Target:
         target,
         output=_with_number(target.output, number, ".mcap", ".bag"),
         report=_with_number(target.report, number, ".json"),
+        html=_with_number(target.html, number, ".html"),
     )
 
 
