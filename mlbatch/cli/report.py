@@ -12,7 +12,6 @@ def report(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="REPORT|OUTPUT",
             help="A report (JSON), or an output of convert with its report in or next to it.",
         ),
     ],

@@ -23,6 +23,8 @@ from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 MOST_POINTS = 54_000
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG V2.0\n"
+# Opcode and length.
+_RECORD_HEAD_BYTES = 9
 _BYTE = 255
 _WORD = 65535
 # Shares of the points that the range of a colour covers: single bright points are no scale.
@@ -152,22 +154,40 @@ def _of_messages(
 
 
 def _mcap_messages(file: Path, places: list[Place], topics: list[str]) -> Iterator[Message]:
-    from mcap.reader import make_reader
+    """Messages at the start of each place, from the chunks that contain it.
 
+    The names of the time limits of `iter_messages` differ between versions of the library.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.reader import make_reader
+    from mcap.records import Chunk
+    from mcap.records import Message as Record
+    from mcap.stream_reader import breakup_chunk
+
+    starts = {place.start_ns for place in places}
     with library_errors("an MCAP file with an index"), file.open("rb") as stream:
-        reader = make_reader(stream)
-        for place in places:
-            found = reader.iter_messages(topics, place.start_ns, place.start_ns + 1)
-            for schema, channel, message in found:
-                yield Message(
-                    where=f"{file.name} {channel.topic}",
-                    topic=channel.topic,
-                    type="" if schema is None else schema.name.replace("/msg/", "/"),
-                    encoding=channel.message_encoding,
-                    log_ns=message.log_time,
-                    publish_ns=message.publish_time,
-                    data=message.data,
-                )
+        summary = make_reader(stream).get_summary()
+        if summary is None:
+            raise DamageError("a summary", "none")
+        for index in summary.chunk_indexes:
+            first_ns = index.message_start_time
+            if not any(first_ns <= start <= index.message_end_time for start in starts):
+                continue
+            stream.seek(index.chunk_start_offset + _RECORD_HEAD_BYTES)
+            for record in breakup_chunk(Chunk.read(ReadDataStream(stream))):
+                if not isinstance(record, Record) or record.log_time not in starts:
+                    continue
+                channel = summary.channels[record.channel_id]
+                if channel.topic in topics:
+                    yield Message(
+                        where=f"{file.name} {channel.topic}",
+                        topic=channel.topic,
+                        type=summary.schemas[channel.schema_id].name.replace("/msg/", "/"),
+                        encoding=channel.message_encoding,
+                        log_ns=record.log_time,
+                        publish_ns=record.publish_time,
+                        data=record.data,
+                    )
 
 
 def _bag_messages(file: Path, places: list[Place], topics: list[str]) -> Iterator[Message]:
@@ -205,7 +225,8 @@ class _Points:
 
 
 def _valid(scan: StoredScan) -> _Points:
-    valid: BoolArray = np.isfinite(scan.xyz).all(axis=-1)
+    finite: BoolArray = np.isfinite(scan.xyz)
+    valid = np.asarray(finite.all(axis=-1))
     count = int(np.count_nonzero(valid))
     lidar: U8Array | None = None
     if scan.sensor is not None:

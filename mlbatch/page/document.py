@@ -166,9 +166,7 @@ def _header(source: Source, title: str, found: list[Finding], windows: Windows |
     written = report.at("scans").count("written")
     names = ", ".join(sensor.text("name") for sensor in sensors)
     rate = report.text("grid", "rate_hz")
-    summary = (
-        f"{number(written, 'scan')} at {rate} Hz of {number(len(sensors), 'lidar')} ({names})"
-    )
+    summary = f"{number(written, 'scan')} at {rate} Hz of {number(len(sensors), 'lidar')} ({names})"
     recorded_s = report.number("timing", "recorded_s")
     if recorded_s:
         summary += f", from {_seconds(recorded_s)} of recording"
@@ -265,9 +263,7 @@ def _timeline(windows: Windows | None) -> str:
     if windows is None:
         return _section("Timeline", f"<p class='lacks'>{_NO_TABLE}</p>")
     group = summarise(windows).group
-    joined = (
-        f" Each value summarises {group} windows, by the worst of them." if group > 1 else ""
-    )
+    joined = f" Each value summarises {group} windows, by the worst of them." if group > 1 else ""
     estimated = [
         name for name, flag in zip(windows.sensors, windows.estimated, strict=True) if flag
     ]
@@ -326,7 +322,7 @@ def _scans(clouds: list[PageCloud], why_not: str) -> str:
         f"<div class='controls'>Colour: {buttons}</div><div class='tops'>{views}</div>"
         "<figure><canvas id='cloud' tabindex='0'></canvas><figcaption id='cloudinfo'>"
         "</figcaption></figure><div id='legend'></div>",
-        "From above (x up, y left, 10 m grid or finer) and in space: drag to rotate, wheel to "
+        "From above (x up, y left) and in space: drag to rotate, wheel to "
         "enlarge; select a scan above. Axes at the body frame and at each lidar: x red, y green, "
         f"z blue.{note}",
     )
@@ -528,15 +524,14 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = "".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
     )
-    return f"<div class='scroll'><table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>"
+    table = f"<table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table>"
+    return f"<div class='scroll'>{table}</div>"
 
 
 # -- data of the plots ------------------------------------------------------------------------
 
 
-def _plot_data(
-    report: Values, windows: Windows | None, clouds: list[PageCloud]
-) -> dict[str, Any]:
+def _plot_data(report: Values, windows: Windows | None, clouds: list[PageCloud]) -> dict[str, Any]:
     sensors = report.items("sensors")
     data: dict[str, Any] = {
         "sensors": [sensor.text("name") for sensor in sensors],
@@ -584,9 +579,7 @@ def _window_data(windows: Windows) -> dict[str, Any]:
         "group": found.group,
         "period_ms": period_ms,
         "first_index": int(windows.index[0]),
-        "slices": int(round(steps / max(1, int(windows.index[last] - windows.index[0]))))
-        if steps
-        else 1,
+        "slices": windows.slices,
         "step": _packed(found.step - found.step[0]),
         "count": _packed(found.count),
         "incomplete": _packed(found.incomplete),

@@ -75,8 +75,8 @@
 
   function setView(from, to) {
     const least = Math.min(total, 4);
-    let span = Math.max(least, Math.min(total, to - from));
-    from = Math.max(0, Math.min(total - span, from));
+    const span = Math.max(least, Math.min(total, to - from));
+    from = Math.max(0, Math.min(total - span, (from + to - span) / 2));
     view.from = from;
     view.to = from + span;
     if (framePending) return;
@@ -310,7 +310,7 @@
     if (!fromZero) low -= pad;
     high += pad;
     const yOf = (value) => bottom - (value - low) / (high - low) * (bottom - top);
-    valueAxis(ctx, size.width, low, high, yOf);
+    const label = valueAxis(ctx, size.width, low, high, yOf);
     series.forEach((values, i) => {
       if (!values) return;
       ctx.strokeStyle = colors[i];
@@ -331,22 +331,35 @@
         if (last === null) ctx.lineTo(x + Math.min(1, columnWidth), yOf(most));
         last = most;
       }
-  XX(ctx, width, low, high, yOf) {
+      ctx.stroke();
+    });
+    label();
+  }
+
+  // Draw the lines of an axis; gives a function that labels them, for when the data are drawn.
+  function valueAxis(ctx, width, low, high, yOf) {
     const step = niceStep(high - low, 3);
     const digits = digitsOf(step);
+    const labels = [];
     for (let v = Math.ceil(low / step) * step; v <= high; v += step) {
       const text = Math.abs(v) >= 1e6 ? (v / 1e6).toFixed(1) + " M" :
         Math.abs(v) >= 1e4 ? (v / 1e3).toFixed(0) + " k" : v.toFixed(digits);
-      const y = Math.max(12, yOf(v) - 3);
+      labels.push([text, Math.max(12, yOf(v) - 3)]);
       ctx.strokeStyle = color("grid");
       ctx.lineWidth = 1;
       ctx.beginPath();
       ctx.moveTo(0, Math.round(yOf(v)) + .5);
       ctx.lineTo(width, Math.round(yOf(v)) + .5);
       ctx.stroke();
+    }
+    return () => labels.forEach(([text, y]) => {
+      ctx.globalAlpha = .85;
+      ctx.fillStyle = color("panel");
+      ctx.fillRect(0, y - 10, ctx.measureText(text).width + 8, 13);
+      ctx.globalAlpha = 1;
       ctx.fillStyle = color("soft");
       ctx.fillText(text, 4, y);
-    }
+    });
   }
 
   // -- clocks -----------------------------------------------------------------------------------
@@ -363,7 +376,7 @@
     high += pad;
     const right = size.width - 8;
     const yOf = (value) => bottom - (value - low) / (high - low) * (bottom - top);
-    valueAxis(ctx, size.width, low, high, yOf);
+    valueAxis(ctx, size.width, low, high, yOf)();
     const step = niceStep(span, size.width / 90);
     ctx.fillStyle = color("soft");
     for (let t = 0; t <= span; t += step) {
@@ -604,7 +617,8 @@
       SCALE.map((c) => "rgb(" + c.join(",") + ")").join(",") + ")";
     if (colouring === "lidar") data.sensors.forEach((name, i) => item(name, sensorColor(i)));
     else if (colouring === "height") {
-      item("height " + cloud.height[0].toFixed(1) + " to " + cloud.height[1].toFixed(1) + " m",
+      // Plus zero: no sign of a rounded zero.
+      item("height " + (Math.round(cloud.height[0] * 10) / 10 + 0).toFixed(1) + " to " + cloud.height[1].toFixed(1) + " m",
         ramp);
     } else if (colouring === "time") item("time 0 to " + cloud.window_ms.toFixed(0) + " ms", ramp);
     else item("intensity, 2 % to 98 % of the points", ramp);
@@ -699,13 +713,16 @@
   startClouds();
   const drawAll = () => {
     style = getComputedStyle(document.documentElement);
+    drawnWidth = document.body.clientWidth;
     redraws.forEach((draw) => draw());
   };
   let resizing = null;
-  window.addEventListener("resize", () => {
+  let drawnWidth = 0;
+  new ResizeObserver(() => {
     clearTimeout(resizing);
-    resizing = setTimeout(drawAll, 60);
-  });
+    // Scroll bars change the width without an event of the window.
+    if (document.body.clientWidth !== drawnWidth) resizing = setTimeout(drawAll, 60);
+  }).observe(document.body);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
   drawAll();
   // For tests: the page is drawn, in ms since it was opened.

@@ -53,9 +53,9 @@ class Values:
     def counts(self, *path: str) -> dict[str, int]:
         """Counts by reason."""
         found = self.at(*path)
-        return {key: found.count(key) for key in found.keys()}
+        return {key: found.count(key) for key in found.names()}
 
-    def keys(self) -> Iterator[str]:
+    def names(self) -> Iterator[str]:
         """The keys of an object."""
         if isinstance(self.root, dict):
             yield from self.root

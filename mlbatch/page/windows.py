@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.errors import ExportError
 from mlbatch.units import NS_PER_MS
 
@@ -23,6 +23,7 @@ class Windows:
     """Rows of scans.csv, (n,) each; by sensor (n, s)."""
 
     sensors: tuple[str, ...]
+    slices: int  # a window
     index: I64Array
     slice: I64Array
     # Number on the grid of windows or slices.
@@ -98,25 +99,27 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
     part = _whole(cells["slice"])
     start_ns = _whole(cells["start_ns"])
     end_ns = _whole(cells["end_ns"])
-    columns = _table([_whole(cells[f"columns_{name}"]) for name in names], rows)
+    columns = np.zeros((rows, len(names)), dtype=np.int64)
+    gap_ms = np.zeros((rows, len(names)))
     expected = np.zeros((rows, len(names)), dtype=np.int64)
     estimated = np.zeros(len(names), dtype=bool)
     for i, name in enumerate(names):
+        columns[:, i] = _whole(cells[f"columns_{name}"])
+        gap_ms[:, i] = _numbers(cells[f"max_gap_ns_{name}"]) / NS_PER_MS
         missing = cells.get(f"missing_{name}", ("",) * rows)
         if all(missing):
             expected[:, i] = columns[:, i] + _whole(missing)
         else:
             present = columns[columns[:, i] > 0, i]
             # The head and the tail are shorter; most windows are whole.
-            expected[:, i] = 0 if not len(present) else int(np.median(present))
+            expected[:, i] = 0 if not len(present) else int(median(present))
             estimated[i] = True
-    first_ns = _numbers(cells["first_stamp_ns"], "")
-    last_ns = _numbers(cells["last_stamp_ns"], "")
-    gap_ms: F64Array = (
-        _table([_numbers(cells[f"max_gap_ns_{name}"], "") for name in names], rows) / NS_PER_MS
-    )
+    # Empty in a scan without columns.
+    first_ns = _whole([text or "0" for text in cells["first_stamp_ns"]])
+    last_ns = _whole([text or "0" for text in cells["last_stamp_ns"]])
     return Windows(
         sensors=names,
+        slices=slices,
         index=index,
         slice=part,
         step=index * slices + part,
@@ -124,7 +127,7 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
         end_ns=end_ns,
         points=_whole(cells["points"]),
         complete=np.array([cell == "true" for cell in cells["complete"]], dtype=bool),
-        span_ms=np.nan_to_num((last_ns - first_ns) / NS_PER_MS),
+        span_ms=(last_ns - first_ns) / NS_PER_MS,
         delay_ms=_delays_ms(cells.get("ready_host_ns"), end_ns),
         columns=columns,
         expected=expected,
@@ -143,8 +146,8 @@ def _whole(texts: Sequence[str]) -> I64Array:
     return np.array(values, dtype=np.int64)
 
 
-def _numbers(texts: Sequence[str], absent: str) -> F64Array:
-    return np.array([math.nan if text == absent else float(text) for text in texts])
+def _numbers(texts: Sequence[str]) -> F64Array:
+    return np.array([float(text) if text else math.nan for text in texts])
 
 
 def _delays_ms(texts: Sequence[str] | None, end_ns: I64Array) -> F64Array:
@@ -159,13 +162,8 @@ def _shares(
     cells: dict[str, tuple[str, ...]], word: str, names: tuple[str, ...], rows: int
 ) -> F64Array:
     absent = ("",) * rows
-    return _table([_numbers(cells.get(f"{word}_{name}", absent), "") for name in names], rows)
-
-
-def _table(columns: list[I64Array] | list[F64Array], rows: int) -> I64Array:
-    """Columns of sensors as (n, s)."""
-    found: I64Array = np.stack(columns, axis=1) if columns else np.zeros((rows, 0), dtype=np.int64)
-    return found
+    columns = [_numbers(cells.get(f"{word}_{name}", absent)) for name in names]
+    return np.stack(columns, axis=1) if columns else np.zeros((rows, 0))
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,6 +44,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--ignore": "repeatable",
         "--fault": "repeatable",
         "--fault-seed": "random",
+        "--html": "page.*HTML",
         "--dry-run": "report.*split.*line.*segment",
         "--report": "JSON",
         "--jobs": "same time",
@@ -72,6 +73,11 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "sensors": {"--json": "JSON"},
     "verify": {"--report": "JSON.*next to", "--json": "JSON"},
+    "report": {
+        "--output": r"page.*\.html",
+        "--report": "JSON.*next to",
+        "--overwrite": "existing",
+    },
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",

@@ -12,7 +12,7 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
-    ("api", "compare", "bench"),
+    ("api", "compare", "bench", "page"),
     ("pipeline",),
     ("discovery",),
     ("readers", "sensors", "writers", "verify", "faults"),

@@ -48,7 +48,7 @@ NEEDLESS = (
     *("mlbatch.verify.verdict", "mlbatch.bench.runner", "mlbatch.api"),
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
-    *("mlbatch.cli.inspect", "mlbatch.cli.verify"),
+    *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
     *("numpy.ma", "rosbags", "rich"),
 )
 
