@@ -59,7 +59,8 @@ class BeamTable:
 
     def vectors(self) -> F32Array:
         """Return U1, U2, U3 of every beam: (3 vectors, 3 axes, B) float32."""
-        return self.direction.transpose(0, 2, 1).astype(np.float32, order="C")
+        vectors: F32Array = self.direction.transpose(0, 2, 1).astype(np.float32, order="C")
+        return vectors
 
     def origins(self) -> F32Array:
         """Return beam origins at all rotor positions: (W, axes, B or 1) float32, m."""
@@ -67,7 +68,8 @@ class BeamTable:
         first, second, third = self.origin.transpose(0, 2, 1)
         cosine = np.cos(angle_rad)[:, None, None]
         sine = np.sin(angle_rad)[:, None, None]
-        return (cosine * first + sine * second + third).astype(np.float32)
+        origins: F32Array = (cosine * first + sine * second + third).astype(np.float32)
+        return origins
 
 
 def spherical(

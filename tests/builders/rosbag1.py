@@ -19,8 +19,8 @@ CHUNK = 5
 
 def definition_of(connection: Connection) -> str:
     """Definition of a type: a text before rosbags 0.10, an object with a text since."""
-    definition: str = getattr(connection.msgdef, "data", connection.msgdef)
-    return definition
+    text: object = connection.msgdef
+    return str(getattr(text, "data", text))
 
 
 def write_rosbag1(
