@@ -279,7 +279,7 @@ def _timeline(windows: Windows | None) -> str:
         "incomplete</h3><canvas id='timeline'></canvas>"
         "<h3>Fill of each window: columns received / expected "
         "<span class='ramp'></span> 0 to 100 %</h3><canvas id='fill'></canvas>"
-        "<h3>Widest gap between two columns, ms</h3><canvas id='gap'></canvas>"
+        "<h3>Longest time without a column, ms</h3><canvas id='gap'></canvas>"
         "<h3>Points of a scan</h3><canvas id='points'></canvas>"
         "<h3>Set span: first to last column of a scan, ms</h3><canvas id='span'></canvas>"
         "<h3>Delay: receive time of the packet that closed a window, after its end, ms</h3>"

@@ -24,15 +24,22 @@ REMEDIES = {
     "late_stream": "name the sensor in a rig file (--rig)",
     "no_metadata": "give the sensor's metadata or calibration with --metadata FILE",
     "no_decoder": "see mlbatch sensors for the supported models",
+    "no_overlap": "give recordings of one drive, or remove the optional sensors from the rig",
+    "unassigned": "name both lidars in a rig file (--rig), each with its serial number",
+    "not_in_rig": "add the lidar to the rig, or leave it out with --ignore",
     "not_seen_yet": "check address, port or topic of the sensor in the rig",
     "calibration": "check that the calibration belongs to this sensor",
     "rejected": "check model, return mode and calibration: mlbatch inspect RECORDING",
     "clipped": "choose a point layout with a float32 intensity (--point-layout standard)",
     "late": "raise --max-wait; look for damaged timestamps (--decode crc=check)",
+    "loss": _NETWORK,
+    "no_points": "look for a covered lens; check --min-range, --max-range and --exclude-box",
+    "empty_cloud": "check that the sensor measures; leave scans out with --drop-incomplete",
     "timescale": "set all sensors to one time source (PTP or GPS), or use --clock host",
     "extrinsics_contradict": "correct one of the sources, or give the pose in a rig file (--rig)",
     "extrinsics_frame": "give the pose in a rig file (--rig): extrinsics: {frame: NAME}",
     "extrinsics_mixed": "give all poses in a rig file (--rig)",
+    "same_pose": "correct the pose of one of them in the rig file",
     "constant_tf": "nothing to do if the sensor does not move; else publish on /tf_static",
     "urdf": "give the pose in a rig file (--rig)",
     "other_ros": "write an output of the same ROS version (--format rosbag1, mcap or rosbag2)",
@@ -42,6 +49,7 @@ REMEDIES = {
     "clock_jump": "use --on-jump split, or --clock host",
     "host_step": "do not set the clock of the capture host during a recording",
     "max_wait": "give --max-wait in seconds",
+    "cloud_time": "state the unit of the time field in the rig (points: unit)",
     "clouds": "nothing to do; check that the interpretation is correct",
 }
 _INFORMATION = frozenset({"clouds", "constant_tf", "calibration"})
@@ -49,8 +57,6 @@ _SERIOUS = frozenset({"clocks", "clock_jump", "recording", "clock_epoch"})
 
 # Shares of packets or columns.
 _LITTLE, _MUCH = 0.001, 0.01
-# Fill below which a window is thin.
-_THIN = 0.5
 # Distance that clocks drift apart during the recording.
 _DRIFT_MS, _MUCH_DRIFT_MS = 0.5, 5.0
 _MOST_STALLS = 6
@@ -81,11 +87,9 @@ def findings(report: Values, windows: Windows | None) -> list[Finding]:
         *_scans(report),
         *(() if windows is None else _stalls(windows)),
         *_packets(report),
-        *(() if windows is None else _thin(windows)),
         *_columns(report),
         *_clocks(report),
         *_faults(report),
-        *_unassigned(report),
         *_warnings(report),
     ]
     return sorted(found, key=lambda one: -one.level)
@@ -181,12 +185,14 @@ def _intervals(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _packets(report: Values) -> Iterator[Finding]:
+    warned = {one.text("sensor") for one in report.items("warnings") if one.text("code") == "loss"}
     for sensor in report.items("sensors"):
         name = sensor.text("name")
         packets = sensor.at("packets")
         lost = packets.count("lost")
         sent = packets.count("read") + lost
-        if lost:
+        # Else the warning states it.
+        if lost and name not in warned:
             level = _level(lost, sent)
             text = f"{name} lost {number(lost, 'packet')} of {sent:,}, {percent(lost, sent)}."
             yield Finding(level, text, _NETWORK)
@@ -206,19 +212,6 @@ def _level(part: int, whole: int) -> Level:
     if part >= _MUCH * whole:
         return Level.PROBLEM
     return Level.WARNING if part >= _LITTLE * whole else Level.NOTE
-
-
-def _thin(windows: Windows) -> Iterator[Finding]:
-    fill = windows.fill
-    for i, name in enumerate(windows.sensors):
-        thin = (fill[:, i] < _THIN) & (windows.columns[:, i] > 0)
-        if count := int(np.count_nonzero(thin)):
-            row = int(fill[:, i].argmin())
-            text = (
-                f"{number(count, 'scan')} with less than half of the columns of {name}, the lowest "
-                f"at +{windows.seconds(row):.1f} s."
-            )
-            yield Finding(Level.WARNING, text, "see the fill below; " + _NETWORK)
 
 
 def _columns(report: Values) -> Iterator[Finding]:
@@ -262,15 +255,15 @@ def _faults(report: Values) -> Iterator[Finding]:
         yield Finding(Level.NOTE, f"Faults were injected by --fault: {texts}.")
 
 
-def _unassigned(report: Values) -> Iterator[Finding]:
-    for one in report.items("unassigned"):
-        what = one.text("what")
-        if "lidar" in what.lower() and not what.startswith("ignored"):
-            text = f"{one.text('stream')}: {one.count('packets'):,} packets not used: {what}."
-            yield Finding(Level.WARNING, text, "add the sensor to the rig, or give its metadata")
-
-
 def _warnings(report: Values) -> Iterator[Finding]:
+    losses = {
+        sensor.text("name"): _level(
+            sensor.count("packets", "lost"),
+            sensor.count("packets", "lost") + sensor.count("packets", "read"),
+        )
+        for sensor in report.items("sensors")
+        if sensor.count("packets", "lost")
+    }
     for one in report.items("warnings"):
         code = one.text("code")
         level = Level.WARNING
@@ -278,5 +271,7 @@ def _warnings(report: Values) -> Iterator[Finding]:
             level = Level.NOTE
         elif code in _SERIOUS:
             level = Level.PROBLEM
+        elif code == "loss":
+            level = max(level, losses.get(one.text("sensor"), level))
         remedy = REMEDIES.get(code, "see docs/report.md")
         yield Finding(level, one.text("message"), remedy, code)

@@ -40,33 +40,33 @@ class Windows:
     expected: I64Array
     # (s,): `expected` is not in the table, and is the median of the windows with columns.
     estimated: BoolArray
-    # NaN where the table, or the window, has none.
+    # Columns per expected column, 0 to 1.
+    fill: F64Array
+    # Longest time without a column, also of earlier windows.
     gap_ms: F64Array
+    # NaN where the table has none.
     coverage: F64Array
     overlap: F64Array
 
     def __len__(self) -> int:
         return len(self.index)
 
-    @property
-    def fill(self) -> F64Array:
-        """Columns per expected column, (n, s), 0 to 1; 1 where none is expected."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share: F64Array = self.columns / self.expected
-        # Where the grid cuts between two columns, a whole window has one less.
-        is_whole = (self.columns > 0) & (self.expected - self.columns <= 1)
-        return np.clip(np.where(is_whole | (self.expected == 0), 1.0, share), 0.0, 1.0)
-
     def seconds(self, row: int) -> float:
         """Start of a window after the first one, s."""
         return int(self.start_ns[row] - self.start_ns[0]) / 1e9
 
     def worst(self) -> int:
-        """The window with the lowest fill of any sensor; without a gap, that with fewest points."""
-        lowest = self.fill.min(axis=1)
-        if lowest.min() < 1.0:
-            return int(lowest.argmin())
-        return int(self.points.argmin())
+        """The window with the lowest fill of any sensor; without a gap, that with fewest points.
+
+        Of several windows neither the head nor an incomplete last one, which are partial.
+        """
+        rows = np.arange(len(self))
+        kept = rows[int(self.index[0] < 0) : len(self) - (not self.complete[-1])]
+        if not len(kept):
+            kept = rows
+        lowest = self.fill[kept].min(axis=1, initial=1.0)
+        ranked = lowest if lowest.min() < 1.0 else self.points[kept]
+        return int(kept[int(ranked.argmin())])
 
 
 def read_windows(text: str, slices: int) -> Windows | None:
@@ -132,11 +132,21 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
         columns=columns,
         expected=expected,
         estimated=estimated,
-        # Without columns there is no gap between two.
-        gap_ms=np.where(columns > 1, gap_ms, math.nan),
+        fill=_fill(columns, expected, _shares(cells, "fill", names, rows)),
+        gap_ms=gap_ms,
         coverage=_shares(cells, "coverage", names, rows),
         overlap=_shares(cells, "overlap", names, rows),
     )
+
+
+def _fill(columns: I64Array, expected: I64Array, known: F64Array) -> F64Array:
+    """The fill in the table; where it has none, by the expected columns."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share: F64Array = columns / expected
+    # Where the grid cuts between two columns, a whole window has one less.
+    is_whole = (expected == 0) | ((columns > 0) & (expected - columns <= 1))
+    own = np.where(is_whole, 1.0, share)
+    return np.clip(np.where(np.isfinite(known), known, own), 0.0, 1.0)
 
 
 def _whole(texts: Sequence[str]) -> I64Array:

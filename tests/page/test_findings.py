@@ -58,11 +58,12 @@ def test_a_silent_sensor_is_named_with_its_time(silent: range, text: str) -> Non
     assert found(document, columns) == [f"PROBLEM: {text}"]
 
 
-def test_windows_with_few_columns_are_counted() -> None:
-    columns = [[512, 512], [512, 200], [512, 100], [512, 256]]
-    document = report(sensor("left"), sensor("right", 1))
-    expected = "WARNING: 2 scans with less than half of the columns of right, the lowest at +0.2 s."
-    assert found(document, columns) == [expected]
+def test_the_warning_of_a_loss_is_not_repeated() -> None:
+    message = "left: 20 of 1000 packets lost (2 %)"
+    warning = {"code": "loss", "sensor": "left", "message": message}
+    document = report(sensor("left", lost=20), sensor("right", 1, lost=1), warnings=[warning])
+    expected = [f"PROBLEM: {message}", "WARNING: right lost 1 packet of 1,000, 0.10 %."]
+    assert found(document) == expected
 
 
 def test_drifting_clocks_are_weighed_by_the_length_of_the_recording() -> None:
@@ -87,16 +88,6 @@ def test_the_verdict_is_the_worst_finding() -> None:
 
 def test_a_run_without_a_scan_is_a_problem() -> None:
     assert found(report(sensor("left"), scans=0)) == ["PROBLEM: No scan was written."]
-
-
-def test_lidars_that_are_not_used_are_a_warning() -> None:
-    streams = [
-        {"stream": "10.0.0.9", "packets": 70, "what": "not_in_rig: lidar packets of Ouster"},
-        {"stream": "10.0.0.8", "packets": 3, "what": "unknown (12 bytes)"},
-        {"stream": "10.0.0.7", "packets": 3, "what": "ignored: lidar packets"},
-    ]
-    (text,) = found(report(sensor("left"), unassigned=streams))
-    assert text.startswith("WARNING: 10.0.0.9: 70 packets not used")
 
 
 def test_every_warning_has_a_remedy() -> None:

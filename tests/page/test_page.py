@@ -131,7 +131,7 @@ def test_an_mcap_file_alone_contains_its_report_and_table(shell: Shell) -> None:
     [
         # From 320 to 620 ms after the full second; scan 0 begins at 100 ms.
         ("stall:right:300ms-600ms", ["right sent nothing from +0.3 s to +0.5 s"]),
-        ("drop:left:20%", ["left lost"]),
+        ("drop:left:20%", ["left: ", "packets lost"]),
     ],
 )
 def test_faults_are_in_the_heading(fault: str, texts: list[str], shell: Shell) -> None:

@@ -21,9 +21,9 @@ def windows(
 
 
 def test_fill_is_columns_per_expected_column() -> None:
-    found = windows([[512, 256], [384, 0]], [[0, 256], [128, 512]])
-    np.testing.assert_array_equal(found.fill, [[1.0, 0.5], [0.75, 0.0]])
-    np.testing.assert_array_equal(found.expected, np.full((2, 2), 512))
+    found = windows([[512, 256], [384, 0], [512, 512]], [[0, 256], [128, 512], [0, 0]])
+    np.testing.assert_array_equal(found.fill, [[1.0, 0.5], [0.75, 0.0], [1.0, 1.0]])
+    np.testing.assert_array_equal(found.expected, np.full((3, 2), 512))
     assert not found.estimated.any()
     assert found.worst() == 1
 
@@ -41,12 +41,29 @@ def test_unknown_expectations_are_the_median_of_windows_with_columns() -> None:
     assert found.fill[2, 0] == 0.5
 
 
-def test_a_window_without_columns_has_no_gap_and_others_have_delay_and_span() -> None:
+def test_windows_have_gap_delay_and_span() -> None:
     found = windows([[512, 0]])
     assert found.gap_ms[0, 0] == pytest.approx(0.1953)
-    assert np.isnan(found.gap_ms[0, 1])
     assert found.delay_ms[0] == 2.0
     assert found.span_ms[0] == pytest.approx(99.8)
+
+
+def test_the_fill_of_the_table_counts() -> None:
+    """A lidar that is dark in a part of the revolution has fewer columns than its rate says."""
+    text = table(("left",), [[256], [512]], [[0], [0]])
+    head, first, second = text.splitlines()
+    text = "\n".join([f"{head},fill_left", f"{first},0.5", f"{second},"])
+    found = read_windows(text, 1)
+    assert found is not None
+    np.testing.assert_array_equal(found.fill, [[0.5], [1.0]])
+
+
+def test_the_worst_window_is_neither_head_nor_tail() -> None:
+    columns = [[100, 100], [512, 512], [512, 300], [512, 512], [512, 0]]
+    text = table(("left", "right"), columns, [[512 - count for count in own] for own in columns])
+    found = read_windows(text.replace("\n0,0,", "\n-1,0,", 1), 1)
+    assert found is not None
+    assert found.worst() == 2
 
 
 def test_long_runs_are_summarised_by_their_worst_windows() -> None:
