@@ -70,7 +70,8 @@ def choose_places(windows: Windows) -> list[Place]:
     row = windows.worst()
     is_whole = windows.fill[row].min() >= 1.0
     worst = "fewest points" if is_whole else "worst"
-    chosen = (("first", 0), ("middle", len(windows) // 2), (worst, row))
+    first = int(windows.has_head and len(windows) > 1)
+    chosen = (("first", first), ("middle", len(windows) // 2), (worst, row))
     for title, row in chosen:
         titles.setdefault(row, []).append(title)
     return [

@@ -273,6 +273,8 @@ def _timeline(windows: Windows | None) -> str:
         if estimated
         else ""
     )
+    far_ms = windows.far_ms
+    far = f" (less {far_ms / 1000:,.0f} s: the clocks differ)" if far_ms else ""
     plots = (
         "<h3>Columns of each sensor: received, <span class='swatch missing'></span> missing, "
         "<span class='swatch none'></span> no scan, <span class='swatch incomplete'></span> "
@@ -282,7 +284,7 @@ def _timeline(windows: Windows | None) -> str:
         "<h3>Longest time without a column, ms</h3><canvas id='gap'></canvas>"
         "<h3>Points of a scan</h3><canvas id='points'></canvas>"
         "<h3>Set span: first to last column of a scan, ms</h3><canvas id='span'></canvas>"
-        "<h3>Delay: receive time of the packet that closed a window, after its end, ms</h3>"
+        f"<h3>Delay: receive time of the packet that closed a window, after its end, ms{far}</h3>"
         "<canvas id='delay'></canvas>"
     )
     return _section(
@@ -407,7 +409,7 @@ def _clock(report: Values) -> str:
             sensor.text("name"),
             clock.text("source"),
             clock.text("epoch"),
-            "" if offset is None else f"{offset:,.3f} ms",
+            "" if offset is None else _offset(offset),
             "not determined" if drift is None else f"{drift:+.2f} ppm",
             "" if drift is None else f"{drift * 3.6:+.1f} ms/h",
             notes,
@@ -425,6 +427,12 @@ def _clock(report: Values) -> str:
         "run; the report has no single measurements."
     )
     return _section("Clocks", plot + _table(head, rows), about)
+
+
+def _offset(offset_ms: float) -> str:
+    if abs(offset_ms) >= 10_000:
+        return f"{offset_ms / 1000:,.3f} s"
+    return f"{offset_ms:.3f} ms"
 
 
 def _sensors(report: Values) -> str:
@@ -585,7 +593,7 @@ def _window_data(windows: Windows) -> dict[str, Any]:
         "incomplete": _packed(found.incomplete),
         "points": _scaled(found.points),
         "span": _scaled(found.span_ms),
-        "delay": _scaled(found.delay_ms),
+        "delay": _scaled(found.delay_ms - windows.far_ms),
         "columns": [_packed(column) for column in found.columns.T],
         "expected": [_packed(column) for column in found.expected.T],
         "fill": [_scaled(column, 1.0) for column in found.fill.T],

@@ -84,7 +84,7 @@ class Finding:
 def findings(report: Values, windows: Windows | None) -> list[Finding]:
     """All findings, the most serious first."""
     found = [
-        *_scans(report),
+        *_scans(report, windows),
         *(() if windows is None else _stalls(windows)),
         *_packets(report),
         *_columns(report),
@@ -120,7 +120,7 @@ def number(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _scans(report: Values) -> Iterator[Finding]:
+def _scans(report: Values, windows: Windows | None) -> Iterator[Finding]:
     scans = report.at("scans")
     written = scans.count("written")
     if not written:
@@ -135,7 +135,11 @@ def _scans(report: Values) -> Iterator[Finding]:
             f"{number(empty, 'window')} without a column of any sensor: no scan was written.",
             "look for a pause of the capture; the indices of scans keep the gap",
         )
-    if incomplete := scans.count("incomplete"):
+    incomplete = scans.count("incomplete")
+    if windows is not None and windows.has_head:
+        yield Finding(Level.NOTE, "Head and tail are incomplete, as requested by --keep-partial.")
+        incomplete -= 1 + int(not windows.complete[-1])
+    if incomplete > 0:
         yield Finding(
             Level.WARNING,
             f"{number(incomplete, 'scan')} of {written:,} "
@@ -152,6 +156,10 @@ def _stalls(windows: Windows) -> Iterator[Finding]:
     """Intervals of whole windows in which a sensor sent nothing."""
     for i, name in enumerate(windows.sensors):
         silent: BoolArray = windows.columns[:, i] == 0
+        if windows.has_head and len(silent) > 1:
+            # Head and tail are partial: alone, they are no stall.
+            silent[0] &= silent[1]
+            silent[-1] &= silent[-2] | windows.complete[-1]
         intervals = _intervals(silent)
         for first, end in intervals[:_MOST_STALLS]:
             begin_s = windows.seconds(first)

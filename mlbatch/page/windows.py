@@ -16,6 +16,8 @@ from mlbatch.units import NS_PER_MS
 # Values (windows x sensors) of a page; longer runs are summarised, several windows a value.
 MOST_CELLS = 160_000
 _LARGEST = 2**62
+# No delay of a network.
+_FAR_MS = 60_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +57,25 @@ class Windows:
         """Start of a window after the first one, s."""
         return int(self.start_ns[row] - self.start_ns[0]) / 1e9
 
+    @property
+    def has_head(self) -> bool:
+        """Whether the first window is partial, by `--keep-partial`."""
+        return int(self.index[0]) < 0
+
+    @property
+    def far_ms(self) -> float:
+        """Smallest delay, if it is only the offset of a clock with another date; else 0."""
+        known = self.delay_ms[np.isfinite(self.delay_ms)]
+        least = float(known.min()) if len(known) else 0.0
+        return least if abs(least) > _FAR_MS else 0.0
+
     def worst(self) -> int:
         """The window with the lowest fill of any sensor; without a gap, that with fewest points.
 
         Of several windows neither the head nor an incomplete last one, which are partial.
         """
         rows = np.arange(len(self))
-        kept = rows[int(self.index[0] < 0) : len(self) - (not self.complete[-1])]
+        kept = rows[int(self.has_head) : len(self) - (not self.complete[-1])]
         if not len(kept):
             kept = rows
         lowest = self.fill[kept].min(axis=1, initial=1.0)

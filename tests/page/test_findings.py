@@ -58,6 +58,17 @@ def test_a_silent_sensor_is_named_with_its_time(silent: range, text: str) -> Non
     assert found(document, columns) == [f"PROBLEM: {text}"]
 
 
+def test_head_and_tail_are_partial_by_request() -> None:
+    document = report(sensor("left"), sensor("right", 1))
+    document["scans"]["incomplete"] = 3
+    columns = [[100, 100], [512, 512], [512, 512], [512, 0]]
+    missing = [[512 - count for count in own] for own in columns]
+    text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
+    texts = [one.text for one in findings(Values(document), read_windows(text, 1))]
+    assert "1 scan of 10 is incomplete: a sensor does not cover the window." in texts
+    assert "Head and tail are incomplete, as requested by --keep-partial." in texts
+
+
 def test_the_warning_of_a_loss_is_not_repeated() -> None:
     message = "left: 20 of 1000 packets lost (2 %)"
     warning = {"code": "loss", "sensor": "left", "message": message}

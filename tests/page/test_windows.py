@@ -7,7 +7,7 @@ import pytest
 
 from mlbatch.errors import ExportError
 from mlbatch.page.windows import MOST_CELLS, Windows, read_windows, summarise
-from tests.page.runs import table
+from tests.page.runs import PERIOD_NS, START_NS, table
 
 
 def windows(
@@ -63,7 +63,19 @@ def test_the_worst_window_is_neither_head_nor_tail() -> None:
     text = table(("left", "right"), columns, [[512 - count for count in own] for own in columns])
     found = read_windows(text.replace("\n0,0,", "\n-1,0,", 1), 1)
     assert found is not None
+    assert found.has_head
     assert found.worst() == 2
+
+
+@pytest.mark.parametrize(("late_ns", "far_ms"), [(2_000_000, 0.0), (10**17, 1e11)])
+def test_a_clock_of_another_date_is_no_delay(late_ns: int, far_ms: float) -> None:
+    text = table(("left",), [[512], [512]])
+    ends = [START_NS + (index + 1) * PERIOD_NS for index in range(2)]
+    for end_ns in ends:
+        text = text.replace(f",{end_ns + 2_000_000}\n", f",{end_ns + late_ns}\n")
+    found = read_windows(text, 1)
+    assert found is not None
+    assert found.far_ms == far_ms
 
 
 def test_long_runs_are_summarised_by_their_worst_windows() -> None:
