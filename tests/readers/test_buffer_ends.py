@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mcap.writer import IndexType
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.readers.formats import mcap, pcap, pcapng, rosbag1, rosbag2
@@ -36,7 +36,7 @@ from tests.builders.captures import (
     write_pcap,
     write_pcapng,
 )
-from tests.builders.engines import few_kernels, needs_numba
+from tests.builders.engines import needs_native
 from tests.builders.reading import Seen, assert_balanced, seen_of
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
@@ -141,7 +141,7 @@ def _rosbag1(compression: str) -> Format:
 FORMATS = {
     "pcap": _pcap("numpy"),
     "pcap, big endian": _pcap("numpy", big_endian=True),
-    "pcap, compiled": _pcap("numba"),
+    "pcap, compiled": _pcap("native"),
     "pcapng": _pcapng(),
     "pcapng, big endian": _pcapng(big_endian=True),
     "MCAP": _mcap(mcaps.Form(chunk_bytes=700)),
@@ -157,14 +157,8 @@ FORMATS = {
 }
 _COMPILED = {"pcap, compiled"}
 _EACH = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[needs_numba] * (name in _COMPILED)) for name in FORMATS]
+    "name", [pytest.param(name, marks=[needs_native] * (name in _COMPILED)) for name in FORMATS]
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with few_kernels(tmp_path_factory):
-        yield
 
 
 def packets_of(rows: Sequence[tuple[int, int]]) -> list[tuple[int, bytes]]:
@@ -208,11 +202,11 @@ def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> No
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("engine", ["numpy", pytest.param("numba", marks=needs_numba)])
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("native", marks=needs_native)])
 def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
     tmp_path: Path, engine: str, big_endian: bool
 ) -> None:
-    kernel = CaptureKernel() if engine == "numba" else None
+    loops = CaptureLoops() if engine == "native" else None
     pick = random.Random(1)
     path = tmp_path / "a.pcap"
     for length in range(1, 201):
@@ -223,7 +217,7 @@ def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
         assert isinstance(recording, CaptureRecording)
         sizes = [len(payload) + _ETHERNET_HEADERS + _RECORD_BYTES for _, payload in packets]
         after = np.cumsum([_FILE_HEADER_BYTES, *sizes])
-        file = _File(recording, kernel, np.frombuffer(content + bytes(SLACK), np.uint8), after)
+        file = _File(recording, loops, np.frombuffer(content + bytes(SLACK), np.uint8), after)
         # Around the 17th equal frame of the row, and around its last.
         cuts = [
             cut
@@ -239,13 +233,13 @@ class _File:
     """A capture with one buffer end; after: ends of its header and of each record."""
 
     recording: CaptureRecording
-    kernel: CaptureKernel | None
+    loops: CaptureLoops | None
     data: U8Array
     after: I64Array
 
     def check(self, cut: int, host_ns: list[int]) -> None:
         """A walk over the bytes before `cut`, and one over the rest, find all frames."""
-        walker = self.recording.walker(self.kernel)
+        walker = self.recording.walker(self.loops)
         whole = int(np.searchsorted(self.after[1:], cut, side="right"))
         front = walker.walk(self.data[: cut + SLACK], 0, cut)
         assert len(front.frames) == whole
