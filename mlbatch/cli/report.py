@@ -18,7 +18,7 @@ def report(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="The page. [default: next to the report, with suffix .html]"
+            "-o", "--output", help="The page. [default: OUTPUT.html, or REPORT with suffix .html]"
         ),
     ] = None,
     report: Annotated[

@@ -131,7 +131,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         open_output = _opener(name, output, options)
         report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
-    _check_page(target, report_path)
+    _check_page(target, report_path, name)
     with _progress(target.quiet) as progress:
         conversion, inputs = _converted(
             job, open_output, progress, resume_log, _report_writer(target, report_path)
@@ -221,8 +221,8 @@ def _command() -> str:
     return shlex.join(["mlbatch", *sys.argv[1:]])
 
 
-def _check_page(target: Target, report_path: Path | None) -> None:
-    """Refuse a page that cannot be written, before the run."""
+def _check_page(target: Target, report_path: Path | None, name: str) -> None:
+    """Refuse a page that cannot be written, before the run; name: of the output's format."""
     if target.html is None:
         return
     from mlbatch.page import check_page
@@ -233,10 +233,13 @@ def _check_page(target: Target, report_path: Path | None) -> None:
             f"{target.html}: expected a page outside the output, found one in {target.written}; "
             "choose another name"
         )
-    if report_path is not None and report_path.absolute() == page:
+    own = [] if report_path is None else [report_path]
+    if target.written is not None:
+        own.append(report_paths(target.written, name).scans_csv)
+    if page in [path.absolute() for path in own]:
         raise ExportError(
-            f"{target.html}: expected a page apart from the report, found the same name; choose "
-            "another"
+            f"{target.html}: expected a page apart from the output, its table and report, found "
+            "the name of one of them; choose another"
         )
     check_page(target.html, overwrite=target.overwrite or target.resume)
 

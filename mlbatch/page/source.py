@@ -78,14 +78,21 @@ def _of_report(path: Path) -> Source:
     table = ReportPlaces.of(output, None).table_text()
     # The folder of a dry run's report has no scans.
     is_output = output.is_file() or table is not None
-    return Source(report, table, output if is_output else None, path.with_suffix(".html"))
+    if not is_output:
+        return Source(report, table, None, path.with_suffix(".html"))
+    return Source(report, table, output, page_of(output))
+
+
+def page_of(output: Path) -> Path:
+    """Usual place of the page; not in a folder of scans, which could not be overwritten then."""
+    named = output if output.name else output.resolve()
+    return named.with_name(f"{named.name}.html")
 
 
 def _of_output(path: Path, report: Path | None) -> Source:
     places = ReportPlaces.of(path, report)
     text = places.report_text()
     table = places.table_text()
-    page = places.report.with_suffix(".html")
     if text is None or table is None:
         inner_report, inner_table = _inside(path)
         text = inner_report if text is None else text
@@ -95,7 +102,7 @@ def _of_output(path: Path, report: Path | None) -> Source:
             f"{path}: expected a report in or next to the output, found none; give it with "
             "--report, or convert again"
         )
-    return Source(read_report(places.report, text), table, path, page)
+    return Source(read_report(places.report, text), table, path, page_of(path))
 
 
 def _inside(path: Path) -> tuple[str | None, str | None]:

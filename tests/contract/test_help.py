@@ -77,7 +77,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "sensors": {"--json": "JSON"},
     "verify": {"--report": "JSON.*next to", "--json": "JSON"},
     "report": {
-        "--output": r"page.*\.html",
+        "--output": r"page.*OUTPUT\.html",
         "--report": "JSON.*next to",
         "--overwrite": "existing",
     },

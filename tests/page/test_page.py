@@ -95,8 +95,8 @@ def test_convert_writes_the_page_with_its_command(shell: Shell) -> None:
     assert "--html page.html" in page
     assert Path("page.html").stat().st_size < 1_000_000
     again = shell("report scans.mcap.report.json")
-    assert again.out == "wrote scans.mcap.report.html\n"
-    assert Path("scans.mcap.report.html").read_bytes() == Path("page.html").read_bytes()
+    assert again.out == "wrote scans.mcap.html\n"
+    assert Path("scans.mcap.html").read_bytes() == Path("page.html").read_bytes()
 
 
 def test_a_dry_run_has_a_page_without_scans(shell: Shell) -> None:
@@ -115,14 +115,25 @@ def test_a_report_alone_makes_a_page_that_says_what_it_lacks(shell: Shell) -> No
     assert plot_data(Path("run.html"))["windows"] is None
 
 
+@pytest.mark.parametrize("words", ["report scans", "report scans/report.json"])
+def test_the_page_of_a_folder_is_next_to_it(words: str, shell: Shell) -> None:
+    """Otherwise the folder could not be overwritten, since it has another file."""
+    assert shell(f"convert {FIX} -o scans --quiet").code == 0
+    outcome = shell(words)
+    assert outcome.code == 0
+    assert Path("scans.html").is_file()
+    assert plot_data(Path("scans.html"))["clouds"]
+    assert shell(f"convert {FIX} -o scans --quiet --overwrite").code == 0
+
+
 def test_an_mcap_file_alone_contains_its_report_and_table(shell: Shell) -> None:
     assert shell(f"convert {FIX} -o scans.mcap --quiet").code == 0
     Path("scans.mcap").rename("moved.mcap")
-    assert shell("report moved.mcap").out == "wrote moved.mcap.report.html\n"
-    data = plot_data(Path("moved.mcap.report.html"))
+    assert shell("report moved.mcap").out == "wrote moved.mcap.html\n"
+    data = plot_data(Path("moved.mcap.html"))
     assert len(unpacked(data["windows"]["step"])) == 7
     assert len(data["clouds"]) == 2
-    page = Path("moved.mcap.report.html").read_text(encoding="utf-8")
+    page = Path("moved.mcap.html").read_text(encoding="utf-8")
     assert "The report has no command line" in page
 
 
@@ -175,7 +186,7 @@ def test_hostile_names_are_text(shell: Shell) -> None:
     cells = [cell.replace('"x', "").replace('"', "") for cell in head.split(",")]
     line = ",".join('"' + cell.replace('"', '""') + '"' for cell in cells)
     Path("scans.csv").write_text(f"{line}\n{rest}", encoding="utf-8")
-    assert shell("report report.json").code == 0
+    assert shell("report report.json -o report.html").code == 0
     page = Path("report.html").read_text(encoding="utf-8")
     assert page.count("<script") == 2
     assert page.count("</script") == 2
@@ -235,14 +246,17 @@ def test_mistakes_are_one_line(arguments: str, message: str, shell: Shell) -> No
     [
         ("scans/page.html", "expected a page outside the output"),
         ("none/page.html", "expected a page in an existing folder"),
-        ("run.json", "expected a page apart from the report"),
+        ("run.json", "expected a page apart from the output, its table and report"),
+        ("s.mcap.scans.csv", "expected a page apart from the output, its table and report"),
+        ("s.mcap", "expected a page outside the output"),
     ],
 )
 def test_convert_refuses_a_wrong_page_before_it_runs(page: str, message: str, shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o scans --html {page} --report run.json")
+    output = "scans" if "/" in page else "s.mcap"
+    outcome = shell(f"convert {FIX} -o {output} --html {page} --report run.json")
     assert outcome.code == 1
     assert message in outcome.err
-    assert not Path("scans").exists()
+    assert list(Path().iterdir()) == []
 
 
 def test_segments_have_numbered_pages(shell: Shell) -> None:
