@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
 from mlbatch.verify import npz, ply
-from mlbatch.verify.containers import Message, library_errors
+from mlbatch.verify.containers import BoundedFile, Message, library_errors
 from mlbatch.verify.encoding import MessageCursor
 from mlbatch.verify.folders import entries, scan_files
 from mlbatch.verify.messages import CLOUD, read_cloud, stored_scan
@@ -165,8 +165,10 @@ def _mcap_messages(file: Path, places: list[Place], topics: list[str]) -> Iterat
     from mcap.records import Message as Record
     from mcap.stream_reader import breakup_chunk
 
+    from mlbatch.verify.mcap_file import unpacked
+
     starts = {place.start_ns for place in places}
-    with library_errors("an MCAP file with an index"), file.open("rb") as stream:
+    with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:
         summary = make_reader(stream).get_summary()
         if summary is None:
             raise DamageError("a summary", "none")
@@ -175,7 +177,10 @@ def _mcap_messages(file: Path, places: list[Place], topics: list[str]) -> Iterat
             if not any(first_ns <= start <= index.message_end_time for start in starts):
                 continue
             stream.seek(index.chunk_start_offset + _RECORD_HEAD_BYTES)
-            for record in breakup_chunk(Chunk.read(ReadDataStream(stream))):
+            chunk = Chunk.read(ReadDataStream(stream))
+            # The library unpacks to any size.
+            data = unpacked(chunk.compression, chunk.data, chunk.uncompressed_size)
+            for record in breakup_chunk(replace(chunk, compression="", data=data)):
                 if not isinstance(record, Record) or record.log_time not in starts:
                     continue
                 channel = summary.channels[record.channel_id]

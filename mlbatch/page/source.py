@@ -114,13 +114,13 @@ def _inside(path: Path) -> tuple[str | None, str | None]:
         return None, None
     from mcap.reader import make_reader
 
-    from mlbatch.verify.containers import library_errors
+    from mlbatch.verify.containers import BoundedFile, library_errors
     from mlbatch.verify.verdict import DamageError
 
     report = None
     table = None
     try:
-        with library_errors("an MCAP file with an index"), file.open("rb") as stream:
+        with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:
             reader = make_reader(stream)
             for metadata in reader.iter_metadata():
                 if metadata.name == "mlbatch.report":

@@ -16,6 +16,8 @@ from mlbatch.units import NS_PER_MS
 # Values (windows x sensors) of a page; longer runs are summarised, several windows a value.
 MOST_CELLS = 160_000
 _LARGEST = 2**62
+# Share of an estimated number of columns that is no loss: rotors vary.
+_NEARLY = 0.99
 # No delay of a network.
 _FAR_MS = 60_000.0
 
@@ -146,19 +148,20 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
         columns=columns,
         expected=expected,
         estimated=estimated,
-        fill=_fill(columns, expected, _shares(cells, "fill", names, rows)),
+        fill=_fill(columns, expected, estimated, _shares(cells, "fill", names, rows)),
         gap_ms=gap_ms,
         coverage=_shares(cells, "coverage", names, rows),
         overlap=_shares(cells, "overlap", names, rows),
     )
 
 
-def _fill(columns: I64Array, expected: I64Array, known: F64Array) -> F64Array:
+def _fill(columns: I64Array, expected: I64Array, estimated: BoolArray, known: F64Array) -> F64Array:
     """The fill in the table; where it has none, by the expected columns."""
     with np.errstate(divide="ignore", invalid="ignore"):
         share: F64Array = columns / expected
     # Where the grid cuts between two columns, a whole window has one less.
     is_whole = (expected == 0) | ((columns > 0) & (expected - columns <= 1))
+    is_whole |= estimated & (share >= _NEARLY)
     own = np.where(is_whole, 1.0, share)
     return np.clip(np.where(np.isfinite(known), known, own), 0.0, 1.0)
 

@@ -39,6 +39,8 @@ def test_unknown_expectations_are_the_median_of_windows_with_columns() -> None:
     assert found.estimated.all()
     assert found.fill[0, 1] == 0.0
     assert found.fill[2, 0] == 0.5
+    # 500 of 505 columns: the pace of a rotor varies by as much.
+    assert found.fill[1, 1] == 1.0
 
 
 def test_windows_have_gap_delay_and_span() -> None:
