@@ -35,14 +35,18 @@ def read_table(text: str, where: str) -> Rows:
         )
     rows: Rows = np.zeros(len(lines) - 1, [(name, _type_of(name)) for name in head])
     for number, line in enumerate(lines[1:]):
-        try:
-            rows[number] = tuple(map(_value, head, line, strict=True))
-        except (KeyError, ValueError) as err:
-            raise RecordingError(
-                f"{where} line {number + 2}: expected {len(head)} values of a scan, found "
-                f"{','.join(line)[:80]!r}; restore it, or convert again"
-            ) from err
+        rows[number] = _row(head, line, f"{where} line {number + 2}")
     return rows
+
+
+def _row(head: list[str], line: list[str], where: str) -> tuple[bool | float | int, ...]:
+    try:
+        return tuple(_value(name, cell) for name, cell in zip(head, line, strict=True))
+    except (KeyError, ValueError) as err:
+        raise RecordingError(
+            f"{where}: expected {len(head)} values of a scan, found {','.join(line)[:80]!r}; "
+            "restore it, or convert again"
+        ) from err
 
 
 def _type_of(name: str) -> str:
