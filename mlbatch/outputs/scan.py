@@ -206,7 +206,7 @@ class Scan:
         rotation = poses[:, :3, :3][own]
         offset = self.xyz - poses[:, :3, 3][own]
         # The inverse of a rotation is its transpose.
-        moved = np.einsum("...ji,...j->...i", rotation, offset)
+        moved: F64Array = np.einsum("...ji,...j->...i", rotation, offset)
         return moved.astype(np.float32)
 
     # -- other forms --------------------------------------------------------------------------
@@ -228,7 +228,7 @@ class Scan:
         if layout == "autoware":
             self._require_poses(f"layout {layout}")
         points = points_of(self._record())
-        records = np.zeros(points.time_ns.shape or (0,), chosen.dtype)
+        records: Records = np.zeros(points.time_ns.shape or (0,), chosen.dtype)
         chosen.pack(points, records)
         return records.T
 
@@ -269,6 +269,10 @@ class Scan:
     def _record(self) -> types.Scan:
         """The same arrays as conversions pass them to writers."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "absent"}
+        for name in self.absent & set(_POINT_ARRAYS):
+            if values[name] is not None:
+                # Not used by the layout, but of the shape of all others.
+                values[name] = np.zeros(self.xyz.shape[:-1], values[name].dtype)
         return types.Scan(points=self.point_count, **values)
 
     # -- checks -------------------------------------------------------------------------------

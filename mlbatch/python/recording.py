@@ -317,9 +317,8 @@ class Recording:
 
 def scans_of(job: Job) -> Iterator[Scan]:
     """Yield the scans of a job, each with arrays of its own."""
-    with contextlib.closing(Conversion(job).scans()) as scans:
-        for scan, _ in scans:
-            yield Scan.copied(scan)
+    for scan, _ in Conversion(job).scans():
+        yield Scan.copied(scan)
 
 
 def _last_of(job: Job) -> Scan | None:

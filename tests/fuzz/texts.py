@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from mlbatch import sensors
+from mlbatch.cli import options
 from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
