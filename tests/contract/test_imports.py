@@ -21,7 +21,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("report", "rig", "clocks"),
     ("lidar", "frames", "ros"),
     ("types", "native"),
-    ("arrays", "units"),
+    ("arrays", "units", "entry_points"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", ""),
 )
