@@ -230,7 +230,8 @@ class Scan:
         points = points_of(self._record())
         records: Records = np.zeros(points.time_ns.shape or (0,), chosen.dtype)
         chosen.pack(points, records)
-        return records.T
+        in_shape: Records = records.T
+        return in_shape
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame with a row for each point; UsageError without pandas.

@@ -233,6 +233,6 @@ def test_mcap_of_others(tmp_path: Path) -> None:
     with (tmp_path / "other.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(RecordingError, match=r"expected an MCAP file of mlbatch"):
         list(mlbatch.read(tmp_path / "other.mcap"))

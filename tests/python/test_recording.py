@@ -105,8 +105,18 @@ def test_one_name_of_a_sensor() -> None:
 
 
 def test_scans_are_those_of_the_command_line(rec: Recording, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mlbatch", "convert", CAPTURE, "--rig", RIG, "--rate", "20"]
-    subprocess.run([*command, "-o", tmp_path / "scans", "--quiet"], check=True)
+    command = [
+        sys.executable,
+        "-m",
+        "mlbatch",
+        "convert",
+        str(CAPTURE),
+        "--rig",
+        str(RIG),
+        "--rate",
+        "20",
+    ]
+    subprocess.run([*command, "-o", str(tmp_path / "scans"), "--quiet"], check=True)
     files = sorted((tmp_path / "scans").glob("*.npz"))
     for file, scan in zip(files, rec.scans(20), strict=True):
         with np.load(file) as stored:

@@ -19,8 +19,18 @@ RIG = FIXTURE / "rig.yaml"
 
 
 def test_the_output_is_that_of_the_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mlbatch", "convert", CAPTURE, "--rig", RIG, "--rate", "20"]
-    subprocess.run([*command, "-o", tmp_path / "a.mcap", "--quiet"], check=True)
+    command = [
+        sys.executable,
+        "-m",
+        "mlbatch",
+        "convert",
+        str(CAPTURE),
+        "--rig",
+        str(RIG),
+        "--rate",
+        "20",
+    ]
+    subprocess.run([*command, "-o", str(tmp_path / "a.mcap"), "--quiet"], check=True)
     rec = mlbatch.open(CAPTURE, rig=RIG)
     run = mlbatch.convert(rec, str(tmp_path / "b.mcap"), rate=20)
     assert run.path == tmp_path / "b.mcap"
