@@ -11,6 +11,7 @@ import numpy.typing as npt
 U8Array: TypeAlias = npt.NDArray[np.uint8]
 U16Array: TypeAlias = npt.NDArray[np.uint16]
 U32Array: TypeAlias = npt.NDArray[np.uint32]
+U64Array: TypeAlias = npt.NDArray[np.uint64]
 I32Array: TypeAlias = npt.NDArray[np.int32]
 I64Array: TypeAlias = npt.NDArray[np.int64]
 F32Array: TypeAlias = npt.NDArray[np.float32]

@@ -2,9 +2,10 @@
 
     python -m tests.resume_storm --count 200 --seed 1
 
-Every conversion is a forked process that is killed by SIGKILL, after a random time or at a random
-call that touches a file (write, flush, rename ...). It is resumed, perhaps killed again, and left
-to end. All files must be those of an uninterrupted run, but the report's timings.
+Every conversion is a forked process that gets a signal (KILL, INT, TERM or HUP), after a random
+time or at a random call that touches a file (write, flush, fsync, rename ...). It is resumed,
+perhaps killed again, and left to end. All files must be those of an uninterrupted run, but the
+report's timings, and no others may be left. Signals other than KILL have to end a run in order.
 """
 
 from __future__ import annotations
@@ -38,10 +39,19 @@ from tests.builders.sessions_of_bags import write_mcap
 TURN_NS = 100 * NS_PER_MS
 SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)
 TWO = ("--identity-extrinsics", "--keep-partial")
-PACKED = ("--compression", "zstd:1", "--jobs", "2")
+ZSTD = ("--compression", "zstd:1")
 TOUCHES = frozenset(
-    {"write", "writev", "flush", "truncate", "rename", "replace", "unlink", "mkdir", "rmdir"}
+    {
+        *("write", "writev", "flush", "truncate", "fsync"),
+        *("rename", "replace", "unlink", "mkdir", "rmdir"),
+    }
 )
+SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Exit codes of a child whose command raised something else than an exit.
+RAISED = 99
+# Of one that was interrupted before or after its command.
+OUTSIDE = 98
+INTERRUPTED = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,24 +63,24 @@ class Case:
     options: tuple[str, ...] = ()
 
 
-CASES = {
+_ONE_JOB = {
     "mcap": Case("session/drive.pcap", "out.mcap", TWO),
     "mcap slices": Case("session/drive.pcap", "out.mcap", (*TWO, "--slices", "4")),
     "mcap split": Case("session/drive.pcap", "out.mcap", (*TWO, "--split")),
     "mcap organized": Case("session/drive.pcap", "out.mcap", (*TWO, "--layout", "organized")),
     "mcap passed": Case("bag/drive.mcap", "out.mcap", (*TWO, "--pass", "/chatter")),
+    "mcap zstd": Case("session/drive.pcap", "out.mcap", (*TWO, *ZSTD, "--slices", "2")),
     "rosbag1": Case("session/drive.pcap", "out.bag", (*TWO, "--slices", "3")),
     "rosbag2": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", "--pass", "/chatter")),
+    "rosbag2 zstd": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", *ZSTD)),
     "npz": Case("session/drive.pcap", "out", TWO),
     "npz split": Case("session/drive.pcap", "out", (*TWO, "--split", "--slices", "2")),
     "ply": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--min-range", "4.1")),
-    "mcap jobs": Case("session/drive.pcap", "out.mcap", (*TWO, "--jobs", "2")),
-    "mcap zstd": Case("session/drive.pcap", "out.mcap", (*TWO, *PACKED, "--slices", "2")),
-    "rosbag1 jobs": Case("session/drive.pcap", "out.bag", (*TWO, "--jobs", "3")),
-    "rosbag2 zstd": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", *PACKED)),
-    "npz jobs": Case("session/drive.pcap", "out", (*TWO, "--jobs", "2", "--split")),
-    "ply jobs": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--jobs", "2")),
     "jumps": Case("jumps/drive.pcap", "out.mcap", ("--on-jump", "split", "--keep-partial")),
+}
+CASES = _ONE_JOB | {
+    f"{name} jobs": replace(case, options=(*case.options, "--jobs", "3"))
+    for name, case in _ONE_JOB.items()
 }
 
 
@@ -138,10 +148,11 @@ class End:
 
     after_s: float | None = None
     at_call: int | None = None
+    signal: signal.Signals = signal.SIGKILL
 
 
 def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
-    """Convert in a process of its own; gives its exit code, -9 when it was killed.
+    """Convert in a process of its own; gives its exit code, negative when a signal ended it.
 
     With `at_call` 0 all calls are counted: the number is left in the file `calls`.
     """
@@ -150,7 +161,7 @@ def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
         _convert(folder, words, end, interval_s)
     timer = None
     if end.after_s is not None:
-        timer = threading.Timer(end.after_s, _kill, (child,))
+        timer = threading.Timer(end.after_s, _kill, (child, end.signal))
         timer.start()
     _, status = os.waitpid(child, 0)
     if timer is not None:
@@ -159,10 +170,10 @@ def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
     return os.waitstatus_to_exitcode(status)
 
 
-def _kill(child: int) -> None:
+def _kill(child: int, number: signal.Signals) -> None:
     # It may have ended by itself.
     with contextlib.suppress(ProcessLookupError):
-        os.kill(child, signal.SIGKILL)
+        os.kill(child, number)
 
 
 def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoReturn:
@@ -174,13 +185,16 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
     sys.argv = ["mlbatch", *words]
     calls = 0
     begun = False
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
     def count(frame: FrameType, event: str, call: Any) -> None:
         nonlocal calls
         if begun and event == "c_call" and call.__name__ in TOUCHES:
             calls += 1
             if calls == end.at_call:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), end.signal)
 
     begin = resume.ResumeLog.begin
 
@@ -195,8 +209,9 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
         threading.setprofile(count)
         # What comes before, random times strike.
         setattr(resume.ResumeLog, "begin", begin_and_count)  # noqa: B010 - no type allows it
-    code = 99
+    code = OUTSIDE
     try:
+        code = RAISED
         mlbatch()
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0
@@ -231,7 +246,8 @@ class Storm:
         self._folder = folder
         self._chance = random.Random(seed)
         self._again = again
-        self.kills = self.resumed = 0
+        self.kills = dict.fromkeys(SIGNALS, 0)
+        self.resumed = 0
         write_recordings(folder / "in", turns)
         self._whole: dict[str, tuple[dict[str, object], int, float]] = {}
 
@@ -240,10 +256,12 @@ class Storm:
         whole, calls, wall_s = self._whole.get(name) or self._measure(name)
         place = self._folder / "work"
         place.mkdir()
-        self._kill(place, name, calls, wall_s)
-        for _ in range(self._chance.randint(0, self._again)):
-            self._kill(place, name, calls, wall_s)
-            self._tear(place)
+        for number in range(1 + self._chance.randint(0, self._again)):
+            fault = self._kill(place, name, calls, wall_s)
+            if fault:
+                return fault
+            if number:
+                self._tear(place)
         code = run(place, [*self._words(name), "--resume"], End(), 0.0)
         said = (place / "said").read_text()
         self.resumed += "resumed after" in said
@@ -273,17 +291,29 @@ class Storm:
         self._whole[name] = whole, calls, wall_s
         return self._whole[name]
 
-    def _kill(self, place: Path, name: str, calls: int, wall_s: float) -> None:
+    def _kill(self, place: Path, name: str, calls: int, wall_s: float) -> str:
+        """A run that gets a signal; gives what is wrong with how it ends."""
         words = [*self._words(name), "--resume"]
+        number = self._chance.choice(SIGNALS)
         chance = self._chance.random()
         if self._chance.random() < 0.5:
-            end = End(after_s=(0.1 + chance) * wall_s)
+            end = End(after_s=(0.1 + chance) * wall_s, signal=number)
         else:
             # The last calls complete the output and are fewer than those before.
             late = self._chance.random() < 0.3
-            end = End(at_call=max(1, calls - int(40 * chance) if late else int(calls * chance)))
+            at_call = max(1, calls - int(40 * chance) if late else int(calls * chance))
+            end = End(at_call=at_call, signal=number)
+        before = (place / "said").stat().st_size if (place / "said").exists() else 0
         code = run(place, words, end, self._chance.choice((0.0, 0.0, 0.02)))
-        self.kills += code == -signal.SIGKILL
+        said = (place / "said").read_text()[before:]
+        ended = {-number, INTERRUPTED} - ({INTERRUPTED} if number == signal.SIGKILL else set())
+        self.kills[number] += code in ended
+        in_order = code != INTERRUPTED or said.rstrip("\n").splitlines()[-1].startswith(
+            "mlbatch: error: interrupted"
+        )
+        if code not in ended | {0, OUTSIDE} or not in_order or "Traceback" in said:
+            return f"{name}: {number.name} with {end}: exit code {code}: {said}"
+        return ""
 
     def _tear(self, place: Path) -> None:
         """Cut off the end of a state file, as if its last line had not been written whole."""
@@ -317,21 +347,19 @@ def main() -> None:
     parser.add_argument("--again", type=int, default=2, help="most further kills of an output")
     given = parser.parse_args()
     outputs = 0
-    wrong = list[str]()
+    fault = ""
     names = list(CASES)
     with storm(given.seed, given.turns, given.again) as one:
-        while one.kills < given.count and len(wrong) < 5:
+        while sum(one.kills.values()) < given.count and not fault:
             fault = one.strike(names[outputs % len(names)])
             outputs += 1
-            if fault:
-                wrong.append(fault)
-                print(fault, flush=True)
-                break
+        kills = ", ".join(f"{count} {number.name}" for number, count in one.kills.items())
         print(
-            f"{one.kills} kills, {outputs} outputs, {one.resumed} of them resumed after scans, "
-            f"{len(wrong)} not as in one piece"
+            f"{sum(one.kills.values())} kills, {outputs} outputs, {one.resumed} of them resumed "
+            f"after scans, {int(bool(fault))} not as in one piece ({kills})"
         )
-    sys.exit(bool(wrong))
+        print(fault, end="")
+    sys.exit(bool(fault))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ _BETWEEN_COLLECTIONS = 100_000
 
 EXIT_ERROR = 1
 EXIT_USAGE = 2
+EXIT_LIMIT = 3
 EXIT_INTERRUPTED = 130
 
 
@@ -26,9 +27,9 @@ def main() -> None:
     """Run the command line; exit codes: docs/commands.md."""
     gc.set_threshold(_BETWEEN_COLLECTIONS)
     atexit.register(gc.freeze)
-    from mlbatch.cli.app import command_line
-
     try:
+        from mlbatch.cli.app import command_line
+
         code = command_line(*sys.argv[1:2])(standalone_mode=False)
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt

@@ -30,6 +30,10 @@ def convert(
     layout: Annotated[
         str, typer.Option(help="dense: valid points only; organized: slots x columns.")
     ] = "dense",
+    sort: Annotated[
+        str,
+        typer.Option(help="Order of a scan's points: columns (time of their columns) or points."),
+    ] = "columns",
     point_layout: Annotated[
         str, typer.Option(help="Fields of a PointCloud2 point (preset).")
     ] = "standard",
@@ -99,7 +103,10 @@ def convert(
         list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="Leave out this sensor (name, serial number, topic or IP:PORT); repeatable."
+        ),
     ] = None,
     pass_: Annotated[
         list[str] | None,
@@ -129,11 +136,21 @@ def convert(
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
     ] = False,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Exit with 3 beyond limits, as loss>0.1%,underfilled>0; repeatable.",
+            metavar="LIMITS",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing output.")
     ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run to the same OUTPUT.")
+    ] = False,
+    no_fsync: Annotated[
+        bool, typer.Option("--no-fsync", help="Do not wait until the output is on the disk.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary, no progress.")] = False,
     verbose: Annotated[
@@ -144,7 +161,8 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.pipeline.job import Job
+    from mlbatch.pipeline.job import Job, check_sort
+    from mlbatch.report.limits import parse_limits
 
     options.choices(
         layout=(layout, ("dense", "organized")),
@@ -172,6 +190,7 @@ def convert(
         rate=None if rate is None else options.rate(rate),
         slices=slices,
         layout=layout,
+        sort=check_sort("--sort", sort, layout),
         split=split,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
@@ -202,8 +221,10 @@ def convert(
             report=None if options.is_stdout(report) else report,
             prints_report=options.is_stdout(report),
             split_jumps=on_jump == "split",
+            limits=parse_limits(fail_on or ()),
             overwrite=overwrite,
             resume=options.resume(resume, dry_run=dry_run),
+            fsync=not no_fsync,
             quiet=quiet,
             verbose=verbose,
         ),

@@ -5,7 +5,9 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
+import _thread
 import contextlib
+import json
 import signal
 import sys
 import threading
@@ -16,6 +18,7 @@ from types import FrameType
 
 import typer
 
+from mlbatch.cli import EXIT_LIMIT
 from mlbatch.errors import (
     ClockJump,
     ExportError,
@@ -30,7 +33,8 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.report.report import RunReport, report_text, summary_lines
+from mlbatch.report.limits import Limit, exceeded
+from mlbatch.report.report import RunReport, build_report, report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -41,8 +45,12 @@ from mlbatch.writers import (
     extras,
     open_writer,
     report_paths,
+    sync_entries,
     write_text,
 )
+
+# An interrupt that got lost is raised again after this time.
+_REPEAT_S = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,8 +65,10 @@ class Target:
     report: Path | None
     prints_report: bool  # to standard output, without a summary
     split_jumps: bool
+    limits: tuple[Limit, ...]  # of `--fail-on`
     overwrite: bool
     resume: bool
+    fsync: bool
     quiet: bool
     verbose: bool
 
@@ -69,12 +79,16 @@ class Target:
 
 
 def run(job: Job, target: Target) -> None:
-    """Convert, write the report, print the summary; with `--on-jump split` each segment."""
+    """Convert, write the report, print the summary; with `--on-jump split` each segment.
+
+    Raises typer.Exit with code 3 after outputs that exceed limits of `--fail-on`.
+    """
     with _terminated_as_interrupt():
-        if target.split_jumps:
-            _run_segments(job, target)
-        else:
-            _run_one(job, target)
+        beyond = _run_segments(job, target) if target.split_jumps else _run_one(job, target)
+    for line in beyond:
+        _say(f"limit exceeded: {line}")
+    if beyond:
+        raise typer.Exit(EXIT_LIMIT)
 
 
 def _say(text: str) -> None:
@@ -85,11 +99,16 @@ def _say(text: str) -> None:
 # -- one output -------------------------------------------------------------------------------
 
 
-def _run_one(job: Job, target: Target) -> None:
+def _run_one(job: Job, target: Target) -> list[str]:
+    """Make one output; returns what exceeds limits of `--fail-on`, a line each."""
     # A dry run without an output decodes what a .mcap of this point layout would contain.
     name = choose_format(target.output or Path("scans.mcap"), target.format)
     options = WriterOptions(
-        target.point_layout, target.overwrite, job.split, compression=target.compression
+        target.point_layout,
+        target.overwrite,
+        job.split,
+        compression=target.compression,
+        fsync=target.fsync,
     )
     check_compression(name, options)
     job = replace(job, extras=extras(name, options))
@@ -100,7 +119,7 @@ def _run_one(job: Job, target: Target) -> None:
         output = target.written
         preflight.check_output(job, output, name)
         if target.resume and _is_complete(output, overwrite=target.overwrite):
-            return
+            return _beyond_limits_before(target, name)
         resume_log = _resume_log(job, output, name, options, resumes=target.resume)
         options = replace(options, kept_bytes=resume_log.kept_bytes)
         if options.kept_bytes is None:
@@ -118,12 +137,17 @@ def _run_one(job: Job, target: Target) -> None:
         _say(f"warning: {note.code}: {note.message}")
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
-    elif target.prints_report or (target.dry_run and report_path is None):
+    if target.prints_report or (target.dry_run and report_path is None):
         # One line a segment: several JSON documents in a row are no document.
         typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
-        return
-    if target.quiet:
-        return
+    elif not target.quiet:
+        _print_summary(conversion, inputs, target, report_path)
+    return exceeded(target.limits, build_report(inputs))
+
+
+def _print_summary(
+    conversion: Conversion, inputs: RunReport, target: Target, report_path: Path | None
+) -> None:
     if target.verbose:
         _print_sensors(conversion)
     for line in summary_lines(inputs):
@@ -131,6 +155,20 @@ def _run_one(job: Job, target: Target) -> None:
             typer.echo(one_line(line))
     if target.written is not None:
         typer.echo(f"wrote {target.written}, report {report_path}")
+
+
+def _beyond_limits_before(target: Target, name: str) -> list[str]:
+    """What exceeds limits in the output that an earlier run completed; name: of the format."""
+    if not target.limits or target.output is None:
+        return []
+    path = target.report or report_paths(target.output, name).report
+    try:
+        return exceeded(target.limits, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as err:
+        raise ExportError(
+            f"{path}: expected the report of the complete output for --fail-on, found "
+            f"{getattr(err, 'strerror', None) or 'no JSON'!r}; give its path by --report"
+        ) from err
 
 
 def _converted(
@@ -146,12 +184,12 @@ def _converted(
     except (ExportError, RecordingError) as err:
         # A subclass has another cause than the disk.
         is_disk = isinstance(err.__cause__, OSError) and type(err) in (ExportError, RecordingError)
-        if resume_log is None or not resume_log.recorded or not is_disk:
+        if resume_log is None or not resume_log.is_resumable or not is_disk:
             raise
         advice = f"then --resume continues after the {resume_log.recorded} scans that are safe"
         raise type(err)(f"{err}; {advice}") from err
     except KeyboardInterrupt as err:
-        if resume_log is None or not resume_log.recorded:
+        if resume_log is None or not resume_log.is_resumable:
             raise
         raise Interrupted(
             "interrupted; finished scans are kept in .partial, from where --resume continues"
@@ -165,7 +203,10 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
         if report_path is None or target.output is None:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
-        write_text(partial / report_path.name if is_inside else report_path, report_text(inputs))
+        path = partial / report_path.name if is_inside else report_path
+        write_text(path, report_text(inputs), target.fsync)
+        if target.fsync and path.parent.absolute() != target.output.parent.absolute():
+            sync_entries(path.parent)
 
     return write
 
@@ -203,8 +244,12 @@ def _why_not_native() -> str:
 # -- segments between clock steps -------------------------------------------------------------
 
 
-def _run_segments(job: Job, target: Target) -> None:
-    """Convert each segment between clock steps; a step is found when a segment reaches it."""
+def _run_segments(job: Job, target: Target) -> list[str]:
+    """Convert each segment between clock steps; a step is found when a segment reaches it.
+
+    Returns what exceeds limits of `--fail-on`, a line each.
+    """
+    beyond = []
     if job.faults:
         # Times of faults count from the start of the session, in all segments.
         job = replace(job, fault_begin_ns=Conversion(job).session.begin_ns)
@@ -220,7 +265,8 @@ def _run_segments(job: Job, target: Target) -> None:
             if target.resume:
                 # The end of the segment is needed first: complete segments are not made again.
                 _refuse_jump(one)
-            _run_one(one, own_target)
+            label = "" if is_whole else f"segment {number}: "
+            beyond += [f"{label}{line}" for line in _run_one(one, own_target)]
             outputs += 1
         except ClockJump as jump:
             if jump.host_ns <= (segment.begin_ns or 0):
@@ -244,6 +290,7 @@ def _run_segments(job: Job, target: Target) -> None:
             f"expected a whole window between two clock steps, found none in {number} segments; "
             "write partial ones with --keep-partial"
         )
+    return beyond
 
 
 def _refuse_jump(job: Job) -> None:
@@ -273,7 +320,7 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM as an interrupt from the keyboard."""
+    """Treat SIGTERM and SIGHUP (the terminal was closed) as an interrupt from the keyboard."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -281,11 +328,44 @@ def _terminated_as_interrupt() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    # One that is ignored remains so: nohup is to outlive its terminal.
+    caught = {number: one for number, one in before.items() if one is not signal.SIG_IGN}
+    try:
+        for number in caught:
+            signal.signal(number, interrupt)
+        with _interrupts_repeated():
+            yield
+    finally:
+        for number, one in caught.items():
+            signal.signal(number, one)
+
+
+@contextlib.contextmanager
+def _interrupts_repeated() -> Iterator[None]:
+    """Repeat an interrupt that was raised where Python ignores exceptions.
+
+    It is raised between any two instructions of the first thread, also in a finalizer or the
+    callback of a weak reference, which would end with a traceback while the run continues.
+    """
+    before = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def repeat(ignored: sys.UnraisableHookArgs) -> None:
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            # Later: here it would be ignored again.
+            timers.append(threading.Timer(_REPEAT_S, _thread.interrupt_main))
+            timers[-1].start()
+        else:
+            before(ignored)
+
+    sys.unraisablehook = repeat
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = before
+        for timer in timers:
+            timer.cancel()
 
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:
@@ -303,10 +383,13 @@ def _resume_log(
     job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
 ) -> ResumeLog:
     """Progress of an output: that of the interrupted run, or from the start."""
-    state = resume.find(output).state
+    earlier = resume.find(output)
+    state = earlier.state
+    if earlier.damage and resumes:
+        _say(earlier.damage)
     if state is not None and not resumes:
         _say(
-            f"warning: interrupted: {output}.partial with {len(state.rows)} finished scans is "
+            f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
             "discarded; --resume would continue after them"
         )
     log = ResumeLog(output, job, name, options, state if resumes else None)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import I64Array, U8Array
+from mlbatch.arrays import I64Array, U8Array, U64Array
 from mlbatch.lidar.interface import Records
 
 _FIRST_PACKETS = 64
+_WORD = 8  # bytes
 
 
 class PacketRing:
@@ -29,6 +30,10 @@ class PacketRing:
         self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
+        # Of all packets, and up to the packet in each slot; only where they are asked for.
+        self._has_sums = False
+        self._sum = np.uint64(0)
+        self._sums: U64Array = np.zeros(_FIRST_PACKETS, np.uint64)
         self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
 
     @property
@@ -68,8 +73,24 @@ class PacketRing:
             for begin in start.tolist():
                 target[at : at + size] = source[begin : begin + size]
                 at += stride
+        if count and self._has_sums:
+            sums = self._sums[slot % self._capacity :][:count]
+            np.cumsum(_sums(packets), out=sums)
+            sums += self._sum
+            self._sum = sums[-1]
         self._next = slot + count
         return packets, np.arange(slot, slot + count) * self._places
+
+    def keep_sums(self) -> None:
+        """Sum packets from now on, for `sum_until`."""
+        self._has_sums = True
+
+    def sum_until(self, ring_index: int) -> int:
+        """Return the sum of all packets since `keep_sums`, up to that of a column still needed.
+
+        See `_sums`. Only for the thread that stores packets.
+        """
+        return int(self._sums[ring_index // self._places % self._capacity])
 
     def gather(self, ring_index: I64Array, out: U8Array) -> None:
         """Copy the columns at `ring_index` (n,) to the rows of `out` (n, records.size)."""
@@ -143,8 +164,26 @@ class PacketRing:
         before = old[: capacity * stride].reshape(capacity, stride)
         after = new[: larger * stride].reshape(larger, stride)
         after[live % larger] = before[live % capacity]
+        sums = np.zeros(larger, np.uint64)
+        sums[live % larger] = self._sums[live % capacity]
+        self._sums = sums
         # Last, since other threads gather columns meanwhile.
         self._use(new, larger)
+
+
+def _sums(packets: U8Array) -> U64Array:
+    """Return the checksums of packets (n, size): sums of their 64-bit words, modulo 2^64.
+
+    They cost a hundredth of what CRC-32 of zlib costs. Every change of a single byte changes the
+    sum; words that change places do not.
+    """
+    size = packets.shape[1]
+    words = packets if size < _WORD else packets[:, : size // _WORD * _WORD].view(np.uint64)
+    sums: U64Array = words.sum(axis=1, dtype=np.uint64)
+    if size > _WORD and size % _WORD:
+        # The last word overlaps the one before.
+        sums += packets[:, size - _WORD :].view(np.uint64)[:, 0]
+    return sums
 
 
 def _copy_evenly(data: U8Array, start: I64Array, packets: U8Array) -> bool:

@@ -1,7 +1,7 @@
 """Plug-ins of other distributions: modules named by entry points of three groups.
 
 Source: packaging.python.org, "Entry points specification". They are looked up only where no
-built-in plug-in fits, since reading the metadata of all distributions takes 0.05 s.
+built-in plug-in fits: `importlib.metadata` takes up to 0.05 s to import and to read all of them.
 """
 
 from __future__ import annotations

@@ -109,5 +109,6 @@ def scan_of_cloud(place: CloudPlace, rows: Rows, complete: bool) -> Scan:
         max_gap_ns=row.max_gap_ns,
         coverage=row.coverage,
         overlap=row.overlap,
+        fill=np.array(row.fill, np.float32),
         absent=frozenset({*empty, *_COLUMN_ARRAYS, "ring_base"}),
     )

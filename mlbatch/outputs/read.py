@@ -138,6 +138,7 @@ def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
             int(grid["slices"]),
             grid["timescale"],
             int(grid["t_init_ns"]),
+            grid.get("sort", "columns"),
             RunFiles(str(path), report, table.decode("utf-8", "replace")),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as err:
@@ -243,6 +244,7 @@ def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterato
             scan.max_gap_ns = row.max_gap_ns
             scan.coverage = row.coverage
             scan.overlap = row.overlap
+            scan.fill = np.array(row.fill, np.float32)
             scan.ready_host_ns = row.ready_host_ns
         yield scan
 
@@ -269,7 +271,14 @@ def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
         slices = int(values["slices"])
         rate_hz = str(values["rate_hz"])
         about = RunOfOutput(
-            str(file.path), names, rate_hz, slices, str(values["timescale"]), None, run.files
+            str(file.path),
+            names,
+            rate_hz,
+            slices,
+            str(values["timescale"]),
+            None,
+            str(values.get("sort", "columns")),
+            run.files,
         )
         layout = "dense" if values["xyz"].ndim == 2 else "organized"
         info = run.shared(about, str(values["frame_id"]), layout)
@@ -295,6 +304,7 @@ def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
             column_lidar_id=columns,
             columns_per_sensor=tuple(np.bincount(columns, minlength=len(names)).tolist()),
             max_gap_ns=(),
+            fill=values.get("fill", np.zeros(0, np.float32)),
             absent=frozenset({"ring_base"}),
         )
     except (KeyError, TypeError, ValueError) as err:
@@ -334,6 +344,7 @@ def _ply_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
             slices,
             comments["timescale"],
             None,
+            comments.get("sort", "columns"),
             run.files,
         )
         info = run.shared(about, comments["frame_id"], "dense")

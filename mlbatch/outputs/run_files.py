@@ -18,6 +18,8 @@ from mlbatch.units import parse_rate
 from mlbatch.writers.atomic import REPORT_JSON, SCANS_CSV, side_path
 
 _SCHEMA = "mlbatch.report/1"
+# Of outputs of versions that had no other.
+_SORT = "columns"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,7 @@ class RunFiles:
                 int(grid["slices"]),
                 str(document["timescale"]),
                 grid["t_init_ns"],
+                str(grid.get("sort", _SORT)),
                 self,
             )
         except (KeyError, TypeError, ValueError, RecursionError) as err:
@@ -95,12 +98,15 @@ class RunOfOutput:
     slices: int
     timescale: str
     t_init_ns: int | None
+    sort: str
     files: RunFiles
 
     def info(self, frame_id: str, layout: str) -> RunInfo:
         """What all scans share."""
         sensors = self.files.sensors(self.sensors)
-        return RunInfo(sensors, frame_id, self.rate_hz, self.timescale, self.slices, layout)
+        return RunInfo(
+            sensors, frame_id, self.rate_hz, self.timescale, self.slices, layout, self.sort
+        )
 
     def places(self) -> Places:
         """Index and slice of scans by their start; RecordingError for an impossible grid."""
@@ -140,9 +146,11 @@ def row_of(table: TableOfRun | None, index: int, part: int, only: int | None) ->
     return ScanRow(
         row.complete,
         tuple(count if i == only else 0 for i, count in enumerate(row.columns)),
-        tuple(gap if i == only else 0 for i, gap in enumerate(row.max_gap_ns)),
+        # Of the window, as is fill: also of sensors that are not in this scan.
+        row.max_gap_ns,
         tuple(share if i == only else 0.0 for i, share in enumerate(row.coverage)),
         tuple(share if i == only else 0.0 for i, share in enumerate(row.overlap)),
+        row.fill,
         row.ready_host_ns,
     )
 

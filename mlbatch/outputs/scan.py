@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -85,9 +85,12 @@ class Scan:
     column_stamp_ns: I64Array  # (n,)
     column_lidar_id: U8Array  # (n,)
     columns_per_sensor: tuple[int, ...]
-    max_gap_ns: tuple[int, ...]  # by sensor, widest step between columns; 0: fewer than two
+    # By sensor: widest time without a column, from the last one before the window up to its end.
+    max_gap_ns: tuple[int, ...]
     coverage: tuple[float, ...] = ()  # by sensor, share of a revolution passed at least once
     overlap: tuple[float, ...] = ()  # by sensor, share of a revolution passed more than once
+    # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     absent: frozenset[str] = frozenset()
 
     @classmethod
@@ -125,6 +128,11 @@ class Scan:
     def slices(self) -> int:
         """Slices of a window."""
         return self.info.slices
+
+    @property
+    def sort(self) -> str:
+        """Order of the points of a dense scan: `columns` or `points`."""
+        return self.info.sort
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -182,6 +190,7 @@ class Scan:
             max_gap_ns=_only(self.max_gap_ns, number, 0),
             coverage=_only(self.coverage, number, 0.0),
             overlap=_only(self.overlap, number, 0.0),
+            fill=np.where(np.arange(len(self.fill)) == number, self.fill, np.float32("nan")),
         )
         found.xyz = self.xyz[mine]
         for name in _POINT_ARRAYS:
@@ -274,7 +283,7 @@ class Scan:
             if values[name] is not None:
                 # Not used by the layout, but of the shape of all others.
                 values[name] = np.zeros(self.xyz.shape[:-1], values[name].dtype)
-        return types.Scan(points=self.point_count, **values)
+        return types.Scan(points=self.point_count, points_per_sensor=(), **values)
 
     # -- checks -------------------------------------------------------------------------------
 

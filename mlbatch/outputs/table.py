@@ -72,6 +72,7 @@ class ScanRow:
     max_gap_ns: tuple[int, ...] = ()
     coverage: tuple[float, ...] = ()
     overlap: tuple[float, ...] = ()
+    fill: tuple[float, ...] = ()
     ready_host_ns: int = 0
 
 
@@ -99,6 +100,7 @@ class TableOfRun:
             max_gap_ns=tuple(self._of("max_gap_ns_", number)),
             coverage=tuple(self._of("coverage_", number)),
             overlap=tuple(self._of("overlap_", number)),
+            fill=tuple(self._of("fill_", number)),
             ready_host_ns=int(row["ready_host_ns"]),
         )
 

@@ -101,6 +101,7 @@ class Conversion:
             [sensor.intake() for sensor in self.sensors],
             Policy(job.max_wait_ns, job.keep_partial, job.start, job.end),
             self.session.clocks.guards,
+            [sensor.pace() for sensor in self.sensors],
         )
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.refuse_unknown(self.session.recordings)
@@ -136,6 +137,7 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes)
                 if self.batcher.past_end:
                     break
+        self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
 
@@ -183,17 +185,10 @@ class Conversion:
     def _is_too_incomplete(self, window: Window) -> bool:
         """True if --drop-incomplete leaves a window out; its columns are counted."""
         share = self.job.drop_incomplete / 100
-        if not share:
+        # No comparison with an unknown fill is true.
+        if not share or not bool((window.fill < share).any()):
             return False
         counts = np.bincount(window.sensor, minlength=len(self.sensors)).tolist()
-        seconds = (window.end_ns - window.start_ns) / NS_PER_S
-        for sensor, count in zip(self.sensors, counts, strict=True):
-            rate = sensor.columns_per_s
-            # Of a sensor of unknown rate at least one column is expected.
-            if count < (1 if rate is None else share * rate * seconds):
-                break
-        else:
-            return False
         for sensor, count in zip(self.sensors, counts, strict=True):
             sensor.ledger.columns.drop("incomplete", count)
         self.dropped_incomplete += 1
@@ -210,7 +205,8 @@ class Conversion:
         self._check_dates(shared)
         self._check_limits()
         self._check_passed()
-        info = self.session.run_info(rate_text(self.grid.rate), shared)
+        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        info = self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
         self.info = info
         self.table = ScanTable(info, [sensor.columns_per_s for sensor in self.sensors])
         boxes_m = self.session.boxes_m

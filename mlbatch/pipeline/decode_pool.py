@@ -9,16 +9,20 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Scan
+from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
 
 # Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
 # Gives a decoder of these sensors; with `--split` of one sensor, whose index is the second.
 NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
+# Columns at the end of a window that are searched first.
+_TAIL = 64
 
 
 @dataclass(slots=True)
@@ -117,6 +121,7 @@ class DecodePool:
 
         Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
+        self._rings = [source.ring for source in sources]
         self._split = split
         self._open: list[DecodeTask] = []
         self.workers = [
@@ -138,6 +143,9 @@ class DecodePool:
             window.end_ns,
             window.complete,
             window.ready_host_ns,
+            window.edge_gap_ns,
+            window.fill,
+            window.is_partial,
         )
         columns = WindowColumns(window.stamp_ns, window.sensor, window.ring_index, window.encoder)
         if not self._split:
@@ -162,6 +170,20 @@ class DecodePool:
         self._open.append(task)
         return task
 
+    def content(self, task: DecodeTask, before: int) -> int:
+        """Checksum of a task's timestamps, of all packets up to its last, and of `before`."""
+        columns = task.columns
+        content = crc32(np.ascontiguousarray(columns.stamp_ns).view(np.uint8).data, before)
+        for sensor, ring in enumerate(self._rings):
+            if task.only is None:
+                last = _last(columns.sensor, sensor)
+            else:
+                last = len(columns) - 1 if task.only == sensor else None
+            if last is not None:
+                total = ring.sum_until(int(columns.ring_index[last]))
+                content = crc32(total.to_bytes(8, "little"), content)
+        return content
+
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor that a task still needs; None: none."""
         self._open = [task for task in self._open if not task.is_decoded]
@@ -176,6 +198,16 @@ class DecodePool:
         for worker in self.workers:
             total.add(worker.points[sensor].counters)
         return total
+
+
+def _last(sensors: I64Array, sensor: int) -> int | None:
+    """Index of the last column of a sensor, None without one; sensors: (n,) of all columns."""
+    # Columns of the sensors alternate.
+    for count in (_TAIL, len(sensors)):
+        own = np.flatnonzero(sensors[-count:] == sensor)
+        if len(own):
+            return max(0, len(sensors) - count) + int(own[-1])
+    return None
 
 
 def _with_own_lidars(sources: Sequence[Source]) -> list[Source]:

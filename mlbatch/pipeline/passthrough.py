@@ -230,6 +230,14 @@ class MessageQueue:
         for recording in recordings:
             recording.keep = selected(recording.topics, self._patterns)
 
+    def is_asked(self, recordings: Iterable[Recording]) -> bool:
+        """True if the output can store messages of a topic that is to be forwarded."""
+        return any(
+            topic.encoding in self._encodings and selected([topic], self._patterns)
+            for recording in recordings
+            for topic in recording.topics
+        )
+
     def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
         """Raise UsageError for a pattern that matches no topic of the recordings."""
         names = [topic.name for recording in recordings for topic in recording.topics]

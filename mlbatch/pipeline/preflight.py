@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import state_path
+from mlbatch.pipeline.state_file import state_path
 from mlbatch.rig.rig import read_rig
 from mlbatch.writers import (
     check_free_space,

@@ -19,7 +19,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
-from mlbatch.report.report import RunReport, imbalances, report_text
+from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import RunInfo, Summary
 from mlbatch.writers import ScanWriter
 
@@ -81,7 +81,6 @@ class _Output:
         self._resume_log = resume_log
         self._idle: list[DecodeWorker] = []
         self._is_begun = False
-        self._scans = 0
 
     def make(self, progress: Progress | None) -> None:
         """Decode and write all scans."""
@@ -112,10 +111,7 @@ class _Output:
         if task is None and not before:
             return None
         self._begin()
-        is_kept = False
-        if task is not None:
-            is_kept = self._resume_log is not None and self._scans < self._resume_log.done
-            self._scans += 1
+        is_kept = self._resume_log is not None and self._resume_log.take(before, task)
         return ScanTask(
             self._run,
             task,
@@ -170,5 +166,6 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Ru
         if last is not None:
             last(inputs, partial)
 
-    writer.finish(Summary(run.batcher.t_init_ns, report, table), complete)
+    summary = Summary(run.batcher.t_init_ns, report, table, fill_totals(inputs))
+    writer.finish(summary, complete)
     return inputs

@@ -13,7 +13,7 @@ from typing import TypeAlias
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.native import ALIASES, ENGINES
-from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
+from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, check_sort, wait_ns
 from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.units import parse_rate
 
@@ -120,6 +120,7 @@ class ScanOptions:
     end: Moment | None = None
     slices: int = 1
     layout: str = "dense"
+    sort: str = "columns"
     split: bool = False
     keep_partial: bool = False
     drop_incomplete: float = 0.0
@@ -146,6 +147,7 @@ class ScanOptions:
             rate=None if self.rate is None else parse_rate(str(self.rate)),
             slices=check_slices("slices", self.slices),
             layout=self.layout,
+            sort=check_sort("sort", self.sort, self.layout),
             split=self.split,
             keep_partial=self.keep_partial,
             keep_repeated=self.keep_repeated,

@@ -32,6 +32,7 @@ from mlbatch.writers import (
     extras,
     open_writer,
     report_paths,
+    sync_entries,
     write_text,
 )
 
@@ -117,6 +118,7 @@ class OutputOptions:
     point_layout: str = "standard"
     compression: str = "none"
     overwrite: bool = False
+    fsync: bool = True  # wait until the output is on the disk
     report: Path | None = None
     jobs: int = 1
 
@@ -129,7 +131,11 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         )
     name = choose_format(output or Path("scans.mcap"), options.format)
     writer_options = WriterOptions(
-        options.point_layout, options.overwrite, job.split, compression=options.compression
+        options.point_layout,
+        options.overwrite,
+        job.split,
+        compression=options.compression,
+        fsync=options.fsync,
     )
     check_compression(name, writer_options)
     job = replace(job, extras=extras(name, writer_options), jobs=options.jobs)
@@ -155,7 +161,9 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
 
     def write_report(content: RunReport, partial: Path) -> None:
         path = partial / report_path.name if is_inside else report_path
-        write_text(path, report_text(content))
+        write_text(path, report_text(content), options.fsync)
+        if options.fsync and path.parent.absolute() != output.parent.absolute():
+            sync_entries(path.parent)
 
     _, content = convert(job, opener, None, log, write_report)
     return Run(output, Report(content), report_path)

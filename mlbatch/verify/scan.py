@@ -50,6 +50,10 @@ class StoredScan:
     column_stamp_ns: I64Array | None = None
     # (n,)
     column_lidar_id: U8Array | None = None
+    # (s,) by sensor of the run, or of the only sensor; NaN: unknown.
+    fill: F32Array | None = None
+    # Points by time instead of by column.
+    by_time: bool = False
 
     @property
     def point(self) -> str:

@@ -29,6 +29,7 @@ from mlbatch.writers.base import (
     WriterModule,
     WriterOptions,
 )
+from mlbatch.writers.durable import sync_entries, sync_to_disk
 from mlbatch.writers.formats import (
     built_in_names,
     format_module,
@@ -65,6 +66,8 @@ __all__ = [
     "partial_path",
     "plugin",
     "report_paths",
+    "sync_entries",
+    "sync_to_disk",
     "write_text",
 ]
 

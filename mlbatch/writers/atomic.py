@@ -1,8 +1,9 @@
 """Atomic outputs: complete under the final name, or not there at all.
 
 An output is written to `<OUTPUT>.partial` and renamed at the end. A killed run leaves its
-`.partial`; the next run to the same output continues it (`--resume`) or replaces it. This covers
-killed processes. It does not cover a power failure right after a run: nothing is synced to disk.
+`.partial`; the next run to the same output continues it (`--resume`) or replaces it. A power cut
+leaves the old or the new output: the data are forced to the disk before the output is renamed, and
+its name after that, unless `--no-fsync` is given.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.errors import ExportError
+from mlbatch.writers.durable import sync_entries, sync_to_disk
 from mlbatch.writers.formats import format_module, is_format
 
 PARTIAL_SUFFIX = ".partial"
@@ -59,21 +61,41 @@ class Output:
     target: Path  # final path
     partial: Path  # path until `publish`
     overwrite: bool  # whether an earlier output at `target` may be replaced
+    fsync: bool = False  # whether data and names are forced to the disk
+
+    def sync(self) -> None:
+        """Force the data to the disk; call before the report of the output is written."""
+        if self.fsync:
+            with export_errors(self.partial):
+                sync_to_disk(self.partial)
 
     def publish(self) -> None:
         """Move the finished output to its final path, replacing an earlier output."""
         with export_errors(self.target):
-            old = old_path(self.target)
-            if not os.path.lexists(self.target):
-                self.partial.rename(self.target)
-                # Left by a run that was killed between the two renames of a folder.
+            if self.partial.is_dir():
+                # The report in it is newer than `sync`.
+                self._sync_entries(self.partial)
+            self._move()
+            self._sync_entries(self.target.parent)
+
+    def _move(self) -> None:
+        old = old_path(self.target)
+        if not os.path.lexists(self.target):
+            self.partial.rename(self.target)
+            # Left by a run that was killed between the two renames of a folder.
+            if old.exists():
+                self._sync_entries(self.target.parent)
                 _remove(old)
-                return
-            _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
-            if self.target.is_dir():
-                self._replace_folder()
-            else:
-                os.replace(self.partial, self.target)
+            return
+        _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
+        if self.target.is_dir():
+            self._replace_folder()
+        else:
+            os.replace(self.partial, self.target)
+
+    def _sync_entries(self, folder: Path) -> None:
+        if self.fsync:
+            sync_entries(folder)
 
     def _replace_folder(self) -> None:
         """Swap folders: a folder cannot be renamed onto one that is not empty."""
@@ -85,6 +107,8 @@ class Output:
         except OSError:
             old.rename(self.target)
             raise
+        # Until now a power cut may bring the old name back.
+        self._sync_entries(self.target.parent)
         shutil.rmtree(old)
 
 
@@ -121,21 +145,26 @@ def check_name(target: Path) -> None:
         )
 
 
-def prepare(target: Path, overwrite: bool, folder: bool, keep: bool = False) -> Output:
-    """Check that `target` can be written; create a new `.partial` unless `keep`."""
+def prepare(
+    target: Path, overwrite: bool, folder: bool, keep: bool = False, fsync: bool = False
+) -> Output:
+    """Check that `target` can be written; create a new `.partial` unless `keep`.
+
+    fsync: as in `Output`.
+    """
     check_name(target)
     if os.path.lexists(target):
         _check_replaceable(target, overwrite, folder)
     partial = partial_path(target)
     if keep:
-        return Output(target, partial, overwrite)
+        return Output(target, partial, overwrite, fsync)
     with export_errors(partial):
         _remove(partial)
         if folder:
             partial.mkdir()
         else:
             partial.touch()
-    return Output(target, partial, overwrite)
+    return Output(target, partial, overwrite, fsync)
 
 
 def discard(target: Path) -> None:
@@ -177,11 +206,16 @@ def check_free_space(target: Path, needed_bytes: int) -> None:
         )
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a small file atomically, replacing an older one."""
+def write_text(path: Path, text: str, fsync: bool = False) -> None:
+    """Write a small file atomically, replacing an older one.
+
+    fsync: force its data to the disk before it has its name, which is left to the caller.
+    """
     partial = partial_path(path)
     with export_errors(path):
         partial.write_text(text, encoding="utf-8", newline="\n")
+        if fsync:
+            sync_to_disk(partial)
         os.replace(partial, path)
 
 

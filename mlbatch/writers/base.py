@@ -26,6 +26,7 @@ class WriterOptions:
     # a new `.partial`.
     kept_bytes: int | None = None
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
+    fsync: bool = True  # force the output to the disk before it gets its name
 
 
 @dataclass(frozen=True, slots=True)

@@ -318,6 +318,7 @@ class McapContainer:
         """Add the metadata records and scans.csv, complete and close the file."""
         self._write_all_chunks()
         self._write_metadata("mlbatch.grid", grid)
+        self._write_metadata("mlbatch.fill", summary.fill)
         self._write_metadata("mlbatch.report", {"json": summary.report_json})
         log_ns = summary.t_init_ns or 0
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)

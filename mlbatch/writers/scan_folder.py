@@ -45,7 +45,9 @@ class FolderWriter:
                 f"{options.point_layout}; write a .mcap, since presets are fields of PointCloud2"
             )
         keep = options.kept_bytes is not None
-        self._output = prepare(target, options.overwrite, folder=True, keep=keep)
+        self._output = prepare(
+            target, options.overwrite, folder=True, keep=keep, fsync=options.fsync
+        )
         self._name = name
         self._encoder = encoder
         self._idle: list[Encoder] = []
@@ -82,6 +84,7 @@ class FolderWriter:
         path = self._output.partial / SCANS_CSV
         with export_errors(path):
             path.write_text(summary.scans_csv, encoding="utf-8", newline="\n")
+        self._output.sync()
         if last is not None:
             last(self._output.partial)
         self._output.publish()

@@ -301,8 +301,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/two_lidars.pcap --rig misspelt.yaml",
         1,
         "misspelt.yaml:2: sensors[0].extrinsic: expected a key of name, model, stream, metadata, "
-        "extrinsics, clock, min_range_m, max_range_m, optional, decode, found 'extrinsic'; the "
-        "nearest known key is extrinsics",
+        "extrinsics, clock, min_range_m, max_range_m, optional, decode, points, found 'extrinsic'; "
+        "the nearest known key is extrinsics",
     ),
     "rig sensor of no stream": (
         "fix/two_lidars.pcap --rig fix/astray.yaml",

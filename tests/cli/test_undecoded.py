@@ -44,15 +44,20 @@ def test_metadata_that_are_missing_are_asked_for_first(shell: Shell, tmp_path: P
     assert "give the sensor's with --metadata FILE" in outcome.err
 
 
-def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: Path) -> None:
+def test_a_lidar_without_decoder_among_others_is_refused_unless_ignored(
+    shell: Shell, tmp_path: Path
+) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
     outcome = shell(f"convert {capture} -o out")
+    assert outcome.code == 1
+    assert outcome.err == (
+        f"mlbatch: error: {capture}: {WHERE}: {WHAT}; {ADVICE}; leave it out with --ignore "
+        "10.0.0.8:6699\n"
+    )
+    outcome = shell(f"convert {capture} -o out --ignore 10.0.0.8:6699 --strict")
     assert outcome.code == 0, outcome.err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    (warning,) = report["warnings"]
-    assert warning["code"] == "no_decoder"
-    unassigned = "its packets are counted as unassigned"
-    assert warning["message"] == f"{WHERE}: {WHAT}; {unassigned}; {ADVICE}"
+    assert report["warnings"] == []
     assert [(one["stream"], one["packets"]) for one in report["unassigned"]] == [(WHERE, 20)]
 
 

@@ -54,6 +54,6 @@ def test_options_have_the_names_of_the_command() -> None:
     from tests.contract.test_help import OPTIONS
 
     known = {option.removeprefix("--").replace("-", "_") for option in OPTIONS["convert"]}
-    known |= {"recording", "recordings", "output", "exclude_boxes", "copy_topics"}
+    known |= {"recording", "recordings", "output", "exclude_boxes", "copy_topics", "fsync"}
     for function in (api.open, api.scans, api.convert):
         assert set(inspect.signature(function).parameters) <= known, function.__name__

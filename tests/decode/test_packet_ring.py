@@ -14,6 +14,15 @@ from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.interface import Records
 
 
+def _sum(payload: bytes) -> int:
+    """Sum of the words of 8 bytes, and of the last 8 bytes if these are no word."""
+    if len(payload) < 8:
+        return sum(payload)
+    words = [payload[at : at + 8] for at in range(0, len(payload) - 7, 8)]
+    words += [payload[-8:]] * bool(len(payload) % 8)
+    return sum(int.from_bytes(word, "little") for word in words) % 2**64
+
+
 @dataclass
 class Stored:
     """A ring, and the expected column of each ring index in a dictionary."""
@@ -24,12 +33,15 @@ class Stored:
     columns: int
     ring: PacketRing = field(init=False)
     records: dict[int, bytes] = field(default_factory=dict)
+    sums: dict[int, int] = field(default_factory=dict)
+    sum: int = 0
     count: int = 0
 
     def __post_init__(self) -> None:
         self.ring = PacketRing(
             self.packet_size, Records(self.record_start, self.record_size, self.record_size)
         )
+        self.ring.keep_sums()
 
     def store(self, count: int, gap: int = 0) -> U8Array:
         """Store packets that are `gap` bytes apart in a batch; return the view of the ring."""
@@ -42,9 +54,11 @@ class Stored:
         for number, first in enumerate(place.tolist()):
             payload = data[number * stride :][: self.packet_size]
             np.testing.assert_array_equal(packets[number], payload)
+            self.sum = (self.sum + _sum(payload.tobytes())) % 2**64
             for column in range(self.columns):
                 begin = self.record_start + column * self.record_size
                 self.records[first + column] = payload[begin : begin + self.record_size].tobytes()
+                self.sums[first + column] = self.sum
         self.count += 1
         return packets
 
@@ -58,6 +72,8 @@ class Stored:
         place = np.array(sorted(self.records), np.int64)
         out = np.empty((len(place), self.record_size), np.uint8)
         self.ring.gather(place, out)
+        for one in place.tolist():
+            assert self.ring.sum_until(one) == self.sums[one]
         assert [row.tobytes() for row in out] == [self.records[p] for p in place.tolist()]
 
 
@@ -108,3 +124,24 @@ def test_all_of_a_stalled_sensor_is_kept(waiting: int) -> None:
         stored.store(1)
     stored.check()
     assert len(stored.records) == 3 * waiting
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 15, 16, 23])
+def test_every_change_of_a_byte_changes_the_checksum(size: int) -> None:
+    """Also by the top bit of a byte, which could overflow the sum."""
+    packet = np.full(size, 0x7F, np.uint8)
+    changed = np.array(
+        [
+            np.where(np.arange(size) == at, 0x7F ^ flip, packet)
+            for at in range(size)
+            for flip in range(1, 256)
+        ],
+        np.uint8,
+    )
+    ring = PacketRing(size, Records(0, size, size))
+    ring.keep_sums()
+    data = np.concatenate([packet, changed.reshape(-1)])
+    start = np.arange(len(changed) + 1, dtype=np.int64) * size
+    _, place = ring.store(data, start, None)
+    totals = np.array([ring.sum_until(one) for one in place.tolist()], np.uint64)
+    assert not (np.diff(totals) == totals[0]).any()

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mlbatch
+from mlbatch.errors import RigError
 from mlbatch.rig.rig import read_rig
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
@@ -22,6 +24,7 @@ from tests.builders.sessions import (
     SMALL,
     Shell,
     Unit,
+    arrays,
     twin,
     write_metadata,
     write_session,
@@ -103,6 +106,16 @@ def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
     )
 
 
+def test_a_second_lidar_at_one_address_is_noted(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), twin(Unit(), 333, Unit().ip))
+    (tmp_path / "333.json").unlink()
+    outcome = shell(f"inspect {capture}")
+    assert outcome.out.splitlines()[-1] == (
+        "note: 10.0.0.1 > port 7502: Ouster lidar, serial 333, 1280 bytes: needs its metadata as "
+        "well; 96 packets are of no sensor; give its --metadata"
+    )
+
+
 def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     capture.write_bytes(capture.read_bytes()[:-100])
@@ -130,15 +143,36 @@ def test_extrinsics_of_the_metadata_are_shown_and_written(shell: Shell, tmp_path
     np.testing.assert_array_equal(sensor.extrinsics, np.reshape(pose, (4, 4)))
 
 
-def test_the_rig_is_accepted_and_gives_the_same_scans(shell: Shell) -> None:
+def test_extrinsics_nobody_gave_are_written_as_unknown_and_refused(shell: Shell) -> None:
     written = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
     assert (written.code, written.err) == (0, "")
     assert written.out.splitlines()[-1] == "wrote rig.yaml"
-    text = Path("rig.yaml").read_text()
-    assert text.count("# extrinsics unknown: measure them") == 2
-    zero = "extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}"
-    assert text.count(zero) == 2
-    with_rig = shell(f"convert {CAPTURE} --rig rig.yaml -o with-rig")
+    lines = Path("rig.yaml").read_text().splitlines()
+    places = [number for number, line in enumerate(lines, 1) if line == "    extrinsics: unknown"]
+    assert len(places) == 2
+    comment = (
+        "  # extrinsics not known: measure them and replace `unknown` by "
+        "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
+    )
+    assert lines.count(comment) == 2
+    refused = shell(f"convert {CAPTURE} --rig rig.yaml -o out")
+    assert (refused.code, refused.out) == (1, "")
+    assert refused.err == (
+        f"mlbatch: error: rig.yaml:{places[0]}: sensors[0].extrinsics: expected the pose of "
+        f"{LEFT}, required for every sensor when there are two or more, found unknown (also of "
+        f"{RIGHT}); measure it and give translation_m and a rotation, or accept the body origin "
+        "with --identity-extrinsics\n"
+    )
+    assert not Path("out").exists()
+    with pytest.raises(RigError, match=rf"rig.yaml:{places[0]}: sensors\[0\].extrinsics: "):
+        next(mlbatch.scans(CAPTURE, rig="rig.yaml"))
+    # Poses play no part in a comparison.
+    assert shell(f"compare {CAPTURE} --rig rig.yaml").code == 0
+
+
+def test_the_rig_gives_the_same_scans(shell: Shell) -> None:
+    assert shell(f"inspect {CAPTURE} --write-rig rig.yaml").code == 0
+    with_rig = shell(f"convert {CAPTURE} --rig rig.yaml --identity-extrinsics -o with-rig")
     assert (with_rig.code, with_rig.err) == (0, "")
     found = shell(f"convert {CAPTURE} --identity-extrinsics -o found")
     assert (found.code, found.err) == (0, "")
@@ -147,6 +181,29 @@ def test_the_rig_is_accepted_and_gives_the_same_scans(shell: Shell) -> None:
         if name != "report.json":
             assert Path("with-rig", name).read_bytes() == Path("found", name).read_bytes()
     assert names.count("000006.npz") == 1
+
+
+def test_a_single_lidar_of_unknown_extrinsics_stays_in_its_own_frame(
+    shell: Shell, tmp_path: Path
+) -> None:
+    capture = write_session(tmp_path, Unit())
+    assert shell(f"inspect {capture} --write-rig rig.yaml").code == 0
+    assert "    extrinsics: unknown\n" in Path("rig.yaml").read_text()
+    assert shell(f"convert {capture} -o found").code == 0
+    done = shell(f"convert {capture} --rig rig.yaml -o with-rig")
+    assert (done.code, done.err) == (0, "")
+    found = arrays("found/000000.npz")
+    with_rig = arrays("with-rig/000000.npz")
+    assert str(with_rig["frame_id"]) == "ouster_111"
+    assert found.keys() == with_rig.keys()
+    for key in found:
+        np.testing.assert_array_equal(found[key], with_rig[key])
+    # One of two, too.
+    capture = write_session(tmp_path / "two", Unit(), twin(Unit(), 222))
+    assert shell(f"inspect {capture} --write-rig two.yaml").code == 0
+    assert shell(f"convert {capture} --rig two.yaml -o out").code == 1
+    assert shell(f"convert {capture} --rig two.yaml --only ouster_222 -o out").code == 0
+    assert str(arrays("out/000000.npz")["frame_id"]) == "ouster_222"
 
 
 def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
@@ -179,7 +236,7 @@ def test_a_rig_of_legacy_lidars_names_their_addresses(shell: Shell, tmp_path: Pa
     first, second = read_rig(Path("rig.yaml")).sensors
     assert (first.name, str(first.stream)) == ("ouster_111", "source_ip 10.0.0.1, port 7502")
     assert (second.name, str(second.stream)) == ("ouster_222", "source_ip 10.0.0.2, port 7502")
-    assert shell(f"convert {capture} --rig rig.yaml -o out").code == 0
+    assert shell(f"convert {capture} --rig rig.yaml --identity-extrinsics -o out").code == 0
 
 
 def test_the_order_of_sensors_is_that_of_serial_numbers(shell: Shell, tmp_path: Path) -> None:

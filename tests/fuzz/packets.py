@@ -37,7 +37,7 @@ from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.golden.test_every_model import CASES
 
 # Parts of an input that are no datagrams: a calibration, its name.
-CALIBRATION, _LIDAR_PORT, _DEVICE_PORT = 0, 2368, 7788
+CALIBRATION, _LIDAR_PORT, DEVICE_PORT = 0, 2368, 7788
 _PACKETS = 8
 _OUSTER_PACKETS = 3
 START_NS = 1_700_000_000_000_000_000
@@ -55,7 +55,7 @@ def _streams() -> dict[str, Seeds]:
             kind = NAMES.index(Path(sent.file).suffix)
             parts.append(Part(CALIBRATION, kind, sent.content))
         parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.seen.payloads[:_PACKETS]]
-        parts += [Part(_DEVICE_PORT, at, data) for at, data in sent.neighbours]
+        parts += [Part(DEVICE_PORT, at, data) for at, data in sent.neighbours]
         found.setdefault(make.__name__.removesuffix("_sent"), []).append(joined(parts))
     spec = velodyne.VelodyneSpec("VLP-16")
     position = velodyne.position_packets(spec, np.arange(4, dtype=np.float64) * 5e5)

@@ -16,7 +16,7 @@ import pytest
 from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, contents, write_recordings
 
-KILLS = 18
+KILLS = 26
 SEED = 3
 LIMITED = """
 import resource, sys
@@ -44,9 +44,10 @@ def test_a_small_storm() -> None:
     options = ("--count", str(KILLS), "--seed", str(SEED), "--turns", "10", "--again", "0")
     done = _run("-m", "tests.resume_storm", *options)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
-    counts = re.findall(r"\d+", done.stdout)
-    kills, outputs, resumed, wrong = map(int, counts)
+    kills, outputs, resumed, wrong, *by_signal = map(int, re.findall(r"\d+", done.stdout))
     assert (kills, wrong) == (KILLS, 0)
+    assert sum(by_signal) == KILLS
+    assert min(by_signal) >= 1
     assert outputs >= len(CASES)
     assert resumed >= 1
 

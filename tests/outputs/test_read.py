@@ -46,10 +46,12 @@ def _assert_same(read: Scan, wrote: Scan, step_ns: int) -> None:
         assert getattr(read, name) == getattr(wrote, name), name
     assert read.max_gap_ns == wrote.max_gap_ns
     assert read.ready_host_ns == wrote.ready_host_ns
+    np.testing.assert_array_equal(read.fill, wrote.fill)
     np.testing.assert_allclose(read.coverage, wrote.coverage, atol=5e-4)
     assert (read.sensors, read.frame_id) == (wrote.sensors, wrote.frame_id)
     assert (read.rate_hz, read.timescale) == (wrote.rate_hz, wrote.timescale)
     assert (read.slices, read.info.layout) == (wrote.slices, wrote.info.layout)
+    assert read.sort == wrote.sort
     for one, other in zip(read.info.sensors, wrote.info.sensors, strict=True):
         assert (one.name, one.model) == (other.name, other.model)
         np.testing.assert_array_equal(one.body_from_sensor, other.body_from_sensor)
@@ -88,6 +90,15 @@ def test_scans_come_back(
                 np.testing.assert_array_equal(getattr(one, key), getattr(other, key))
 
 
+@pytest.mark.parametrize(("name", "kind"), FORMATS)
+def test_scans_sorted_by_points_come_back(
+    name: str, kind: str | None, rec: Recording, tmp_path: Path
+) -> None:
+    mlbatch.convert(rec, tmp_path / name, format=kind, sort="points")
+    for one, other in zip(mlbatch.read(tmp_path / name), rec.scans(sort="points"), strict=True):
+        _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
+
+
 @pytest.mark.parametrize(("name", "kind"), FORMATS[:4])
 def test_organized_scans_come_back(
     name: str, kind: str | None, rec: Recording, tmp_path: Path
@@ -113,8 +124,11 @@ def test_slices_of_single_sensors_come_back(
     wrote = sorted(rec.scans(split=True, slices=4), key=key)
     assert len({key(scan) for scan in read}) == len(read) == len(wrote)
     for one, other in zip(read, wrote, strict=True):
-        # The table has the last arrival of both sensors.
+        # The table has the last arrival and the gaps of both sensors.
         other.ready_host_ns = one.ready_host_ns
+        own = int(one.lidar_id[0])
+        assert one.max_gap_ns[own] == other.max_gap_ns[own]
+        other.max_gap_ns = one.max_gap_ns
         _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
 
 

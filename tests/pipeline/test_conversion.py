@@ -34,7 +34,7 @@ def _rig(folder: Path, *clocks: str) -> Path:
     rig = folder / "rig.yaml"
     lines = [
         f'- {{name: s{serial}, stream: {{serial: "{serial}"}}, metadata: {serial}.json, '
-        f"extrinsics: {{translation_m: [0, 0, 0]}}, clock: {clock}}}\n"
+        f"extrinsics: {{translation_m: [{serial}, 0, 0]}}, clock: {clock}}}\n"
         for serial, clock in zip((111, 222), clocks, strict=True)
     ]
     rig.write_text("sensors:\n" + "".join(lines))

@@ -6,22 +6,26 @@ import contextlib
 import fcntl
 import json
 import os
+import shutil
 import signal
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
-from mlbatch.pipeline import resume
-from mlbatch.pipeline import resume as _resume_state
+from mlbatch.pipeline import job_identity, resume, state_file
 from mlbatch.readers import source
 from mlbatch.types import Scan
+from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
-from tests.resume_storm import contents
+from tests.resume_storm import contents, write_recordings
 
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 # From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
@@ -36,7 +40,8 @@ def shell(
     """The command line, in an empty folder; every scan gets a line of the state file."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
-    monkeypatch.setattr(os, "sync", lambda: None)
+    for module in (state_file, atomic):
+        monkeypatch.setattr(module, "sync_to_disk", lambda path: None)
     return Shell(monkeypatch, capsys)
 
 
@@ -61,6 +66,11 @@ def _interrupt(shell: Shell, words: str = f"{CAPTURE} -o out") -> None:
         _fail_at(patch, 3, KeyboardInterrupt())
         assert shell(f"convert {words}").code == 130
     assert STATE.is_file()
+
+
+def _records(state: Path) -> list[dict[str, Any]]:
+    """Content of a state file, without checksums."""
+    return [json.loads(line.partition(" ")[2]) for line in state.read_text().splitlines()]
 
 
 def _whole(shell: Shell, words: str = CAPTURE) -> dict[str, object]:
@@ -100,19 +110,77 @@ def test_an_interrupt_names_resume(shell: Shell, monkeypatch: pytest.MonkeyPatch
     )
 
 
-def test_a_request_to_end_is_an_interrupt(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_request_to_end_is_an_interrupt(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    before = signal.signal(number, signal.SIG_DFL)
     encode = npz.NpzEncoder.encode
 
     def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
         if scan.index == 1:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(number)
         return encode(encoder, scan)
 
     monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 130
-    assert signal.getsignal(signal.SIGTERM) is before
-    assert '"synced":true' in STATE.read_text().splitlines()[-1]
+    assert signal.signal(number, before) is signal.SIG_DFL
+    assert _records(STATE)[-1] == {"synced": True}
+
+
+def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    encode = npz.NpzEncoder.encode
+
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
+        signal.raise_signal(signal.SIGHUP)
+        return encode(encoder, scan)
+
+    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
+    assert shell(f"convert {CAPTURE} -o out").code == 0
+    assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
+
+
+def test_an_interrupt_after_the_last_rename_leaves_the_output_alone(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ending(log: resume.ResumeLog) -> None:
+        raise KeyboardInterrupt
+
+    whole = _whole(shell)
+    monkeypatch.setattr(resume.ResumeLog, "remove", ending)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert (outcome.code, outcome.err) == (130, "mlbatch: error: interrupted\n")
+    assert contents(Path()) == whole
+
+
+class _Ending:
+    """Receives a signal in its finalizer, where Python prints and ignores exceptions."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_an_interrupt_in_a_finalizer_is_not_lost(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take = resume.ResumeLog.take
+    calls = 0
+
+    def ending(log: resume.ResumeLog, *given: Any) -> bool:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            _Ending()
+        if calls == 3:
+            time.sleep(0.2)
+        return take(log, *given)
+
+    monkeypatch.setattr(resume.ResumeLog, "take", ending)
+    outcome = shell(f"convert {CAPTURE} -o out")
+    assert outcome.code == 130
+    assert outcome.err.startswith("mlbatch: error: interrupted")
+    assert calls == 3
 
 
 def test_nothing_to_resume_is_reported(shell: Shell) -> None:
@@ -184,6 +252,129 @@ def test_another_recording_calibration_or_pose_is_refused(shell: Shell, tmp_path
     assert "found calibration of ouster_111 '" in shell(f"convert {words} --resume").err
 
 
+# Revolutions of 0.8 MB: samples are 0.1 MB apart.
+LARGE = replace(SMALL, beams=128)
+
+
+def _flip(path: Path, at: int) -> None:
+    """Change a byte of a file, but neither its size nor its times."""
+    times = path.stat()
+    content = bytearray(path.read_bytes())
+    content[at] ^= 4
+    path.write_bytes(content)
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
+def _unsampled(size: int, near: float) -> int:
+    """A byte of a recording that is in no sample."""
+    sampled = [range(at, at + count) for at, count in job_identity._sampled(size, size)]
+    at = int(near * size)
+    return next(one for one in range(at, size) if not any(one in part for part in sampled))
+
+
+def test_a_recording_with_another_sample_is_refused(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path / "in", Unit(LARGE, turns=8))
+    size = capture.stat().st_size
+    words = f"{capture} -o out"
+    middle = next(at for at, _ in job_identity._sampled(size, size) if at > size // 2)
+    for at in (100, middle, size - 100):
+        _interrupt(shell, words)
+        _flip(capture, at)
+        outcome = shell(f"convert {words} --resume")
+        assert outcome.code == 2
+        assert "expected the job of the interrupted run, found recording 1 'drive." in outcome.err
+        _flip(capture, at)
+    assert shell(f"convert {words} --resume").code == 0
+
+
+def test_other_packets_in_finished_scans_are_refused(shell: Shell, tmp_path: Path) -> None:
+    """No sample has them, and neither size nor time of the recording changed."""
+    capture = write_session(tmp_path / "in", Unit(LARGE, turns=8))
+    words = f"{capture} -o out"
+    whole = _whole(shell, str(capture))
+    _interrupt(shell, words)
+    # Scan 1 of 7 begins about 1.8 revolutions after the start, as that has 20 ms of a window.
+    at = _unsampled(capture.stat().st_size, 0.3)
+    _flip(capture, at)
+    outcome = shell(f"convert {words} --resume")
+    assert outcome.code == 2
+    assert outcome.err.splitlines()[-1] == (
+        "mlbatch: error: out.partial: expected the packets of the interrupted run, found others "
+        "for scan 2 of 3 that are finished: a recording was changed; restore it, or leave out "
+        "--resume to start over"
+    )
+    _flip(capture, at)
+    outcome = shell(f"convert {words} --resume")
+    assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
+    assert contents(Path()) == whole
+
+
+def test_other_packets_behind_finished_scans_are_converted(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path / "in", Unit(LARGE, turns=8))
+    words = f"{capture} -o out"
+    before = _whole(shell, str(capture))
+    shutil.rmtree("whole")
+    _interrupt(shell, words)
+    _flip(capture, _unsampled(capture.stat().st_size, 0.8))
+    assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
+    found = contents(Path())
+    assert found == _whole(shell, str(capture))
+    assert found != before
+
+
+def test_another_forwarded_message_is_refused(shell: Shell, tmp_path: Path) -> None:
+    write_recordings(tmp_path / "in", 12)
+    recording = tmp_path / "in" / "bag" / "drive.mcap"
+    case = f"{recording} -o out.mcap --identity-extrinsics --keep-partial --pass /chatter"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resume.ResumeLog, "complete", _refuse)
+        assert shell(f"convert {case}").code == 1
+    content = recording.read_bytes()
+    at = len(content) // 10
+    while not content[at : at + 100].isdigit():
+        at = _unsampled(len(content), (at + 100) / len(content))
+    _flip(recording, at)
+    outcome = shell(f"convert {case} --resume")
+    assert outcome.code == 2
+    assert "expected the packets of the interrupted run" in outcome.err
+
+
+def test_another_byte_of_a_calibration_is_refused(shell: Shell, tmp_path: Path) -> None:
+    """Also one without influence: the file is not the same."""
+    capture = write_session(tmp_path / "in", Unit(turns=8))
+    _interrupt(shell, f"{capture} -o out")
+    metadata = tmp_path / "in" / "111.json"
+    _flip(metadata, metadata.read_bytes().index(b"calibration_status") + 3)
+    assert "found calibration of ouster_111 '" in shell(f"convert {capture} -o out --resume").err
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("translation_m: [", "translation_m: [1"),
+        ("sensors:", "exclude_boxes_m: [[9, 9, 9, 10, 10, 10]]\nsensors:"),
+    ],
+)
+def test_another_rig_of_the_same_time_is_refused(
+    shell: Shell, tmp_path: Path, before: str, after: str
+) -> None:
+    shutil.copytree(FIXTURE, tmp_path / "in")
+    rig = tmp_path / "in" / "rig.yaml"
+    words = f"{tmp_path / 'in' / 'two_lidars.pcap'} --rig {rig} -o out"
+    _interrupt(shell, words)
+    times = rig.stat()
+    sound = rig.read_text()
+    rig.write_text(sound.replace(before, after, 1))
+    os.utime(rig, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert rig.read_text() != sound
+    outcome = shell(f"convert {words} --resume")
+    assert outcome.code == 2
+    assert "expected the job of the interrupted run, found " in outcome.err
+    # Comments have no influence.
+    rig.write_text(f"# The rig.\n{sound}")
+    assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
+
+
 def test_a_lost_scan_is_refused(shell: Shell) -> None:
     _interrupt(shell)
     Path("out.partial/000001.npz").unlink()
@@ -202,7 +393,7 @@ def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
         patch.setattr(resume.ResumeLog, "complete", _refuse)
         assert shell(f"convert {capture} -o out.mcap").code == 1
     partial = Path("out.mcap.partial")
-    kept = json.loads(Path("out.mcap.partial.state").read_text().splitlines()[-2])["kept_bytes"]
+    kept = _records(Path("out.mcap.partial.state"))[-2]["kept_bytes"]
     os.truncate(partial, kept - 1)
     outcome = shell(f"convert {capture} -o out.mcap --resume")
     assert outcome.code == 1
@@ -267,33 +458,116 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]\n", "nonsense\n", '{"boot":"","schema":"mlbatch.state/2"}\n']
+    ("text", "records"),
+    [
+        ("", ""),
+        ("{", ""),
+        ("[]\n", "another checksum"),
+        ("nonsense\n", "another checksum"),
+        ('{"boot":"","schema":"mlbatch.state/1"}\n', "another checksum"),
+    ],
 )
-def test_an_unreadable_state_is_ignored(shell: Shell, text: str) -> None:
+def test_an_unreadable_state_is_ignored(shell: Shell, text: str, records: str) -> None:
     _interrupt(shell)
     STATE.write_text(text)
     outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
+    *damage, last = outcome.err.splitlines()
+    assert last == "mlbatch: out: nothing to resume; started over"
+    assert damage == [_damage(1)] * bool(records)
     assert outcome.code == 0
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        '{"kept_bytes":0,"scans":[[[1,2,3,4,"5"],[0,0,0,0,0]]]}',
-        '{"kept_bytes":-1,"scans":[]}',
-        '{"kept_bytes":"0","scans":[]}',
-        '{"kept_bytes":0,"scans":7}',
-        '{"kept_bytes":0,"sca',
-    ],
-)
-def test_lines_after_a_damaged_one_count_for_nothing(shell: Shell, line: str) -> None:
+def _damage(record: int) -> str:
+    return (
+        f"mlbatch: {STATE}: expected records as they were written, found record {record} with "
+        "another checksum; scans from there on are converted again"
+    )
+
+
+def _swapped(lines: list[str]) -> list[str]:
+    return [*lines[:2], lines[3], lines[2], *lines[4:]]
+
+
+def _dropped(lines: list[str]) -> list[str]:
+    return [*lines[:2], *lines[3:]]
+
+
+def _repeated(lines: list[str]) -> list[str]:
+    return [*lines[:2], lines[1], *lines[2:]]
+
+
+def _changed(lines: list[str]) -> list[str]:
+    checksum, _, record = lines[2].partition(" ")
+    return [*lines[:2], f"{checksum} {record.replace('0', '1', 1)}", *lines[3:]]
+
+
+@pytest.mark.parametrize("change", [_swapped, _dropped, _repeated, _changed])
+def test_records_from_a_damaged_one_on_are_made_again(
+    shell: Shell, change: Callable[[list[str]], list[str]]
+) -> None:
+    """Records: the job, a scan each of three, synced."""
     whole = _whole(shell)
     _interrupt(shell)
-    head, first, *others = STATE.read_text().splitlines()
-    STATE.write_text("\n".join([head, first, line, *others]) + "\n")
-    assert "resumed after 1 scans" in shell(f"convert {CAPTURE} -o out --resume").err
+    lines = STATE.read_text().splitlines()
+    assert len(lines) == 5
+    STATE.write_text("".join(f"{line}\n" for line in change(lines)))
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.err.splitlines() == [_damage(3), "mlbatch: out: resumed after 1 scans"]
     assert contents(Path()) == whole
+
+
+def test_a_record_cut_off_by_a_kill_is_no_damage(shell: Shell) -> None:
+    whole = _whole(shell)
+    _interrupt(shell)
+    lines = STATE.read_text().splitlines()
+    STATE.write_text("\n".join(lines[:3])[:-7])
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.err == "mlbatch: out: resumed after 1 scans\n"
+    assert contents(Path()) == whole
+
+
+def test_no_change_of_a_byte_gives_another_state(shell: Shell) -> None:
+    """What a changed file says is what some of its first records say, or nothing."""
+    _interrupt(shell)
+    content = STATE.read_bytes()
+    states = [state_file.read_state(STATE).state]
+    lines = content.splitlines(keepends=True)
+    for count in range(len(lines)):
+        STATE.write_bytes(b"".join(lines[:count]))
+        states.append(state_file.read_state(STATE).state)
+    assert len(lines) == 5
+    for at in range(len(content)):
+        for flip in (0x01, 0x20, 0x80, content[at] ^ ord("\n"), content[at] ^ ord("0")):
+            if not flip:
+                continue
+            STATE.write_bytes(content[:at] + bytes([content[at] ^ flip]) + content[at + 1 :])
+            found = state_file.read_state(STATE)
+            assert found.state in states
+            assert found.state != states[0]
+
+
+@pytest.mark.long
+def test_no_change_of_a_byte_gives_another_output(shell: Shell) -> None:
+    """The same to the end, for bytes of all records."""
+    whole = _whole(shell)
+    _interrupt(shell)
+    Path("out.partial").rename("kept")
+    content = STATE.read_bytes()
+    after = set()
+    for at in range(3, len(content), len(content) // 40):
+        shutil.rmtree("out", ignore_errors=True)
+        shutil.copytree("kept", "out.partial")
+        STATE.write_bytes(content[:at] + bytes([content[at] ^ 4]) + content[at + 1 :])
+        outcome = shell(f"convert {CAPTURE} -o out --resume")
+        after.add(outcome.err.splitlines()[-1])
+        assert outcome.code == 0
+        assert contents(Path()) == whole
+    assert after >= {
+        "mlbatch: out: nothing to resume; started over",
+        "mlbatch: out: resumed after 1 scans",
+        "mlbatch: out: resumed after 2 scans",
+        "mlbatch: out: resumed after 3 scans",
+    }
 
 
 def test_after_a_restart_only_what_reached_the_disk_counts(
@@ -301,13 +575,13 @@ def test_after_a_restart_only_what_reached_the_disk_counts(
 ) -> None:
     whole = _whole(shell)
     _interrupt(shell)
-    lines = STATE.read_text().splitlines()
-    monkeypatch.setattr(_resume_state, "_boot", lambda: "later")
+    lines = STATE.read_text().splitlines(keepends=True)
+    monkeypatch.setattr(state_file, "_boot", lambda: "later")
     assert "synced" in lines[-1]
-    STATE.write_text("\n".join(lines[:-1]) + "\n")
+    STATE.write_text("".join(lines[:-1]))
     found = resume.find(Path("out"))
     assert (found.state, found.is_complete) == (None, False)
-    STATE.write_text("\n".join([*lines, *lines[-2:-1]]) + "\n")
+    STATE.write_text("".join(lines))
     assert "resumed after 3 scans" in shell(f"convert {CAPTURE} -o out --resume").err
     assert contents(Path()) == whole
 
@@ -374,7 +648,7 @@ def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
 def test_a_kill_after_the_last_rename_leaves_nothing_to_do(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    monkeypatch.setattr(_resume_state.StateFile, "remove", lambda file: None)
+    monkeypatch.setattr(state_file.StateFile, "remove", lambda file: None)
     assert shell(f"convert {CAPTURE} -o out").code == 0
     Path("out.old.partial").mkdir()
     outcome = shell(f"convert {CAPTURE} -o out --resume {option}")

@@ -78,7 +78,9 @@ def test_metadata_and_table_of_scans(tmp_path: Path) -> None:
         "slices": "1",
         "timescale": "utc",
         "frame_id": "base_link",
+        "sort": "columns",
     }
+    assert notes["mlbatch.fill"] == SUMMARY.fill
     assert (attachment.name, attachment.data.decode()) == ("scans.csv", SUMMARY.scans_csv)
     assert (tmp_path / "out.mcap.scans.csv").read_text() == SUMMARY.scans_csv
 

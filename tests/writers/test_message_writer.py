@@ -12,7 +12,7 @@ import pytest
 from mlbatch.errors import ExportError
 from mlbatch.types import IMU, Message, Summary
 from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
-from mlbatch.writers.message_writer import quaternion
+from mlbatch.writers.message_writer import quaternion, static_edges
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -103,6 +103,21 @@ def test_static_transforms_are_the_poses(name: str, tmp_path: Path) -> None:
     found = (right.rotation.x, right.rotation.y, right.rotation.z, right.rotation.w)
     # 90 degrees about z.
     assert found == pytest.approx((0, 0, HALF, HALF))
+
+
+def test_two_frames_of_one_name_are_refused(tmp_path: Path) -> None:
+    info = run_info()
+    left, right = info.sensors
+    same = replace(
+        info, sensors=(replace(left, sensor_from_imu=np.eye(4)), replace(right, name="left_imu"))
+    )
+    with pytest.raises(ExportError, match="found left_imu for a sensor and for an IMU"):
+        open_writer("mcap", tmp_path / "scans.mcap", same, WriterOptions("standard"))
+    assert list(tmp_path.iterdir()) == []
+    # A frame of the recording does not replace an own one.
+    recorded = replace(info, frames=(("gps", np.eye(4)), ("left", np.eye(4))))
+    children = [child for _, child, _ in static_edges(recorded)]
+    assert children == ["left", "right", "gps"]
 
 
 @each_container

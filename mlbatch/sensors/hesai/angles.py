@@ -142,6 +142,11 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
     if _sha256(body) != content[_AT128_BODY.itemsize :]:
         _fail_at128(path, "content that matches its SHA-256", "changed content")
     values = np.frombuffer(body, _AT128_BODY)[0]
+    for name, limit in _HIGHEST_DEG.items():
+        largest = float(np.abs(values[name].astype(np.float64)).max())
+        largest_deg = largest * resolution / _ANGLE_UNITS_PER_DEG
+        if largest_deg > limit:
+            _fail_at128(path, f"{name} from -{limit:g} to {limit:g} deg", f"{largest_deg:g}")
     angle = resolution * RAD_PER_DEG / _ANGLE_UNITS_PER_DEG
     adjust = resolution * RAD_PER_DEG / _ADJUST_UNITS_PER_DEG
     return At128File(

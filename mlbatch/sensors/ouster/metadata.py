@@ -9,6 +9,7 @@ Sections with an error text instead of an object count as absent.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
+from mlbatch.lidar.limits import MAX_BEAM_M, MAX_ORIGIN_M, MAX_POSE_M
 from mlbatch.sensors.ouster.profiles import (
     HEADER_TYPES,
     LEGACY,
@@ -100,18 +102,15 @@ class Document:
             self.fail(key, expected, f"{len(value)} entries")
         return self._finite(key, expected, value)
 
-    def pose_mm(self, key: str) -> F64Array | None:
-        """A rigid (4, 4) transform, millimetres in the file, metres here; None if absent."""
-        pose = self._pose(key)
+    def pose_mm(self, key: str, most_m: float) -> F64Array | None:
+        """As `pose`, millimetres in the file, metres here; most_m: longest translation."""
+        pose = self.pose(key, most_m * MM_PER_M, "mm")
         if pose is not None:
             pose[:3, 3] *= M_PER_MM
         return pose
 
-    def pose_m(self, key: str) -> F64Array | None:
-        """A rigid (4, 4) transform in metres; None if absent."""
-        return self._pose(key)
-
-    def _pose(self, key: str) -> F64Array | None:
+    def pose(self, key: str, most: float, unit: str) -> F64Array | None:
+        """A rigid (4, 4) transform; None if absent. most: longest plausible translation."""
         expected = "16 finite numbers, a rigid transform row by row"
         values = self.numbers(key, 16, expected)
         if values is None:
@@ -127,6 +126,9 @@ class Document:
         )
         if not rigid:
             self.fail(key, expected, self.values[key])
+        length = math.hypot(*pose[:3, 3])
+        if length > most:
+            self.fail(key, f"a translation of at most {most:g} {unit}", f"{length:g} {unit}")
         return pose
 
     def _finite(self, key: str, expected: str, values: list[object]) -> F64Array:
@@ -176,6 +178,8 @@ def _is_ouster(top: dict[str, object]) -> bool:
     )
 
 
+# Largest angles of beams.
+_ANGLES_DEG = {"beam_altitude_angles": 90.0, "beam_azimuth_angles": 360.0}
 _DEFAULT_LIDAR_PORT = 7502
 _DEFAULT_IMU_PORT = 7503
 _DEFAULT_COLUMNS_PER_PACKET = 16
@@ -236,8 +240,12 @@ def parse_metadata(document: Document) -> Metadata:
     altitude_deg, azimuth_deg = _angles_deg(document)
     layout = _layout(document, len(altitude_deg))
     columns_per_frame, lidar_mode = _frame(document, layout.columns)
-    lidar_to_sensor = document.pose_mm("lidar_to_sensor_transform")
-    imu_to_sensor = document.pose_mm("imu_to_sensor_transform")
+    lidar_to_sensor = document.pose_mm("lidar_to_sensor_transform", MAX_ORIGIN_M)
+    if lidar_to_sensor is None:
+        lidar_to_sensor = _DEFAULT_LIDAR_TO_SENSOR_M.copy()
+    beam_offset_m = _beam_offset_m(document)
+    _refuse_far_beams(document, beam_offset_m, lidar_to_sensor)
+    imu_to_sensor = document.pose_mm("imu_to_sensor_transform", MAX_ORIGIN_M)
     lidar_port = document.integer("udp_port_lidar", 0, _U16)
     imu_port = document.integer("udp_port_imu", 0, _U16)
     return Metadata(
@@ -251,10 +259,8 @@ def parse_metadata(document: Document) -> Metadata:
         column_window=_window(document, columns_per_frame),
         altitude_rad=altitude_deg * RAD_PER_DEG,
         azimuth_rad=azimuth_deg * RAD_PER_DEG,
-        beam_offset_m=_beam_offset_m(document),
-        lidar_to_sensor=(
-            _DEFAULT_LIDAR_TO_SENSOR_M.copy() if lidar_to_sensor is None else lidar_to_sensor
-        ),
+        beam_offset_m=beam_offset_m,
+        lidar_to_sensor=lidar_to_sensor,
         imu_to_sensor=_DEFAULT_IMU_TO_SENSOR_M.copy() if imu_to_sensor is None else imu_to_sensor,
         extrinsics=_extrinsics(document),
         lidar_mode=lidar_mode,
@@ -273,7 +279,7 @@ def parse_metadata(document: Document) -> Metadata:
 def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
     found: list[F64Array] = []
     count: int | None = None
-    for key in ("beam_altitude_angles", "beam_azimuth_angles"):
+    for key, most_deg in _ANGLES_DEG.items():
         value = document.values.get(key)
         if isinstance(value, list) and any(isinstance(entry, list) for entry in value):
             document.fail(
@@ -283,7 +289,8 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
         angles = document.numbers(key, count, expected)
         if angles is None or not len(angles):
             document.fail(key, expected, "nothing")
-        if np.abs(angles).max() > 360:
+        if np.abs(angles).max() > most_deg:
+            expected = f"angles from -{most_deg:g} to {most_deg:g} degrees"
             document.fail(key, expected, str(angles[np.abs(angles).argmax()]))
         found.append(angles)
         count = len(angles)
@@ -354,13 +361,29 @@ def _serial(document: Document) -> int:
 
 
 def _beam_offset_m(document: Document) -> tuple[float, float]:
-    beam_to_lidar_mm = document.numbers("beam_to_lidar_transform", 16, "16 finite numbers")
+    beam_to_lidar_mm = document.pose("beam_to_lidar_transform", MAX_ORIGIN_M * MM_PER_M, "mm")
     if beam_to_lidar_mm is not None:
-        return float(beam_to_lidar_mm[3]) / MM_PER_M, float(beam_to_lidar_mm[11]) / MM_PER_M
-    offset_mm = document.number("lidar_origin_to_beam_origin_mm")
+        return float(beam_to_lidar_mm[0, 3]) / MM_PER_M, float(beam_to_lidar_mm[2, 3]) / MM_PER_M
+    key = "lidar_origin_to_beam_origin_mm"
+    offset_mm = document.number(key)
     if offset_mm is None:
         offset_mm = _default_offset_mm(document)
+    if abs(offset_mm) > MAX_ORIGIN_M * MM_PER_M:
+        document.fail(key, f"at most {MAX_ORIGIN_M * MM_PER_M:g} mm", f"{offset_mm:g} mm")
     return offset_mm / MM_PER_M, 0.0
+
+
+def _refuse_far_beams(
+    document: Document, beam_offset_m: tuple[float, float], lidar_to_sensor: F64Array
+) -> None:
+    """Raise RigError if beams leave too far from the origin of the sensor frame."""
+    away_m = math.hypot(*beam_offset_m) + math.hypot(*lidar_to_sensor[:3, 3])
+    if away_m > MAX_BEAM_M:
+        document.fail(
+            "lidar_to_sensor_transform",
+            f"beams that leave within {MAX_BEAM_M:g} m of the origin of the sensor",
+            f"{away_m:g} m with their own offset",
+        )
 
 
 def _default_offset_mm(document: Document) -> float:
@@ -370,7 +393,7 @@ def _default_offset_mm(document: Document) -> float:
 
 def _extrinsics(document: Document) -> F64Array | None:
     """Pose in the body frame; None for the identity, which tools write if they know no pose."""
-    pose = document.pose_m("extrinsic")
+    pose = document.pose("extrinsic", MAX_POSE_M, "m")
     return None if pose is None or np.array_equal(pose, np.eye(4)) else pose
 
 

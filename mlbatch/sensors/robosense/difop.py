@@ -94,7 +94,11 @@ class Difop:
         azimuth = azimuth * offsets.unit_deg
         if not offsets.signed:
             elevation[: count // 2] *= -1.0
-        usable = (np.abs(elevation) <= _MOST_DEG).all() and len(np.unique(elevation)) > 1
+        usable = (
+            (np.abs(elevation) <= _MOST_DEG).all()
+            and (np.abs(azimuth) <= 2 * _MOST_DEG).all()
+            and len(np.unique(elevation)) > 1
+        )
         return Angles(elevation, azimuth) if usable else None
 
     def _angles(self, at: int, count: int, *, signed: bool) -> F64Array | None:

@@ -242,6 +242,7 @@ class RobosenseLidar(BaseLidar):
         self.packet_size = evidence.size
         self.columns_per_packet = shape.rows * shape.columns
         self.column_period_ns = float(row.round_ns)
+        self._columns_per_round = returned.returns if shape.is_split else 1
         self.records = shape.records
         self.return_types = (returned.type,) * shape.returns
         self.channel = np.arange(row.channels)
@@ -266,6 +267,11 @@ class RobosenseLidar(BaseLidar):
         self._packets = PacketReader(timed, shape, steps_per_m, mirrored=mirrored, moving=moving)
         self._packets.learn_speed(points)
         self.pixels = self._packets.pixels()
+
+    @property
+    def columns_per_s(self) -> float:
+        """Columns sent in a second: one a round, or one for each of its returns."""
+        return self._columns_per_round * super().columns_per_s
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) True for point packets, False for device packets on the same topic."""

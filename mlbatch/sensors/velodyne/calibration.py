@@ -20,6 +20,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array
 from mlbatch.errors import RigError
+from mlbatch.lidar.limits import MAX_ORIGIN_M, MAX_SPREAD_M
 from mlbatch.units import RAD_PER_DEG
 
 if TYPE_CHECKING:
@@ -77,11 +78,15 @@ class _Quantity:
 _QUANTITIES: Mapping[str, _Quantity] = {
     "azimuth_rad": _Quantity("rot_correction", "rotCorrection_", True, math.pi / 2),
     "elevation_rad": _Quantity("vert_correction", "vertCorrection_", True, math.pi / 2, True),
-    "dist_correction_m": _Quantity("dist_correction", "distCorrection_", False, 5.0),
-    "dist_correction_x_m": _Quantity("dist_correction_x", "distCorrectionX_", False, 5.0),
-    "dist_correction_y_m": _Quantity("dist_correction_y", "distCorrectionY_", False, 5.0),
-    "vert_offset_m": _Quantity("vert_offset_correction", "vertOffsetCorrection_", False, 1.0),
-    "horiz_offset_m": _Quantity("horiz_offset_correction", "horizOffsetCorrection_", False, 1.0),
+    "dist_correction_m": _Quantity("dist_correction", "distCorrection_", False, 2.0),
+    "dist_correction_x_m": _Quantity("dist_correction_x", "distCorrectionX_", False, 2.0),
+    "dist_correction_y_m": _Quantity("dist_correction_y", "distCorrectionY_", False, 2.0),
+    "vert_offset_m": _Quantity(
+        "vert_offset_correction", "vertOffsetCorrection_", False, MAX_ORIGIN_M
+    ),
+    "horiz_offset_m": _Quantity(
+        "horiz_offset_correction", "horizOffsetCorrection_", False, MAX_ORIGIN_M
+    ),
 }
 
 
@@ -247,11 +252,29 @@ def _file(
         name: np.array([_value(path, form, by_id[laser], name) for laser in range(lasers)])
         for name in _QUANTITIES
     }
+    _refuse_spread(path, form, values)
     flags = np.zeros(lasers, np.bool_)
     flags[: min(lasers, len(enabled))] = enabled[:lasers]
     on = int(flags.sum())
     notes = () if on == len(entries) else (f"{on} of {len(entries)} lasers are enabled",)
     return VelodyneFile(path, lasers, unit_m, enabled=flags, notes=notes, **values)
+
+
+def _refuse_spread(path: Path, form: _Format, values: Mapping[str, F64Array]) -> None:
+    """Raise RigError if lasers of one sensor would measure from places too far apart."""
+    lengths_m = [values[name] for name in _QUANTITIES if name.startswith("dist_correction")]
+    # Near corrections of 0 are not given.
+    given_m = np.concatenate([lengths_m[0], *(one[one != 0] for one in lengths_m[1:])])
+    offset_m = np.hypot(values["vert_offset_m"], values["horiz_offset_m"])
+    spread_m = float(np.ptp(given_m) + offset_m.max())
+    if spread_m > MAX_SPREAD_M:
+        raise _error(
+            path,
+            form.keys["dist_correction_m"],
+            f"lasers that measure from places within {MAX_SPREAD_M:g} m of each other",
+            f"{spread_m:.3g} m, with the offsets of a laser",
+            _UNIT_REMEDY,
+        )
 
 
 def _by_id(path: Path, form: _Format, entries: list[_Entry]) -> dict[int, _Entry]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -240,6 +241,16 @@ def _set(*path: str) -> Callable[[JsonObject, object], None]:
 BEAMS = ("beam_intrinsics", "beam_altitude_angles")
 AZIMUTHS = ("beam_intrinsics", "beam_azimuth_angles")
 FORMAT = "lidar_data_format"
+BEAM_TO_LIDAR = ("beam_intrinsics", "beam_to_lidar_transform")
+LIDAR_TO_SENSOR = ("lidar_intrinsics", "lidar_to_sensor_transform")
+IMU_TO_SENSOR = ("imu_intrinsics", "imu_to_sensor_transform")
+
+
+def _moved(x: float, scale: float = 1.0) -> list[float]:
+    """A transform row by row: no rotation, x as translation."""
+    return [scale, 0, 0, x, 0, scale, 0, 0, 0, 0, scale, 0, 0, 0, 0, 1]
+
+
 MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
     (BEAMS, None, "beam_altitude_angles: expected angles in degrees, found nothing"),
     (BEAMS, [], "beam_altitude_angles: expected angles in degrees, found nothing"),
@@ -249,7 +260,11 @@ MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
     (BEAMS, [1.0] * 63 + [float("nan")], "beam_altitude_angles: expected angles .*, found nan"),
     (BEAMS, [1.0] * 63 + [float("-inf")], "beam_altitude_angles: expected angles .*, found -inf"),
     (BEAMS, [1.0] * 63 + [10**400], "beam_altitude_angles: .*found a number too large for a float"),
-    (BEAMS, [1.0] * 63 + [1e5], "beam_altitude_angles: expected angles in degrees, found 100000"),
+    (
+        BEAMS,
+        [1.0] * 63 + [1e5],
+        "beam_altitude_angles: expected angles from -90 to 90 degrees, found 100000",
+    ),
     (BEAMS, [[1.0] * 64] * 4, "beam_altitude_angles: .*a unit that does not spin"),
     (AZIMUTHS, [1.0] * 63, "beam_azimuth_angles: expected 64 angles in degrees, found 63 entries"),
     (AZIMUTHS, None, "beam_azimuth_angles: expected 64 angles in degrees, found nothing"),
@@ -309,7 +324,28 @@ MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
     (
         ("beam_intrinsics", "beam_to_lidar_transform"),
         {"x": 1},
-        "beam_to_lidar_transform: expected 16 finite numbers, found",
+        "beam_to_lidar_transform: expected 16 finite numbers, a rigid transform .*, found",
+    ),
+    # Numbers as in files with damaged bytes: 6e15 m, and others that no lidar can have.
+    (BEAM_TO_LIDAR, _moved(6e18), "beam_to_lidar_transform: .* at most 1000 mm, found 6e"),
+    (BEAM_TO_LIDAR, _moved(1001.0), "beam_to_lidar_transform: .* at most 1000 mm, found 1001 mm"),
+    (BEAM_TO_LIDAR, _moved(0.0, scale=1.1), "beam_to_lidar_transform: expected .* rigid"),
+    (BEAM_TO_LIDAR, _moved(math.inf), "beam_to_lidar_transform: expected .*, found inf"),
+    (LIDAR_TO_SENSOR, _moved(6e18), "lidar_to_sensor_transform: .* at most 1000 mm, found 6e"),
+    (LIDAR_TO_SENSOR, _moved(math.nan), "lidar_to_sensor_transform: expected .*, found nan"),
+    (
+        LIDAR_TO_SENSOR,
+        _moved(495.0),
+        "lidar_to_sensor_transform: expected beams that leave within 0.5 m of the origin of the "
+        "sensor, found 0.5",
+    ),
+    (IMU_TO_SENSOR, _moved(-1500.0), "imu_to_sensor_transform: .* at most 1000 mm, found 1500 mm"),
+    (IMU_TO_SENSOR, _moved(0.0, scale=-1.0), "imu_to_sensor_transform: expected .* rigid"),
+    (("ouster-sdk",), {"extrinsic": _moved(101.0)}, "extrinsic: .* at most 100 m, found 101 m"),
+    (
+        ("beam_intrinsics", "beam_altitude_angles"),
+        [90.5] + [1.0] * 63,
+        "beam_altitude_angles: expected angles from -90 to 90 degrees, found 90.5",
     ),
     (("ouster-sdk",), {"extrinsic": [2.0] * 16}, "extrinsic: expected 16 finite numbers, a rigid"),
 ]

@@ -122,12 +122,23 @@ def test_files_of_the_encoder_are_read(model: str) -> None:
         ),
         (yaml_of(sixteen(rot_correction=1.6)), "lasers[3].rot_correction: expected at most 1.5708"),
         # Centimetres instead of metres.
-        (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: expected at most 5 m"),
+        (yaml_of(sixteen(dist_correction=130)), "lasers[3].dist_correction: expected at most 2 m"),
         (
             yaml_of(sixteen(vert_offset_correction=19.5)),
             "expected at most 1 m in absolute value, found 19.5",
         ),
         (yaml_of(sixteen(horiz_offset_correction=-2.6)), "expected at most 1 m in absolute value"),
+        # Lasers that measure from places far apart; the second by corrections for near points.
+        (
+            yaml_of(sixteen(dist_correction=1.3)),
+            "dist_correction: expected lasers that measure from places within 1 m of each other, "
+            "found 1.3 m",
+        ),
+        (yaml_of(sixteen(dist_correction_x=-0.6, dist_correction_y=0.6)), "found 1.2 m"),
+        (
+            yaml_of(sixteen(vert_offset_correction=0.8, horiz_offset_correction=0.8)),
+            "found 1.13 m, with the offsets of a laser",
+        ),
         (
             yaml_of(sixteen(), "num_lasers: 32\n"),
             "num_lasers: expected 16, the lasers listed, found 32",
@@ -203,6 +214,9 @@ def test_xml_gives_degrees_and_centimetres() -> None:
         horizOffsetCorrection_=-2.6,
         focalSlope_=1.4,
     )
+    # A laser without a correction would be 1.5 m off.
+    for entry in changed:
+        entry.setdefault("distCorrection_", 150)
     file = read(xml_of(changed[::-1], [1] * 64), XML)
     assert (file.lasers, file.notes) == (64, ())
     assert file.unit_m == pytest.approx(0.002)
@@ -214,7 +228,8 @@ def test_xml_gives_degrees_and_centimetres() -> None:
     assert file.dist_correction_y_m[3] == pytest.approx(1.525)
     assert file.vert_offset_m[3] == pytest.approx(0.195)
     assert file.horiz_offset_m[3] == pytest.approx(-0.026)
-    assert file.dist_correction_m[4] == 0
+    assert file.dist_correction_m[4] == pytest.approx(1.5)
+    assert file.horiz_offset_m[4] == 0
 
 
 def test_xml_of_32_lasers_lists_64() -> None:
@@ -268,7 +283,7 @@ ENTITIES = '<!DOCTYPE boost_serialization [<!ENTITY a "1111111111"><!ENTITY b "&
         ),
         (
             xml_of(entries(64, distCorrection_=1500)),
-            "distCorrection_: expected at most 500 cm",
+            "distCorrection_: expected at most 200 cm",
         ),
         (xml_of(entries(64), [0] * 64), "DB.enabled_: expected enabled lasers, found none"),
         (xml_of(entries(64), [2] * 64), "DB.enabled_: expected at most 128 items of 0 or 1"),

@@ -1,0 +1,201 @@
+"""The identity of a job: options, versions and the content of its inputs, as texts.
+
+An interrupted run is resumed only by a job of the same identity. The content of recordings is
+sampled here, since they may have many gigabytes; `ResumeLog.take` compares what is read of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import numpy as np
+
+import mlbatch
+from mlbatch.errors import RecordingError
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.sensor import Sensor
+from mlbatch.writers import WriterOptions
+
+# Fields of a job that are not part of its identity: digests of files and sensors replace them, or
+# the output does not depend on them.
+_NOT_IDENTITY = frozenset(
+    {"recordings", "selection", "segment", "extras", "fault_begin_ns", "jobs", "engine"}
+)
+# What decoding takes from a calibration, apart from `beams`; see `Lidar`.
+_CALIBRATED = (
+    "model",
+    "mode",
+    "serial",
+    "channels",
+    "returns",
+    "return_types",
+    "typed_by",
+    "packet_size",
+    "columns_per_packet",
+    "records",
+    "pixel_layout",
+    "channel",
+    "firing_ns",
+    "beams",
+    "timestamp_mode",
+    "calibration",
+)
+_DIGITS = 12
+
+# A file of a recording is sampled at its start, at its end and at blocks between, at equal
+# distances; small ones are read as a whole. A session has so many blocks, for any size.
+_WHOLE_BYTES = 1 << 20
+_END_BYTES = 1 << 16
+_BLOCK_BYTES = 1 << 14
+_BLOCKS = 64
+
+
+def job_identity(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
+    """Options of a job by name, as texts; name: of the format."""
+    found = {"mlbatch": mlbatch.__version__, "numpy": np.__version__, "format": name}
+    found["point layout"] = options.point_layout
+    found["compression"] = options.compression
+    for key, value in _options(job):
+        found[key.replace("_", " ")] = _text(value)
+    return found
+
+
+def input_identity(run: Conversion) -> dict[str, str]:
+    """Sizes, times and samples of the recordings, digests of calibrations and poses."""
+    found = {}
+    recordings = [_files(path) for path in run.job.recordings]
+    total = sum(file.stat().st_size for files in recordings for file in files)
+    for number, (path, files) in enumerate(zip(run.job.recordings, recordings, strict=True), 1):
+        size_and_time = _size_and_time(files)
+        content = _content(files, total)
+        found[f"recording {number}"] = f"{path.name} ({size_and_time}, content {content})"
+    for path in run.job.selection.metadata:
+        found[f"metadata {path.name}"] = _content([path], 0)
+    for sensor in run.sensors:
+        found[f"calibration of {sensor.name}"] = _calibration(sensor)
+        pose = (sensor.body_from_sensor, sensor.clock.offset_ns)
+        found[f"pose of {sensor.name}"] = _digest(pose)
+    found["rig"] = _digest(run.session.setup.rig)
+    found["sensors"] = ", ".join(sensor.name for sensor in run.sensors)
+    return found
+
+
+def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:
+    """First difference between two identities, as text; "" if they are equal."""
+    for key in (*old, *new):
+        before = old.get(key, "none")
+        now = new.get(key, "none")
+        if before != now:
+            return f"{key} {now or 'not given'!r} instead of {before or 'not given'!r}"
+    return ""
+
+
+def _options(job: Job) -> Iterator[tuple[str, object]]:
+    for holder in (job, job.selection):
+        for one in fields(holder):
+            if one.name not in _NOT_IDENTITY:
+                yield one.name, getattr(holder, one.name)
+
+
+def _text(value: object) -> str:
+    """A value as a user would write it, the same in every process."""
+    if value is None or value == () or value == {}:
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}={_text(value[key])}" for key in sorted(value))
+    if isinstance(value, tuple):
+        return ", ".join(map(_text, value))
+    return str(value)
+
+
+# -- files ------------------------------------------------------------------------------------
+
+
+def _files(path: Path) -> list[Path]:
+    """A recording, or all files of its folder."""
+    return sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+
+
+def _size_and_time(files: Sequence[Path]) -> str:
+    """Size and last modification of files."""
+    stats = [file.stat() for file in files]
+    size = sum(one.st_size for one in stats)
+    return f"{size} bytes, changed at {max((one.st_mtime_ns for one in stats), default=0)} ns"
+
+
+def _content(files: Sequence[Path], session_bytes: int) -> str:
+    """Digest of samples of files; session_bytes: of all files that share the samples."""
+    digest = hashlib.sha256()
+    for file in files:
+        for sample in _samples(file, session_bytes):
+            digest.update(sample)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _samples(file: Path, session_bytes: int) -> Iterator[bytes]:
+    """Samples of the content of a file."""
+    try:
+        with file.open("rb", buffering=0) as opened:
+            descriptor = opened.fileno()
+            size = os.fstat(descriptor).st_size
+            for begin, count in _sampled(size, session_bytes):
+                yield os.pread(descriptor, count, begin)
+    except OSError as err:
+        raise RecordingError(
+            f"{file}: expected an input, could not read it ({err.strerror}); check the disk"
+        ) from err
+
+
+def _sampled(size: int, session_bytes: int) -> Iterator[tuple[int, int]]:
+    """Begin and length of the samples of a file of `size` bytes."""
+    if size <= _WHOLE_BYTES:
+        yield 0, size
+        return
+    yield 0, _END_BYTES
+    blocks = -(-_BLOCKS * size // max(size, session_bytes))
+    for number in range(blocks):
+        yield (2 * number + 1) * size // (2 * blocks), _BLOCK_BYTES
+    yield size - _END_BYTES, _END_BYTES
+
+
+# -- values -----------------------------------------------------------------------------------
+
+
+def _calibration(sensor: Sensor) -> str:
+    """Digest of a sensor's calibration: its file, if there is one, and what is made of it."""
+    lidar = sensor.lidar
+    path = Path(lidar.calibration)
+    content = _content([path], 0) if path.is_file() else ""
+    return _digest((content, *(getattr(lidar, name) for name in _CALIBRATED)))
+
+
+def _digest(value: object) -> str:
+    digest = hashlib.sha256()
+    for piece in _pieces(value):
+        digest.update(piece)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _pieces(value: object) -> Iterator[bytes]:
+    """A value as bytes that are the same in every process."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif is_dataclass(value) and not isinstance(value, type):
+        for one in fields(value):
+            yield one.name.encode()
+            yield from _pieces(getattr(value, one.name))
+    elif isinstance(value, Mapping):
+        for key in sorted(value, key=str):
+            yield str(key).encode()
+            yield from _pieces(value[key])
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _pieces(item)
+    else:
+        yield f"{value!r};".encode()
