@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -278,9 +279,16 @@ class Conversion:
         """Point counters of a sensor so far."""
         return PointCounts() if self._pool is None else self._pool.points(sensor)
 
-    def passed_through(self, end_ns: int | None) -> list[ImuSamples | Message]:
-        """IMU samples and recorded messages before `end_ns` (None: all), each given once."""
-        return self.passthrough.drain_until(end_ns, self.batcher.limits_ns, self._clock_offset_ns())
+    def passed_through(
+        self, end_ns: int | None, most_bytes: float = math.inf
+    ) -> list[ImuSamples | Message]:
+        """IMU samples and recorded messages before `end_ns` (None: all), each given once.
+
+        most_bytes: of messages, before the rest is left for the next call.
+        """
+        return self.passthrough.drain_until(
+            end_ns, self.batcher.limits_ns, self._clock_offset_ns(), most_bytes
+        )
 
     def _clock_offset_ns(self) -> int | None:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""

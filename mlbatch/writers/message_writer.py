@@ -28,6 +28,8 @@ from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_
 # Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
 WAITING_SAMPLES = 65536
 WAITING_BYTES = 16 << 20
+# Memory of a message in addition to its bytes.
+_MESSAGE_BYTES = 400
 _TF_STATIC = "/tf_static"
 
 # sensor_msgs/Imu: -1 in the covariance means no orientation; a covariance of zeros is unknown.
@@ -229,7 +231,7 @@ class MessageWriter:
                 return
             self._waiting.append(item)
             if isinstance(item, Message):
-                self._waiting_bytes += len(item.data)
+                self._waiting_bytes += len(item.data) + _MESSAGE_BYTES
             else:
                 self._waiting_samples += len(item.stamp_ns)
             if self._waiting_samples >= WAITING_SAMPLES or self._waiting_bytes >= WAITING_BYTES:

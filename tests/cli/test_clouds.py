@@ -640,4 +640,7 @@ def test_engines_and_jobs_agree(shell: Shell, tmp_path: Path, engine: str, jobs:
     assert _run(shell, _two_frames(), "--identity-extrinsics --engine numpy").code == 0
     for one, path in zip(found, scan_files(tmp_path / "out"), strict=True):
         with np.load(path) as other:
-            assert all(np.array_equal(one[key], other[key]) for key in other.files)
+            # A cloud has no known fill.
+            assert {key: one[key].tobytes() for key in one} == {
+                key: other[key].tobytes() for key in other.files
+            }

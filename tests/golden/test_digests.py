@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import io
 import itertools
 import json
@@ -31,6 +30,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.cli import main
+from mlbatch.native.library import trouble
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
     CONTAINERS,
@@ -64,7 +64,7 @@ class Run:
     @property
     def can_run(self) -> bool:
         """Whether its engine is here."""
-        return self.engine != "native" or importlib.util.find_spec("native") is not None
+        return self.engine != "native" or not trouble()
 
 
 @dataclass(frozen=True, slots=True)
