@@ -1,7 +1,8 @@
 # All set-up happens here: python3 (3.10 or later), git and make are enough.
 #
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
-#   make test    formatting, lint, types, all tests, branch coverage
+#   make test    formatting, lint, types, all tests
+#   make coverage   all tests with branch coverage, at least 95 %
 #   make test-quick   the tests of daily work, within a minute
 #   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
@@ -22,7 +23,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick test-lowest lint bench fuzz fuzz-sanitized clean
+.PHONY: help demo test coverage test-quick test-lowest lint bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -35,7 +36,10 @@ demo: $(VENV)/dev.stamp
 	@$(BIN)/python docs/demo.py demo
 
 test: lint
-	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered
+	$(BIN)/python -m pytest -n 2
+
+coverage: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered --cov-fail-under=95
 
 test-quick: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n 2 -m 'not slow and not long'

@@ -158,7 +158,7 @@ def _packets(sampler: Sampler, kind: PacketKind, lidar: Lidar) -> _Packets:
     if len(stamp_ns):
         span_ns = median(stamp_ns[:, -1] - stamp_ns[:, 0])
         # Blocks of two returns have one timestamp.
-        columns = len(np.unique(stamp_ns[0]))
+        columns = len(set(stamp_ns[0].tolist()))
         swept = rotor[:, -1] - rotor[:, 0]
         turn = median(swept - np.rint(swept))
     # A packet ends one column after the begin of its last column.
@@ -187,10 +187,10 @@ def _overlapping(packets: _Packets) -> Pair | None:
         if not overlaps.any():
             continue
         continued = packets.continued(rows, _MOST_LOST)
-        continues = continued.any(axis=0) | continued.any(axis=1)
+        continues: BoolArray = np.logical_or(continued.any(axis=0), continued.any(axis=1))
         foreign = overlaps & continues[1:] & continues[:-1]
         foreign &= ~packets.follows(rows[:-1], rows[1:])
-        pairs += [(int(rows[at]), int(rows[at + 1])) for at in np.flatnonzero(foreign)]
+        pairs += [(int(rows[at]), int(rows[at + 1])) for at in foreign.nonzero()[0].tolist()]
     if steps < _MIN_STEPS or len(pairs) < _SEVERAL * steps:
         return None
     return pairs[0]

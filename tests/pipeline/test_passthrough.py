@@ -134,7 +134,7 @@ def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(message_spill.os, "pwrite", full)
+    monkeypatch.setattr("os.pwrite", full)
     queue = MessageQueue([], frozenset({"cdr"}))
     with pytest.raises(ExportError, match=r"No space left on device.*set TMPDIR") as error:
         queue.add(Message(TOPICS[0], at, bytes(300_000)) for at in range(20))
