@@ -119,7 +119,7 @@ class ExampleLidar(BaseLidar):
             direction=spherical(np.zeros(4), elevation_rad),
             origin=np.zeros((3, 1, 3)),
             reach_m=np.zeros(1),
-            angle_rad=np.arange(POSITIONS) * (2 * np.pi / POSITIONS),
+            angle_rad=np.arange(POSITIONS, dtype=np.float64) * (2 * np.pi / POSITIONS),
         )
         self.calibration = "built in"
 
@@ -127,7 +127,8 @@ class ExampleLidar(BaseLidar):
         """(P,) index into FAULTS."""
         angles_fit = (_fields(packets)["column"]["angle"] < POSITIONS).all(axis=1)
         bad = ~(_begins_right(packets) & angles_fit)
-        return bad.astype(np.uint8) * np.uint8(FAULTS.index("bad_header"))
+        verdicts: U8Array = bad.astype(np.uint8) * np.uint8(FAULTS.index("bad_header"))
+        return verdicts
 
     def sequence(self, packets: U8Array) -> I64Array:
         """(P,) packet counter."""
