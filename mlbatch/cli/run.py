@@ -5,17 +5,13 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import json
 import shlex
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
 
 import typer
 
@@ -30,6 +26,7 @@ from mlbatch.errors import (
 )
 from mlbatch.pipeline import preflight, resume
 from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.interrupts import interruptible
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
@@ -49,9 +46,6 @@ from mlbatch.writers import (
     sync_entries,
     write_text,
 )
-
-# An interrupt that got lost is raised again after this time.
-_REPEAT_S = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +79,7 @@ def run(job: Job, target: Target) -> None:
 
     Raises typer.Exit with code 3 after outputs that exceed limits of `--fail-on`.
     """
-    with _terminated_as_interrupt():
+    with interruptible():
         beyond = _run_segments(job, target) if target.split_jumps else _run_one(job, target)
     for line in beyond:
         _say(f"limit exceeded: {line}")
@@ -362,56 +356,6 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 
 # -- interrupted runs -------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _terminated_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP (the terminal was closed) as an interrupt from the keyboard."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    # One that is ignored remains so: nohup is to outlive its terminal.
-    caught = {number: one for number, one in before.items() if one is not signal.SIG_IGN}
-    try:
-        for number in caught:
-            signal.signal(number, interrupt)
-        with _interrupts_repeated():
-            yield
-    finally:
-        for number, one in caught.items():
-            signal.signal(number, one)
-
-
-@contextlib.contextmanager
-def _interrupts_repeated() -> Iterator[None]:
-    """Repeat an interrupt that was raised where Python ignores exceptions.
-
-    It is raised between any two instructions of the first thread, also in a finalizer or the
-    callback of a weak reference, which would end with a traceback while the run continues.
-    """
-    before = sys.unraisablehook
-    timers: list[threading.Timer] = []
-
-    def repeat(ignored: sys.UnraisableHookArgs) -> None:
-        if issubclass(ignored.exc_type, KeyboardInterrupt):
-            # Later: here it would be ignored again.
-            timers.append(threading.Timer(_REPEAT_S, _thread.interrupt_main))
-            timers[-1].start()
-        else:
-            before(ignored)
-
-    sys.unraisablehook = repeat
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
-        for timer in timers:
-            timer.cancel()
 
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:
