@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import importlib
 import json
 import os
@@ -52,6 +53,7 @@ RAISED = 99
 # Of one that was interrupted before or after its command.
 OUTSIDE = 98
 INTERRUPTED = 130
+HANG_S = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,12 +161,14 @@ def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
     child = os.fork()
     if not child:
         _convert(folder, words, end, interval_s)
-    timer = None
+    # One that hangs shows where.
+    timers = [threading.Timer(HANG_S, _kill, (child, signal.SIGABRT))]
     if end.after_s is not None:
-        timer = threading.Timer(end.after_s, _kill, (child, end.signal))
+        timers.append(threading.Timer(end.after_s, _kill, (child, end.signal)))
+    for timer in timers:
         timer.start()
     _, status = os.waitpid(child, 0)
-    if timer is not None:
+    for timer in timers:
         timer.cancel()
         timer.join()
     return os.waitstatus_to_exitcode(status)
@@ -181,6 +185,7 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
     with open("said", "a") as said:
         os.dup2(said.fileno(), 1)
         os.dup2(said.fileno(), 2)
+    faulthandler.enable(2)
     resume.INTERVAL_S = interval_s
     sys.argv = ["mlbatch", *words]
     calls = 0
@@ -230,7 +235,11 @@ def contents(folder: Path) -> dict[str, object]:
         if path.is_dir():
             found[name] = None
         elif path.name.endswith("report.json"):
-            found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
+            found[name] = {
+                k: v
+                for k, v in json.loads(path.read_text()).items()
+                if k not in ("timing", "command")
+            }
         else:
             found[name] = path.read_bytes()
     return found

@@ -13,6 +13,8 @@ from functools import partial
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
+from mlbatch.pipeline.interrupts import Uninterrupted
+
 
 class StagedTask(Protocol):
     """A task in four stages, each run once, in this order."""
@@ -72,12 +74,10 @@ class OrderedWorkers(Generic[Task]):
             threading.Thread(target=self._run, name=f"mlbatch-{number}", daemon=True)
             for number in range(threads)
         ]
-        for thread in self._threads:
-            thread.start()
 
     def put(self, task: Task) -> None:
         """Append a task; waits while too many are unfinished; raises the error of one."""
-        with self._changed:
+        with Uninterrupted(), self._changed:
             self._waiting.append((self._given, task))
             self._given += 1
             self._changed.notify_all()
@@ -86,11 +86,19 @@ class OrderedWorkers(Generic[Task]):
 
     def finish(self) -> None:
         """Wait until all tasks are done; raises the error of one."""
-        with self._changed:
+        with Uninterrupted(), self._changed:
             self._wait(lambda: self._given == self._past[-1])
         self._raise_error()
 
     def __enter__(self) -> OrderedWorkers[Task]:
+        """Start the threads."""
+        try:
+            with Uninterrupted():
+                for thread in self._threads:
+                    thread.start()
+        except KeyboardInterrupt:
+            self._end()
+            raise
         return self
 
     def __exit__(
@@ -100,6 +108,12 @@ class OrderedWorkers(Generic[Task]):
         at: TracebackType | None,
     ) -> None:
         """End all threads, also after an error; the error of an earlier task is raised first."""
+        with Uninterrupted():
+            self._end()
+        if error is not self._error:
+            self._raise_error()
+
+    def _end(self) -> None:
         try:
             with self._changed:
                 self._wait(lambda: self._given == self._past[-1])
@@ -110,8 +124,6 @@ class OrderedWorkers(Generic[Task]):
                 self._changed.notify_all()
         for thread in self._threads:
             thread.join()
-        if error is not self._error:
-            self._raise_error()
 
     def _raise_error(self) -> None:
         if self._error is not None:
