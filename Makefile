@@ -1,21 +1,29 @@
 # All set-up happens here: python3 (3.10 or later), git and make are enough.
 #
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
-#   make test    formatting, lint, types, all tests, branch coverage
+#   make test    formatting, lint, types, all tests
+#   make coverage   all tests with branch coverage, at least 95 %
 #   make test-quick   the tests of daily work, within a minute
+#   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
+#   make fuzz-sanitized   its targets of compiled loops, with sanitizers in the C code
 #   make clean   remove what the others made
 
 PYTHON ?= python3
+# The oldest dependencies have no wheels for later versions.
+LOWEST_PYTHON ?= $(PYTHON)
 VENV := .venv
+LOWEST := .venv-lowest
 BIN := $(VENV)/bin
 RIG := fixtures/two_lidars
+# Of the compiled engine, which an installation builds.
+SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick lint bench fuzz clean
+.PHONY: help demo test coverage test-quick test-lowest lint bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -28,10 +36,16 @@ demo: $(VENV)/dev.stamp
 	@$(BIN)/python docs/demo.py demo
 
 test: lint
-	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered
+	$(BIN)/python -m pytest -n 2
+
+coverage: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered --cov-fail-under=95
 
 test-quick: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n 2 -m 'not slow and not long'
+
+test-lowest: $(LOWEST)/dev.stamp
+	$(LOWEST)/bin/python -m pytest -n 2 -m 'not slow and not long'
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
@@ -49,10 +63,19 @@ MINUTES ?= 0
 fuzz: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.fuzz.run --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
-clean:
-	rm -rf $(VENV) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+# The fuzzer with the C code under AddressSanitizer and UndefinedBehaviorSanitizer.
+fuzz-sanitized: $(VENV)/dev.stamp
+	mkdir -p build
+	$(CC) -std=c11 -g -O1 -fno-omit-frame-pointer -ffp-contract=off -fsanitize=address,undefined \
+		-fno-sanitize-recover=all -fPIC -shared -o build/native-sanitized.so mlbatch/native/*.c
+	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
+		ASAN_OPTIONS=detect_leaks=0 MLBATCH_NATIVE=$(CURDIR)/build/native-sanitized.so \
+		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
-# The environment is updated when pyproject.toml changes.
+clean:
+	rm -rf $(VENV) $(LOWEST) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+
+# The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
 		echo "make: expected Python 3.10 or later, found $$($(PYTHON) --version 2>&1);" \
@@ -61,12 +84,22 @@ $(VENV)/bin/python:
 		echo "make: $(PYTHON) cannot make a virtual environment;" \
 			"on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
 
-$(VENV)/core.stamp: pyproject.toml | $(VENV)/bin/python
+$(VENV)/core.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/dev.stamp: pyproject.toml | $(VENV)/bin/python
+$(VENV)/dev.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch and its tools into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ $(VENV)/core.stamp
+
+$(LOWEST)/dev.stamp: pyproject.toml .ci/lowest.txt
+	@$(LOWEST_PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' || { \
+		echo "make: expected Python 3.10 or 3.11, found $$($(LOWEST_PYTHON) --version 2>&1);" \
+			"choose another: make LOWEST_PYTHON=python3.11 test-lowest"; exit 1; }
+	@echo "installing the oldest dependencies into $(LOWEST)"
+	@$(LOWEST_PYTHON) -m venv --clear $(LOWEST)
+	@$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint .ci/lowest.txt --editable '.[dev]'
+	@touch $@

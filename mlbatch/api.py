@@ -11,11 +11,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
+from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.conversion import Conversion
-from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, wait_ns
+from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, check_sort, wait_ns
 from mlbatch.types import Scan
 from mlbatch.units import parse_rate
 
@@ -28,6 +28,7 @@ def scans(
     rate: int | float | str | Fraction | None = None,
     slices: int = 1,
     layout: str = "dense",
+    sort: str = "columns",
     keep_partial: bool = False,
     max_wait: float = 1.0,
     clock: str = "sensor",
@@ -50,7 +51,7 @@ def scans(
     for name, value, known in (
         ("layout", layout, ("dense", "organized")),
         ("clock", clock, ("sensor", "host")),
-        ("engine", engine, ENGINES),
+        ("engine", engine, (*ENGINES, *ALIASES)),
     ):
         if value not in known:
             raise UsageError(f"{name}: expected {' or '.join(known)}, found {value!r}; choose one")
@@ -70,6 +71,7 @@ def scans(
         rate=None if rate is None else parse_rate(str(rate)),
         slices=check_slices("slices", slices),
         layout=layout,
+        sort=check_sort("sort", sort, layout),
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
         max_wait_ns=wait_ns("max_wait", max_wait, max_wait),

@@ -6,6 +6,8 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
 
@@ -13,15 +15,29 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16
 class Stream:
     """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.
 
-    Source ports are ephemeral and no part of it.
+    Source ports are ephemeral and no part of it. frame_id, lidar_id: only where a topic has decoded
+    clouds of several lidars.
     """
 
     source_ip: str = ""
     port: int = 0  # destination
     topic: str = ""
+    frame_id: str = ""
+    lidar_id: int | None = None
 
     def __str__(self) -> str:
-        return self.topic or f"{self.source_ip} > port {self.port}"
+        parts = [f"frame_id {self.frame_id}"] if self.frame_id else []
+        parts += [] if self.lidar_id is None else [f"lidar_id {self.lidar_id}"]
+        part = f" ({', '.join(parts)})" if parts else ""
+        return f"{self.topic}{part}" if self.topic else f"{self.source_ip} > port {self.port}"
+
+    @property
+    def names(self) -> frozenset[str]:
+        """What `--only` and `--ignore` accept for it."""
+        if self.topic:
+            return frozenset({str(self), self.topic})
+        address = f"[{self.source_ip}]" if ":" in self.source_ip else self.source_ip
+        return frozenset({str(self), f"{address}:{self.port}"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +145,15 @@ class Recording:
         """
         raise NotImplementedError
 
+    def last_packets(self, streams: StreamTable) -> PacketBatch | None:
+        """Return packets at the end, without reading those before; None where that is impossible.
+
+        streams: numbers their streams. The batch stays valid.
+        """
+        return None
+
     def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `numba`; ignored by containers that have one implementation."""
+        """Read by `numpy` or `native`; ignored by containers that have one implementation."""
 
 
 class WrappedRecording(Recording):
@@ -198,6 +221,9 @@ class SensorInfo:
     returns: int
     ring_base: int  # first ring number of its channels
     body_from_sensor: F64Array  # (4, 4) m
+    has_reflectivity: bool = False  # calibrated, in addition to intensity
+    # (4, 4) m; None: it sends no IMU data.
+    sensor_from_imu: F64Array | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,10 +236,15 @@ class RunInfo:
     timescale: str  # utc, tai, uptime or unknown
     slices: int = 1  # a window
     layout: str = "dense"  # or organized
+    sort: str = "columns"  # order of the points of a dense scan: by their columns, or `points`
+    # Static frames of the recording that forwarded messages may name: name, (4, 4) body_from_frame.
+    frames: tuple[tuple[str, F64Array], ...] = ()
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
+# Listed with EXTRAS by outputs whose intensity has 8 bits: points outside 0 to 255 are counted.
+BYTE_INTENSITY = "byte_intensity"
 # Listed with EXTRAS by outputs that store IMU samples.
 IMU = "imu"
 # Listed with EXTRAS by outputs that store recorded messages: the encodings they can store.
@@ -248,9 +279,14 @@ class Scan:
     column_lidar_id: U8Array  # (n,)
     points: int
     columns_per_sensor: tuple[int, ...]
-    max_gap_ns: tuple[int, ...]  # by sensor, widest step between columns; 0: fewer than two
+    points_per_sensor: tuple[int, ...]
+    # By sensor: widest time without a column, from the last one before the window up to its end.
+    max_gap_ns: tuple[int, ...]
     coverage: tuple[float, ...] = ()  # by sensor, share of a revolution passed at least once
     overlap: tuple[float, ...] = ()  # by sensor, share of a revolution passed more than once
+    # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    is_partial: bool = False  # the head or the tail
 
     @property
     def slices(self) -> int:
@@ -275,3 +311,5 @@ class Summary:
     t_init_ns: int | None  # None: no window was reached
     report_json: str  # report.json without timings and paths
     scans_csv: str  # text of scans.csv
+    # Totals of fill, as texts by name; docs/formats.md#mcap.
+    fill: dict[str, str] = field(default_factory=dict)

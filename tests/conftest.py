@@ -21,7 +21,6 @@ LONG = (
     "matrix/",
     "property/",
     "recordings/",
-    "decode/kernels/",
     "batching/test_reference.py",
     "cli/test_bench.py",
     "clocks/test_simulated.py",

@@ -23,6 +23,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
+from mlbatch.batching.fill import UNKNOWN_PACE, FillMeter, Pace
+from mlbatch.batching.gaps import EdgeGaps
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Arrival, Intake, JumpGuard
 from mlbatch.batching.windows import Policy, Schedule, Window
@@ -76,10 +78,12 @@ class Batcher:
         intakes: Sequence[Intake],
         policy: Policy,
         guards: Sequence[JumpGuard] = (),
+        paces: Sequence[Pace] = (),
     ) -> None:
         """Arguments of a run.
 
-        intakes: one a sensor; guards: one a sensor, or none where clocks are not checked.
+        intakes: one a sensor; guards: one a sensor, or none where clocks are not checked; paces:
+        one a sensor, or none where the rates are unknown.
         """
         self._grid = grid
         self._policy = policy
@@ -89,6 +93,8 @@ class Batcher:
         # All columns before this stamp are published.
         self._until = NEVER
         self._guards = tuple(guards)
+        self._gaps = EdgeGaps(len(self._tracks))
+        self._fill = FillMeter(paces or [UNKNOWN_PACE] * len(self._tracks))
 
     # -- main loop ----------------------------------------------------------------------------
 
@@ -239,7 +245,9 @@ class Batcher:
                 firsts.append((int(ranks[number][row]), number))
         for _, number in sorted(firsts):
             refuse_incomparable(
-                [(track.intake.name, track.offset_ns) for track in self._tracks], number
+                [(track.intake.name, track.offset_ns) for track in self._tracks],
+                number,
+                has_receive_times=all(track.intake.has_receive_times for track in self._tracks),
             )
 
     # -- step 2: newest stamps, eq. (1), watermark ----------------------------------------------
@@ -390,6 +398,11 @@ class Batcher:
             closed_by = int(np.searchsorted(progress.watermark, end))
             part = slice(done, upto)
             done = upto
+            # Also of windows that are dropped: later ones must not depend on options.
+            gaps_ns = self._gaps.measure(start, end, columns.stamp_ns[part], sensor[part])
+            fill = self._fill.measure(
+                end - start, columns.stamp_ns[part], sensor[part], columns.encoder[part]
+            )
             reason = self._schedule.enter(window, last_of_all)
             if reason:
                 self._drop(sensor[part], reason)
@@ -405,6 +418,9 @@ class Batcher:
                 sensor=sensor[part],
                 ring_index=columns.ring_index[part],
                 encoder=columns.encoder[part],
+                edge_gap_ns=gaps_ns,
+                fill=fill,
+                is_partial=self._schedule.is_partial(window, last_of_all),
             )
         for track in self._tracks:
             track.gaps = [gap for gap in track.gaps if gap[1] > until]

@@ -83,13 +83,15 @@ class Intake:
         offset_ns: int = 0,
         modulus: int = 0,
         packet_ns: float = 0.0,
+        has_receive_times: bool = True,
     ) -> None:
         """Arguments of one sensor.
 
         host_clock: replace stamps by receive times; offset_ns: added to stamps; modulus,
-        packet_ns: as in PacketLoss.
+        packet_ns: as in PacketLoss; has_receive_times: False where `--clock host` is refused.
         """
         self.name = name
+        self.has_receive_times = has_receive_times
         self.loss = PacketLoss(modulus, packet_ns)
         self.rejected: dict[str, int] = {}
         self._host_clock = host_clock
@@ -262,7 +264,7 @@ class Intake:
         return ClockJump(
             f"sensor {self.name}: clock reset within the recording: expected stamps of one "
             f"continuous clock, found a step back from {newest / NS_PER_S:.6f} s to "
-            f"{back / NS_PER_S:.6f} s; use --on-jump split, or --clock host",
+            f"{back / NS_PER_S:.6f} s; {remedies(self.has_receive_times)}",
             host_ns,
         )
 
@@ -295,6 +297,11 @@ def _joined(first: Arrival, second: Arrival) -> Arrival:
         headers,
         np.concatenate([first.ring_index, second.ring_index]),
     )
+
+
+def remedies(has_receive_times: bool) -> str:
+    """What to do about a clock that jumps; has_receive_times: as in `Intake`."""
+    return "use --on-jump split" + (", or --clock host" if has_receive_times else "")
 
 
 class Watch(Protocol):
@@ -366,6 +373,6 @@ class JumpGuard:
             f"sensor {self.name}: clock jump within the recording: expected stamps of one "
             f"continuous clock, found a step forward from {before / NS_PER_S:.6f} s to "
             f"{after / NS_PER_S:.6f} s within {passed / NS_PER_S:.6f} s at the capture host; "
-            "use --on-jump split, or --clock host",
+            f"{remedies(self._watch is not None)}",
             int(hosts[at + 1]),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mlbatch.arrays import I64Array
+from mlbatch.arrays import F32Array, I64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.units import NS_PER_S
 
@@ -50,6 +50,10 @@ class Window:
     sensor: I64Array  # (n,) index of the column's sensor
     ring_index: I64Array  # (n,) as in `Columns`
     encoder: I64Array  # (n,) as in `Columns`
+    # By sensor: see `gaps.EdgeGaps` and `fill.FillMeter`.
+    edge_gap_ns: tuple[int, ...]
+    fill: F32Array
+    is_partial: bool  # the head or the tail
 
 
 class Schedule:
@@ -92,8 +96,12 @@ class Schedule:
             return ""
         if index == -1:
             return "head"
+        return "tail" if self.is_partial(window, last_of_all) else ""
+
+    def is_partial(self, window: int, last_of_all: int | None) -> bool:
+        """True for the head and the tail; last_of_all: as in `enter`."""
         is_tail = last_of_all is not None and self._grid.index_of(last_of_all) == window
-        return "tail" if is_tail else ""
+        return is_tail or self.index_of(window) == -1
 
     def is_past_end(self, watermark_ns: int) -> bool:
         """True once all windows that begin before `--end` are closed."""

@@ -161,7 +161,6 @@ def is_current(folder: Path) -> bool:
 
 AUTO: Final = "auto"
 NUMPY: Final = "numpy"
-NUMBA: Final = "numba"
 
 
 @dataclass(frozen=True, slots=True)

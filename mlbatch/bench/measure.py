@@ -26,7 +26,7 @@ BYTES_PER_MB: Final = 1_000_000
 _RSS_UNIT_BYTES: Final = 1 if os.uname().sysname == "Darwin" else 1024
 # Measured processes import the mlbatch of the measuring process.
 _PACKAGE_FOLDER: Final = str(Path(__file__).resolve().parents[2])
-_LIBRARIES: Final = ("numpy", "numba", "llvmlite", "isal", "mcap", "zstandard")
+_LIBRARIES: Final = ("numpy", "isal", "mcap", "zstandard")
 
 
 class BenchError(MlbatchError):

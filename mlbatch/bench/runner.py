@@ -185,7 +185,7 @@ class BenchSession:
         """Conversions first: floors copy and write as many bytes as they did."""
         conversions = case.conversions(self.settings.engines)
         for conversion in conversions:
-            # Not measured: the first run compiles modules and kernels. An error occurs again.
+            # Not measured: the first run compiles modules. An error occurs again.
             with contextlib.suppress(BenchError):
                 self._convert(conversion)
         programs = [Program(c.name, OURS, partial(self._convert, c), c.base) for c in conversions]

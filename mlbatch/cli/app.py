@@ -3,14 +3,42 @@
 from __future__ import annotations
 
 import importlib
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 import mlbatch
+from mlbatch.errors import UsageError
 
 # Modules of this package, each with a function of the same name, in the order of `--help`.
+_PATH_TYPES = ("path", "file", "directory")
 COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "bench")
+
+
+# Options that may be `-`, standard output: command and parameter.
+PRINTABLE = frozenset({("convert", "report"), ("inspect", "write_rig")})
+
+
+class Command(TyperCommand):
+    """A command that takes `-` for standard output where it can be that, and refuses it elsewhere.
+
+    Otherwise `-` would name a file.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Check the paths, run the command."""
+        for param in self.params:
+            value = ctx.params.get(param.name)
+            values = value if isinstance(value, (list, tuple)) else [value]
+            is_path = param.type.name in _PATH_TYPES
+            if is_path and "-" in map(str, values) and (self.name, param.name) not in PRINTABLE:
+                name = param.human_readable_name if param.param_type_name == "argument" else ""
+                raise UsageError(
+                    f"{name or param.opts[0]}: expected a path, found -: neither standard input "
+                    "nor standard output can be used here; give a file or folder"
+                )
+        return super().invoke(ctx)
 
 
 def command_line(first: str = "") -> typer.Typer:
@@ -28,23 +56,32 @@ def command_line(first: str = "") -> typer.Typer:
     app.callback(invoke_without_command=True)(root)
     for name in (first,) if first in COMMANDS else COMMANDS:
         module = importlib.import_module(f"mlbatch.cli.{name}")
-        app.command()(getattr(module, name))
+        app.command(cls=Command)(getattr(module, name))
     return app
-
-
-def _version(is_given: bool) -> None:
-    if is_given:
-        typer.echo(f"mlbatch {mlbatch.__version__}")
-        raise typer.Exit
 
 
 def root(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="With --version: the engine, too.")
     ] = False,
 ) -> None:
     """Time-consistent merged scans from raw packets of many lidars, offline."""
+    if version:
+        typer.echo(f"mlbatch {mlbatch.__version__}")
+        if verbose:
+            _print_engine()
+        raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help(), err=True)
         raise typer.Exit(2)
+
+
+def _print_engine() -> None:
+    """Print which engine `auto` chooses, and why it is not the compiled one."""
+    from mlbatch.native import BUILD_ADVICE
+    from mlbatch.native.library import trouble
+
+    why = trouble()
+    typer.echo(f"engine numpy; native: {why}; {BUILD_ADVICE}" if why else "engine native")

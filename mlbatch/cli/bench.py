@@ -14,10 +14,7 @@ from mlbatch.errors import UsageError
 if TYPE_CHECKING:
     from mlbatch.bench.runner import Settings
 
-ENGINES = ("all", "numpy", "numba", "auto")
-# Distribution of the engine numba, and the extra that installs it.
-COMPILER = "numba"
-EXTRA = "mlbatch[fast]"
+ENGINES = ("all", "numpy", "native", "auto")
 MAX_SECONDS = 3600.0
 MAX_RUNS = 1000
 
@@ -29,7 +26,8 @@ def bench(
         list[str] | None, typer.Option(help="Measure this case only; repeatable. [default: all]")
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="all (that are installed), numpy, numba, or auto: convert's choice.")
+        str,
+        typer.Option(help="all (installed), numpy, native, or auto: the choice of convert."),
     ] = "all",
     peer_python: Annotated[
         list[Path] | None,
@@ -107,13 +105,13 @@ def settings_from(
 
 def engines_to_measure(engine: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Engines to measure, and notes on the others."""
-    from mlbatch.bench.measure import version
+    from mlbatch.native import library_path
 
     if engine != "all":
         return (engine,), ()
-    if version(COMPILER):
-        return ("numpy", "numba"), ()
-    return ("numpy",), (f"engine numba was not measured: pip install {EXTRA}",)
+    if library_path() is not None:
+        return ("numpy", "native"), ()
+    return ("numpy",), ("engine native was not measured: its library is not installed",)
 
 
 def _show(text: str) -> None:

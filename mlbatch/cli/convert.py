@@ -30,12 +30,16 @@ def convert(
     layout: Annotated[
         str, typer.Option(help="dense: valid points only; organized: slots x columns.")
     ] = "dense",
+    sort: Annotated[
+        str,
+        typer.Option(help="Order of a scan's points: columns (time of their columns) or points."),
+    ] = "columns",
     point_layout: Annotated[
         str, typer.Option(help="Fields of a PointCloud2 point (preset).")
     ] = "standard",
     compression: Annotated[
         str,
-        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 3)."),
+        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1)."),
     ] = "none",
     slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
     split: Annotated[
@@ -99,7 +103,10 @@ def convert(
         list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option(help="Leave this sensor out; repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="Leave out this sensor (name, serial number, topic or IP:PORT); repeatable."
+        ),
     ] = None,
     pass_: Annotated[
         list[str] | None,
@@ -117,15 +124,25 @@ def convert(
             help="Do not write; print the report (with --on-jump split a line a segment).",
         ),
     ] = False,
-    report: Annotated[Path | None, typer.Option(help="Path of the report (JSON).")] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Path of the report (JSON); -: print it instead of the summary."),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
-        typer.Option(help="Decoder: auto, numpy, or numba (needs mlbatch[fast])."),
+        typer.Option(help="Decoder: auto, numpy, or native (compiled)."),
     ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
     ] = False,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Exit with 3 beyond limits, as loss>0.1%,underfilled>0; repeatable.",
+            metavar="LIMITS",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing output.")
     ] = False,
@@ -143,17 +160,17 @@ def convert(
     """Turn raw lidar packets into merged scans at an exact rate."""
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
-    from mlbatch.decode.kernels import ENGINES
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.pipeline.job import Job
+    from mlbatch.pipeline.job import Job, check_sort
+    from mlbatch.report.limits import parse_limits
 
     options.choices(
         layout=(layout, ("dense", "organized")),
         clock=(clock, ("sensor", "host")),
         align_to=(align_to, ("host", "first")),
         on_jump=(on_jump, ("error", "split")),
-        engine=(engine, ENGINES),
     )
+    engine = options.engine(engine)
     options.output(output, dry_run=dry_run)
     options.slices(slices)
     options.ranges_m(min_range, max_range)
@@ -173,6 +190,7 @@ def convert(
         rate=None if rate is None else options.rate(rate),
         slices=slices,
         layout=layout,
+        sort=check_sort("--sort", sort, layout),
         split=split,
         keep_partial=keep_partial,
         keep_repeated=keep_repeated,
@@ -200,8 +218,10 @@ def convert(
             point_layout=point_layout,
             compression=compression,
             dry_run=dry_run,
-            report=report,
+            report=None if options.is_stdout(report) else report,
+            prints_report=options.is_stdout(report),
             split_jumps=on_jump == "split",
+            limits=parse_limits(fail_on or ()),
             overwrite=overwrite,
             resume=options.resume(resume, dry_run=dry_run),
             fsync=not no_fsync,

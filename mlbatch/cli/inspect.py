@@ -20,18 +20,31 @@ def inspect(
         typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
     ] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Loss and clocks of the whole recording, not of 10 s.")
+        bool,
+        typer.Option("--whole", help="Packets, loss and clocks of the whole recording, not 10 s."),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     write_rig: Annotated[
-        Path | None, typer.Option(help="Write a rig file that `convert` accepts.")
+        Path | None, typer.Option(help="Write a rig file that `convert` accepts; -: print only it.")
     ] = None,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
     from mlbatch.cli.tables import table_lines
     from mlbatch.discovery.inspect import inspect as inspect_recordings
 
+    prints_rig = write_rig == Path("-")
+    if prints_rig and as_json:
+        from mlbatch.errors import UsageError
+
+        raise UsageError(
+            "--write-rig -: expected standard output for the rig alone, found --json; leave one out"
+        )
     found = inspect_recordings(tuple(recordings), tuple(metadata or ()), whole=whole)
+    if prints_rig:
+        typer.echo(found.rig_text(Path()), nl=False)
+        for note in found.notes:
+            typer.echo(one_line(f"mlbatch: note: {note}"), err=True)
+        return
     if write_rig is not None:
         from mlbatch.errors import ExportError
         from mlbatch.writers import write_text

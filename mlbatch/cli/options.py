@@ -11,8 +11,11 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import typer
+
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
+from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.job import MOST_S, check_ranges_m, check_slices, wait_ns
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import NS_PER_S, parse_rate
@@ -137,6 +140,14 @@ def choice(option: str, text: str, allowed: Sequence[str]) -> str:
     )
 
 
+def engine(name: str) -> str:
+    """Check `--engine`; the name of an earlier engine gives its successor, with a note."""
+    if name in ALIASES:
+        typer.echo(f"mlbatch: --engine {name} is now {ALIASES[name]}", err=True)
+        return ALIASES[name]
+    return choice("--engine", name, ENGINES)
+
+
 def percent(option: str, value: float) -> float:
     """A percentage."""
     if not 0 <= value <= 100:
@@ -170,6 +181,11 @@ def jobs(number: int) -> int:
             f"--jobs: expected 1 to {MAX_JOBS}, found {number}; give the number of free cores"
         )
     return number
+
+
+def is_stdout(path: Path | None) -> bool:
+    """True for `-`, standard output."""
+    return path == Path("-")
 
 
 def output(path: Path | None, *, dry_run: bool) -> None:

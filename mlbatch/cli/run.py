@@ -6,6 +6,7 @@ Apart from `convert.py`, whose options are described without loading any of this
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import typer
 
+from mlbatch.cli import EXIT_LIMIT
 from mlbatch.errors import (
     ClockJump,
     ExportError,
@@ -28,7 +30,8 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.report.report import RunReport, report_text, summary_lines
+from mlbatch.report.limits import Limit, exceeded
+from mlbatch.report.report import RunReport, build_report, report_text, summary_lines
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -54,7 +57,9 @@ class Target:
     compression: str
     dry_run: bool
     report: Path | None
+    prints_report: bool  # to standard output, without a summary
     split_jumps: bool
+    limits: tuple[Limit, ...]  # of `--fail-on`
     overwrite: bool
     resume: bool
     fsync: bool
@@ -68,12 +73,16 @@ class Target:
 
 
 def run(job: Job, target: Target) -> None:
-    """Convert, write the report, print the summary; with `--on-jump split` each segment."""
+    """Convert, write the report, print the summary; with `--on-jump split` each segment.
+
+    Raises typer.Exit with code 3 after outputs that exceed limits of `--fail-on`.
+    """
     with interruptible():
-        if target.split_jumps:
-            _run_segments(job, target)
-        else:
-            _run_one(job, target)
+        beyond = _run_segments(job, target) if target.split_jumps else _run_one(job, target)
+    for line in beyond:
+        _say(f"limit exceeded: {line}")
+    if beyond:
+        raise typer.Exit(EXIT_LIMIT)
 
 
 def _say(text: str) -> None:
@@ -84,7 +93,8 @@ def _say(text: str) -> None:
 # -- one output -------------------------------------------------------------------------------
 
 
-def _run_one(job: Job, target: Target) -> None:
+def _run_one(job: Job, target: Target) -> list[str]:
+    """Make one output; returns what exceeds limits of `--fail-on`, a line each."""
     # A dry run without an output decodes what a .mcap of this point layout would contain.
     name = choose_format(target.output or Path("scans.mcap"), target.format)
     options = WriterOptions(
@@ -103,7 +113,7 @@ def _run_one(job: Job, target: Target) -> None:
         output = target.written
         preflight.check_output(job, output, name)
         if target.resume and _is_complete(output, overwrite=target.overwrite):
-            return
+            return _beyond_limits_before(target, name)
         resume_log = _resume_log(job, output, name, options, resumes=target.resume)
         options = replace(options, kept_bytes=resume_log.kept_bytes)
         if options.kept_bytes is None:
@@ -121,12 +131,17 @@ def _run_one(job: Job, target: Target) -> None:
         _say(f"warning: {note.code}: {note.message}")
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
-    elif target.dry_run and report_path is None:
+    if target.prints_report or (target.dry_run and report_path is None):
         # One line a segment: several JSON documents in a row are no document.
         typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
-        return
-    if target.quiet:
-        return
+    elif not target.quiet:
+        _print_summary(conversion, inputs, target, report_path)
+    return exceeded(target.limits, build_report(inputs))
+
+
+def _print_summary(
+    conversion: Conversion, inputs: RunReport, target: Target, report_path: Path | None
+) -> None:
     if target.verbose:
         _print_sensors(conversion)
     for line in summary_lines(inputs):
@@ -134,6 +149,20 @@ def _run_one(job: Job, target: Target) -> None:
             typer.echo(one_line(line))
     if target.written is not None:
         typer.echo(f"wrote {target.written}, report {report_path}")
+
+
+def _beyond_limits_before(target: Target, name: str) -> list[str]:
+    """What exceeds limits in the output that an earlier run completed; name: of the format."""
+    if not target.limits or target.output is None:
+        return []
+    path = target.report or report_paths(target.output, name).report
+    try:
+        return exceeded(target.limits, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as err:
+        raise ExportError(
+            f"{path}: expected the report of the complete output for --fail-on, found "
+            f"{getattr(err, 'strerror', None) or 'no JSON'!r}; give its path by --report"
+        ) from err
 
 
 def _converted(
@@ -194,14 +223,27 @@ def _print_sensors(conversion: Conversion) -> None:
                 f"extrinsics from {sensor.detected.pose.describe()}"
             )
         )
-    typer.echo(f"decoded by {conversion.session.engine}")
+    engine = conversion.session.engine
+    why = "" if engine == "native" or conversion.job.engine == "numpy" else _why_not_native()
+    typer.echo(one_line(f"decoded by {engine}{why}"))
+
+
+def _why_not_native() -> str:
+    from mlbatch.native import BUILD_ADVICE
+    from mlbatch.native.library import trouble
+
+    return f" (native: {trouble()}; {BUILD_ADVICE})"
 
 
 # -- segments between clock steps -------------------------------------------------------------
 
 
-def _run_segments(job: Job, target: Target) -> None:
-    """Convert each segment between clock steps; a step is found when a segment reaches it."""
+def _run_segments(job: Job, target: Target) -> list[str]:
+    """Convert each segment between clock steps; a step is found when a segment reaches it.
+
+    Returns what exceeds limits of `--fail-on`, a line each.
+    """
+    beyond = []
     if job.faults:
         # Times of faults count from the start of the session, in all segments.
         job = replace(job, fault_begin_ns=Conversion(job).session.begin_ns)
@@ -217,7 +259,8 @@ def _run_segments(job: Job, target: Target) -> None:
             if target.resume:
                 # The end of the segment is needed first: complete segments are not made again.
                 _refuse_jump(one)
-            _run_one(one, own_target)
+            label = "" if is_whole else f"segment {number}: "
+            beyond += [f"{label}{line}" for line in _run_one(one, own_target)]
             outputs += 1
         except ClockJump as jump:
             if jump.host_ns <= (segment.begin_ns or 0):
@@ -241,6 +284,7 @@ def _run_segments(job: Job, target: Target) -> None:
             f"expected a whole window between two clock steps, found none in {number} segments; "
             "write partial ones with --keep-partial"
         )
+    return beyond
 
 
 def _refuse_jump(job: Job) -> None:

@@ -338,11 +338,15 @@ _NAMED_WITHIN_NS = 50 * NS_PER_MS
 _TODAY_NS = 1_700_000_000 * NS_PER_S
 
 
-def refuse_incomparable(offsets_ns: list[tuple[str, int | None]], number: int) -> None:
+def refuse_incomparable(
+    offsets_ns: list[tuple[str, int | None]], number: int, *, has_receive_times: bool = True
+) -> None:
     """Compare sensor `number` with all others that have a packet; ClockError beyond 1 s.
 
-    offsets_ns: name of each sensor and its first stamp minus the receive time of its packet.
+    offsets_ns: name of each sensor and its first stamp minus the receive time of its packet;
+    has_receive_times: False if packets of a sensor have none of their own, as those of clouds.
     """
+    by_host = "use --align-clocks or --clock host, or " if has_receive_times else ""
     name, mine_ns = offsets_ns[number]
     for other, theirs_ns in offsets_ns[:number] + offsets_ns[number + 1 :]:
         if mine_ns is None or theirs_ns is None or abs(mine_ns - theirs_ns) <= COMPARABLE_NS:
@@ -354,6 +358,5 @@ def refuse_incomparable(offsets_ns: list[tuple[str, int | None]], number: int) -
             f"clocks of the sensors cannot be compared: expected at most 1 s between them, found "
             f"{apart_ns / NS_PER_S:.3f} s{named}: stamp minus receive time is "
             f"{theirs_ns / NS_PER_S:+.3f} s for {other} and {mine_ns / NS_PER_S:+.3f} s for "
-            f"{name}; use --align-clocks or --clock host, or give clock.offset_s or clock.epoch in "
-            "the rig"
+            f"{name}; {by_host}give clock.offset_s or clock.epoch in the rig"
         )

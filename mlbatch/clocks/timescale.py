@@ -113,6 +113,18 @@ def timescale(stamp_ns: int, host_ns: int) -> str:
     return UNKNOWN
 
 
+def describe_time(stamp_ns: int, name: str) -> str:
+    """A time as text: date and timescale `name`, or seconds of a clock without a date."""
+    if stamp_ns < EPOCH_NS:
+        since = "since power-on" if name == UPTIME else "of a clock without a date"
+        return f"{stamp_ns / NS_PER_S:.3f} s {since}"
+    moment = datetime.fromtimestamp(stamp_ns // NS_PER_S, timezone.utc)
+    text = f"{moment:%Y-%m-%dT%H:%M:%S}.{stamp_ns % NS_PER_S // NS_PER_MS:03d}"
+    if name == UTC:
+        return f"{text}Z"
+    return f"{text} TAI" if name == TAI else f"{text} by the sensors' clock, timescale unknown"
+
+
 def common_timescale(names: list[str]) -> str:
     """Timescale of scans of several sensors: theirs if they agree, else unknown."""
     return names[0] if len(set(names)) == 1 else UNKNOWN

@@ -1,31 +1,33 @@
 """Columns of a window to the arrays of a scan; every pixel is written once, to its final row.
 
 Sensors with equal pixel layouts are decoded together, by numpy (`numpy_engine.py`) or by compiled
-loops (`numba_engine.py`); both give the same bytes.
+loops (`native_engine.py`); both give the same bytes.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from dataclasses import dataclass, field, replace
+from operator import sub
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, U8Array
+from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.decode.coverage import NO_COLUMNS, ColumnStats
 from mlbatch.decode.engine import Engine, EngineSetup
 from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns, by_time
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import EXTRAS, RunInfo, Scan
 
 __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
-# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_OUTCOMES`.
+# Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,9 @@ class ScanHeader:
     end_ns: int
     complete: bool
     ready_host_ns: int
+    edge_gap_ns: tuple[int, ...] = ()  # by sensor, widest gap at either bound
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    is_partial: bool = False
 
 
 class _EngineChoice(NamedTuple):
@@ -50,17 +55,17 @@ class _EngineChoice(NamedTuple):
     joins_rotors: bool
 
 
-def _numba_engine(setup: EngineSetup) -> Engine:
-    # Imported on demand: numba is an optional dependency.
-    from mlbatch.decode.numba_engine import NumbaEngine
+def _native_engine(setup: EngineSetup) -> Engine:
+    # Imported on demand: the library may be missing.
+    from mlbatch.decode.native_engine import NativeEngine
 
-    return NumbaEngine(setup)
+    return NativeEngine(setup)
 
 
 _ENGINES: Mapping[str, _EngineChoice] = {
     "numpy": _EngineChoice(NumpyEngine, joins_rotors=True),
     # Its groups join what its projectors do not; a compiled loop follows one rotor.
-    "numba": _EngineChoice(_numba_engine, joins_rotors=False),
+    "native": _EngineChoice(_native_engine, joins_rotors=False),
 }
 
 
@@ -80,7 +85,7 @@ class Decoder:
         """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
 
         only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
-        whose arrays are valid at a time; engine: numpy or numba.
+        whose arrays are valid at a time; engine: numpy or native.
         """
         self._info = info
         self._only = only
@@ -119,6 +124,8 @@ class Decoder:
         positions = [None if one is None else len(one) for one in angles]
         self._statistics = self._engine.column_statistics(positions)
         self._buffer = self._new_buffer(0)
+        # With `sort` the points before they are sorted; no scan has views of it.
+        self._unsorted = self._new_buffer(0)
         self._other_buffers = deque(self._new_buffer(0) for _ in range(buffers - 1))
 
     @property
@@ -142,8 +149,11 @@ class Decoder:
         self._other_buffers.append(self._buffer)
         self._buffer = self._other_buffers.popleft()
         self._reserve(len(columns))
+        before = self._written()
         points = self._engine.decode(columns, header.start_ns, 0, self._buffer)
-        return self._scan(columns, header, points)
+        if self._info.sort == "points":
+            self._sort(points)
+        return self._scan(columns, header, points, before)
 
     def _scan_without_points(
         self, columns: WindowColumns, header: ScanHeader, outcomes: PointOutcomes
@@ -152,12 +162,12 @@ class Decoder:
         if self._is_organized:
             self._reserve(len(columns))
         counts = self.counts
-        before = sum(one.written for one in counts)
+        before = self._written()
         own = outcomes if self._only is None else outcomes[self._only : self._only + 1]
         for one, numbers in zip(counts, own, strict=True):
             one.add(numbers)
-        points = sum(one.written for one in counts) - before
-        return replace(self._scan(columns, header, 0), points=points)
+        scan = self._scan(columns, header, 0, before)
+        return replace(scan, points=sum(scan.points_per_sensor))
 
     def _reserve(self, columns: int) -> None:
         """Make the buffer large enough for so many columns."""
@@ -165,13 +175,29 @@ class Decoder:
         if rows > self._buffer.rows:
             self._buffer = self._new_buffer(rows)
 
+    def _sort(self, points: int) -> None:
+        """Sort the points of a dense scan by time, those of one time by column."""
+        if self._unsorted.rows < self._buffer.rows:
+            self._unsorted = self._new_buffer(self._buffer.rows)
+        self._buffer, self._unsorted = self._unsorted, self._buffer
+        by_time(self._unsorted, points, self._buffer)
+
     def _new_buffer(self, rows: int) -> ScanBuffer:
         return ScanBuffer(rows, self._slots if self._is_organized else None)
 
-    def _scan(self, columns: WindowColumns, header: ScanHeader, points: int) -> Scan:
+    def _written(self) -> list[int]:
+        """Return the points so far of each sensor of the run."""
+        own = [one.written for one in self.counts]
+        return self._of_all(own, 0)
+
+    def _scan(
+        self, columns: WindowColumns, header: ScanHeader, points: int, before: Sequence[int]
+    ) -> Scan:
+        """before: points of each sensor before this scan."""
         rows = slice(0, len(columns) if self._is_organized else points)
         buffer = self._buffer
         stats = self._column_stats(columns)
+        edge_gap_ns = header.edge_gap_ns or (0,) * len(stats)
         has_column = "column" in self._extras and not self._is_organized
         return Scan(
             info=self._info,
@@ -194,9 +220,12 @@ class Decoder:
             column_lidar_id=self._lidar_id(columns),
             points=points,
             columns_per_sensor=tuple(one.columns for one in stats),
-            max_gap_ns=tuple(one.max_gap_ns for one in stats),
+            points_per_sensor=tuple(map(sub, self._written(), before)),
+            max_gap_ns=tuple(map(max, (one.max_gap_ns for one in stats), edge_gap_ns)),
             coverage=tuple(one.coverage for one in stats),
             overlap=tuple(one.overlap for one in stats),
+            fill=header.fill,
+            is_partial=header.is_partial,
         )
 
     def _lidar_id(self, columns: WindowColumns) -> U8Array:
@@ -206,11 +235,14 @@ class Decoder:
 
     def _column_stats(self, columns: WindowColumns) -> list[ColumnStats]:
         """Return the column statistics of all sensors of the run."""
-        stats = self._statistics.measure(columns)
+        return self._of_all(self._statistics.measure(columns), NO_COLUMNS)
+
+    def _of_all(self, own: list[Value], nothing: Value) -> list[Value]:
+        """Return values of all sensors of the run; nothing: of those without a decoder here."""
         if self._only is None:
-            return stats
-        others = [NO_COLUMNS] * (len(self._info.sensors) - 1)
-        return [*others[: self._only], *stats, *others[self._only :]]
+            return own
+        others = [nothing] * (len(self._info.sensors) - 1)
+        return [*others[: self._only], *own, *others[self._only :]]
 
 
 def _groups(sources: Sequence[Source], joins_rotors: bool) -> list[list[int]]:

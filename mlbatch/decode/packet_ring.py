@@ -30,7 +30,8 @@ class PacketRing:
         self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
-        # Of all packets, and up to the packet in each slot.
+        # Of all packets, and up to the packet in each slot; only where they are asked for.
+        self._has_sums = False
         self._sum = np.uint64(0)
         self._sums: U64Array = np.zeros(_FIRST_PACKETS, np.uint64)
         self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
@@ -72,7 +73,7 @@ class PacketRing:
             for begin in start.tolist():
                 target[at : at + size] = source[begin : begin + size]
                 at += stride
-        if count:
+        if count and self._has_sums:
             sums = self._sums[slot % self._capacity :][:count]
             np.cumsum(_sums(packets), out=sums)
             sums += self._sum
@@ -80,8 +81,12 @@ class PacketRing:
         self._next = slot + count
         return packets, np.arange(slot, slot + count) * self._places
 
+    def keep_sums(self) -> None:
+        """Sum packets from now on, for `sum_until`."""
+        self._has_sums = True
+
     def sum_until(self, ring_index: int) -> int:
-        """Return the sum of all packets ever stored, up to that of a column still needed.
+        """Return the sum of all packets since `keep_sums`, up to that of a column still needed.
 
         See `_sums`. Only for the thread that stores packets.
         """

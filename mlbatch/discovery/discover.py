@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import ipaddress
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+import numpy as np
 
 from mlbatch import sensors
+from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
+from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import (
     ExpectedSensor,
     Matched,
@@ -19,7 +25,6 @@ from mlbatch.discovery.match import (
     is_model,
     match,
     match_rig,
-    shared_address,
 )
 from mlbatch.discovery.probe import (
     MetadataCollector,
@@ -33,11 +38,14 @@ from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError, RigError, UsageError
-from mlbatch.frames.tree import some
+from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
-from mlbatch.types import Recording, StreamTable
+from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.readers.bag.cloud_topics import CloudTopics
 
 # Items of a list in an error.
 _SHOWN = 4
@@ -51,11 +59,52 @@ class SensorSelection:
     rig: Path | None = None
     metadata: tuple[Path, ...] = ()
     only: tuple[str, ...] = ()  # names or serial numbers
-    ignore: tuple[str, ...] = ()  # names or serial numbers
+    ignore: tuple[str, ...] = ()  # names, serial numbers, topics or IP:PORT
     identity_extrinsics: bool = False  # accept sensors without extrinsics
     host_clock: bool = False  # receive times replace timestamps
     aligned: bool = False  # --align-clocks: clocks need not be comparable
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
+
+
+@dataclass(frozen=True, slots=True)
+class Ignored:
+    """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
+
+    sensors: tuple[DetectedSensor, ...] = ()
+    words: tuple[str, ...] = ()
+    all_others: bool = False  # True if --only leaves out all lidars that it does not name
+
+    def packets(self, stream: Stream, kind: PacketKind, packets: U8Array) -> BoolArray:
+        """Return which packets (P, size) of a kind are left out: (P,) bool."""
+        is_lidar = "lidar" in (sensors.describe(kind.size, packets[:1]) or "")
+        is_named = any(_names_stream(word, stream) for word in self.words)
+        if is_named or (self.all_others and is_lidar):
+            return np.ones(len(packets), np.bool_)
+        left_out = np.zeros(len(packets), np.bool_)
+        for sensor in self.sensors:
+            lidar = sensor.lidar
+            if kind.size in (lidar.packet_size, lidar.packet_size + 1):
+                if kind in sensor.kinds or lidar.carries_serial:
+                    left_out |= lidar.sent_by_me(packets[:, : lidar.packet_size])
+            elif kind in sensor.kinds:
+                left_out[:] = True
+        if self.serials and is_lidar:
+            # Several lidars may share an address.
+            for row in np.flatnonzero(~left_out).tolist():
+                what = sensors.describe(kind.size, packets[row : row + 1])
+                left_out[row] = _names_serial(self.serials, what)
+        return left_out
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Words that are no sensors, hence serial numbers of other lidars, or addresses."""
+        known = {word for one in self.sensors for word in (one.name, one.lidar.serial)}
+        return tuple(word for word in self.words if word not in known and not _is_address(word))
+
+    def names(self, stream: Stream, what: str | None) -> bool:
+        """Return whether --ignore names a stream, or the serial number in its description."""
+        by_stream = any(_names_stream(word, stream) for word in self.words)
+        return self.all_others or by_stream or _names_serial(self.words, what)
 
 
 @dataclass(slots=True)
@@ -71,7 +120,14 @@ class Discovery:
     rig: Rig | None = None
     notes: list[Note] = field(default_factory=list)
     not_in_rig: set[PacketKind] = field(default_factory=set)
-    ignored: set[PacketKind] = field(default_factory=set)
+    # Kinds of lidars without a sensor that `notes` name.
+    noted: set[PacketKind] = field(default_factory=set)
+    tree: FrameTree = field(default_factory=FrameTree)  # static frames of the recording
+    ignored: Ignored = field(default_factory=lambda: Ignored())
+
+    def frames(self) -> dict[str, F64Array]:
+        """Return (4, 4) body_from_frame, m, of the recording's static frames, by name."""
+        return self.tree.poses(clean(self.frame_id))
 
 
 def discover(
@@ -87,7 +143,13 @@ def discover(
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
     rig = None if selection.rig is None else read_rig(selection.rig)
-    recordings = with_clouds(recordings, table, _topics(rig))
+    apart = _why_apart(recordings, selection, rig)
+    if apart and to_convert:
+        raise RecordingError(apart)
+    recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
+    refused = {} if clouds is None else clouds.refused
+    if to_convert:
+        _refuse_clouds_of_rig(rig, refused, selection)
     sampler, collector = probe(recordings, table)
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
@@ -102,15 +164,28 @@ def discover(
     if to_convert and not any(sensor.kinds for sensor in matched.sensors):
         examined = examined or find_calibrations(paths, selection.metadata)[1]
         names = _names(examined, recorded)
-        reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures)
+        reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures, refused)
         raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
+    chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
+    left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
+    ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
+    noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     notes: list[Note] = []
     if rig is None:
-        notes += _unmatched(
-            sampler, lidar_kinds, examined, _names(examined, recorded), matched.failures
-        )
+        unmatched = _unmatched(sampler, matched, noted, examined, _names(examined, recorded))
+        if to_convert:
+            texts = [] if selection.only else _refusals(refused)
+            texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
+            _refuse_left_out(texts, recordings)
+        notes += [note for _, note in unmatched]
+    else:
+        # Other packets on the stream of a sensor are not unassigned but rejected.
+        taken = {stream for sensor in chosen for stream in sensor.streams}
+        noted = [kind for kind in noted if kind.stream not in taken]
+        notes += [_not_in_rig(sampler, kind) for kind in noted]
+    if clouds is not None:
+        notes += _cloud_notes(table, clouds, chosen, to_convert=to_convert)
     notes += _unused(matched.sensors, selection.metadata)
-    chosen = _choose(matched.sensors, selection)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
     if to_convert:
@@ -121,14 +196,17 @@ def discover(
         collector.extrinsics,
         table,
         rig,
+        frames={} if clouds is None else clouds.frames,
         calibration_topics=collector.calibration_topics,
         identity_extrinsics=selection.identity_extrinsics,
     )
+    if apart:
+        notes.append(Note("no_overlap", "", apart))
     notes += [Note("message", "", fault) for fault in collector.faults]
     notes += extrinsics.notes
     for sensor in chosen:
-        texts = (*sensor.notes, *sensor.lidar.notes)
-        notes += [Note("calibration", sensor.name, text) for text in texts]
+        findings = (*sensor.notes, *sensor.lidar.notes)
+        notes += [Note("calibration", sensor.name, text) for text in findings]
         if not sensor.kinds:
             text = "no packet of it in the first 10 seconds"
             notes.append(Note("not_seen_yet", sensor.name, text))
@@ -142,7 +220,9 @@ def discover(
         rig=rig,
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),
-        ignored={kind for one in matched.sensors if one not in chosen for kind in one.kinds},
+        noted=set(noted),
+        tree=extrinsics.tree,
+        ignored=ignored,
     )
 
 
@@ -192,10 +272,33 @@ def _is_lidar(sampler: Sampler, kind: PacketKind) -> bool:
 # -- sensors of the rig ---------------------------------------------------------------------------
 
 
-def _topics(rig: Rig | None) -> set[str]:
-    """Topics in the rig."""
-    streams = [] if rig is None else [one.stream for one in rig.sensors if one.stream is not None]
-    return {stream.topic for stream in streams} - {""}
+def _why_apart(recordings: Sequence[Recording], selection: SensorSelection, rig: Rig | None) -> str:
+    """Why captures are no session, as far as their first and last packets show; else ""."""
+    if len(recordings) < 2 or selection.only:
+        return ""
+    # Not loaded for single recordings.
+    from mlbatch.discovery.overlap import problem, spans_of_captures
+
+    ignored = Ignored(words=selection.ignore)
+
+    def is_wanted(stream: Stream, what: str) -> bool:
+        if ignored.names(stream, what):
+            return False
+        return rig is None or any(
+            not sensor.optional and _may_be(sensor, stream, what) for sensor in rig.sensors
+        )
+
+    text, _ = problem(spans_of_captures(recordings, is_wanted))
+    return text
+
+
+def _may_be(sensor: RigSensor, stream: Stream, what: str) -> bool:
+    """True if packets of a stream may be those of a sensor of the rig."""
+    selector = sensor.stream
+    if selector is None:
+        return True
+    is_other = selector.serial and "serial" in what and not _names_serial([selector.serial], what)
+    return selector.selects(stream) and not is_other
 
 
 def _match(
@@ -242,10 +345,18 @@ def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> No
     chosen = [kind for kind in sampler.kinds if sensor.stream.selects(streams[kind.stream])]
     texts = [describe(sampler, kind) or "" for kind in chosen]
     lidars = [text for text in texts if "lidar" in text]
-    if lidars and all(map(lacks_decoder, lidars)):
+    if lidars and all(map(lacks_decoder, lidars)) and not _is_readable(sampler, chosen, sensor):
         raise RigError(
             f"{origin}: sensor {sensor.name}: {sensor.stream} carries {lidars[0]}; {_NO_SUPPORTED}"
         )
+
+
+def _is_readable(sampler: Sampler, kinds: Sequence[PacketKind], sensor: RigSensor) -> bool:
+    """Whether packets of unknown model can be decoded as the model that the rig names."""
+    if sensor.model is None:
+        return False
+    named = [one for one in sensors.built_in() if one.model == sensor.model]
+    return any(one.match_score(sampler.evidence(kind)) for one in named for kind in kinds)
 
 
 def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
@@ -282,29 +393,133 @@ def _names(examined: Sequence[Path], recorded: Sequence[Calibration]) -> list[st
 
 def _unmatched(
     sampler: Sampler,
+    matched: Matched,
     kinds: Sequence[PacketKind],
     examined: Sequence[Path],
     names: Sequence[str],
-    failures: Mapping[PacketKind, str],
-) -> list[Note]:
-    """Warnings about lidar packets of no sensor; examined, names: of possible calibrations."""
+) -> list[tuple[PacketKind, Note]]:
+    """Why lidar packets are of no sensor, and what to do.
+
+    examined, names: of possible calibrations.
+    """
     notes = []
     # A file that cannot be used may be the one that is missing.
     faults = some([*filter(None, map(fault_of, examined))], _SHOWN) if kinds else ""
     for kind in kinds:
         what = describe(sampler, kind) or ""
         start = f"{sampler.table.streams[kind.stream]}: {what}"
-        unassigned = "its packets are counted as unassigned"
+        ignore = f"--ignore {_ignore_word(sampler.table.streams[kind.stream])}"
         if lacks_decoder(what):
-            notes.append(Note("no_decoder", "", f"{start}; {unassigned}; {_NO_SUPPORTED}"))
-        elif kind in failures:
-            notes.append(Note("no_metadata", "", f"{start}; {failures[kind]}; {unassigned}"))
+            note = Note("no_decoder", "", f"{start}; {_NO_SUPPORTED}; leave it out with {ignore}")
+        elif kind in matched.failures:
+            text = f"{start}; {matched.failures[kind]}, or leave it out with {ignore}"
+            note = Note("no_metadata", "", text)
         else:
             expected = f"expected metadata that match, found {_known(names)}"
-            text = f"{start}; {expected}; {unassigned}; give --metadata FILE"
+            text = f"{start}; {expected}; give --metadata FILE, or leave it out with {ignore}"
             text += f" ({faults})" if faults else ""
-            notes.append(Note("no_metadata", "", text))
+            note = Note("no_metadata", "", text)
+        notes.append((kind, note))
     return notes
+
+
+def _refusals(refused: Mapping[str, str]) -> list[str]:
+    """Why clouds cannot be used, and that they may be left out."""
+    return [
+        f"{topic}: {text}"
+        + ("" if "--ignore" in text else f", or leave the topic out with --ignore {topic}")
+        for topic, text in refused.items()
+    ]
+
+
+def _cloud_notes(
+    table: StreamTable, clouds: CloudTopics, chosen: Sequence[DetectedSensor], *, to_convert: bool
+) -> Iterator[Note]:
+    """Warnings about the times of chosen clouds, and without a conversion of those refused."""
+    topics = {table.streams[number].topic for sensor in chosen for number in sensor.streams}
+    for topic, text in clouds.warnings:
+        if topic in topics:
+            yield Note("cloud_time", "", f"{topic}: {text}")
+    if not to_convert:
+        for topic, text in clouds.refused.items():
+            yield Note("cloud_time", "", f"{topic}: {text}")
+
+
+def _refuse_left_out(texts: Sequence[str], recordings: Sequence[Recording]) -> None:
+    """Raise RecordingError if lidars of the session would be left out whole; texts: of each."""
+    if texts:
+        raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
+
+
+def _some_texts(texts: Sequence[str]) -> str:
+    """The first text in full, and how many others there are."""
+    others = f" (and {len(texts) - 1} more: {'; '.join(texts[1:])})" if len(texts) > 1 else ""
+    return texts[0] + others
+
+
+def _is_owned(kind: PacketKind, found: Sequence[DetectedSensor]) -> bool:
+    """True for packets of another size on the stream of a sensor, which are rejected there."""
+    return any(kind.stream in sensor.streams for sensor in found)
+
+
+def _ignore_word(stream: Stream) -> str:
+    """How `--ignore` names a stream; not by its topic if that has clouds of several lidars."""
+    if stream.topic:
+        return shlex.quote(str(stream))
+    return min(name for name in stream.names if " " not in name)
+
+
+def _refuse_clouds_of_rig(
+    rig: Rig | None, refused: Mapping[str, str], selection: SensorSelection
+) -> None:
+    """Raise RigError for a sensor of the rig whose clouds cannot be used."""
+    for sensor in () if rig is None else rig.sensors:
+        topic = "" if sensor.stream is None else sensor.stream.topic
+        if topic in refused:
+            place = f"{selection.rig}: sensor {sensor.name}"
+            raise RigError(f"{place}: {topic}: {refused[topic]}")
+
+
+def _not_in_rig(sampler: Sampler, kind: PacketKind) -> Note:
+    """Warning about lidar packets in the first 10 s of a stream that the rig lacks."""
+    return not_in_rig(sampler.table.streams[kind.stream], describe(sampler, kind) or "")
+
+
+def not_in_rig(stream: Stream, what: str) -> Note:
+    """Warning about lidar packets of a stream that the rig lacks."""
+    text = (
+        f"{stream}: {what}; expected a sensor of the rig, found none for it; its packets are "
+        "counted as unassigned; add it to the rig, or leave it out with --ignore "
+        f"{_ignore_word(stream) if stream.topic else stream.source_ip}"
+    )
+    return Note("not_in_rig", "", text)
+
+
+def _is_ignored(sampler: Sampler, ignored: Ignored, kind: PacketKind) -> bool:
+    return ignored.names(sampler.table.streams[kind.stream], describe(sampler, kind))
+
+
+def _names_stream(word: str, stream: Stream) -> bool:
+    """True if a word is the topic, the source IP or IP:port of a stream, or its name in reports."""
+    return word in stream.names or (bool(word) and word == stream.source_ip)
+
+
+def _names_serial(words: Sequence[str], what: str | None) -> bool:
+    """True if one of the words is the serial number in a description."""
+    return any(f"serial {word}," in (what or "") for word in words)
+
+
+def _is_address(word: str) -> bool:
+    """True for a topic, an IP address or IP:port, which may begin to send later."""
+    if word.startswith("/"):
+        return True
+    for text in (word, word.rpartition(":")[0]):
+        try:
+            ipaddress.ip_address(text)
+        except ValueError:
+            continue
+        return True
+    return False
 
 
 def _unused(found: Sequence[DetectedSensor], given: Sequence[Path]) -> list[Note]:
@@ -324,14 +539,17 @@ def _why_none(
     lidar_kinds: Sequence[PacketKind],
     examined: Sequence[str],
     failures: Mapping[PacketKind, str],
+    refused: Mapping[str, str],
 ) -> str:
-    """Why no sensor was found, and what to do."""
-    where = ", ".join(str(recording.path) for recording in recordings)
+    """Why no sensor was found, and what to do; refused: why clouds cannot be used, by topic."""
+    where = _paths(recordings)
     table = sampler.table
     types = packet_types(recordings)
     for kind, why in failures.items():
         others = f" (without a match: {some(examined, _SHOWN)})" if examined else ""
         return f"{where}: {table.streams[kind.stream]}: {why}{others}"
+    if refused:
+        return f"{where}: {_some_texts(_refusals(refused))}"
     carried = [(table.streams[kind.stream], describe(sampler, kind) or "") for kind in lidar_kinds]
     for stream, what in carried:
         if not lacks_decoder(what):
@@ -367,6 +585,10 @@ def _hints(
     return f" ({hints})" if hints else ""
 
 
+def _paths(recordings: Sequence[Recording]) -> str:
+    return ", ".join(str(recording.path) for recording in recordings)
+
+
 def _known(names: Sequence[str]) -> str:
     return f"only {some(names, _SHOWN)}" if names else "none in the recording's directory"
 
@@ -374,21 +596,50 @@ def _known(names: Sequence[str]) -> str:
 # -- choice and checks ----------------------------------------------------------------------------
 
 
-def _choose(found: Sequence[DetectedSensor], selection: SensorSelection) -> list[DetectedSensor]:
-    """Apply --only and --ignore; both accept names and serial numbers."""
+def _choose(
+    sampler: Sampler,
+    found: Sequence[DetectedSensor],
+    lidar_kinds: Sequence[PacketKind],
+    selection: SensorSelection,
+) -> list[DetectedSensor]:
+    """Apply --only and --ignore.
+
+    Both accept names and serial numbers; --ignore also addresses, and serial numbers of lidars that
+    are no sensors.
+    """
     known = {word for sensor in found for word in (sensor.name, sensor.lidar.serial) if word}
-    for option, words in (("--only", selection.only), ("--ignore", selection.ignore)):
-        for word in words:
-            if word not in known:
-                raise UsageError(
-                    f"{option}: expected the name or serial number of a sensor, one of "
-                    f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
-                )
+    others = Ignored(words=selection.ignore)
+    unknown = [word for word in selection.only if word not in known]
+    option = "--only"
+    if not unknown:
+        option = "--ignore"
+        unknown = [
+            word
+            for word in selection.ignore
+            if word not in known
+            and not _is_address(word)
+            and not any(
+                _is_ignored(sampler, replace(others, words=(word,)), kind) for kind in lidar_kinds
+            )
+        ]
+    for word in unknown:
+        raise UsageError(
+            f"{option}: expected the name or serial number of a sensor, one of "
+            f"{', '.join(sensor.name for sensor in found)}, found {word!r}; choose one"
+        )
+    streams = sampler.table.streams
     chosen = [
         sensor
         for sensor in found
         if (not selection.only or {sensor.name, sensor.lidar.serial} & set(selection.only))
         and not {sensor.name, sensor.lidar.serial} & set(selection.ignore)
+        and not (
+            sensor.streams
+            and all(
+                any(_names_stream(word, streams[number]) for word in selection.ignore)
+                for number in sensor.streams
+            )
+        )
     ]
     if found and not chosen:
         raise UsageError(
@@ -418,4 +669,8 @@ def _refuse_incomparable_clocks(
         if offset_ns is not None:
             offset_ns += sensor.offset_ns
         offsets_ns.append((sensor.name, offset_ns))
-        refuse_incomparable(offsets_ns, len(offsets_ns) - 1)
+        refuse_incomparable(
+            offsets_ns,
+            len(offsets_ns) - 1,
+            has_receive_times=all(map(sampler.has_receive_times, chosen)),
+        )

@@ -22,12 +22,14 @@ from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
 from mlbatch.lidar.limits import MAX_TRANSLATION_M
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig
-from mlbatch.types import StreamTable
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, UnknownExtrinsics
+from mlbatch.types import Stream, StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
 # Parent, child, translation x, y, z in metres, quaternion x, y, z, w.
 Transform: TypeAlias = tuple[str, str, Sequence[float], Sequence[float]]
+# Of a rig: (4, 4) body_from_sensor, m, or the name of a frame of the recording, or unknown.
+RigExtrinsics: TypeAlias = F64Array | str | UnknownExtrinsics
 # Sources whose edges form the tree, in order of trust.
 TREE_SOURCES = ("tf_static", "tf", "urdf")
 # Poses farther apart contradict each other.
@@ -39,11 +41,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsics:
-    """Poses of all sensors of a session in one body frame, and warnings."""
+    """Poses of all sensors of a session in one body frame, warnings, and all static frames."""
 
     body_frame: str
     poses: dict[str, Pose]
     notes: tuple[Note, ...]
+    tree: FrameTree
 
 
 @dataclass(slots=True)
@@ -101,7 +104,7 @@ class ExtrinsicsSources:
     def resolve(
         self,
         sensor_frames: Mapping[str, Sequence[Candidate]],
-        rig_extrinsics: Mapping[str, F64Array | str],
+        rig_extrinsics: Mapping[str, RigExtrinsics],
         metadata_extrinsics: Mapping[str, F64Array],
         body_frame: str | None,
         *,
@@ -109,9 +112,9 @@ class ExtrinsicsSources:
     ) -> Extrinsics:
         """Poses of all sensors; RigError if one of several sensors has no extrinsics.
 
-        sensor_frames: by sensor, frames it may have; rig_extrinsics: (4, 4) body_from_sensor, m, or
-        the name of a frame; metadata_extrinsics: (4, 4) body_from_sensor, m; body_frame: that of
-        the rig; identity_extrinsics: sensors without extrinsics are at the body origin.
+        sensor_frames: by sensor, frames it may have; metadata_extrinsics: (4, 4) body_from_sensor,
+        m; body_frame: that of the rig; identity_extrinsics: sensors without extrinsics are at the
+        body origin.
         """
         trees = self._trees()
         named = {name: frame for name, frame in rig_extrinsics.items() if isinstance(frame, str)}
@@ -138,12 +141,24 @@ class ExtrinsicsSources:
             if name in found.reasons and poses[name].source != "rig":
                 notes.append(_note("extrinsics_frame", name, found.reasons[name]))
         missing = [name for name, pose in poses.items() if not pose.is_known]
-        if missing and len(poses) > 1 and not identity_extrinsics:
-            _refuse_unknown(missing, found.reasons)
+        unknown = {
+            name: one.place
+            for name, one in rig_extrinsics.items()
+            if isinstance(one, UnknownExtrinsics)
+        }
+        if len(poses) > 1 and not identity_extrinsics:
+            if unknown:
+                _refuse_unknown_in_rig(unknown, poses)
+            if missing:
+                _refuse_unknown(missing, found.reasons)
+        notes += _same_poses(poses)
+        if unknown and missing and not identity_extrinsics:
+            # A single sensor: no frame of the rig describes its points.
+            body_frame = missing[0]
         body = body_frame or _body_frame(poses, found.body)
         if body_frame is None:
             notes += _assumed_frames(poses, body)
-        return Extrinsics(body, poses, tuple(notes))
+        return Extrinsics(body, poses, tuple(notes), tree)
 
     def _add_edge(self, tree: FrameTree, transform: Transform, source: str) -> None:
         try:
@@ -176,16 +191,19 @@ def place(
     table: StreamTable,
     rig: Rig | None,
     *,
+    frames: Mapping[Stream, str] | None = None,
     calibration_topics: Collection[str] = (),
     identity_extrinsics: bool,
 ) -> Extrinsics:
     """Set the poses of all sensors; RigError if one of several sensors has no extrinsics.
 
-    calibration_topics: topics with calibrations of sensors.
+    frames: frame_id of the points of streams, where their messages name one; calibration_topics:
+    topics with calibrations of sensors.
     """
     vendors = Counter(sensor.lidar.vendor for sensor in sensors)
-    frames = {
-        sensor.name: candidates(
+    known_frames = {
+        sensor.name: _stated(table, sensor, frames or {})
+        or candidates(
             sensor.lidar.vendor,
             _places(table, sensor, calibration_topics),
             alone=vendors[sensor.lidar.vendor] == 1,
@@ -205,11 +223,19 @@ def place(
     }
     body_frame = None if rig is None else rig.body_frame
     extrinsics = sources.resolve(
-        frames, by_rig, by_metadata, body_frame, identity_extrinsics=identity_extrinsics
+        known_frames, by_rig, by_metadata, body_frame, identity_extrinsics=identity_extrinsics
     )
     for sensor in sensors:
         sensor.pose = extrinsics.poses[sensor.name]
     return extrinsics
+
+
+def _stated(
+    table: StreamTable, sensor: DetectedSensor, frames: Mapping[Stream, str]
+) -> tuple[Candidate, ...]:
+    """The frame that the messages of a sensor name, which no similar name can replace."""
+    named = {clean(frames.get(table.streams[stream], "")) for stream in sensor.streams} - {""}
+    return tuple(Candidate(frame) for frame in sorted(named))
 
 
 def _places(
@@ -310,9 +336,13 @@ class _FrameFinder:
                 found.reasons[name] = "; ".join(reasons)
             elif self.tree.frames:
                 frames = some(self.tree.frames)
+                own = self.candidates[name]
                 found.reasons[name] = (
-                    f"none of the recording's frames ({frames}) is named as its driver would name "
-                    "it"
+                    f"its points are in frame {own[0].frame}, which is none of the recording's "
+                    f"({frames})"
+                    if len(own) == 1
+                    else f"none of the recording's frames ({frames}) is named as its driver would "
+                    "name it"
                 )
             return
         best, pose = connected[0]
@@ -344,7 +374,7 @@ def _chain_sources(chain: Chain) -> list[str]:
 
 def _answers(
     name: str,
-    rig: Mapping[str, F64Array | str],
+    rig: Mapping[str, RigExtrinsics],
     found: _FramesFound,
     metadata: Mapping[str, F64Array],
 ) -> list[Pose]:
@@ -401,6 +431,24 @@ def _gap(one: Pose, other: Pose) -> str:
     return f"{apart_m * MM_PER_M:.1f} mm and {apart_rad / RAD_PER_DEG:.2f} degrees"
 
 
+def _same_poses(poses: Mapping[str, Pose]) -> Iterator[Note]:
+    """Warnings about sensors at the pose of an earlier one; not where no source gives a pose.
+
+    The body origin is then accepted by the user.
+    """
+    known = [(name, pose) for name, pose in poses.items() if pose.is_known]
+    for number, (name, pose) in enumerate(known):
+        for other, other_pose in known[:number]:
+            if not _gap(other_pose, pose):
+                text = (
+                    f"expected a pose of its own, found that of {other} ({pose.source}); correct "
+                    "its extrinsics, or leave out those of both and give --identity-extrinsics if "
+                    "their points are in the body frame already"
+                )
+                yield _note("same_pose", name, text)
+                break
+
+
 def _assumed_frames(poses: Mapping[str, Pose], body: str) -> Iterator[Note]:
     """Warnings where metadata, which do not name their body frame, are used with a tree."""
     if any(pose.source in TREE_SOURCES for pose in poses.values()):
@@ -434,6 +482,20 @@ def _refuse_frame(name: str, frame: str, tree: FrameTree, reasons: Mapping[str, 
     reason = reasons[name] if frame in tree and name in reasons else tree.unknown(frame)
     remedy = "correct it, or give translation_m and a rotation"
     raise RigError(f"sensor {name}: extrinsics by frame ({frame}): {reason}; {remedy}")
+
+
+def _refuse_unknown_in_rig(unknown: Mapping[str, str], poses: Mapping[str, Pose]) -> NoReturn:
+    """Raise RigError for `extrinsics: unknown`; unknown: place in the rig file, by sensor."""
+    (name, place), *others = unknown.items()
+    also = f" (also of {', '.join(other for other, _ in others)})" if others else ""
+    remedy = "measure it and give translation_m and a rotation"
+    if poses[name].is_known:
+        remedy = f"remove the key to use that of {poses[name].describe()}"
+    raise RigError(
+        f"{place}: expected the pose of {name}, required for every sensor when there are two or "
+        f"more, found unknown{also}; {remedy}, or accept the body origin with "
+        "--identity-extrinsics"
+    )
 
 
 def _refuse_far(name: str, pose: Pose) -> None:

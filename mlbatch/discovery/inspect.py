@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from mlbatch import sensors
+from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import Comparison, compare
+from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import timescale
-from mlbatch.clocks.watch import ClockWatch
+from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.discover import (
     Discovery,
@@ -22,16 +25,22 @@ from mlbatch.discovery.discover import (
     name_kind,
     packet_types,
 )
-from mlbatch.discovery.match import describe, shared_address
+from mlbatch.discovery.interleaved import shared_address
+from mlbatch.discovery.match import describe
 from mlbatch.discovery.probe import first_seconds
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RigError
-from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.readers import merge, open_recording
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector
+from mlbatch.rig.rig import (
+    DEFAULT_BODY_FRAME,
+    Rig,
+    RigSensor,
+    StreamSelector,
+    UnknownExtrinsics,
+)
 from mlbatch.rig.write import write_rig
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -49,6 +58,10 @@ HEAD = (
     "calibration",
     "extrinsics",
     "missing",
+)
+_MEASURE = (
+    "extrinsics not known: measure them and replace `unknown` by "
+    "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
 )
 # Warnings that concern a conversion; the table shows missing metadata and decoders.
 _CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "calibration", "not_seen_yet"})
@@ -102,7 +115,7 @@ class StreamReport:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """All streams of the first 10 seconds of a session."""
+    """All streams of the first 10 seconds of a session, or of all of it."""
 
     streams: tuple[StreamReport, ...]  # one for each packet kind
     sensors: tuple[DetectedSensor, ...]
@@ -111,6 +124,7 @@ class Inspection:
     files: dict[str, Path] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     clocks: Comparison | None = None  # None without timestamps
+    whole: bool = False  # counts, loss and clocks are those of whole recordings
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
@@ -120,6 +134,7 @@ class Inspection:
         """The JSON document of `--json`."""
         return {
             "schema": "mlbatch.inspect/1",
+            "whole": self.whole,
             "streams": [asdict(stream) for stream in self.streams],
             "notes": list(self.notes),
             "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
@@ -130,7 +145,7 @@ class Inspection:
         return [] if self.clocks is None else self.clocks.describe()
 
     def rig_text(self, folder: Path) -> str:
-        """A rig file for these sensors; unknown extrinsics are the identity, with a comment."""
+        """A rig file for these sensors; extrinsics without a source are `unknown`."""
         if not self.sensors:
             raise RigError(
                 "--write-rig: expected at least one lidar with its metadata, found none; "
@@ -139,9 +154,8 @@ class Inspection:
         sensors = []
         comments = {}
         for sensor in self.sensors:
-            # As angles, which are easier to replace than a matrix.
-            extrinsics = from_rpy_deg((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-            comments[sensor.name] = "extrinsics unknown: measure them"
+            extrinsics: F64Array | UnknownExtrinsics = UnknownExtrinsics()
+            comments[sensor.name] = _MEASURE
             if sensor.pose.is_known:
                 extrinsics = sensor.pose.body_from_sensor
                 comments[sensor.name] = f"extrinsics of {sensor.pose.describe()}"
@@ -164,7 +178,7 @@ def inspect(
 ) -> Inspection:
     """Inspect the first 10 s of recordings, with the metadata given or in their directories.
 
-    whole: measure loss and clocks on the whole recordings.
+    whole: count packets and measure loss and clocks on the whole recordings.
     """
     table = StreamTable()
     discovery = discover(
@@ -173,7 +187,9 @@ def inspect(
         SensorSelection(metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,
     )
-    measured = _measure(discovery, whole=whole)
+    early = frozenset(discovery.sampler.kinds)
+    others: dict[PacketKind, _OtherPackets] = {}
+    measured = _measure(discovery, others, whole=whole)
     types = packet_types(discovery.recordings)
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
@@ -192,9 +208,36 @@ def inspect(
             for sensor in discovery.sensors
             if sensor.lidar.calibration in files
         },
-        notes=tuple(_notes(discovery)),
+        notes=(
+            *_notes(discovery),
+            *_late_notes(discovery, early),
+            *_other_lidars(discovery, others),
+            *_clock_notes(known),
+        ),
         clocks=compare(known) if known else None,
+        whole=whole,
     )
+
+
+def _late_notes(discovery: Discovery, early: Collection[PacketKind]) -> Iterator[str]:
+    """Lidars that began after the first 10 s, in which sensors are detected; early: kinds then."""
+    sampler = discovery.sampler
+    owned = {kind for sensor in discovery.sensors for kind in sensor.kinds}
+    for kind in sampler.kinds:
+        what = "" if kind in early or kind in owned else describe(sampler, kind) or ""
+        if "lidar" in what:
+            yield (
+                f"{sampler.table.streams[kind.stream]}: {what}; it started after the first 10 s, "
+                "in which sensors are detected; name the sensor in a rig file (--rig)"
+            )
+
+
+def _clock_notes(known: Sequence[tuple[str, ClockEstimate]]) -> Iterator[str]:
+    """Clocks that are off from the capture host's, one by one: they may not be comparable."""
+    for name, finding in known:
+        text = describe_off([HostOffset.measured(name, finding)])
+        if text:
+            yield text
 
 
 def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
@@ -202,7 +245,13 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
     if sensor.lidar.carries_serial:
         return StreamSelector(serial=sensor.lidar.serial)
     stream = table.streams[min(sensor.kinds).stream]
-    return StreamSelector(stream.source_ip, stream.port, stream.topic)
+    return StreamSelector(
+        stream.source_ip,
+        stream.port,
+        stream.topic,
+        frame_id=stream.frame_id,
+        lidar_id=stream.lidar_id,
+    )
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:
@@ -240,31 +289,85 @@ class _Measured:
         self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
         self.watch: ClockWatch = clock_watch(lidar)
         self.first: tuple[int, int] | None = None
+        # Kinds with a packet of this sensor; one that begins late may be of another.
+        self.sent: set[PacketKind] = set()
 
 
-def _measure(discovery: Discovery, *, whole: bool) -> dict[DetectedSensor, _Measured]:
-    """Loss and clock of each sensor, in the first seconds or the whole session."""
+@dataclass(slots=True)
+class _OtherPackets:
+    """Packets of no sensor among those of a sensor's kind; what: a lidar's description, or ""."""
+
+    packets: int = 0
+    what: str = ""
+
+
+def _other_lidars(
+    discovery: Discovery, others: Mapping[PacketKind, _OtherPackets]
+) -> Iterator[str]:
+    """Lidars that share the address of a sensor."""
+    for kind, one in sorted(others.items()):
+        if one.what:
+            stream = discovery.sampler.table.streams[kind.stream]
+            yield (
+                f"{stream}: {one.what} as well; {one.packets} packets are of no sensor; "
+                "give its --metadata"
+            )
+
+
+def _measure(
+    discovery: Discovery, others: dict[PacketKind, _OtherPackets], *, whole: bool
+) -> dict[DetectedSensor, _Measured]:
+    """Loss and clock of each sensor, in the first seconds or the whole session.
+
+    others: gets the packets of no sensor; whole: packets of all kinds are counted again, with those
+    that begin later.
+    """
+    sampler = discovery.sampler
+    if whole:
+        sampler.restart_counts()
+    late: set[PacketKind] = set()
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
     for batch in merge(recordings) if whole else first_seconds(recordings):
         for kind, index in split_by_kind(batch):
-            for sensor in discovery.sensors:
-                if kind not in sensor.kinds:
-                    continue
+            if whole and sampler.count(kind, index, batch):
+                late.add(kind)
+                # It may be of one of the sensors.
+                discovery.router.route(kind, np.frombuffer(sampler.kinds[kind].payloads[0], "u1"))
+            owned = np.zeros(len(index), np.bool_)
+            owners = [sensor for sensor in discovery.sensors if kind in sensor.kinds]
+            for sensor in owners:
                 lidar = sensor.lidar
                 one = measured[sensor]
                 packets, _ = one.ring.store(batch.data, batch.start[index], None)
-                good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
+                own = lidar.sent_by_me(packets)
+                owned |= own
+                if own.any():
+                    one.sent.add(kind)
+                good = own & (lidar.faults(packets) == 0)
                 host_ns = batch.host_ns[index[good]]
                 headers = lidar.column_headers(packets[good], host_ns)
                 one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
-                if discovery.sampler.has_receive_times(sensor):
+                if sampler.has_receive_times(sensor):
                     _, newest_ns = extremes(headers)
                     known = newest_ns > NEVER
                     one.watch.add(newest_ns[known], host_ns[known])
                 if one.first is None and headers.valid.any():
                     row, column = np.argwhere(headers.valid)[0]
                     one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
+            if owners and not owned.all():
+                left = index[~owned]
+                other = others.setdefault(kind, _OtherPackets())
+                other.packets += len(left)
+                row_bytes = batch.data[batch.start[left[0]] + np.arange(kind.size)]
+                what = "" if other.what else sensors.describe(kind.size, row_bytes[None]) or ""
+                if "lidar" in what:
+                    other.what = what
+    for sensor, one in measured.items():
+        sensor.kinds -= late - one.sent
+    # Late packets of no sensor are a stream of their own, not others among those of a sensor.
+    for kind in late.difference(*(sensor.kinds for sensor in discovery.sensors)):
+        others.pop(kind, None)
     return measured
 
 

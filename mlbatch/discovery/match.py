@@ -7,6 +7,8 @@ shared one every stream is a sensor of its own. File names play no part.
 from __future__ import annotations
 
 import ipaddress
+import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,16 +17,14 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import BoolArray, F64Array, I64Array, median
+from mlbatch.arrays import BoolArray
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
-from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import RigSensor, StreamSelector
-from mlbatch.types import ColumnHeaders, StreamTable
-from mlbatch.units import NS_PER_MS, NS_PER_S
+from mlbatch.types import StreamTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,10 +192,15 @@ def _refuse_several_streams(
 
 def _order(
     table: StreamTable, sensor: DetectedSensor
-) -> tuple[int, int, tuple[tuple[int, int, str], ...]]:
+) -> tuple[int, int, tuple[tuple[int, int, str, str, int], ...]]:
     """Sort key: serial number, else source IP and port, else topic."""
     streams = (table.streams[kind.stream] for kind in sensor.kinds)
-    places = tuple(sorted((_ip_number(one.source_ip), one.port, one.topic) for one in streams))
+    places = tuple(
+        sorted(
+            (_ip_number(one.source_ip), one.port, one.topic, one.frame_id, one.lidar_id or 0)
+            for one in streams
+        )
+    )
     if sensor.lidar.serial.isdigit():
         return (0, int(sensor.lidar.serial), places)
     return (1, 0, places)
@@ -217,6 +222,29 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
             sensor.name = place
         else:
             sensor.name = f"{vendor}_{sensor.lidar.serial or counts[vendor]}"
+        sensor.name += _part(table, sensor)
+    _number_equal_names(found)
+
+
+def _part(table: StreamTable, sensor: DetectedSensor) -> str:
+    """The end of the name of a lidar whose clouds share a topic with others, else ""."""
+    stream = min((table.streams[number] for number in sensor.streams), key=str)
+    words = [stream.frame_id] if stream.frame_id else []
+    words += [] if stream.lidar_id is None else [str(stream.lidar_id)]
+    return "".join(f"_{re.sub(r'[^A-Za-z0-9]+', '_', word).strip('_')}" for word in words)
+
+
+def _number_equal_names(found: Sequence[DetectedSensor]) -> None:
+    """Give sensors on several topics of one namespace names of their own."""
+    names = Counter(sensor.name for sensor in found)
+    taken = set(names)
+    for name in [name for name, count in names.items() if count > 1]:
+        same = [sensor for sensor in found if sensor.name == name]
+        for number, sensor in enumerate(same[1:], 2):
+            while f"{name}_{number}" in taken:
+                number += 1
+            sensor.name = f"{name}_{number}"
+            taken.add(sensor.name)
 
 
 # -- with a rig -----------------------------------------------------------------------------------
@@ -480,89 +508,3 @@ def _lidars_on(sampler: Sampler, selector: StreamSelector, kinds: Sequence[Packe
 def _paths(calibrations: Sequence[Calibration]) -> str:
     names = (str(one.path) for one in calibrations if one.path is not None)
     return ", ".join(names) or "the files given"
-
-
-# -- several lidars at one address ----------------------------------------------------------------
-#
-# The columns of a packet follow those of the packet before. More than one lidar sends on a stream
-# if a part of its packets overlap in time, or if all overlap with the rotor at other angles, or if
-# timestamps step back and forth. Duplicate and reordered packets give no such steps.
-
-# Of the time from the first to the last column of a packet: steps to the next packet that overlap
-# (with a margin for rounded timestamps), and steps between neighbours in time.
-_OVERLAP = 0.95
-_NEIGHBOUR = 2.5
-# Shares of the steps between neighbours that are foreign: by several lidars, by all steps.
-_SEVERAL = 0.15
-_ALL = 0.9
-_MIN_STEPS = 8
-# Deviation of the rotor from its usual step: share of the step, and rounding of angles.
-_ROTOR_SHARE = 0.25
-_ROTOR_ROUNDING = 1e-3  # revolutions
-_REVOLUTION_TICKS = 2.0**32
-
-
-def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
-    """Error text if several lidars send on a stream of a sensor, else ""."""
-    lidar = sensor.lidar
-    for kind in sorted(sensor.kinds & sampler.kinds.keys()):
-        packets, host_ns = sampler.good_samples(kind, lidar)
-        headers = lidar.column_headers(packets, host_ns)
-        whole = headers.valid.all(axis=1)
-        headers = ColumnHeaders(
-            headers.stamp_ns[whole], headers.encoder[whole], headers.valid[whole]
-        )
-        step_ns = _foreign_step_ns(headers, lidar)
-        if step_ns is not None:
-            span_ns = median(_spans_ns(headers))
-            return (
-                f"sensor {sensor.name}: {sampler.table.streams[kind.stream]}: expected packets of "
-                f"one {lidar.model}, found packets of {span_ns / NS_PER_MS:.3f} ms that "
-                f"step by {step_ns / NS_PER_MS:+.3f} ms: several lidars share the address; "
-                "give each an address or a port of its own and record again"
-            )
-    return ""
-
-
-def _spans_ns(headers: ColumnHeaders) -> F64Array:
-    """(P,) time from the first to the last column of each packet."""
-    return np.asarray(headers.stamp_ns[:, -1] - headers.stamp_ns[:, 0], np.float64)
-
-
-def _foreign_step_ns(headers: ColumnHeaders, lidar: Lidar) -> float | None:
-    """Median of the steps that one lidar cannot make; None if there are too few."""
-    span_ns = _spans_ns(headers)
-    step_ns = np.diff(headers.stamp_ns[:, 0]).astype(np.float64)
-    near_ns = np.minimum(span_ns[1:], span_ns[:-1])
-    back_and_forth = step_ns < -NS_PER_S
-    overlaps = (step_ns != 0) & (np.abs(step_ns) < _OVERLAP * near_ns)
-    foreign = overlaps | back_and_forth
-    steps = (step_ns != 0) & (np.abs(step_ns) < _NEIGHBOUR * near_ns) | back_and_forth
-    count = int(np.count_nonzero(steps))
-    foreign_count = int(np.count_nonzero(foreign))
-    if count < _MIN_STEPS or foreign_count < _SEVERAL * count:
-        return None
-    if foreign_count > _ALL * count and not back_and_forth.any():
-        # Two lidars half a packet apart, or one whose column period differs from the known one.
-        rows = np.flatnonzero(steps)
-        elsewhere = _is_rotor_elsewhere(headers, rows, step_ns[rows], lidar)
-        if np.count_nonzero(elsewhere) < _SEVERAL * count:
-            return None
-    return median(step_ns[foreign])
-
-
-def _is_rotor_elsewhere(
-    headers: ColumnHeaders, rows: I64Array, step_ns: F64Array, lidar: Lidar
-) -> BoolArray:
-    """(n,) True for steps after packets `rows` (n,) in which the rotor leaves its usual speed."""
-    positions = lidar.beams.angle_rad
-    first = headers.encoder[:, 0]
-    if positions is None:
-        revolutions = rotor_ticks(first) / _REVOLUTION_TICKS
-    else:
-        revolutions = first / len(positions)
-    turned = np.diff(revolutions)[rows]
-    turned -= np.rint(turned)
-    usual = step_ns * (turned.sum() / max(abs(step_ns.sum()), 1.0))
-    off = np.abs(turned - usual - np.rint(turned - usual))
-    return np.asarray(off > np.maximum(_ROTOR_SHARE * np.abs(usual), _ROTOR_ROUNDING), np.bool_)

@@ -6,9 +6,11 @@ Sources: docs/sources/messages.md sections 2 (calibrations) and 6 (transforms).
 from __future__ import annotations
 
 import contextlib
+import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +21,12 @@ from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import has_packets, merge
+from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.readers.bag.cloud_topics import CloudTopics
 
 # Length of the part that is probed.
 PROBE_NS = 10 * NS_PER_S
@@ -50,28 +56,49 @@ _RECORDED_SCORE = 10_000
 
 
 def with_clouds(
-    recordings: Sequence[Recording], table: StreamTable, topics: Collection[str]
-) -> list[Recording]:
-    """The recordings, with decoded clouds on `topics` (those in the rig) as packets.
+    recordings: Sequence[Recording], table: StreamTable, rig: Rig | None, ignore: Collection[str]
+) -> tuple[list[Recording], CloudTopics | None]:
+    """The recordings, with decoded clouds on topics in the rig as packets; and these clouds.
 
-    Without topics: all clouds, if the session contains no raw packets.
+    Without such topics: all clouds, if the session contains no raw packets. ignore: topics to leave
+    out.
     """
     recorded = [topic for recording in recordings for topic in recording.topics]
     if not recorded:
-        return list(recordings)
+        return list(recordings), None
     # Not loaded for captures.
-    from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
-    from mlbatch.ros.point_packets import Layout
+    from mlbatch.readers.bag.cloud_topics import CloudTopics, cloud_topics
+    from mlbatch.readers.bag.clouds import CloudRecording
 
+    sensors = () if rig is None else rig.sensors
+    topics = {one.stream.topic for one in sensors if one.stream is not None} - {""}
     clouds = {topic.name: topic for topic in cloud_topics(recorded)}
     # A capture has no topics, only packets.
     has_captures = any(not recording.topics for recording in recordings)
     is_raw = has_captures or any(map(has_packets, recorded))
     chosen = [cloud for name, cloud in clouds.items() if name in topics or not (is_raw or topics)]
+    _refuse_points_of_packets(sensors, clouds)
+    chosen = [topic for topic in chosen if topic.name not in ignore]
     if not chosen:
-        return list(recordings)
-    layouts: dict[str, Layout] = {}
-    return [CloudRecording(recording, table, chosen, layouts) for recording in recordings]
+        return list(recordings), None
+    found = CloudTopics(tuple(chosen), tuple(sensors))
+    found.examine(recordings)
+    if not found.topics:
+        return list(recordings), found
+    return [CloudRecording(recording, table, found) for recording in recordings], found
+
+
+def _refuse_points_of_packets(sensors: Sequence[RigSensor], clouds: Collection[str]) -> None:
+    """Raise RigError for `points` of a sensor whose topic has no clouds."""
+    for sensor in sensors:
+        if sensor.points is None or sensor.stream is None or sensor.stream.topic in clouds:
+            continue
+        place = next(iter(sensor.points.places.values()), f"sensor {sensor.name}")
+        near = difflib.get_close_matches(sensor.stream.topic, list(clouds), n=1, cutoff=0.0)
+        remedy = f"the nearest topic of clouds is {near[0]}" if near else "remove points"
+        raise RigError(
+            f"{place}: expected decoded clouds on {sensor.stream.topic}, found none; {remedy}"
+        )
 
 
 def is_without_packets(recording: Recording) -> bool:
@@ -81,7 +108,7 @@ def is_without_packets(recording: Recording) -> bool:
     # Not loaded for captures.
     from mlbatch.readers.bag.clouds import CloudRecording
 
-    clouds = recording.topics_of_clouds if isinstance(recording, CloudRecording) else ()
+    clouds = recording.clouds.topics if isinstance(recording, CloudRecording) else ()
     return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
 
 

@@ -94,6 +94,12 @@ class Router:
             return True
         if not sensor.selector.selects(stream):
             return False
+        # Of a topic that turns out to have clouds of several lidars, only what the rig names.
+        if (sensor.selector.frame_id, sensor.selector.lidar_id) != (
+            stream.frame_id,
+            stream.lidar_id,
+        ):
+            return False
         # A later stream joins only by the serial number in its packets, or by the rig's selector.
         if sensor.selector == StreamSelector() and not sensor.lidar.carries_serial:
             return False

@@ -18,6 +18,8 @@ from mlbatch.units import NS_PER_S
 # First packets of a kind that are kept.
 SAMPLES_PER_KIND = 16
 SAMPLE_EVERY_NS = NS_PER_S // 4
+# Packets in a row that are kept of each: where two lidars alternate, some of both.
+SAMPLES_IN_A_ROW = 6
 # Rates are not measured on less.
 SHORTEST_NS = 2 * NS_PER_S
 # Packets with a new first word are kept up to this count; most vendors change it in every packet.
@@ -33,11 +35,12 @@ class KindSamples:
 
     payloads: list[bytes]  # of the kept packets
     host_ns: list[int]  # of the kept packets, receive times
+    numbers: list[int]  # of the kept packets, among all of the kind
     packets: int  # count, kept or not
     first_host_ns: int
     last_host_ns: int
     first_words: set[int]  # of the packets kept for their first word
-    keep_next: bool = False  # True after the first packet of a quarter of a second
+    since_tick: int = 0  # packets since the first one of a quarter of a second
 
     def arrays(self) -> tuple[U8Array, I64Array]:
         """Kept payloads (k, size) and their receive times (k,)."""
@@ -59,18 +62,48 @@ class Sampler:
         """Sample a batch."""
         for kind, index in split_by_kind(batch):
             first_ns = int(batch.host_ns[index[0]])
-            samples = self.kinds.get(kind)
-            if samples is None:
-                source_ip = self.table.streams[kind.stream].source_ip
-                self._kinds_of_ip.setdefault(source_ip, []).append(kind)
-                samples = KindSamples([], [], 0, first_ns, 0, set())
-                self.kinds[kind] = samples
-            for at in _rows_to_keep(samples, kind, index, batch):
+            samples = self.kinds.get(kind) or self._new(kind, first_ns)
+            for row in _rows_to_keep(samples, kind, index, batch):
+                at = int(index[row])
                 begin = int(batch.start[at])
                 samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
                 samples.host_ns.append(int(batch.host_ns[at]))
+                samples.numbers.append(samples.packets + row)
             samples.packets += len(index)
             samples.last_host_ns = int(batch.host_ns[index[-1]])
+
+    def _new(self, kind: PacketKind, first_host_ns: int) -> KindSamples:
+        """Add a kind without packets."""
+        source_ip = self.table.streams[kind.stream].source_ip
+        self._kinds_of_ip.setdefault(source_ip, []).append(kind)
+        samples = KindSamples([], [], [], 0, first_host_ns, 0, set())
+        self.kinds[kind] = samples
+        return samples
+
+    def restart_counts(self) -> None:
+        """Count from zero in another pass, by `count`; samples are kept."""
+        for samples in self.kinds.values():
+            samples.packets = 0
+
+    def count(self, kind: PacketKind, index: I64Array, batch: PacketBatch) -> bool:
+        """Count the packets of a kind at `index` of a batch; True if the kind is new.
+
+        One packet of a new kind is kept: memory does not grow with the recording.
+        """
+        first_ns = int(batch.host_ns[index[0]])
+        is_new = kind not in self.kinds
+        if is_new:
+            samples = self._new(kind, first_ns)
+            begin = int(batch.start[index[0]])
+            samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
+            samples.host_ns.append(first_ns)
+            samples.numbers.append(0)
+        samples = self.kinds[kind]
+        if not samples.packets:
+            samples.first_host_ns = first_ns
+        samples.packets += len(index)
+        samples.last_host_ns = int(batch.host_ns[index[-1]])
+        return is_new
 
     def evidence(self, kind: PacketKind) -> Evidence:
         """Samples of a kind and of its neighbours, as vendors recognise them."""
@@ -90,10 +123,18 @@ class Sampler:
 
     def good_samples(self, kind: PacketKind, lidar: Lidar) -> tuple[U8Array, I64Array]:
         """Packets (k, packet_size) of a kind that a lidar sent intact, receive times (k,)."""
-        packets, host_ns = self.kinds[kind].arrays()
+        packets, host_ns, _ = self.numbered_samples(kind, lidar)
+        return packets, host_ns
+
+    def numbered_samples(
+        self, kind: PacketKind, lidar: Lidar
+    ) -> tuple[U8Array, I64Array, I64Array]:
+        """As `good_samples`, and the numbers of the packets among all of the kind (k,)."""
+        samples = self.kinds[kind]
+        packets, host_ns = samples.arrays()
         packets = packets[:, : lidar.packet_size]
         good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
-        return packets[good], host_ns[good]
+        return packets[good], host_ns[good], np.array(samples.numbers, np.int64)[good]
 
     def first_host_ns(self, sensor: DetectedSensor) -> int | None:
         """Receive time of the first packet of a sensor; None if it sent none."""
@@ -153,7 +194,7 @@ class Sampler:
 def _rows_to_keep(
     samples: KindSamples, kind: PacketKind, index: I64Array, batch: PacketBatch
 ) -> list[int]:
-    """Which packets of a kind to keep: the first ones, then two of every quarter of a second.
+    """Rows of `index` to keep: the first packets, then six of every quarter of a second.
 
     Several sensors may share a kind, and one of them may start later than the others. The choice
     follows receive times, so that it does not depend on the size of batches. The first packets
@@ -163,8 +204,12 @@ def _rows_to_keep(
     last_host_ns = samples.last_host_ns
     tick = np.concatenate([[last_host_ns], host_ns]) // SAMPLE_EVERY_NS
     is_first = tick[1:] != tick[:-1]
-    keep = is_first | np.concatenate([[samples.keep_next], is_first[:-1]])
-    samples.keep_next = bool(is_first[-1])
+    # Of each packet, the number of packets since the first one of its quarter.
+    number = np.arange(len(index))
+    last_first = np.maximum.accumulate(np.where(is_first, number, -1))
+    since = np.where(last_first < 0, samples.since_tick + 1 + number, number - last_first)
+    keep = since < SAMPLES_IN_A_ROW
+    samples.since_tick = int(since[-1])
     keep[: max(SAMPLES_PER_KIND - samples.packets, 0)] = True
     if kind.size >= _WORD_BYTES and len(samples.first_words) < MAX_FIRST_WORDS:
         words = batch.data[batch.start[index, None] + np.arange(_WORD_BYTES)].view("<u4")[:, 0]
@@ -174,7 +219,7 @@ def _rows_to_keep(
             if value not in samples.first_words and len(samples.first_words) < MAX_FIRST_WORDS:
                 samples.first_words.add(value)
                 keep[rows[at]] = True
-    chosen: list[int] = index[keep].tolist()
+    chosen: list[int] = np.flatnonzero(keep).tolist()
     return chosen
 
 

@@ -18,6 +18,8 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import compose, from_quaternion, inverse, quaternion
 
+# Vehicles have less than 200.
+MOST_FRAMES = 1000
 _REMEDY = "give the extrinsics in a rig file (--rig)"
 
 
@@ -144,6 +146,20 @@ class FrameTree:
         down = [edge.child for edge in reversed(edges_b)]
         frames = (*(edge.child for edge in edges_a), meeting, *down)
         return Chain(matrix, frames, (*edges_a, *reversed(edges_b)))
+
+    def poses(self, body: str, most: int = MOST_FRAMES) -> dict[str, F64Array]:
+        """Return (4, 4) body_from_frame, m, of the first `most` frames connected with `body`."""
+        found: dict[str, F64Array] = {}
+        if body not in self:
+            return found
+        for frame in self.frames:
+            try:
+                chain = self.chain(body, frame)
+            except RigError:
+                continue
+            if chain is not None and frame != body and len(found) < most:
+                found[frame] = chain.matrix
+        return found
 
     def ancestor(self, frames: Sequence[str]) -> str | None:
         """Return the nearest common ancestor of `frames`, which may be one of them."""

@@ -4,10 +4,9 @@
                          + (cos a * O1[b] + sin a * O2[b] + O3[b])
 
 Axis conventions and extrinsics are folded into the vectors once, in float64. For a pixel only
-element-wise + and * in a fixed order remain, so results depend neither on the CPU nor on library
-versions. If the rotor angles are known in advance, the directions of all of them are rounded once
-to float32 (`Tabled`); else directions are computed for every column, each beam at the angle of the
-rotor when it fires (`Turning`).
+element-wise + and * of float32 in a fixed order remain, so results depend neither on the CPU nor on
+library versions. If the rotor angles are known in advance, all beams of a column fire at the angle
+of its position (`Tabled`); else each beam is at the angle of the rotor when it fires (`Turning`).
 """
 
 from __future__ import annotations
@@ -53,30 +52,24 @@ class BeamTable:
         origin[2] += translation
         return replace(self, direction=_rotated(self.direction, rotation), origin=origin)
 
-    def directions(self) -> F32Array:
-        """Return beam directions at all rotor positions: (axes, W, B) float32."""
-        return self._rotated(self.direction)
+    def rotor(self) -> tuple[F32Array, F32Array]:
+        """Return cosines and sines of all rotor positions: (W,) float32."""
+        angle_rad = np.zeros(1) if self.angle_rad is None else self.angle_rad
+        return np.cos(angle_rad).astype(np.float32), np.sin(angle_rad).astype(np.float32)
+
+    def vectors(self) -> F32Array:
+        """Return U1, U2, U3 of every beam: (3 vectors, 3 axes, B) float32."""
+        vectors: F32Array = self.direction.transpose(0, 2, 1).astype(np.float32, order="C")
+        return vectors
 
     def origins(self) -> F32Array:
-        """Return beam origins at all rotor positions: (axes, W, B or 1) float32, m."""
-        return self._rotated(self.origin)
-
-    def _rotated(self, vectors: F64Array) -> F32Array:
+        """Return beam origins at all rotor positions: (W, axes, B or 1) float32, m."""
         angle_rad = np.zeros(1) if self.angle_rad is None else self.angle_rad
-        cosine = np.cos(angle_rad)[:, None]
-        sine = np.sin(angle_rad)[:, None]
-        # In memory position by position, which is how they are looked up.
-        rows = np.empty((len(angle_rad), 3, vectors.shape[1]), np.float32)
-        rotated: F32Array = rows.transpose(1, 0, 2)
-        # Reused: allocating each term costs more than the sums.
-        total, term = np.empty((2, *rotated.shape[1:]))
-        for axis in range(3):
-            np.multiply(cosine, vectors[0, :, axis], out=total)
-            np.multiply(sine, vectors[1, :, axis], out=term)
-            np.add(total, term, out=total)
-            np.add(total, vectors[2, :, axis], out=total)
-            rotated[axis] = total
-        return rotated
+        first, second, third = self.origin.transpose(0, 2, 1)
+        cosine = np.cos(angle_rad)[:, None, None]
+        sine = np.sin(angle_rad)[:, None, None]
+        origins: F32Array = (cosine * first + sine * second + third).astype(np.float32)
+        return origins
 
 
 def spherical(
@@ -172,34 +165,54 @@ class Projection(Protocol):
 
 
 class Tabled:
-    """Sensors whose rotor angles are known in advance: directions come from a table.
+    """Sensors whose rotor angles are known in advance, one for every rotor position.
 
-    direction: (rows, 3, B), origin: (rows, 3, B or 1) float32, m, of all sensors in sequence;
-    first_position: (sensors,), first row of each; reaches_m: (sensors, B or 1).
+    cosine, sine: (rows,), origin: (rows, 3, B or 1) float32, m, of all sensors in sequence;
+    vectors: (sensors, 3 vectors, 3 axes, B); first_position: (sensors,), first row of each;
+    reaches_m: (sensors, B or 1).
     """
 
     def __init__(self, tables: Sequence[BeamTable], columns: int) -> None:
         """tables: beams of each sensor in the body frame; columns: most in a call of `prepare`."""
-        self.direction = _stacked([table.directions() for table in tables])
-        self.origin = _stacked([table.origins() for table in tables])
+        rotors = [table.rotor() for table in tables]
+        self.cosine = np.concatenate([cosine for cosine, _ in rotors])
+        self.sine = np.concatenate([sine for _, sine in rotors])
+        self.vectors = np.stack([table.vectors() for table in tables])
+        self.origin = _joined([table.origins() for table in tables])
         counts = [0 if one.angle_rad is None else len(one.angle_rad) for one in tables]
         self.first_position = np.cumsum([0, *counts[:-1]]).astype(np.int64)
         self.reaches_m = _reaches(tables)
-        beams = self.direction.shape[2]
-        self._taken = np.empty((columns, 3, beams), np.float32)
-        self._moved = np.empty_like(self._taken)
-        self._reached_m = np.empty((columns, beams), np.float32)
+        self._counts = counts
+        self._columns = columns
+        self._direction: F32Array | None = None
         self._runs: list[_Run] = []
+
+    @property
+    def direction(self) -> F32Array:
+        """Directions at all rotor positions, (rows, 3, B) float32; made when first asked for."""
+        if self._direction is None:
+            beams = self.vectors.shape[3]
+            self._direction = np.empty((len(self.cosine), 3, beams), np.float32)
+            self._taken = np.empty((self._columns, 3, beams), np.float32)
+            self._moved = np.empty_like(self._taken)
+            self._reached_m = np.empty((self._columns, beams), np.float32)
+            for first, count, vectors in zip(
+                self.first_position.tolist(), self._counts, self.vectors, strict=True
+            ):
+                rows = slice(first, first + count)
+                _combine(self.cosine[rows], self.sine[rows], vectors, self._direction[rows])
+        return self._direction
 
     def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Look up directions and origins."""
+        table = self.direction
         position = encoder + self.first_position[member]
         is_next = position[1:] - position[:-1] == 1
         is_next &= member[1:] == member[:-1]
         starts = [0, *((~is_next).nonzero()[0] + 1).tolist()]
         count = len(position)
         if len(starts) * _COLUMNS_OF_A_RUN > count + _COLUMNS_OF_A_RUN * len(self.reaches_m):
-            direction = self.direction.take(position, axis=0, out=self._taken[:count], mode="clip")
+            direction = table.take(position, axis=0, out=self._taken[:count], mode="clip")
             origin = self.origin.take(position, axis=0, mode="clip")
             reach_m = self.reaches_m[member]
             self._runs = [_Run(slice(0, count), direction, origin, reach_m)]
@@ -209,7 +222,7 @@ class Tabled:
             first = int(position[begin])
             rows = slice(first, first + end - begin)
             reach_m = self.reaches_m[member[begin]]
-            run = _Run(slice(begin, end), self.direction[rows], self.origin[rows], reach_m)
+            run = _Run(slice(begin, end), table[rows], self.origin[rows], reach_m)
             self._runs.append(run)
 
     def project(self, range_m: F32Array, out: F32Array) -> None:
@@ -411,11 +424,18 @@ def _reaches(tables: Sequence[BeamTable]) -> F32Array:
     return np.stack(np.broadcast_arrays(*(one.reach_m for one in tables))).astype(np.float32)
 
 
-def _stacked(planes: Sequence[F32Array]) -> F32Array:
-    """Join tables (3, W, B) of some sensors to (sum of W, 3, B)."""
-    widest = max(plane.shape[2] for plane in planes)
-    same = [np.broadcast_to(plane, (*plane.shape[:2], widest)) for plane in planes]
-    return np.concatenate([plane.transpose(1, 0, 2) for plane in same])
+def _combine(cosine: F32Array, sine: F32Array, vectors: F32Array, out: F32Array) -> None:
+    """Write cos * V1 + sin * V2 + V3, (W, 3, B), in float32; compiled loops do the same."""
+    first, second, third = vectors
+    np.multiply(cosine[:, None, None], first, out=out)
+    out += sine[:, None, None] * second
+    out += third
+
+
+def _joined(tables: Sequence[F32Array]) -> F32Array:
+    """Join tables (W, 3, B or 1) of some sensors to (sum of W, 3, B or 1)."""
+    widest = max(table.shape[2] for table in tables)
+    return np.concatenate([np.broadcast_to(one, (*one.shape[:2], widest)) for one in tables])
 
 
 def _rotated(vectors: F64Array, rotation: F64Array) -> F64Array:

@@ -136,6 +136,8 @@ class Lidar(Protocol):
     columns_per_packet: int
     # From column to column without gaps; 0: unknown.
     column_period_ns: float
+    # Share of a revolution in which it is set to measure; None: not known.
+    lit_share: float | None
     # Positions of the columns in a packet.
     records: Records
     # Equal for sensors whose records `read` decodes in the same way.
@@ -170,6 +172,11 @@ class Lidar(Protocol):
     # Source of the calibration, for people.
     calibration: str
     notes: tuple[str, ...]
+
+    @property
+    def columns_per_s(self) -> float:
+        """Columns sent in a second, while it measures and without loss; 0: unknown."""
+        ...
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """Return which packets (P, packet_size) have this sensor's serial number: (P,) bool.
@@ -210,8 +217,8 @@ class Lidar(Protocol):
         """Return the samples of IMU packets (P, size), in their order; sensor: its index."""
         ...
 
-    def sensor_from_imu(self) -> F64Array:
-        """Return the pose of the IMU in the sensor frame, (4, 4), m; identity if unknown."""
+    def sensor_from_imu(self) -> F64Array | None:
+        """Return the pose of the IMU in the sensor frame, (4, 4), m; None: no IMU packets."""
         ...
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ import numpy as np
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Policy, Window
+from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
 from mlbatch.discovery.types import Note
@@ -23,9 +25,10 @@ from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
+from mlbatch.pipeline.time_limits import refuse_outside
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
-from mlbatch.types import ImuSamples, Message, RunInfo, Scan
+from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
 from mlbatch.units import NS_PER_S, rate_text
 
 # Called with the bytes read so far, and with those of all recordings.
@@ -99,6 +102,7 @@ class Conversion:
             [sensor.intake() for sensor in self.sensors],
             Policy(job.max_wait_ns, job.keep_partial, job.start, job.end),
             self.session.clocks.guards,
+            [sensor.pace() for sensor in self.sensors],
         )
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.refuse_unknown(self.session.recordings)
@@ -134,6 +138,7 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes)
                 if self.batcher.past_end:
                     break
+        self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
 
@@ -181,17 +186,10 @@ class Conversion:
     def _is_too_incomplete(self, window: Window) -> bool:
         """True if --drop-incomplete leaves a window out; its columns are counted."""
         share = self.job.drop_incomplete / 100
-        if not share:
+        # No comparison with an unknown fill is true.
+        if not share or not bool((window.fill < share).any()):
             return False
         counts = np.bincount(window.sensor, minlength=len(self.sensors)).tolist()
-        seconds = (window.end_ns - window.start_ns) / NS_PER_S
-        for sensor, count in zip(self.sensors, counts, strict=True):
-            rate = sensor.columns_per_s
-            # Of a sensor of unknown rate at least one column is expected.
-            if count < (1 if rate is None else share * rate * seconds):
-                break
-        else:
-            return False
         for sensor, count in zip(self.sensors, counts, strict=True):
             sensor.ledger.columns.drop("incomplete", count)
         self.dropped_incomplete += 1
@@ -206,7 +204,10 @@ class Conversion:
         if len(set(names)) > 1:
             self.warn(Note("timescale", "", f"sensors differ in timescale: {', '.join(names)}"))
         self._check_dates(shared)
-        info = self.session.run_info(rate_text(self.grid.rate), shared)
+        self._check_limits()
+        self._check_passed()
+        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        info = self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
         self.info = info
         self.table = ScanTable(info, [sensor.columns_per_s for sensor in self.sensors])
         boxes_m = self.session.boxes_m
@@ -218,7 +219,13 @@ class Conversion:
             )
 
         sources = [sensor.source() for sensor in self.sensors]
-        self._pool = DecodePool(sources, decoder, workers=job.jobs, split=job.split)
+        self._pool = DecodePool(
+            sources,
+            decoder,
+            workers=job.jobs,
+            split=job.split,
+            counts_clipped=BYTE_INTENSITY in job.extras,
+        )
         return self._pool
 
     @property
@@ -242,6 +249,23 @@ class Conversion:
                 f"(timescale {shared}), found a date; write +SECONDS after the first scan"
             )
 
+    def _check_limits(self) -> None:
+        """Refuse `--start` and `--end` that are no times of the recording."""
+        firsts = [first[0] for first in self.batcher.firsts if first is not None]
+        # Later segments begin where another one ended, and need not contain the limits.
+        if firsts and self.job.segment.begin_ns is None:
+            refuse_outside(self.job.start, self.job.end, min(firsts))
+
+    def _check_passed(self) -> None:
+        """Refuse `--pass` of topics on another clock than that of the scans."""
+        if not self.job.passed:
+            return
+        offset_ns = self._scan_offset_ns()
+        timed = all(sensor.clock.has_receive_times for sensor in self.sensors)
+        line = f"clock: {{offset_s: {-offset_ns / NS_PER_S:.3f}}}"
+        text = remedies(line, timed=timed, sensors=len(self.sensors))
+        self.passthrough.messages.check_clock(self.session.recordings, offset_ns, text)
+
     # -- accounting ---------------------------------------------------------------------------
 
     def account(self, scan: Scan) -> None:
@@ -255,21 +279,33 @@ class Conversion:
         """Point counters of a sensor so far."""
         return PointCounts() if self._pool is None else self._pool.points(sensor)
 
-    def passed_through(self, end_ns: int | None) -> list[ImuSamples | Message]:
-        """IMU samples and recorded messages before `end_ns` (None: all), each given once."""
-        return self.passthrough.drain_until(end_ns, self.batcher.limits_ns, self._clock_offset_ns())
+    def passed_through(
+        self, end_ns: int | None, most_bytes: float = math.inf
+    ) -> list[ImuSamples | Message]:
+        """IMU samples and recorded messages before `end_ns` (None: all), each given once.
+
+        most_bytes: of messages, before the rest is left for the next call.
+        """
+        return self.passthrough.drain_until(
+            end_ns, self.batcher.limits_ns, self._clock_offset_ns(), most_bytes
+        )
 
     def _clock_offset_ns(self) -> int | None:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""
         if self.info is None or self.info.timescale not in ("utc", "tai"):
             return None
-        if self.job.selection.host_clock:
-            return 0
-        offsets = (first[0] - first[1] for first in self.batcher.firsts if first is not None)
-        return next(offsets, None)
+        return self._scan_offset_ns()
+
+    def _scan_offset_ns(self) -> int:
+        """Scan clock minus receive time, by the first packet of the first sensor that has one."""
+        for sensor, first in zip(self.sensors, self.batcher.firsts, strict=True):
+            if first is not None:
+                return 0 if sensor.clock.by_host else first[0] - first[1]
+        return 0
 
     def close(self) -> None:
         """Complete the ledgers; raise where the run has no valid result."""
+        self._check_limits()
         for sensor in self.sensors:
             self._complete_ledger(sensor)
         self._refuse_rejected()

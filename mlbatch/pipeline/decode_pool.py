@@ -15,8 +15,9 @@ from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Scan
 from mlbatch.writers.output_file import crc32
+from mlbatch.writers.point_layouts import clipped_points
 
-# Slots of a scan by outcome, one list a sensor, in the order of `ledger.POINT_OUTCOMES`.
+# Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
 # Gives a decoder of these sensors; with `--split` of one sensor, whose index is the second.
 NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
@@ -52,7 +53,7 @@ class DecodeTask:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A scan, and its slots by outcome, one list a sensor."""
+    """A scan, and the counts of its points, one list a sensor."""
 
     scan: Scan
     outcomes: list[list[int]]
@@ -61,9 +62,15 @@ class Decoded:
 class DecodeWorker:
     """The decoders of one thread, with scratch memory of their own."""
 
-    def __init__(self, sources: Sequence[Source], split: bool, new: NewDecoder) -> None:
-        """split: one decoder a sensor, since each task then is of one sensor."""
+    def __init__(
+        self, sources: Sequence[Source], split: bool, new: NewDecoder, counts_clipped: bool
+    ) -> None:
+        """split: one decoder a sensor, since each task then is of one sensor.
+
+        counts_clipped: the output has intensities of 8 bits.
+        """
         self._sensors = len(sources)
+        self._counts_clipped = counts_clipped
         if split:
             for source in sources:
                 source.ring_base = 0
@@ -74,10 +81,15 @@ class DecodeWorker:
     def decode(self, task: DecodeTask) -> Decoded:
         """Decode a task; the arrays are valid as long as the decoder's buffers last."""
         decoder = self._decoders[task.only or 0]
-        before = [counts.outcomes for counts in decoder.counts]
+        before = [counts.counters for counts in decoder.counts]
         scan = decoder.scan(task.columns, task.label, task.outcomes)
         task.is_decoded = True
-        after = [counts.outcomes for counts in decoder.counts]
+        # A scan that the output already contains has no points, but their counts.
+        if self._counts_clipped and task.outcomes is None:
+            clipped = clipped_points(scan)
+            for number, counts in enumerate(decoder.counts, start=task.only or 0):
+                counts.clipped += clipped[number]
+        after = [counts.counters for counts in decoder.counts]
         outcomes = [
             [late - early for late, early in zip(now, was, strict=True)]
             for now, was in zip(after, before, strict=True)
@@ -97,7 +109,13 @@ class DecodePool:
     """The decode workers of a run, and the tasks whose raw packets are still needed."""
 
     def __init__(
-        self, sources: Sequence[Source], new: NewDecoder, *, workers: int, split: bool
+        self,
+        sources: Sequence[Source],
+        new: NewDecoder,
+        *,
+        workers: int,
+        split: bool,
+        counts_clipped: bool = False,
     ) -> None:
         """workers: one a thread; each has lidars of its own if there are several.
 
@@ -107,7 +125,9 @@ class DecodePool:
         self._split = split
         self._open: list[DecodeTask] = []
         self.workers = [
-            DecodeWorker(_with_own_lidars(sources) if workers > 1 else sources, split, new)
+            DecodeWorker(
+                _with_own_lidars(sources) if workers > 1 else sources, split, new, counts_clipped
+            )
             for _ in range(workers)
         ]
 
@@ -123,6 +143,9 @@ class DecodePool:
             window.end_ns,
             window.complete,
             window.ready_host_ns,
+            window.edge_gap_ns,
+            window.fill,
+            window.is_partial,
         )
         columns = WindowColumns(window.stamp_ns, window.sensor, window.ring_index, window.encoder)
         if not self._split:
@@ -173,7 +196,7 @@ class DecodePool:
         """Point counters of a sensor, over all workers."""
         total = PointCounts()
         for worker in self.workers:
-            total.add(worker.points[sensor].outcomes)
+            total.add(worker.points[sensor].counters)
         return total
 
 

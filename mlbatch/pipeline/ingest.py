@@ -10,13 +10,14 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Arrival
 from mlbatch.discovery.router import Role, Router
-from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.sensors import content_keys
 from mlbatch.types import ImuSamples, PacketBatch
 
+_WORD_BYTES = 4
 # Duplicate IMU packets are detected among this many.
 RECENT_IMU = 64
 # Maps timestamps (P, C) of packets of a sensor, received at (P,), to those that are batched.
@@ -31,18 +32,60 @@ class Ingested:
     imu: list[ImuSamples]
 
 
+@dataclass(slots=True)
+class UnassignedPackets:
+    """Packets of one kind that no sensor has; sample: (k, size), some of them.
+
+    Device packets may be more frequent than those of a lidar, so that after the first packets only
+    those with another first word are kept.
+    """
+
+    sample: U8Array
+    packets: int = 0
+
+    def add(self, batch: PacketBatch, index: I64Array) -> None:
+        """Count packets of a batch, and keep some."""
+        self.packets += len(index)
+        kept = len(self.sample)
+        if kept >= SAMPLES_PER_KIND:
+            return
+        size = self.sample.shape[1]
+        head = batch.data[batch.start[index, None] + np.arange(min(size, _WORD_BYTES))]
+        is_new = ~np.isin(_words(head), _words(self.sample[:, :_WORD_BYTES]))
+        is_new[: max(SAMPLES_PER_KIND // 2 - kept, 0)] = True
+        chosen = np.flatnonzero(is_new)[: SAMPLES_PER_KIND - kept]
+        rows = batch.data[batch.start[index[chosen], None] + np.arange(size)]
+        self.sample = np.concatenate([self.sample, rows])
+
+
+def _words(head: U8Array) -> I64Array:
+    """(n,) numbers of the first bytes (n, up to 4) of packets."""
+    weights = np.int64(1) << 8 * np.arange(head.shape[1])
+    return np.asarray(head @ weights, np.int64)
+
+
+# By kind, and whether the user left them out.
+UnassignedKey = tuple[PacketKind, bool]
+# Which packets (P, size) of a kind the user left out: (P,) bool.
+IsIgnored = Callable[[PacketKind, U8Array], BoolArray]
+
+
 class Ingest:
     """Assigns packets to sensors and reads their column headers; pixels stay raw.
 
-    unassigned: packets of no sensor, by kind; samples: one packet of each such kind, (1, size).
+    unassigned: packets of no sensor.
     """
 
     def __init__(
-        self, router: Router, sensors: Sequence[Sensor], stamp_map: StampMap | None = None
+        self,
+        router: Router,
+        sensors: Sequence[Sensor],
+        stamp_map: StampMap | None = None,
+        is_ignored: IsIgnored | None = None,
     ) -> None:
         """stamp_map: applied to timestamps before they are batched; None: unchanged."""
-        self.unassigned: dict[PacketKind, int] = {}
-        self.samples: dict[PacketKind, U8Array] = {}
+        self.unassigned: dict[UnassignedKey, UnassignedPackets] = {}
+        self._is_ignored = is_ignored
         self._router = router
         self._sensors = list(sensors)
         self._stamp_map = stamp_map
@@ -101,9 +144,22 @@ class Ingest:
     def _unassign(self, kind: PacketKind, batch: PacketBatch, index: I64Array) -> None:
         if not len(index):
             return
-        self.unassigned[kind] = self.unassigned.get(kind, 0) + len(index)
-        if kind not in self.samples:
-            self.samples[kind] = _payload(batch, int(index[0]), kind)[None].copy()
+        if self._is_ignored is None:
+            self._count(kind, False, batch, index)
+            return
+        payloads = batch.data[batch.start[index, None] + np.arange(kind.size)]
+        ignored = self._is_ignored(kind, payloads)
+        self._count(kind, False, batch, index[~ignored])
+        self._count(kind, True, batch, index[ignored])
+
+    def _count(self, kind: PacketKind, ignored: bool, batch: PacketBatch, index: I64Array) -> None:
+        if not len(index):
+            return
+        known = self.unassigned.get((kind, ignored))
+        if known is None:
+            known = UnassignedPackets(np.zeros((0, kind.size), np.uint8))
+            self.unassigned[kind, ignored] = known
+        known.add(batch, index)
 
     def _arrive(
         self,

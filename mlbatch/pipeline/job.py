@@ -24,6 +24,7 @@ DEFAULT_MAX_WAIT_NS = NS_PER_S
 # Upper bound of any time, s: its nanoseconds fit into int64.
 MOST_S = 2**33
 MAX_SLICES = 10_000
+SORTS = ("columns", "points")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class Job:
     rate: Fraction | None = None  # Hz; None: the rig's, else 10
     slices: int = 1  # sub-scans a window
     layout: str = "dense"  # or organized
+    sort: str = "columns"  # or points: order of the points of a scan
     split: bool = False  # one scan a sensor instead of merged ones
     keep_partial: bool = False  # also the first and the last, partial window
     keep_repeated: bool = False  # the second of two equal returns of a shot
@@ -55,7 +57,7 @@ class Job:
     passed: tuple[str, ...] = ()  # patterns of topics to forward
     extras: frozenset[str] = EXTRAS  # optional contents that the output can store
     jobs: int = 1  # scans made at the same time
-    engine: str = "auto"  # one of `decode.kernels.ENGINES`
+    engine: str = "auto"  # one of `native.ENGINES`
 
 
 def wait_ns(option: str, seconds: float, given: object) -> int | None:
@@ -74,6 +76,18 @@ def check_slices(option: str, count: object) -> int:
             "out for 1"
         )
     return index(count)
+
+
+def check_sort(option: str, sort: str, layout: str) -> str:
+    """`sort` of a job; an organized scan has no order of points."""
+    if sort not in SORTS:
+        raise UsageError(f"{option}: expected {' or '.join(SORTS)}, found {sort!r}; choose one")
+    if sort == "points" and layout == "organized":
+        raise UsageError(
+            f"{option} points: expected a dense layout, found organized, whose points have the "
+            "places of their columns; leave one of them out"
+        )
+    return sort
 
 
 def check_ranges_m(low_option: str, low: float, high_option: str, high: float) -> None:

@@ -1,13 +1,18 @@
 """IMU samples and recorded messages: not batched, written with the scan of their time.
 
 Recorded Imu messages are written only if scans are on an epoch clock within 1 s of theirs, at their
-own timestamps; messages of other topics byte for byte at their log time. IMU samples of lidars keep
-the clock of their lidar.
+own timestamps; messages of other topics byte for byte at their log time. Topics that `--pass` names
+are refused where their clock and that of the scans are more than 1 s apart. IMU samples of lidars
+keep the clock of their lidar.
+
+Where no scan follows for long (before the first lidar packet, in a gap of all lidars), messages
+wait in a temporary file: memory does not depend on how many there are.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,8 +22,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.batching.intake import STAMP_LIMIT_NS
-from mlbatch.errors import UsageError
+from mlbatch.clocks.timescale import format_difference
+from mlbatch.errors import ClockError, UsageError
 from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.message_spill import Entry, MessageSpill
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.report.ledger import DecodedCounts
 from mlbatch.types import IMU, MESSAGE_ENCODINGS, ImuSamples, Message, Recording, Topic
@@ -29,6 +36,14 @@ PASS_REASONS = ("no_place", "bad_stamp", "outside_time", "other_clock")
 # Never forward a recorded /tf_static: the writers publish their own.
 OWN_TOPIC = "/tf_static"
 NEAR_NS = NS_PER_S
+# Bytes of messages in memory before later ones go to a temporary file, and how much later than the
+# last scan these are: more than windows wait for usually.
+_MEMORY_BYTES = 4 << 20
+_FAR_NS = 4 * NS_PER_S
+# Memory of a message in addition to its bytes.
+MESSAGE_BYTES = 400
+# Parts of IMU samples that are kept before they are joined.
+_MOST_PARTS = 256
 # Two words of the timestamp in a message's header, by encoding (docs/sources/messages.md, section
 # 1): after 4 bytes of CDR encapsulation, or after the sequence number of ROS 1.
 _STAMP = {"cdr": struct.Struct("<4xiI"), "ros1": struct.Struct("<4xII")}
@@ -72,15 +87,20 @@ class Passthrough:
             self.messages.drop_before(low_ns)
 
     def drain_until(
-        self, end_ns: int | None, limits_ns: TimeLimits, clock_offset_ns: int | None
+        self,
+        end_ns: int | None,
+        limits_ns: TimeLimits,
+        clock_offset_ns: int | None,
+        most_bytes: float = math.inf,
     ) -> list[ImuSamples | Message]:
         """IMU samples, then messages, before `end_ns` (None: all) and inside the limits.
 
-        clock_offset_ns: scan clock minus receive time; None where scans are on no epoch clock.
+        clock_offset_ns: scan clock minus receive time; None where scans are on no epoch clock;
+        most_bytes: of messages, before the rest is left for the next call.
         """
         return [
             *self.imu.drain_until(end_ns, limits_ns),
-            *self.messages.drain_until(end_ns, limits_ns, clock_offset_ns),
+            *self.messages.drain_until(end_ns, limits_ns, clock_offset_ns, most_bytes),
         ]
 
 
@@ -111,6 +131,14 @@ class ImuQueue:
         samples = self._kept(samples, sane, "bad_stamp")
         if len(samples.stamp_ns):
             self._waiting.append(samples)
+        if len(self._waiting) > _MOST_PARTS:
+            self._join()
+
+    def _join(self) -> None:
+        """Join the samples of each sensor, in the order in which they came."""
+        parts = self._waiting
+        numbers = sorted({part.sensor for part in parts})
+        self._waiting = [_joined([p for p in parts if p.sensor == number]) for number in numbers]
 
     def drop_before(self, low_ns: int) -> None:
         """Drop samples before the first limit."""
@@ -148,15 +176,25 @@ class ImuQueue:
         return _part(samples, keep)
 
 
-def _in_order(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of one sensor as one, by timestamp: packets may be reordered."""
-    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    order = np.argsort(stamp_ns, kind="stable")
+def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+    """Samples of one sensor as one."""
     return ImuSamples(
         parts[0].sensor,
-        stamp_ns[order],
-        np.concatenate([part.acceleration for part in parts])[order],
-        np.concatenate([part.angular_velocity for part in parts])[order],
+        np.concatenate([part.stamp_ns for part in parts]),
+        np.concatenate([part.acceleration for part in parts]),
+        np.concatenate([part.angular_velocity for part in parts]),
+    )
+
+
+def _in_order(parts: Sequence[ImuSamples]) -> ImuSamples:
+    """Samples of one sensor as one, by timestamp: packets may be reordered."""
+    samples = _joined(parts)
+    order = np.argsort(samples.stamp_ns, kind="stable")
+    return ImuSamples(
+        samples.sensor,
+        samples.stamp_ns[order],
+        samples.acceleration[order],
+        samples.angular_velocity[order],
     )
 
 
@@ -206,14 +244,22 @@ class MessageQueue:
         self._patterns = list(patterns)
         self._encodings = encodings
         self._begin_ns = begin_ns
-        # A heap by timestamp, then file order: recordings contain messages in any order.
-        self._waiting: list[tuple[int, int, Message]] = []
+        # A heap; later messages are in `_far` once there are many.
+        self._near: list[Entry] = []
+        self._near_bytes = 0
+        self._most_bytes = _MEMORY_BYTES
+        self._far = MessageSpill()
         self._added = 0
+        # Clock of the scans minus that of the capture host, and remedies for a difference.
+        self._scan_offset_ns = 0
+        self._remedies = ""
+        # Up to where messages were taken.
+        self._taken_ns: int | None = None
 
     @property
     def waiting(self) -> int:
         """Number of messages in the queue."""
-        return len(self._waiting)
+        return len(self._near) + len(self._far)
 
     @property
     def has_place(self) -> bool:
@@ -225,6 +271,14 @@ class MessageQueue:
         for recording in recordings:
             recording.keep = selected(recording.topics, self._patterns)
 
+    def is_asked(self, recordings: Iterable[Recording]) -> bool:
+        """True if the output can store messages of a topic that is to be forwarded."""
+        return any(
+            topic.encoding in self._encodings and selected([topic], self._patterns)
+            for recording in recordings
+            for topic in recording.topics
+        )
+
     def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
         """Raise UsageError for a pattern that matches no topic of the recordings."""
         names = [topic.name for recording in recordings for topic in recording.topics]
@@ -234,6 +288,29 @@ class MessageQueue:
                     f"--pass {pattern}: expected a topic of the recording, found none that "
                     "matches; see `mlbatch inspect`"
                 )
+
+    def check_clock(
+        self, recordings: Sequence[Recording], scan_offset_ns: int, remedies: str
+    ) -> None:
+        """Raise ClockError where `--pass` would mix times of clocks more than NEAR_NS apart.
+
+        Messages are written at their log time, IMU messages at that of their header, which is
+        checked when they are written. scan_offset_ns: clock of the scans minus receive time;
+        remedies: what brings both together.
+        """
+        self._scan_offset_ns = scan_offset_ns
+        self._remedies = remedies
+        if abs(scan_offset_ns) <= NEAR_NS:
+            return
+        for recording in recordings:
+            for topic in recording.topics:
+                is_written = topic.encoding in self._encodings and topic.name != OWN_TOPIC
+                if is_written and topic.type != IMU_TYPE and self._is_asked_for(topic):
+                    raise _other_clock(topic, "the capture host's clock", scan_offset_ns, remedies)
+
+    def _is_asked_for(self, topic: Topic) -> bool:
+        """True if `--pass` names the topic."""
+        return any(fnmatchcase(topic.name, pattern) for pattern in self._patterns)
 
     def add(self, messages: Iterable[Message]) -> None:
         """Add messages, in file order."""
@@ -252,8 +329,42 @@ class MessageQueue:
                     counts.drop("bad_stamp")
                     continue
                 stamp_ns = own_ns
-            heapq.heappush(self._waiting, (stamp_ns, self._added, message))
+            heapq.heappush(self._near, ((stamp_ns, message.topic.name, self._added), message))
+            self._near_bytes += len(message.data) + MESSAGE_BYTES
             self._added += 1
+            if self._near_bytes > self._most_bytes:
+                self._spill()
+
+    def _spill(self) -> None:
+        """Move the messages that no scan follows soon to the file."""
+        far_ns = None if self._taken_ns is None else self._taken_ns + _FAR_NS
+        far = [entry for entry in self._near if far_ns is None or entry[0][0] >= far_ns]
+        if far:
+            far.sort()
+            self._far.add(far)
+            self._near = [entry for entry in self._near if far_ns and entry[0][0] < far_ns]
+            heapq.heapify(self._near)
+            self._near_bytes = sum(len(one.data) + MESSAGE_BYTES for _, one in self._near)
+        # Not again for every further message.
+        self._most_bytes = self._near_bytes + _MEMORY_BYTES
+
+    @property
+    def _first_ns(self) -> int | None:
+        """Timestamp of the first message in the queue."""
+        firsts = [self._near[0][0][0]] if self._near else []
+        if self._far.first is not None:
+            firsts.append(self._far.first[0])
+        return min(firsts, default=None)
+
+    def _pop(self) -> tuple[int, Message]:
+        """Take the first message, with its timestamp."""
+        far = self._far.first
+        if far is not None and (not self._near or far < self._near[0][0]):
+            key, message = self._far.pop()
+        else:
+            key, message = heapq.heappop(self._near)
+            self._near_bytes -= len(message.data) + MESSAGE_BYTES
+        return key[0], message
 
     def _is_of_earlier_segment(self, message: Message) -> bool:
         """True for a message read for its metadata that is output of an earlier segment."""
@@ -262,34 +373,70 @@ class MessageQueue:
 
     def drop_before(self, low_ns: int) -> None:
         """Drop messages before the first limit."""
-        while self._waiting and self._waiting[0][0] < low_ns:
-            _, _, message = heapq.heappop(self._waiting)
+        while (first_ns := self._first_ns) is not None and first_ns < low_ns:
+            _, message = self._pop()
             self.counts[message.topic.name].drop("outside_time")
 
     def drain_until(
-        self, end_ns: int | None, limits_ns: TimeLimits, clock_offset_ns: int | None
+        self,
+        end_ns: int | None,
+        limits_ns: TimeLimits,
+        clock_offset_ns: int | None,
+        most_bytes: float = math.inf,
     ) -> list[Message]:
         """Messages before `end_ns` (None: all), at the times they are written at.
 
-        clock_offset_ns: scan clock minus receive time, None where scans are on no epoch clock.
+        clock_offset_ns: scan clock minus receive time, None where scans are on no epoch clock;
+        most_bytes: the rest is left for the next call once messages have this many bytes.
         """
         low_ns, high_ns = limits_ns
         if low_ns is not None:
             self.drop_before(low_ns if end_ns is None else min(low_ns, end_ns))
-        taken = []
-        while self._waiting and (end_ns is None or self._waiting[0][0] < end_ns):
-            stamp_ns, _, message = heapq.heappop(self._waiting)
+        taken: list[Message] = []
+        size = 0
+        while (first_ns := self._first_ns) is not None and size < most_bytes:
+            if end_ns is not None and first_ns >= end_ns:
+                break
+            stamp_ns, message = self._pop()
             counts = self.counts[message.topic.name]
             if high_ns is not None and stamp_ns >= high_ns:
                 counts.drop("outside_time")
-            elif message.topic.type == IMU_TYPE and not _is_near(
+            elif message.topic.type == IMU_TYPE and not self._is_near(
                 stamp_ns, message, clock_offset_ns
             ):
                 counts.drop("other_clock")
             else:
                 counts.written += 1
+                size += len(message.data) + MESSAGE_BYTES
                 taken.append(replace(message, host_ns=stamp_ns))
-        return sorted(taken, key=lambda message: (message.host_ns, message.topic.name))
+        if end_ns is not None:
+            self._taken_ns = end_ns
+        self._most_bytes = max(_MEMORY_BYTES, self._near_bytes)
+        return taken
+
+    def _is_near(self, stamp_ns: int, message: Message, clock_offset_ns: int | None) -> bool:
+        """True if an IMU's clock is that of the scans, both relative to the capture host's.
+
+        ClockError if `--pass` names the topic and not even its first message is near.
+        """
+        ahead_ns = stamp_ns - message.host_ns
+        if not self._is_asked_for(message.topic):
+            return clock_offset_ns is not None and abs(ahead_ns - clock_offset_ns) <= NEAR_NS
+        apart_ns = self._scan_offset_ns - ahead_ns
+        if abs(apart_ns) <= NEAR_NS:
+            return True
+        counts = self.counts[message.topic.name]
+        if not counts.written and "other_clock" not in counts.dropped:
+            raise _other_clock(message.topic, "the clock of its header", apart_ns, self._remedies)
+        return False
+
+
+def _other_clock(topic: Topic, clock: str, apart_ns: int, remedies: str) -> ClockError:
+    return ClockError(
+        f"--pass {topic.name}: expected {clock} and that of the scans within 1 s of each other, "
+        f"since both are written at their own times, found the scans "
+        f"{format_difference(apart_ns)} from it; {remedies}, or leave the topic out"
+    )
 
 
 def header_stamp_ns(message: Message) -> int | None:
@@ -301,10 +448,3 @@ def header_stamp_ns(message: Message) -> int | None:
     if not (0 < seconds < 2**31 and nanoseconds < NS_PER_S):
         return None
     return int(seconds) * NS_PER_S + int(nanoseconds)
-
-
-def _is_near(stamp_ns: int, message: Message, clock_offset_ns: int | None) -> bool:
-    """True if an IMU's clock is that of the scans, both relative to the capture host's."""
-    if clock_offset_ns is None:
-        return False
-    return abs(stamp_ns - message.host_ns - clock_offset_ns) <= NEAR_NS

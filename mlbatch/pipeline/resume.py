@@ -133,6 +133,8 @@ class ResumeLog:
     def join(self, run: Conversion) -> None:
         """Pass the finished scans to a run; UsageError if it is another job."""
         self._run = run
+        for sensor in run.sensors:
+            sensor.ring.keep_sums()
         self._identity |= input_identity(run)
         if self._state is None:
             return

@@ -7,8 +7,9 @@ and N decode and write, a scan each.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mlbatch.errors import NoScanError, RecordingError
@@ -19,9 +20,9 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
-from mlbatch.report.report import RunReport, imbalances, report_text
-from mlbatch.types import RunInfo, Summary
-from mlbatch.writers import ScanWriter
+from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
+from mlbatch.types import ImuSamples, Message, RunInfo, Summary
+from mlbatch.writers import ScanJob, ScanWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Called with the content of the report and the complete output, before that gets its final name.
@@ -30,6 +31,8 @@ Last = Callable[[RunReport, Path], None]
 _AHEAD = 2
 # Tasks that wait for several threads.
 _WAITING = 2
+# Messages that are taken from their queue and written at a time.
+_PORTION_BYTES = 1 << 20
 
 
 def convert(
@@ -91,10 +94,7 @@ class _Output:
             contextlib.closing(run.tasks(progress)) as tasks,
             OrderedWorkers[ScanTask](jobs, ahead) as workers,
         ):
-            for item in tasks:
-                scan_task = self._scan_task(item)
-                if scan_task is None:
-                    continue
+            for scan_task in itertools.chain.from_iterable(map(self._scan_tasks, tasks)):
                 if jobs == 1:
                     scan_task.decode_with(run.pool.workers[0])
                 if jobs == 1 and self._open_writer is None:
@@ -104,12 +104,19 @@ class _Output:
                     workers.put(scan_task)
             workers.finish()
 
-    def _scan_task(self, item: DecodeTask | SkippedWindow) -> ScanTask | None:
-        """The task of a scan with the messages before it; None if there is nothing to write."""
+    def _scan_tasks(self, item: DecodeTask | SkippedWindow) -> Iterator[ScanTask]:
+        """The task of a scan with the messages before it; many messages are tasks of their own."""
         task = None if isinstance(item, SkippedWindow) else item
-        before = self._run.passed_through(item.end_ns)
-        if task is None and not before:
-            return None
+        before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
+        while rest := self._run.passed_through(item.end_ns, _PORTION_BYTES):
+            yield self._scan_task(None, before)
+            before = rest
+        if task is not None or before:
+            yield self._scan_task(task, before)
+
+    def _scan_task(
+        self, task: DecodeTask | None, before: Sequence[ImuSamples | Message]
+    ) -> ScanTask:
         self._begin()
         is_kept = self._resume_log is not None and self._resume_log.take(before, task)
         return ScanTask(
@@ -143,11 +150,22 @@ class _Output:
             self._resume_log.discard()
 
 
+def _write_chunks(job: ScanJob) -> None:
+    """Write the chunks that are complete."""
+    job.pack()
+    job.append()
+    job.compress()
+    job.commit()
+
+
 def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> RunReport:
     """Write the last messages, check the ledgers and complete the output."""
     began_s = time.perf_counter()
-    for item in run.passed_through(None):
-        forward(item, writer)
+    while items := run.passed_through(None, _PORTION_BYTES):
+        for item in items:
+            forward(item, writer)
+        if writer is not None:
+            _write_chunks(writer.flush())
     for note in run_report.message_notes(run):
         run.warn(note)
     inputs = run_report.run_report(run)
@@ -166,5 +184,6 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Ru
         if last is not None:
             last(inputs, partial)
 
-    writer.finish(Summary(run.batcher.t_init_ns, report, table), complete)
+    summary = Summary(run.batcher.t_init_ns, report, table, fill_totals(inputs))
+    writer.finish(summary, complete)
     return inputs

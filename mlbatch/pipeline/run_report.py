@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch import sensors
+from mlbatch.clocks.host_offset import HostOffset, describe_off
+from mlbatch.clocks.timescale import describe_time
+from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
+from mlbatch.pipeline.time_limits import text_of_range, text_of_time
 from mlbatch.report.ledger import ordered
 from mlbatch.report.report import (
     ClockReport,
@@ -33,7 +37,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
 
 _KB_PER_MB = 1024
-_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, Spread(), Spread())
+_NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, 0, Spread(), Spread())
 
 
 def run_report(run: Conversion) -> RunReport:
@@ -47,6 +51,7 @@ def run_report(run: Conversion) -> RunReport:
         rate_hz=rate_text(run.grid.rate),
         t_init_ns=run.batcher.t_init_ns,
         slices=run.job.slices,
+        sort=run.job.sort,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
@@ -64,10 +69,13 @@ def run_report(run: Conversion) -> RunReport:
         if run.session.replay is None
         else tuple(FaultReport(one.fault, one.packets) for one in run.session.replay.counts),
         repeated=_repeated(run),
+        first_scan=_first_scan(run),
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
 
+# Share of a sensor's packets that are lost, above which there is a warning.
+LOST = 0.001
 # Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
 # calibration; one damaged timestamp in the future makes those that follow it late.
 MANY = 0.01
@@ -86,6 +94,39 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
                 yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
 
 
+def host_offsets(run: Conversion) -> list[HostOffset]:
+    """Clocks of the sensors, as batched, against the capture host's; none by receive times."""
+    findings = dict(run.session.clocks.findings())
+    offsets = []
+    for sensor, first in zip(run.sensors, run.batcher.firsts, strict=True):
+        if sensor.clock.by_host or first is None:
+            continue
+        lidar = sensor.lidar
+        found = findings.get(sensor.name)
+        if found is None:
+            offsets.append(
+                HostOffset.of_message(
+                    sensor.name, *first, lidar.clock_period_ns, lidar.timestamp_mode
+                )
+            )
+        else:
+            offsets.append(HostOffset.measured(sensor.name, found))
+    return offsets
+
+
+def _epoch_notes(run: Conversion) -> Iterator[Note]:
+    """Clocks that agree with each other, but not with the capture host's."""
+    offsets = host_offsets(run)
+    off = [one.sensor for one in offsets if one.is_off]
+    if not off:
+        return
+    first = next(sensor for sensor in run.sensors if sensor.name == off[0])
+    given_ns = 0 if first.rig is None else first.rig.offset_ns
+    timed = all(sensor.clock.has_receive_times for sensor in run.sensors)
+    text = describe_off(offsets, given_ns, timed=timed)
+    yield Note("clock_epoch", off[0] if len(run.sensors) == 1 else "", text)
+
+
 def final_notes(run: Conversion) -> list[Note]:
     """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
     notes = [
@@ -94,6 +135,7 @@ def final_notes(run: Conversion) -> list[Note]:
         for text in recording.notes
     ]
     notes += _cloud_notes(run)
+    notes += _epoch_notes(run)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
         # A packet captured twice is no loss.
@@ -111,22 +153,94 @@ def final_notes(run: Conversion) -> list[Note]:
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
-    table = run.session.setup.sampler.table
-    seen = run.session.setup.sampler.kinds
-    for kind in sorted(run.session.ingest.samples):
-        what = _what(run, kind)
-        # A rig lists the sensors to use; others need no warning.
-        if run.session.setup.rig is None and kind not in seen and "lidar" in what:
-            notes.append(
-                Note(
-                    "late_stream",
-                    "",
-                    f"{table.streams[kind[0]]}: {what}; it started after the first 10 s, in "
-                    "which sensors are detected; its packets are counted as unassigned; name the "
-                    "sensor in a rig file (--rig)",
-                )
+        points = sensor.ledger.points
+        if points.clipped:
+            text = (
+                f"{sensor.name}: {points.clipped} of {points.written} points "
+                f"({points.clipped / points.written:.2%}) have an intensity outside 0 to 255, "
+                "which the point layout clips; choose one with a float32 intensity"
             )
+            notes.append(Note("clipped", sensor.name, text))
+    notes += _loss_notes(run)
+    notes += _point_notes(run)
+    notes += _unassigned_notes(run)
     return notes
+
+
+def _loss_notes(run: Conversion) -> Iterator[Note]:
+    """Sensors that lost packets, or of which scans lack half of the columns."""
+    scans = None if run.table is None else run.table.statistics(0)
+    for sensor in run.sensors:
+        packets = sensor.ledger.packets
+        if not packets.read:
+            # Its absence is another warning.
+            continue
+        texts = []
+        sent = packets.accepted + packets.lost
+        if packets.lost > LOST * sent:
+            share = 100 * packets.lost / sent
+            texts.append(f"{packets.lost} of {sent} packets lost ({share:.3g} %)")
+        lacking = 0 if scans is None else scans.underfilled_by_sensor.get(sensor.name, 0)
+        if scans is not None and lacking:
+            without = scans.without.get(sensor.name, 0)
+            texts.append(
+                f"{lacking} of {scans.written} scans have less than half of its columns, {without} "
+                "have none; --drop-incomplete leaves them out"
+            )
+        if texts:
+            yield Note("loss", sensor.name, f"{sensor.name}: {'; '.join(texts)}")
+
+
+def _point_notes(run: Conversion) -> Iterator[Note]:
+    """Scans with columns but no points: of a sensor, and of all."""
+    if run.table is None:
+        return
+    scans = run.table.statistics(0)
+    for name, count in scans.no_points.items():
+        text = (
+            f"{name}: {count} of {scans.written} scans have its columns but none of its points: no "
+            "returns, or all excluded; check its window, --min-range and --exclude-box"
+        )
+        yield Note("no_points", name, text)
+    if scans.empty_clouds:
+        text = f"{scans.empty_clouds} clouds without a point were written"
+        yield Note("empty_cloud", "", text)
+
+
+def _unassigned_notes(run: Conversion) -> Iterator[Note]:
+    """Warnings about lidar packets of no sensor, unless the user left them out.
+
+    Those of `setup.noted` have a warning since the start.
+    """
+    setup = run.session.setup
+    streams = setup.sampler.table.streams
+    for kind, ignored in sorted(run.session.ingest.unassigned):
+        stream = streams[kind.stream]
+        what = _what(run, kind, ignored)
+        owners = [sensor.name for sensor in run.sensors if kind in sensor.detected.kinds]
+        is_late = kind not in setup.sampler.kinds
+        if ignored or kind in setup.noted or "lidar" not in what:
+            continue
+        if owners and not is_late:
+            # Several lidars at one address, or damaged serial numbers.
+            packets = run.session.ingest.unassigned[kind, ignored].packets
+            yield Note(
+                "unassigned",
+                "",
+                f"{stream}: expected packets of {', '.join(owners)}, found {what} as well; "
+                f"{packets} packets are counted as unassigned; give the --metadata of that lidar, "
+                "or leave it out with --ignore SERIAL",
+            )
+        elif setup.rig is not None:
+            yield not_in_rig(stream, what)
+        else:
+            start = "it started after" if is_late else "it was not recognised in"
+            yield Note(
+                "late_stream",
+                "",
+                f"{stream}: {what}; {start} the first 10 s, in which sensors are detected; its "
+                "packets are counted as unassigned; name the sensor in a rig file (--rig)",
+            )
 
 
 def message_notes(run: Conversion) -> list[Note]:
@@ -163,6 +277,15 @@ def why_no_scan(run: Conversion) -> str:
     )
     if all(span is None for span in run.batcher.spans_ns):
         return f"{where}: no scan: expected valid columns, found none ({'; '.join(spans)})"
+    known = [span for span in run.batcher.spans_ns if span is not None]
+    first_ns = min(span[0] for span in known)
+    last_ns = max(span[1] for span in known)
+    start_ns, _ = run.batcher.limits_ns
+    if start_ns is not None and start_ns > last_ns:
+        return (
+            f"{where}: no scan: expected --start in the recording, "
+            f"{text_of_range(first_ns, last_ns)}, found {text_of_time(start_ns)}; choose another"
+        )
     period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
     advice = (
         "write the partial ones with --keep-partial"
@@ -173,6 +296,12 @@ def why_no_scan(run: Conversion) -> str:
         f"{where}: no scan: expected a whole window of {period_ms:g} ms with all sensors, found "
         f"{'; '.join(spans)}; {advice}"
     )
+
+
+def _first_scan(run: Conversion) -> str:
+    if run.table is None or run.table.first_start_ns is None or run.info is None:
+        return ""
+    return describe_time(run.table.first_start_ns, run.info.timescale)
 
 
 def _capture(run: Conversion) -> CaptureCounts:
@@ -209,6 +338,7 @@ def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
         stream="; ".join(streams),
         mode=sensor.lidar.mode,
         ledger=sensor.ledger,
+        fill=None if run.table is None else run.table.fill[sensor.index],
         clock=_clock(run, sensor),
         extrinsics_source=sensor.detected.pose.describe(),
         body_from_sensor=sensor.body_from_sensor,
@@ -244,27 +374,29 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
     rows = []
     streams = setup.sampler.table.streams
     # Not by stream number, which depends on the order of reading.
-    by_name = sorted(
-        run.session.ingest.unassigned.items(), key=lambda item: (str(streams[item[0][0]]), item)
-    )
-    for kind, count in by_name:
-        stream = streams[kind[0]]
-        what = _what(run, kind)
+    by_name = sorted(run.session.ingest.unassigned, key=lambda key: (str(streams[key[0][0]]), key))
+    for kind, ignored in by_name:
+        what = _what(run, kind, ignored)
         if kind not in setup.sampler.kinds:
             what = f"not seen in the first 10 s: {what}"
-        if kind in setup.ignored:
+        if ignored:
             what = f"ignored: {what}"
         elif kind in setup.not_in_rig:
             what = f"not_in_rig: {what}"
-        rows.append(Unassigned(str(stream), count, f"{what} ({kind[1]} bytes)"))
+        count = run.session.ingest.unassigned[kind, ignored].packets
+        rows.append(Unassigned(str(streams[kind.stream]), count, f"{what} ({kind.size} bytes)"))
     return tuple(rows)
 
 
-def _what(run: Conversion, kind: PacketKind) -> str:
-    """Description of unassigned packets: by one of them, else by those sampled by discovery."""
-    sample = run.session.ingest.samples.get(kind)
-    if sample is not None and (text := sensors.describe(kind[1], sample)):
-        return text
+def _what(run: Conversion, kind: PacketKind, ignored: bool) -> str:
+    """Description of unassigned packets: by some of them, else by those sampled by discovery."""
+    sample = run.session.ingest.unassigned[kind, ignored].sample
+    texts = [sensors.describe(kind.size, row[None]) for row in sample]
+    known = [text for text in texts if text]
+    # A damaged packet may be the first.
+    lidars = [text for text in known if "lidar" in text]
+    if known:
+        return (lidars or known)[0]
     if kind in run.session.setup.sampler.kinds:
         return describe(run.session.setup.sampler, kind) or "unknown"
     return "unknown"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import F64Array
+from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
@@ -101,7 +102,15 @@ class Sensor:
             offset_ns=self.clock.offset_ns,
             modulus=lidar.sequence_modulus,
             packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
+            has_receive_times=self.clock.has_receive_times,
         )
+
+    def pace(self) -> Pace:
+        """Columns that the sensor sends without loss."""
+        lidar = self.lidar
+        angles = lidar.beams.angle_rad
+        positions = None if angles is None else len(angles)
+        return Pace(lidar.columns_per_s, lidar.lit_share, positions)
 
     def source(self) -> Source:
         """What decoding needs of this sensor."""

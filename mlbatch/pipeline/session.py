@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mlbatch.arrays import F64Array
-from mlbatch.decode.kernels import choose_engine
+from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
 from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
-from mlbatch.discovery.types import DetectedSensor, Note
+from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError
+from mlbatch.native import choose_engine
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
@@ -28,6 +28,7 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.faults import FaultReplay
+    from mlbatch.pipeline.overlap import RunOverlap
 
 # A note for the user, no warning: how the times of decoded clouds were read.
 CLOUDS = "clouds"
@@ -36,7 +37,7 @@ CLOUDS = "clouds"
 class Session:
     """The recordings of a job and the sensors found in them.
 
-    engine: `numpy` or `numba`; setup: result of discovery; sensors: in the order of `lidar_id`;
+    engine: `numpy` or `native`; setup: result of discovery; sensors: in the order of `lidar_id`;
     replay: of injected faults, or None; delivered: packets given by `packets` so far; notes:
     warnings so far.
     """
@@ -46,9 +47,10 @@ class Session:
         self.delivered = 0
         self.notes: list[Note] = []
         self._received_ns: tuple[int, int] | None = None
+        self._overlap: RunOverlap | None = None
         streams = StreamTable()
         opened = [open_recording(path, streams) for path in job.recordings]
-        self.engine = choose_engine(job.engine, sum(one.size_bytes for one in opened))
+        self.engine = choose_engine(job.engine)
         for recording in opened:
             recording.use_engine(self.engine)
         if job.segment != TimeSegment():
@@ -65,8 +67,16 @@ class Session:
             self.clocks.align(merge(self.recordings), self.setup.router, job.align_clocks_to)
         maps_stamps = bool(job.faults or job.align_clocks_to)
         self.ingest = Ingest(
-            self.setup.router, self.sensors, self.clocks.map_stamps if maps_stamps else None
+            self.setup.router,
+            self.sensors,
+            self.clocks.map_stamps if maps_stamps else None,
+            self._is_ignored if job.selection.only or job.selection.ignore else None,
         )
+
+    def _is_ignored(self, kind: PacketKind, packets: U8Array) -> BoolArray:
+        """Return which packets (P, size) of no sensor the user left out: (P,) bool."""
+        stream = self.setup.sampler.table.streams[kind.stream]
+        return self.setup.ignored.packets(stream, kind, packets)
 
     def _sensor(self, found: DetectedSensor) -> Sensor:
         """The next sensor, with an empty ring and ledger."""
@@ -110,7 +120,14 @@ class Session:
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets in receive order, with injected faults."""
         # Also after an error, files are closed here, by the thread that opened them.
-        with contextlib.closing(merge(self.recordings, is_without_packets)) as merged:
+        # Only for several recordings: it costs a sort of every batch.
+        if len(self.recordings) > 1:
+            # Not loaded for single recordings.
+            from mlbatch.pipeline.overlap import RunOverlap
+
+            self._overlap = RunOverlap(self.recordings, self.setup)
+        seen = None if self._overlap is None else self._overlap.add
+        with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:
             batches: Iterator[PacketBatch] = merged
             if self.replay is not None:
                 batches = self.replay.batches(batches, self.ingest.owners)
@@ -163,8 +180,11 @@ class Session:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
         return excluded_boxes_m(self.job, self.setup.rig)
 
-    def run_info(self, rate_hz: str, timescale: str) -> RunInfo:
-        """What is the same for all scans; rate_hz: exact rate as text."""
+    def run_info(self, rate_hz: str, timescale: str, *, forwards: bool = False) -> RunInfo:
+        """What is the same for all scans.
+
+        rate_hz: exact rate as text; forwards: recorded messages are written, too.
+        """
         job = self.job
         sensors = tuple(
             SensorInfo(
@@ -174,10 +194,22 @@ class Session:
                 sensor.lidar.returns,
                 0 if job.split else sensor.ring_base,
                 sensor.body_from_sensor,
+                sensor.lidar.has_reflectivity,
+                sensor.lidar.sensor_from_imu(),
             )
             for sensor in self.sensors
         )
-        return RunInfo(sensors, self.setup.frame_id, rate_hz, timescale, job.slices, job.layout)
+        frames = tuple(self.setup.frames().items()) if forwards else ()
+        return RunInfo(
+            sensors,
+            self.setup.frame_id,
+            rate_hz,
+            timescale,
+            job.slices,
+            job.layout,
+            job.sort,
+            frames,
+        )
 
     # -- checks and warnings ------------------------------------------------------------------
 
@@ -194,6 +226,12 @@ class Session:
         for sensor in self.sensors:
             if sensor.is_required and not sensor.ledger.packets.read:
                 refuse_absent(sensor.detected, self.job.selection.rig)
+
+    def refuse_apart(self) -> None:
+        """Raise RecordingError if recordings do not overlap; a warning for optional sensors."""
+        text = "" if self._overlap is None else self._overlap.finish()
+        if text:
+            self.warn(Note("no_overlap", "", text))
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""

@@ -36,7 +36,7 @@ class FinishedScan(NamedTuple):
     """A scan that the `.partial` contains.
 
     content: checksum of what was read for it and before it, see `ResumeLog.take`;
-    outcomes: slots by outcome, one list a sensor; see `ledger.POINT_OUTCOMES`.
+    outcomes: slots by outcome, one list a sensor; see `ledger.POINT_COUNTERS`.
     """
 
     content: int

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers.byte_records import SLACK, copy_runs
 from mlbatch.types import PacketBatch, Recording
 
+# Called with the next packets of a recording, before they are merged; None: it has no more.
+Seen: TypeAlias = Callable[[Recording, "PacketBatch | None"], None]
 _NONE = np.zeros(0, np.int64)
 _NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)
 
@@ -26,26 +29,28 @@ def _never(recording: Recording) -> bool:
 
 
 def merge(
-    recordings: Sequence[Recording], by_log_time: Callable[[Recording], bool] = _never
+    recordings: Sequence[Recording],
+    by_log_time: Callable[[Recording], bool] = _never,
+    seen: Seen | None = None,
 ) -> Generator[PacketBatch, None, None]:
     """Yield all packets of all recordings; batches of a single recording are passed on as they are.
 
     Each recording is opened at its first receive time: memory contains those that overlap, not all.
     by_log_time: whether to order a recording by the log times of its messages; only for recordings
-    without packets, which have times of their own.
+    without packets, which have times of their own; seen: called for what several recordings give.
     """
     if len(recordings) == 1:
         yield from recordings[0].packets()
         return
     feeds = [_Feed.peek(recording, by_log_time(recording)) for recording in recordings]
     try:
-        yield from _merged(feeds)
+        yield from _merged(feeds, seen)
     finally:
         for feed in feeds:
             feed.close()
 
 
-def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
+def _merged(feeds: list[_Feed], seen: Seen | None) -> Iterator[PacketBatch]:
     out: U8Array = np.zeros(0, np.uint8)
     while waiting := [feed for feed in feeds if not feed.ended]:
         # The feed that is known up to the earliest time bounds the others; of equals, the first.
@@ -55,7 +60,10 @@ def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
         ready = []
         for feed in waiting:
             is_before = is_before and feed is not slowest
-            ready.append(feed.take(bound_ns, inclusive=is_before or feed is slowest))
+            given = feed.take(bound_ns, inclusive=is_before or feed is slowest)
+            if seen is not None and len(given[0]):
+                seen(feed.recording, given[0])
+            ready.append(given)
         messages = tuple(message for batch, _ in ready for message in batch.messages)
         ready = [(batch, key_ns) for batch, key_ns in ready if len(batch)]
         if len(ready) == 1:
@@ -66,6 +74,8 @@ def _merged(feeds: list[_Feed]) -> Iterator[PacketBatch]:
         elif messages:
             yield replace(_NOTHING, messages=messages)
         slowest.advance()
+        if slowest.ended and seen is not None:
+            seen(slowest.recording, None)
 
 
 @dataclass(slots=True)

@@ -26,6 +26,8 @@ COLUMN_REASONS = (
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
 # Outcomes of a slot of a written column.
 POINT_OUTCOMES = ("no_return", "range", "box", "repeated", "written")
+# Counters of the points of a sensor: `clipped` ones are among those written.
+POINT_COUNTERS = (*POINT_OUTCOMES, "clipped")
 
 
 @dataclass(slots=True)
@@ -66,16 +68,22 @@ class PointCounts:
     box: int = 0
     repeated: int = 0
     written: int = 0
+    clipped: int = 0  # written points whose intensity exceeds the 8 bits of the layout
 
     @property
     def outcomes(self) -> list[int]:
         """Slots by outcome, in the order of POINT_OUTCOMES."""
         return [self.no_return, self.range, self.box, self.repeated, self.written]
 
-    def add(self, outcomes: Sequence[int]) -> None:
-        """Count slots by outcome, in the order of POINT_OUTCOMES."""
-        self.slots += sum(outcomes)
-        for name, count in zip(POINT_OUTCOMES, outcomes, strict=True):
+    @property
+    def counters(self) -> list[int]:
+        """All but `slots`, in the order of POINT_COUNTERS."""
+        return [*self.outcomes, self.clipped]
+
+    def add(self, counts: Sequence[int]) -> None:
+        """Count slots by outcome, and the clipped ones, in the order of POINT_COUNTERS."""
+        self.slots += sum(counts[: len(POINT_OUTCOMES)])
+        for name, count in zip(POINT_COUNTERS, counts, strict=True):
             setattr(self, name, getattr(self, name) + count)
 
 

@@ -70,6 +70,7 @@ class SensorReport:
     stream: str
     mode: str
     ledger: SensorLedger
+    fill: float | None  # mean over the scans, None: unknown
     clock: ClockReport
     extrinsics_source: str
     body_from_sensor: F64Array
@@ -89,7 +90,7 @@ class Timing:
     recorded_s: float  # length of the recording
     points_per_s: float
     peak_rss_mb: float
-    engine: str  # numpy or numba
+    engine: str  # numpy or native
 
     @property
     def realtime_factor(self) -> float:
@@ -133,6 +134,7 @@ class RunReport:
     rate_hz: str
     t_init_ns: int | None  # None: no window was reached
     slices: int
+    sort: str  # as `RunInfo.sort`
     capture: CaptureCounts
     sensors: tuple[SensorReport, ...]
     scans: ScanStatistics
@@ -142,6 +144,7 @@ class RunReport:
     messages: tuple[ForwardedMessages, ...] = ()
     faults: tuple[FaultReport, ...] = ()
     repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
+    first_scan: str = ""  # start of the first scan, as text
 
 
 def build_report(run: RunReport) -> Section:
@@ -157,6 +160,7 @@ def build_report(run: RunReport) -> Section:
             "period_ns": str(NS_PER_S / Fraction(run.rate_hz)),
             "t_init_ns": run.t_init_ns,
             "slices": run.slices,
+            "sort": run.sort,
         },
         "capture": {
             "frames": run.capture.frames,
@@ -192,6 +196,15 @@ def report_text(run: RunReport, machine: bool = True, in_a_line: bool = False) -
     return text.encode("utf-8", "backslashreplace").decode() + "\n"
 
 
+def fill_totals(run: RunReport) -> dict[str, str]:
+    """Totals of fill as texts: sensors in JSON, underfilled scans as a number."""
+    scans = run.scans
+    fill = {sensor.name: sensor.fill for sensor in run.sensors}
+    by_sensor: dict[str, Json] = {"fill": fill, "without": scans.without}
+    texts = {key: json.dumps(value, ensure_ascii=False) for key, value in by_sensor.items()}
+    return {"underfilled": str(scans.underfilled), **texts}
+
+
 def imbalances(run: RunReport) -> list[str]:
     """Counters of a run that do not balance, a line each."""
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
@@ -218,10 +231,18 @@ def summary_lines(run: RunReport) -> list[str]:
         for row in rows
     ]
     scans = run.scans
+    left_out = scans.dropped_incomplete
+    dropped = f", {left_out} left out by --drop-incomplete" if left_out else ""
     lines.append(
         f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
-        f"{scans.empty} empty windows), {scans.points} points, clock {run.timescale}"
+        f"{scans.empty} empty windows{dropped}), {scans.points} points, clock {run.timescale}"
     )
+    if run.first_scan:
+        lines.append(f"first scan at {run.first_scan}")
+    for name, count in scans.underfilled_by_sensor.items():
+        none = scans.without.get(name, 0)
+        tail = f": {none} have none" if none else ""
+        lines.append(f"{count} scans lack columns of {name}{tail}")
     if run.timing is not None:
         timing = run.timing
         lines.append(
@@ -266,6 +287,7 @@ def _sensor(sensor: SensorReport) -> Section:
             "written": columns.written,
             "dropped": ordered(columns.dropped, COLUMN_REASONS),
         },
+        "fill": sensor.fill,
         "points": asdict(sensor.ledger.points),
         "clock": asdict(sensor.clock),
         "extrinsics": {

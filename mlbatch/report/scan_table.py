@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import tempfile
 from array import array
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from mlbatch.errors import ExportError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
+# A scan with less of any sensor's columns is underfilled.
+UNDERFILLED = 0.5
 # scans.csv is kept in memory up to this size, then in a temporary file.
 _SPOOL_BYTES = 2**20
 
@@ -37,6 +40,15 @@ class ScanStatistics:
     empty: int
     incomplete: int
     dropped_incomplete: int
+    # Scans with less than half of the columns of a sensor. Neither the head nor the tail, which are
+    # partial, counts in this and the following.
+    underfilled: int
+    # By sensor: scans with less than half of its columns, without any, with columns but no points.
+    underfilled_by_sensor: dict[str, int]
+    without: dict[str, int]
+    no_points: dict[str, int]
+    # Written scans (with `--split` of any sensor) without a point.
+    empty_clouds: int
     points: int
     span_ms: Spread
     period_ms: Spread
@@ -58,19 +70,27 @@ class ScanTable:
         self._spans_ns = array("q")
         self._periods_ns = array("d")
         self._written = 0
+        self.first_start_ns: int | None = None  # of the first scan
         self._incomplete = 0
         self._points = 0
+        self._empty_clouds = 0
+        self._totals = [_SensorTotals(sensor.name) for sensor in info.sensors]
+        self._underfilled = 0
         names = [sensor.name for sensor in info.sensors]
         start = ["index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns"]
         counts = ["points", "columns", *(f"columns_{name}" for name in names), "complete"]
         gaps = (f"max_gap_ns_{name}" for name in names)
-        shares = (f"{word}_{name}" for word in ("coverage", "overlap", "missing") for name in names)
+        words = ("coverage", "overlap", "missing", "fill")
+        shares = (f"{word}_{name}" for word in words for name in names)
         self._append([*start, *counts, *gaps, *shares, "ready_host_ns"])
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
     def add(self, scan: Scan) -> None:
         """Add a written scan."""
         row = _Row.of(scan)
+        if self.first_start_ns is None:
+            self.first_start_ns = scan.start_ns
+        self._empty_clouds += not scan.points
         if self._open is not None and self._open.key == row.key:
             self._open = self._open.joined(row)
             return
@@ -103,20 +123,32 @@ class ScanTable:
             empty,
             self._incomplete,
             dropped_incomplete,
+            self._underfilled,
+            _counted({one.name: one.underfilled for one in self._totals}),
+            _counted({one.name: one.without for one in self._totals}),
+            _counted({one.name: one.no_points for one in self._totals}),
+            self._empty_clouds,
             self._points,
             _spread(np.frombuffer(self._spans_ns, dtype=np.int64) / NS_PER_MS),
             _spread(np.frombuffer(self._periods_ns, dtype=np.float64) / NS_PER_MS),
         )
+
+    @property
+    def fill(self) -> list[float | None]:
+        """Mean fill of each sensor over the scans; None: unknown."""
+        self._close_row()
+        return [one.mean_fill for one in self._totals]
 
     def _close_row(self) -> None:
         row = self._open
         if row is None:
             return
         self._open = None
-        self._append([*row.cells(), *self._missing(row), row.ready_host_ns])
+        self._append([*row.cells(), *self._missing(row), *_fill_cells(row), row.ready_host_ns])
         self._written += 1
         self._incomplete += not row.complete
         self._points += row.points
+        self._add_totals(row)
         if row.columns:
             self._spans_ns.append(row.last_stamp_ns - row.first_stamp_ns)
         # Divided by the number of slices, so that empty windows do not change the period.
@@ -124,6 +156,16 @@ class ScanTable:
         if self._last is not None and step > self._last[0]:
             self._periods_ns.append((row.start_ns - self._last[1]) / (step - self._last[0]))
         self._last = (step, row.start_ns)
+
+    def _add_totals(self, row: _Row) -> None:
+        if row.is_partial:
+            return
+        is_underfilled = False
+        filled = zip(self._totals, row.columns, row.points_of, row.fill, strict=True)
+        for one, columns, points, fill in filled:
+            one.add(columns, points, fill)
+            is_underfilled |= fill < UNDERFILLED
+        self._underfilled += is_underfilled
 
     def _missing(self, row: _Row) -> list[int | str]:
         """Missing columns of each sensor in a window, by its nominal rate; "" if unknown."""
@@ -146,6 +188,30 @@ class ScanTable:
 
 
 @dataclass(slots=True)
+class _SensorTotals:
+    """Sums of one sensor over scans that are not partial."""
+
+    name: str
+    underfilled: int = 0
+    without: int = 0
+    no_points: int = 0
+    known: int = 0  # scans whose fill is known
+    fill: float = 0.0  # sum over them
+
+    def add(self, columns: int, points: int, fill: float) -> None:
+        self.without += not columns
+        self.no_points += bool(columns) and not points
+        self.underfilled += fill < UNDERFILLED
+        if not math.isnan(fill):
+            self.known += 1
+            self.fill += fill
+
+    @property
+    def mean_fill(self) -> float | None:
+        return round(self.fill / self.known, 6) if self.known else None
+
+
+@dataclass(slots=True)
 class _Row:
     """A row of scans.csv; timestamps are only valid if there are columns."""
 
@@ -161,6 +227,10 @@ class _Row:
     ready_host_ns: int
     coverage: tuple[float, ...]
     overlap: tuple[float, ...]
+    # By sensor; all scans of a window have the same fill.
+    fill: tuple[float, ...]
+    points_of: tuple[int, ...]
+    is_partial: bool
 
     @classmethod
     def of(cls, scan: Scan) -> _Row:
@@ -180,6 +250,9 @@ class _Row:
             scan.ready_host_ns,
             scan.coverage or nothing,
             scan.overlap or nothing,
+            tuple(scan.fill.tolist()) or (math.nan,) * len(nothing),
+            scan.points_per_sensor,
+            scan.is_partial,
         )
 
     def joined(self, other: _Row) -> _Row:
@@ -197,6 +270,9 @@ class _Row:
             max(self.ready_host_ns, other.ready_host_ns),
             tuple(max(pair) for pair in zip(self.coverage, other.coverage, strict=True)),
             tuple(max(pair) for pair in zip(self.overlap, other.overlap, strict=True)),
+            self.fill,
+            tuple(a + b for a, b in zip(self.points_of, other.points_of, strict=True)),
+            self.is_partial,
         )
 
     def cells(self) -> list[int | str]:
@@ -208,6 +284,15 @@ class _Row:
         counts = (self.points, total, *self.columns, complete)
         shares = (f"{share:.3f}" for share in (*self.coverage, *self.overlap))
         return [*start, *counts, *self.max_gap_ns, *shares]
+
+
+def _fill_cells(row: _Row) -> list[str]:
+    # The shortest text of a float32.
+    return ["" if math.isnan(fill) else str(np.float32(fill)) for fill in row.fill]
+
+
+def _counted(counts: dict[str, int]) -> dict[str, int]:
+    return {name: count for name, count in counts.items() if count}
 
 
 def _spread(values_ms: F64Array) -> Spread:

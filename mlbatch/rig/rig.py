@@ -5,25 +5,34 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.types import Stream
 
+if TYPE_CHECKING:
+    from mlbatch.ros.point_times import PointRule
+
 DEFAULT_BODY_FRAME = "base_link"
 # Fields of `StreamSelector`, and keys of `stream` in the file.
-STREAM_FIELDS = ("source_ip", "port", "topic", "serial")
+STREAM_FIELDS = ("source_ip", "port", "topic", "serial", "frame_id", "lidar_id")
 
 
 @dataclass(frozen=True, slots=True)
 class StreamSelector:
-    """The packets of a sensor; an empty string or 0 matches anything."""
+    """The packets of a sensor; an empty string, port 0 or None matches anything.
+
+    frame_id, lidar_id: of one of several lidars whose clouds share a topic.
+    """
 
     source_ip: str = ""
     port: int = 0
     topic: str = ""
     serial: str = ""
+    frame_id: str = ""
+    lidar_id: int | None = None
 
     def selects(self, stream: Stream) -> bool:
         """Return whether a stream matches, apart from the serial numbers in its packets."""
@@ -31,27 +40,37 @@ class StreamSelector:
             self.source_ip in ("", stream.source_ip)
             and self.port in (0, stream.port)
             and self.topic in ("", stream.topic)
+            and self.frame_id in ("", stream.frame_id)
+            and self.lidar_id in (None, stream.lidar_id)
         )
 
     def __str__(self) -> str:
         parts = {name: getattr(self, name) for name in STREAM_FIELDS}
-        return ", ".join(f"{name} {value}" for name, value in parts.items() if value)
+        given = {name: value for name, value in parts.items() if value or name == "lidar_id"}
+        return ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownExtrinsics:
+    """`extrinsics: unknown`; place: file, line and key path of it."""
+
+    place: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
     """One sensor of the rig; None: taken from the recording.
 
-    extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording; clock:
-    sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the
-    timestamps; decode: options as for `--decode`.
+    extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
+    unknown; clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added
+    to the timestamps; decode: options as for `--decode`; points: how its clouds are read.
     """
 
     name: str
     model: str | None = None
     stream: StreamSelector | None = None
     metadata: Path | None = None
-    extrinsics: F64Array | str | None = None
+    extrinsics: F64Array | str | UnknownExtrinsics | None = None
     clock: str | None = None
     epoch: str | None = None
     offset_ns: int = 0
@@ -59,6 +78,7 @@ class RigSensor:
     max_range_m: float | None = None
     optional: bool = False
     decode: dict[str, str] = field(default_factory=dict)
+    points: PointRule | None = None
 
 
 def no_boxes() -> F64Array:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -20,12 +20,24 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
 from mlbatch.lidar.limits import MAX_TRANSLATION_M
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, no_boxes
+from mlbatch.rig.rig import (
+    DEFAULT_BODY_FRAME,
+    Rig,
+    RigSensor,
+    StreamSelector,
+    UnknownExtrinsics,
+    no_boxes,
+)
 from mlbatch.rig.yaml_tree import Node
 from mlbatch.units import NS_PER_S, parse_rate
 
+if TYPE_CHECKING:
+    from mlbatch.ros.point_times import PointRule
+
 # `lidar_id` is a uint8.
 MAX_SENSORS = 256
+# What `inspect --write-rig` writes for extrinsics that nobody gave.
+UNKNOWN = "unknown"
 MAX_OFFSET_S = 2**31
 
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
@@ -125,6 +137,23 @@ def _stream(node: Node) -> StreamSelector:
         port=_PORT.of(fields),
         topic=_TOPIC.of(fields),
         serial=_SERIAL.of(fields),
+        frame_id=_FRAME_ID.of(fields).lstrip("/"),
+        lidar_id=_LIDAR_ID.of(fields),
+    )
+
+
+def _points(node: Node) -> PointRule:
+    """Return how decoded clouds are read; the fields are checked with the first of them."""
+    # Few rigs have it.
+    from mlbatch.ros.point_times import UNITS_NS, PointRule
+
+    fields = _some_fields(node, _POINTS_KEYS)
+    return PointRule(
+        time=_POINT_TIME.of(fields),
+        unit_ns=UNITS_NS.get(_POINT_UNIT.of(fields), 0),
+        origin=_POINT_ORIGIN.of(fields),
+        ring=_POINT_RING.of(fields),
+        places={key: value.place for key, value in fields.items()},
     )
 
 
@@ -132,8 +161,10 @@ def _clock(node: Node) -> Mapping[str, Node]:
     return node.fields(_CLOCK_KEYS)
 
 
-def _extrinsics(node: Node) -> F64Array | str:
-    """Return (4, 4) body_from_sensor, m, or the name of a frame of the recording."""
+def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics:
+    """Return (4, 4) body_from_sensor, m, the name of a frame of the recording, or unknown."""
+    if node.kind == "scalar" and node.text == UNKNOWN:
+        return UnknownExtrinsics(node.place)
     fields = _some_fields(node, _EXTRINSICS_KEYS)
     frame = _FRAME_OF_RECORDING.of(fields)
     if frame:
@@ -194,7 +225,18 @@ _PORT = Key("port", lambda node: node.whole(1, 65535), 0)
 _TOPIC = Key("topic", _word("a topic without spaces"), "")
 # Text, since leading zeros count.
 _SERIAL = Key("serial", _word("a serial number without spaces"), "")
-_STREAM_KEYS = _names(_SOURCE_IP, _PORT, _TOPIC, _SERIAL)
+# Of one of several lidars whose clouds share a topic.
+_FRAME_ID = Key("frame_id", _word("a frame_id without spaces"), "")
+_LIDAR_ID: Key[int | None] = Key("lidar_id", lambda node: node.whole(0, 65535), None)
+_STREAM_KEYS = _names(_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
+# Of streams, with the key that they need.
+_NEEDS = {"frame_id": "topic", "lidar_id": "topic"}
+
+_POINT_TIME = Key("time", _word("the name of a field"), "")
+_POINT_UNIT = Key("unit", _choice("s", "ms", "us", "ns"), "")
+_POINT_ORIGIN = Key("from", _choice("start", "end", "absolute"), "")
+_POINT_RING = Key("ring", _word("the name of a field"), "")
+_POINTS_KEYS = _names(_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING)
 
 _CLOCK_SOURCE: Key[str | None] = Key("source", _choice("sensor", "host"), None)
 _CLOCK_EPOCH: Key[str | None] = Key("epoch", _choice("utc", "tai", "gps"), None)
@@ -220,12 +262,13 @@ _SENSOR_NAME = Key(
 _MODEL: Key[str | None] = Key("model", _model, None)
 _STREAM: Key[StreamSelector | None] = Key("stream", _stream, None)
 _METADATA: Key[Path | None] = Key("metadata", _existing_file, None)
-_EXTRINSICS: Key[F64Array | str | None] = Key("extrinsics", _extrinsics, None)
+_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | None] = Key("extrinsics", _extrinsics, None)
 _CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {})
 _MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None)
 _MAX_RANGE: Key[float | None] = Key("max_range_m", _range_m, None)
 _OPTIONAL = Key("optional", Node.flag, False)
 _DECODE: Key[dict[str, str]] = Key("decode", _options, {})
+_POINTS: Key[PointRule | None] = Key("points", _points, None)
 _SENSOR_KEYS = _names(
     _SENSOR_NAME,
     _MODEL,
@@ -237,6 +280,7 @@ _SENSOR_KEYS = _names(
     _MAX_RANGE,
     _OPTIONAL,
     _DECODE,
+    _POINTS,
 )
 
 # Fleets put the name of the robot before a slash.
@@ -280,7 +324,12 @@ def _sensor(node: Node) -> RigSensor:
         max_range_m=_MAX_RANGE.of(fields),
         optional=_OPTIONAL.of(fields),
         decode=_DECODE.of(fields),
+        points=_POINTS.of(fields),
     )
+    if sensor.points is not None and (sensor.stream is None or not sensor.stream.topic):
+        points = fields["points"]
+        remedy = "give the topic of its clouds as stream: {topic: ...}, or remove points"
+        raise points.error("a sensor on a topic", "none", remedy)
     low_m = sensor.min_range_m or 0.0
     high_m = sensor.max_range_m
     if high_m is not None and high_m <= low_m:
@@ -323,6 +372,9 @@ def _some_fields(node: Node, known: Sequence[str]) -> Mapping[str, Node]:
             if key in fields and other in fields:
                 found = f"{other} as well (line {fields[other].line})"
                 raise fields[key].error(f"{key} without {other}", found, "keep one of the two")
+    for key, other in _NEEDS.items():
+        if key in fields and key in known and other not in fields:
+            raise fields[key].error(f"{key} with {other}", f"no {other}", f"add the {other}")
     return fields
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
@@ -70,6 +70,8 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
         yield "optional: true"
     if sensor.decode:
         yield "decode: " + _braces({_text(k): _text(v) for k, v in sensor.decode.items()})
+    if sensor.points is not None:
+        yield "points: " + _braces({key: _text(v) for key, v in sensor.points.keys().items() if v})
 
 
 def _stream_text(stream: StreamSelector) -> str:
@@ -79,13 +81,18 @@ def _stream_text(stream: StreamSelector) -> str:
             "port": str(stream.port or ""),
             "topic": stream.topic and _text(stream.topic),
             "serial": stream.serial and _text(stream.serial),
+            "frame_id": stream.frame_id and _text(stream.frame_id),
+            "lidar_id": "" if stream.lidar_id is None else str(stream.lidar_id),
         }
     )
 
 
-def _extrinsics_lines(extrinsics: F64Array | str | None) -> Iterator[str]:
+def _extrinsics_lines(extrinsics: F64Array | str | UnknownExtrinsics | None) -> Iterator[str]:
     if extrinsics is None:
         yield from _NO_EXTRINSICS
+        return
+    if isinstance(extrinsics, UnknownExtrinsics):
+        yield "extrinsics: unknown"
         return
     if isinstance(extrinsics, str):
         yield f"extrinsics: {{frame: {_text(extrinsics)}}}"

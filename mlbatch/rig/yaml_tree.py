@@ -56,6 +56,11 @@ class Node:
         return _error(self.file, self.line, self.path, message)
 
     @property
+    def place(self) -> str:
+        """File, line and key path, as errors begin."""
+        return _place(self.file, self.line, self.path)
+
+    @property
     def shown(self) -> str:
         """The value in a few words, for errors."""
         if self.kind == "list":
@@ -270,5 +275,8 @@ def short(text: str) -> str:
 
 
 def _error(file: Path, line: int, path: str, message: str) -> RigError:
-    place = f"{file}:{line}: {path}: " if path else f"{file}:{line}: "
-    return RigError(place + message)
+    return RigError(f"{_place(file, line, path)}: {message}")
+
+
+def _place(file: Path, line: int, path: str) -> str:
+    return f"{file}:{line}: {path}" if path else f"{file}:{line}"

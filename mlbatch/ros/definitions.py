@@ -107,6 +107,12 @@ float64[9] orientation_covariance; geometry_msgs/Vector3 angular_velocity; \
 float64[9] angular_velocity_covariance; geometry_msgs/Vector3 linear_acceleration; \
 float64[9] linear_acceleration_covariance
 """
+# Other forms of types in the table, which recordings without definitions may have.
+_VARIANTS = {
+    "robosense_msgs/RobosensePacket": (
+        "builtin_interfaces/Time stamp; uint8 is_difop; uint8[1500] data; uint32 size"
+    ),
+}
 # Datatypes of a PointField by numpy type.
 FIELD_CODES = {"u1": 2, "<u2": 4, "<u4": 6, "<f4": 7, "<f8": 8}
 _ROS1_HEADER = "uint32 seq\ntime stamp\nstring frame_id"
@@ -131,6 +137,18 @@ def definitions_of(topic: Topic) -> Definitions:
 
         return {**_ours(topic.encoding), **parse_idl(topic.definition)}
     return {**_ours(topic.encoding), **parse(topic.definition, type_key(topic.type))}
+
+
+def variants_of(topic: Topic) -> list[Definitions]:
+    """Other forms of the types of a topic whose definition is assumed, by our table."""
+    ours = definition_text(topic.type)
+    if topic.definition.strip() not in ("", ours.strip()):
+        return []
+    return [
+        {**definitions_of(topic), name: parse(fields.replace("; ", "\n"), name)[name]}
+        for name, fields in _VARIANTS.items()
+        if name == type_key(topic.type) or f"MSG: {name}\n" in ours
+    ]
 
 
 def parse(text: str, root: str) -> dict[str, tuple[Field, ...]]:

@@ -1,44 +1,41 @@
 """Clouds that drivers decoded: sensor_msgs/PointCloud2 and Livox CustomMsg to points with times.
 
 Source: docs/sources/messages.md, sections 1 (CustomMsg), 4 (serialisation) and 8 (fields, times).
-Every length is checked against the message's end before it is used. Drivers agree neither on the
-unit nor on the zero of the times of points, and state neither in the message: type and values of
-the time field decide ("Detection rule" of section 8).
+Every length is checked against the message's end before it is used. Times: `ros.point_times`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import difflib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, U16Array
 from mlbatch.ros.encoding import Cursor, MessageError
 from mlbatch.ros.point_packets import CloudError, Points
+from mlbatch.ros.point_times import CONVENTION, TIME_NAMES, CloudSample, PointRule, Zero, stamps
 from mlbatch.types import Message
-from mlbatch.units import NS_PER_S
 
 # A structured array; numpy has no type for the fields of a dtype.
 Rows: TypeAlias = npt.NDArray[Any]
-# Numbers of the type of a cloud's time field.
-Times: TypeAlias = npt.NDArray[Any]
 _Whole = TypeVar("_Whole", np.uint8, np.uint16)
 
 # sensor_msgs/PointField: datatype by its number.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_FIELDS = 256
 _AXES = ("x", "y", "z")
-_TIME_NAMES = ("t", "time", "timestamp", "time_stamp", "timestamps", "offset_time", "ts")
 # Names of a field by its role; the first that a cloud has counts.
 _ROLES: Mapping[str, tuple[str, ...]] = {
-    "time": _TIME_NAMES,
+    "time": TIME_NAMES,
     "intensity": ("intensity", "i", "reflectivity"),
     "ring": ("ring", "channel", "line"),
     "return_type": ("return_type",),
     "tag": ("tag",),
+    "lidar_id": ("lidar_id",),
 }
 _CUSTOM_POINT = np.dtype(
     [
@@ -55,15 +52,24 @@ _CUSTOM_POINT = np.dtype(
 _CUSTOM_STEPS = {"cdr": 20, "ros1": 19}
 
 
+# More points share one time only where it is not theirs; columns have fewer.
+_MOST_AT_ONCE = 1024
+
+
+class FieldError(CloudError):
+    """A field that the rig names and the cloud lacks."""
+
+
 @dataclass(frozen=True, slots=True)
 class Cloud:
     """A cloud; time_meaning: unit and zero of its times; frame: frame_id of its points.
 
-    without_place: points left out at NaN, infinity or zero; without_time: those without a finite
-    time.
+    lidar_id: (n,) the lidar of each point, None where the message does not say; without_place:
+    points left out at NaN, infinity or zero; without_time: those without a finite time.
     """
 
     points: Points
+    lidar_id: U16Array | None
     time_meaning: str
     frame: str
     without_place: int
@@ -71,50 +77,115 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True)
-class Zero:
-    """What times may count from; field: name and type; base: description of base_ns."""
-
-    field: str
-    base_ns: int
-    base: str
-
-
-@dataclass(frozen=True, slots=True)
 class _Raw:
-    """Points of a message before conversion; rows: fields by role; frame: frame_id."""
+    """Points of a message before conversion.
+
+    rows: fields by role; stamp_ns, frame: of the header; lidar_id: of all points, None without.
+    """
 
     rows: Rows
     zero: Zero
+    stamp_ns: int
     frame: str
+    lidar_id: int | None = None
 
 
-def read_cloud(message: Message) -> Cloud:
-    """The points of a message; CloudError if they cannot be read."""
-    try:
-        raw = _READERS[message.topic.type](message)
-    except MessageError as err:
-        raise CloudError(str(err)) from err
-    time = raw.rows["time"]
-    reals = _reals(raw.rows)
-    x, y, z, _ = reals
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared = x * x + y * y + z * z
-    placed = (squared > 0) & (squared < np.inf)
-    keep = placed & np.isfinite(time) if time.dtype.kind == "f" else placed
+# The rule for the points of a frame.
+Rules: TypeAlias = Callable[[str], PointRule]
+
+
+def by_convention(frame: str) -> PointRule:
+    """The rule of every frame without a rig."""
+    return CONVENTION
+
+
+def read_cloud(message: Message, rules: Rules = by_convention) -> Cloud:
+    """The points of a message; rules: by its frame_id; CloudError if they cannot be read."""
+    raw = _raw(message, rules)
+    rule = rules(raw.frame)
+    reals, placed, keep = _kept(raw.rows)
     rows = raw.rows[keep]
     count = len(rows)
-    stamp_ns, meaning = stamps(rows["time"], raw.zero) if count else (np.empty(0, np.int64), "")
+    stamp_ns = np.empty(0, np.int64)
+    meaning = ""
+    if count:
+        stamp_ns, meaning = stamps(rows["time"], raw.zero, rule, raw.rows["time"])
+        if count > _MOST_AT_ONCE and stamp_ns.min() == stamp_ns.max():
+            raise CloudError(
+                f"field {raw.zero.field}: expected times of the points, found one for all {count} "
+                "points of the cloud"
+            )
+    ring = _ring(rows, rule)
     return_type = _whole(rows, "return_type", np.uint8)
     tag = _whole(rows, "tag", np.uint8)
     points = Points(
         stamp_ns,
         reals[:, keep],
-        _whole(rows, "ring", np.uint16),
+        ring,
         np.zeros(count, np.uint8) if return_type is None else return_type,
         np.zeros(count, np.uint8) if tag is None else tag,
     )
     without_place = len(keep) - int(np.count_nonzero(placed))
-    return Cloud(points, meaning, raw.frame, without_place, len(keep) - count - without_place)
+    lidar_id = _whole(rows, "lidar_id", np.uint16)
+    if raw.lidar_id is not None:
+        lidar_id = np.full(count, raw.lidar_id, np.uint16)
+    return Cloud(
+        points, lidar_id, meaning, raw.frame, without_place, len(keep) - count - without_place
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CloudHead:
+    """What a message says of its lidars; lidar_ids: sorted, empty where it does not."""
+
+    frame: str
+    lidar_ids: tuple[int, ...]
+    sample: CloudSample
+
+
+def sample_cloud(message: Message, rules: Rules) -> CloudHead:
+    """Frame, lidars and times of a message as they are stored; CloudError as in `read_cloud`."""
+    raw = _raw(message, rules)
+    rows = raw.rows[_kept(raw.rows)[2]]
+    time = rows["time"]
+    _ring(rows, rules(raw.frame))
+    ids = _whole(rows, "lidar_id", np.uint16)
+    lidar_ids = () if ids is None else tuple(np.unique(ids).tolist())
+    if raw.lidar_id is not None:
+        lidar_ids = (raw.lidar_id,)
+    low = float(time.min()) if len(time) else 0.0
+    high = float(time.max()) if len(time) else 0.0
+    sample = CloudSample(message.host_ns, raw.stamp_ns, time.dtype, low, high, len(time), raw.zero)
+    return CloudHead(raw.frame, lidar_ids, sample)
+
+
+def _raw(message: Message, rules: Rules) -> _Raw:
+    try:
+        return _READERS[message.topic.type](message, rules)
+    except MessageError as err:
+        raise CloudError(str(err)) from err
+
+
+def _kept(rows: Rows) -> tuple[F32Array, BoolArray, BoolArray]:
+    """Reals (4, n) of points; those with a place (n,); of these those with a finite time (n,)."""
+    time = rows["time"]
+    reals = _reals(rows)
+    x, y, z, _ = reals
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared = x * x + y * y + z * z
+    placed = (squared > 0) & (squared < np.inf)
+    return reals, placed, placed & np.isfinite(time) if time.dtype.kind == "f" else placed
+
+
+def _ring(rows: Rows, rule: PointRule) -> U16Array | None:
+    """The ring of each point; None where there is none, FieldError where the rig names another."""
+    ring = _whole(rows, "ring", np.uint16)
+    if rule.ring and ring is None:
+        raise FieldError(
+            f"{rule.at('ring')}expected a field of whole numbers from 0 to 65535, found others in "
+            f"{rule.ring}; name another one, or remove the key"
+        )
+    return ring
 
 
 def _reals(rows: Rows) -> F32Array:
@@ -147,14 +218,15 @@ def _cursor(message: Message) -> Cursor:
     return Cursor(message.topic.encoding, message.data, 0, len(message.data))
 
 
-def _custom(message: Message) -> _Raw:
+def _custom(message: Message, rules: Rules) -> _Raw:
     """The points of a Livox CustomMsg."""
     cursor = _cursor(message)
     stamp_ns, frame = cursor.header()
     base_ns = cursor.number("Q")
     base = "timebase"
     cursor.number("I")
-    cursor.place(4, 1)
+    lidar_id = cursor.number("B")
+    cursor.place(3, 1)
     count = cursor.number("I")
     step = _CUSTOM_STEPS[message.topic.encoding]
     at = cursor.place(step * (count - 1) + _CUSTOM_POINT.itemsize if count else 0, 1)
@@ -162,7 +234,14 @@ def _custom(message: Message) -> _Raw:
     if base_ns == 0:
         base_ns = stamp_ns
         base = "the header's stamp"
-    return _Raw(rows, Zero("offset_time (uint32)", base_ns, base), frame)
+    for key, given, own in (
+        ("time", rules(frame).time, "offset_time"),
+        ("ring", rules(frame).ring, "line"),
+    ):
+        if given not in ("", own):
+            raise _unknown_field(rules(frame), key, given, (own,))
+    zero = Zero("offset_time (uint32)", base_ns, base)
+    return _Raw(rows, zero, stamp_ns or base_ns, frame, lidar_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +254,7 @@ class _Field:
     count: int
 
 
-def _cloud2(message: Message) -> _Raw:
+def _cloud2(message: Message, rules: Rules) -> _Raw:
     """The points of a sensor_msgs/PointCloud2."""
     cursor = _cursor(message)
     stamp_ns, frame = cursor.header()
@@ -196,11 +275,11 @@ def _cloud2(message: Message) -> _Raw:
             f"expected {height} x {width} points of {step} bytes in rows of {row_step}, found "
             f"{size} bytes of data; the cloud was cut off, or written wrongly"
         )
-    layout, time = _layout(fields, step)
+    layout, time = _layout(fields, step, rules(frame))
     rows: Rows = np.ndarray((height, width), layout, message.data, at, (row_step, step))
     type_name = np.dtype(_TYPES[time.type]).name
     zero = Zero(f"{time.name} ({type_name})", stamp_ns, "the header's stamp")
-    return _Raw(rows.reshape(-1), zero, frame)
+    return _Raw(rows.reshape(-1), zero, stamp_ns, frame)
 
 
 def _fields(cursor: Cursor) -> dict[str, _Field]:
@@ -220,10 +299,17 @@ def _fields(cursor: Cursor) -> dict[str, _Field]:
     return fields
 
 
-def _layout(fields: Mapping[str, _Field], step: int) -> tuple[np.dtype[np.void], _Field]:
+def _layout(
+    fields: Mapping[str, _Field], step: int, rule: PointRule
+) -> tuple[np.dtype[np.void], _Field]:
     """The dtype of points, with fields named by role; and the time field."""
     chosen = {axis: fields[axis] for axis in _AXES if axis in fields}
+    given = {"time": rule.time, "ring": rule.ring}
     for role, names in _ROLES.items():
+        if given.get(role):
+            names = (given[role],)
+            if names[0] not in fields:
+                raise _unknown_field(rule, role, names[0], tuple(fields))
         found = next((fields[name] for name in names if name in fields), None)
         if found is not None:
             chosen[role] = found
@@ -232,8 +318,9 @@ def _layout(fields: Mapping[str, _Field], step: int) -> tuple[np.dtype[np.void],
         raise CloudError(f"expected fields x, y, z, found {present}; choose a topic of points")
     if "time" not in chosen:
         raise CloudError(
-            f"expected the time of each point in a field {', '.join(_TIME_NAMES[:-1])} or "
-            f"{_TIME_NAMES[-1]}, found {present}; record the raw packets, or clouds with times"
+            f"expected the time of each point in a field {', '.join(TIME_NAMES[:-1])} or "
+            f"{TIME_NAMES[-1]}, found {present}; name it in the rig (points: {{time: FIELD}}), "
+            "record the raw packets, or clouds with times"
         )
     for role, field in chosen.items():
         _check(role, field, step)
@@ -265,75 +352,20 @@ def _check(role: str, field: _Field, step: int) -> None:
         )
 
 
-_READERS: Mapping[str, Callable[[Message], _Raw]] = {
+def _unknown_field(rule: PointRule, key: str, name: str, known: Sequence[str]) -> CloudError:
+    """The error for a field of the rig that the cloud lacks."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+    remedy = f"the nearest one is {near[0]}" if near else "choose a topic of points"
+    return FieldError(
+        f"{rule.at(key)}expected a field of the cloud, one of {', '.join(known) or 'none'}, found "
+        f"{name!r}; {remedy}"
+    )
+
+
+_READERS: Mapping[str, Callable[[Message, Rules], _Raw]] = {
     "sensor_msgs/PointCloud2": _cloud2,
     "livox_ros_driver/CustomMsg": _custom,
     "livox_ros_driver2/CustomMsg": _custom,
 }
 # Message types of clouds, and their kind of point packets.
 CLOUD_TYPES: Mapping[str, int] = {name: int(reads is _custom) for name, reads in _READERS.items()}
-
-
-# -- times ----------------------------------------------------------------------------------------
-
-_LIMIT_NS = 2**31 * NS_PER_S
-# No revolution takes longer; times in another unit than the assumed one would.
-_LONGEST_S = 10
-_FLOAT64_BYTES = 8
-
-
-@dataclass(frozen=True, slots=True)
-class _FloatTime:
-    """Meaning of floating-point times whose largest is between two values; ns: of their unit."""
-
-    above: float
-    below: float
-    ns: int
-    absolute: bool
-    words: str
-
-
-_FLOAT_TIMES = (
-    _FloatTime(-1e3, 1e3, NS_PER_S, False, "s after"),
-    _FloatTime(1e8, 1e11, NS_PER_S, True, "s since 1970"),
-    _FloatTime(1e14, float(_LIMIT_NS), 1, True, "ns since 1970"),
-)
-
-
-def stamps(time: Times, zero: Zero) -> tuple[I64Array, str]:
-    """Stamps (ns) of points by their finite times (n > 0,); and the meaning of the times."""
-    if time.dtype.kind != "f":
-        # At most 32 bits, hence 4.3 s.
-        return _after(zero, time.astype(np.int64)), f"{zero.field}, ns after {zero.base}"
-    value = time.astype(np.float64)
-    low = float(value.min())
-    high = float(value.max())
-    meaning = next((one for one in _FLOAT_TIMES if one.above < high < one.below), None)
-    if meaning is None or (meaning.absolute and time.dtype.itemsize < _FLOAT64_BYTES):
-        raise CloudError(
-            f"field {zero.field}: expected s after {zero.base} (below 1000), or float64 s or ns "
-            f"since 1970, found {high:g}; its unit is not known, record the raw packets"
-        )
-    span_s = (high - low) * (meaning.ns / NS_PER_S)
-    if span_s > _LONGEST_S:
-        raise CloudError(
-            f"field {zero.field}: expected times of one cloud within {_LONGEST_S} s, found "
-            f"{span_s:g} s; its unit is not known, record the raw packets"
-        )
-    # In two parts: a float64 of nanoseconds since 1970 has a step of 256.
-    whole = np.floor(value)
-    ns = whole.astype(np.int64) * meaning.ns
-    ns += np.rint((value - whole) * meaning.ns).astype(np.int64)
-    if meaning.absolute:
-        return ns, f"{zero.field}, {meaning.words}"
-    words = "s up to" if high <= 0 > low else meaning.words
-    return _after(zero, ns), f"{zero.field}, {words} {zero.base}"
-
-
-def _after(zero: Zero, offset_ns: I64Array) -> I64Array:
-    if not 0 < zero.base_ns < _LIMIT_NS:
-        raise CloudError(
-            f"field {zero.field}: expected times after {zero.base}, found {zero.base_ns} ns there; "
-            "set the clock of its driver and record again"
-        )
-    return zero.base_ns + offset_ns

@@ -12,6 +12,7 @@ from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.interface import Records
 from mlbatch.lidar.pixel_table import PixelTable
 from mlbatch.types import ImuSamples
+from mlbatch.units import NS_PER_S
 
 
 class BaseLidar:
@@ -42,6 +43,7 @@ class BaseLidar:
     has_reflectivity: bool = False
     sequence_modulus: int = 0
     column_period_ns: float = 0.0
+    lit_share: float | None = None
     imu_port: int = 0
     typed_by: str = "level"
     sends_twice: bool = True
@@ -50,6 +52,11 @@ class BaseLidar:
     timestamp_mode: str = ""
     clock_period_ns: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def columns_per_s(self) -> float:
+        """Columns sent in a second: one a period."""
+        return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """All packets: they carry no serial number."""
@@ -68,9 +75,9 @@ class BaseLidar:
         nothing = np.empty((0, 3))
         return ImuSamples(sensor, np.empty(0, np.int64), nothing, nothing)
 
-    def sensor_from_imu(self) -> F64Array:
-        """Identity: the pose is unknown."""
-        return np.eye(4)
+    def sensor_from_imu(self) -> F64Array | None:
+        """None: no IMU packets."""
+        return None
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
         """None: the beam vectors suffice."""

@@ -8,12 +8,14 @@ from mlbatch.errors import UsageError
 
 _SWITCH = ("on", "off")
 # packet_stamp: whether a Velodyne HDL-32E stamps the start or the end of a packet
-# (docs/sources/velodyne.md section 2).
+# (docs/sources/velodyne.md section 2). range_unit: of a ROBOSENSE Helios
+# (docs/sources/robosense.md section 3).
 DECODE_OPTIONS: Mapping[str, tuple[str, ...]] = {
     "crc": ("check",),
     "firing_azimuth": _SWITCH,
     "optical_centre": _SWITCH,
     "packet_stamp": ("start", "end"),
+    "range_unit": ("2.5mm", "5mm"),
     "vertical_offset": _SWITCH,
 }
 

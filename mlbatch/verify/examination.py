@@ -43,6 +43,9 @@ class Examination:
         self._files = files
         self._grid = metadata.grid(where)
         self._grid_checks = GridChecks(log, self._grid, metadata.t_init_ns, where)
+        self._by_time = metadata.sort == "points"
+        if metadata.sort not in (None, "columns", "points"):
+            log.fail("metadata", f"{where} sort", "columns or points", metadata.sort)
         self._sensors = _MOST_SENSORS if metadata.sensors is None else len(metadata.sensors)
         table = files.table
         if table is not None and metadata.sensors is not None:
@@ -59,6 +62,7 @@ class Examination:
     def scan(self, scan: StoredScan) -> None:
         """Check one scan."""
         log = self.log
+        scan.by_time = self._by_time
         for name, at_ns in (("start_ns", scan.start_ns), ("end_ns", scan.end_ns)):
             if at_ns is not None and abs(at_ns) >= _MOST_NS:
                 log.fail("grid", f"{scan.where} {name}", "a time", at_ns)

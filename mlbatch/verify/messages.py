@@ -6,6 +6,7 @@ Sources: docs/sources/outputs.md sections 2 to 4; sensor_msgs of ROS.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -24,6 +25,30 @@ CLOUD = "sensor_msgs/PointCloud2"
 IMU = "sensor_msgs/Imu"
 TRANSFORMS = "tf2_msgs/TFMessage"
 TF_STATIC = "/tf_static"
+# Types of recorded messages that begin with a header; others may contain one elsewhere.
+WITH_HEADER = frozenset(
+    (
+        IMU,
+        CLOUD,
+        *(
+            f"sensor_msgs/{name}"
+            for name in (
+                *("CameraInfo", "CompressedImage", "FluidPressure", "Illuminance", "Image"),
+                *("JointState", "LaserScan", "MagneticField", "NavSatFix", "PointCloud", "Range"),
+                *("RelativeHumidity", "Temperature", "TimeReference"),
+            )
+        ),
+        *(
+            f"geometry_msgs/{name}Stamped"
+            for name in (
+                *("Accel", "AccelWithCovariance", "Point", "Pose", "PoseWithCovariance"),
+                *("Quaternion", "Transform", "Twist", "TwistWithCovariance", "Vector3", "Wrench"),
+            )
+        ),
+        *("nav_msgs/Odometry", "nav_msgs/Path"),
+    )
+)
+_MOST_FRAMES = 16
 # Stamps outside are never written.
 _STAMP_LIMIT_NS = 2**31 * 10**9
 _LARGEST_ERROR = 1e-6
@@ -175,10 +200,12 @@ def stored_scan(cloud: Cloud, where: str, sensor: int | None) -> StoredScan:
     scan = StoredScan(where, cloud.stamp_ns, xyz, organized, sensor)
     scan.time_ns = time_ns
     scan.time_step_ns = step_ns
-    # An intensity of one byte has no NaN for empty slots.
-    if "intensity" in names and records.dtype["intensity"].kind == "f":
-        intensity: F32Array = records["intensity"]
-        scan.intensity = intensity
+    if "intensity" in names:
+        # An intensity of one byte has no NaN for empty slots.
+        if records.dtype["intensity"].kind == "f":
+            scan.intensity = records["intensity"]
+        else:
+            scan.byte_intensity = records["intensity"]
     if "range" in names:
         range_m: F64Array = records["range"] / 1000.0
         scan.range_m = range_m
@@ -223,6 +250,16 @@ def _times(cloud: Cloud, records: Records) -> tuple[I64Array | None, int]:
     return np.rint(after_s * _NS).astype(np.int64) - rest_ns, int(step_s * _NS) + 1
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """A transform of /tf_static; rotation: quaternion x, y, z, w."""
+
+    parent: str
+    child: str
+    translation_m: F64Array
+    rotation: F64Array
+
+
 # -- topics ---------------------------------------------------------------------------------------
 
 
@@ -241,7 +278,11 @@ class TopicChecks:
     counts: Counter[str] = field(default_factory=Counter)
     _split: bool | None = None
     _last_ns: dict[str, int] = field(default_factory=dict)
-    _frames: set[str] = field(default_factory=set)
+    # Frames in /tf_static.
+    tree: set[str] = field(default_factory=set)
+    # Frames in other messages, by topic: own ones, and recorded ones.
+    _named: dict[str, set[str]] = field(default_factory=dict)
+    _recorded: dict[str, set[str]] = field(default_factory=dict)
 
     @property
     def split(self) -> bool:
@@ -267,6 +308,10 @@ class TopicChecks:
                 self._check_imu(message, f"{owner}_imu")
             elif message.type == IMU:
                 self._check_imu(message, None)
+            elif message.type == TRANSFORMS:
+                self._add_moving_frames(message)
+            if message.type in WITH_HEADER and message.topic not in self._named:
+                self._add_recorded_frame(message)
         except DamageError as err:
             self.log.fail("layout", message.where, err.expected, err.found)
 
@@ -290,6 +335,7 @@ class TopicChecks:
         log.equal("stamps", f"{where} publish time", cloud.stamp_ns, message.publish_ns)
         if self.metadata.frame_id is not None:
             log.equal("metadata", f"{where} frame_id", self.metadata.frame_id, cloud.frame_id)
+        self._named.setdefault(message.topic, set()).add(cloud.frame_id)
         self.examination.scan(stored_scan(cloud, where, sensor))
 
     def _check_imu(self, message: Message, frame_id: str | None) -> None:
@@ -305,6 +351,7 @@ class TopicChecks:
         if frame_id is None:
             return  # Frame, values and order of a recorded message are those of its publisher.
         log.equal("imu", f"{where} frame_id", frame_id, frame)
+        self._named.setdefault(message.topic, set()).add(frame)
         log.equal("imu", f"{where} publish time", stamp_ns, message.publish_ns)
         values = cursor.floats(_IMU_FLOATS)
         cursor.end("an Imu message")
@@ -325,29 +372,104 @@ class TopicChecks:
         if not log.equal("tf_static", f"{where} type", TRANSFORMS, message.type):
             return
         cursor = MessageCursor.of_message(message.data, message.encoding)
-        names = []
-        translations = []
-        rotations = []
+        transforms = []
         for _ in range(cursor.integer("I")):
-            stamp_ns, frame = cursor.header()
+            stamp_ns, parent = cursor.header()
             log.equal("tf_static", f"{where} stamp", message.log_ns, stamp_ns)
-            self._frames.add(frame)
-            names.append(cursor.text())
-            translations.append(np.array(cursor.floats(3)))
-            rotations.append(np.array(cursor.floats(4)))
-        cursor.end("a TFMessage")
-        if self.metadata.frame_id is not None:
-            log.equal("tf_static", f"{where} frames", {self.metadata.frame_id}, self._frames)
-        if self.metadata.sensors is not None:
-            log.equal("tf_static", f"{where} child frames", self.metadata.sensors, tuple(names))
-        poses = None if self.report is None else poses_of(self.report)
-        known = poses if poses is not None and len(poses) == len(names) else None
-        for i, name in enumerate(names):
-            rotation: F64Array = rotations[i]
+            child = cursor.text()
+            translation_m: F64Array = np.array(cursor.floats(3))
+            rotation: F64Array = np.array(cursor.floats(4))
             if not abs(float(rotation @ rotation) - 1) < _LARGEST_ERROR:
-                log.fail("tf_static", f"{where} {name}", "a unit quaternion", rotation)
-            if known is not None:
-                self._check_pose(f"{where} {name}", translations[i], rotation, known[i])
+                log.fail("tf_static", f"{where} {child}", "a unit quaternion", rotation)
+            transforms.append(Transform(parent, child, translation_m, rotation))
+        cursor.end("a TFMessage")
+        roots = self._check_tree(where, transforms)
+        self._check_sensors(where, transforms, roots)
+
+    def _check_tree(self, where: str, transforms: Sequence[Transform]) -> set[str]:
+        """Check that all frames have one parent, and one root above them; gives the roots."""
+        log = self.log
+        children = [one.child for one in transforms]
+        log.equal("tf_static", f"{where} frames with one parent", len(set(children)), len(children))
+        below: dict[str, list[str]] = {}
+        for one in transforms:
+            below.setdefault(one.parent, []).append(one.child)
+        roots = set(below) - set(children)
+        if transforms and self.metadata.frame_id is not None:
+            log.equal("tf_static", f"{where} root", {self.metadata.frame_id}, roots)
+        elif transforms:
+            log.equal("tf_static", f"{where} number of roots", 1, len(roots))
+        self.tree |= {*children, *roots}
+        reached: set[str] = set()
+        waiting = list(roots)
+        while waiting:
+            frame = waiting.pop()
+            if frame not in reached:
+                reached.add(frame)
+                waiting += below.get(frame, ())
+        circle = sorted(set(children) - reached)
+        log.equal("tf_static", f"{where} frames without a root", [], circle)
+        return roots
+
+    def _check_sensors(
+        self, where: str, transforms: Sequence[Transform], roots: Collection[str]
+    ) -> None:
+        """Check the transforms of the sensors, which are the first."""
+        log = self.log
+        names = self.metadata.sensors or ()
+        body = self.metadata.frame_id
+        if body is None:
+            # Bags for ROS 1 have no metadata.
+            body = next(iter(roots), names[0] if len(names) == 1 else None)
+        # A single sensor without extrinsics is the body.
+        sensors = [name for name in names if name != body]
+        found = transforms[: len(sensors)]
+        log.equal("tf_static", f"{where} child frames", sensors, [one.child for one in found])
+        if body is not None:
+            parents = [one.parent for one in found]
+            log.equal("tf_static", f"{where} frames", [body] * len(found), parents)
+        poses = None if self.report is None else poses_of(self.report)
+        if poses is None or len(poses) != len(found):
+            return
+        for one, pose in zip(found, poses, strict=True):
+            self._check_pose(f"{where} {one.child}", one.translation_m, one.rotation, pose)
+
+    def _add_moving_frames(self, message: Message) -> None:
+        """Add the frames of a recorded /tf."""
+        cursor = MessageCursor.of_message(message.data, message.encoding)
+        for _ in range(cursor.integer("I")):
+            _, parent = cursor.header()
+            self.tree |= {_clean(parent), _clean(cursor.text())}
+            cursor.floats(7)
+
+    def _add_recorded_frame(self, message: Message) -> None:
+        """Note the frame of a recorded message."""
+        _, frame = MessageCursor.of_message(message.data, message.encoding).header()
+        frames = self._recorded.setdefault(message.topic, set())
+        if len(frames) < _MOST_FRAMES:
+            frames.add(_clean(frame))
+
+    @property
+    def strange_frames(self) -> str:
+        """Frames that only recorded messages name and that are not in the tree, as text, or ""."""
+        found = [
+            f"{frame or 'no frame'} of {topic}"
+            for topic, frames in sorted(self._recorded.items())
+            for frame in sorted(frames - self.tree)
+        ]
+        return ", ".join(found)
+
+    def _check_frames(self, where: str) -> None:
+        """Check that the frames of own messages are in the tree."""
+        # The body frame alone is a tree without transforms.
+        body = self.metadata.frame_id
+        tree = self.tree or {body or frame for frames in self._named.values() for frame in frames}
+        for topic, frames in sorted(self._named.items()):
+            for frame in sorted(frames):
+                found = frame if frame in tree else "none"
+                self.log.equal("frames", f"{where} {topic} frame in /tf_static", frame, found)
+        for frames in self._recorded.values():
+            self.log.ok("frames", len(frames & self.tree))
 
     def _check_pose(
         self, where: str, translation_m: F64Array, rotation: F64Array, pose: F64Array
@@ -364,6 +486,7 @@ class TopicChecks:
         """Check the counts of messages, and the sums of scans."""
         log = self.log
         log.equal("tf_static", f"{where} messages", 1, self.counts[TF_STATIC])
+        self._check_frames(where)
         self.examination.finish(split=self.split)
         report = self.report
         if report is None:
@@ -383,6 +506,11 @@ class TopicChecks:
         for topic in sorted(set(said) | set(self.counts) - own):
             count = self.counts[topic]
             log.equal("messages", f"{where} {topic}", said.get(topic, 0), count)
+
+
+def _clean(frame: str) -> str:
+    """A frame without the leading slash that ROS 1 allowed."""
+    return frame.lstrip("/")
 
 
 def _matrix(quaternion: F64Array) -> F64Array:

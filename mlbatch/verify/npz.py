@@ -47,7 +47,8 @@ _NUMBERS = {
     "slices": "<i8",
     "complete": "|b1",
 }
-_TEXTS = ("sensors", "frame_id", "rate_hz", "timescale", "schema")
+_BY_SENSOR = {"fill": "<f4"}
+_TEXTS = ("sensors", "frame_id", "rate_hz", "timescale", "sort", "schema")
 # The same in every scan of a run.
 _CONSTANT = ("slices", *_TEXTS)
 
@@ -96,6 +97,7 @@ class NpzReader:
             sensors=self.sensors or None,
             timescale=texts.get("timescale"),
             frame_id=texts.get("frame_id"),
+            sort=texts.get("sort"),
         )
 
     def _fits(self, file: ScanFile, key: str, values: Values) -> bool:
@@ -152,7 +154,8 @@ class NpzReader:
     def _kinds(self, data: dict[str, bytes]) -> dict[str, str]:
         """Types by key; missing keys are damage."""
         points = _POINTS | ({} if self.organized else _DENSE)
-        required = {key: kind for key, (kind, _) in points.items()} | _COLUMNS | _NUMBERS
+        required = {key: kind for key, (kind, _) in points.items()}
+        required |= _COLUMNS | _NUMBERS | _BY_SENSOR
         missing = [key for key in (*required, *_TEXTS) if key not in data]
         if missing:
             raise DamageError("all keys of a scan", f"no {', '.join(missing)}")
@@ -167,6 +170,7 @@ class NpzReader:
         expected = {key: shape + row for key, (_, row) in points.items()}
         expected |= dict.fromkeys(_COLUMNS, columns)
         expected |= dict.fromkeys(_NUMBERS, ())
+        expected["fill"] = (len(self.sensors) if file.sensor is None else 1,)
         fits = True
         for key, own in expected.items():
             if key in values and (values[key].shape != own or len(shape) != axes):
@@ -196,6 +200,7 @@ class NpzReader:
             column=cast("U32Array | None", values.get("column")),
             column_stamp_ns=cast(I64Array, values["column_stamp_ns"]),
             column_lidar_id=cast(U8Array, values["column_lidar_id"]),
+            fill=cast(F32Array, values["fill"]),
         )
 
 

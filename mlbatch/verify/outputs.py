@@ -207,6 +207,8 @@ def _limits(topics: TopicChecks) -> dict[str, str]:
     }
     if topics.layout == "ouster":
         own["geometry"] = _RANGES
+    if topics.strange_frames:
+        own["frames"] = f"recorded messages name frames that are not there: {topics.strange_frames}"
     if topics.split:
         own["rings"] = "rings of every sensor begin at 0 with --split"
     return messages.LIMITS | own

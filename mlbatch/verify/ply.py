@@ -5,6 +5,7 @@ The format: docs/formats.md; G. Turk, "The PLY Polygon File Format", 1994.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -80,6 +81,17 @@ class _Head:
         index, part, slices = map(int, found.groups())
         return index, part, slices
 
+    def fill(self) -> F32Array:
+        """Fill by sensor; `unknown` is NaN."""
+        text = self.comments.get("fill", "none")
+        try:
+            return np.array(
+                [math.nan if word == "unknown" else float(word) for word in text.split(" ")],
+                np.float32,
+            )
+        except ValueError:
+            raise DamageError("comment fill with a number for each sensor", text) from None
+
     def metadata(self) -> RunMetadata:
         """Metadata of the run."""
         _, _, slices = self.place()
@@ -90,6 +102,7 @@ class _Head:
             sensors=tuple(names.split(" ")) if names else None,
             timescale=self.comments.get("timescale"),
             frame_id=self.comments.get("frame_id"),
+            sort=self.comments.get("sort"),
         )
 
 
@@ -159,6 +172,7 @@ class PlyReader:
             ring=ring,
             return_type=points["return_type"],
             lidar_id=lidar_id,
+            fill=head.fill(),
         )
 
 

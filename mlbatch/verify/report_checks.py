@@ -10,7 +10,7 @@ from typing import TypeAlias, cast
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.errors import UsageError
 from mlbatch.units import parse_rate
 from mlbatch.verify.scan_checks import Grid
@@ -38,6 +38,8 @@ _LEDGERS = (
 )
 _OUTCOMES = ("no_return", "range", "box", "repeated", "written")
 # Windows without a scan.
+# Least fill of a scan that is not underfilled.
+_UNDERFILLED = 0.5
 _UNWRITTEN = ("empty", "dropped_incomplete")
 # Sections that differ between runs on the same recording.
 _MACHINE = ("timing", "inputs")
@@ -60,6 +62,8 @@ class RunMetadata:
     sensors: tuple[str, ...] | None = None
     timescale: str | None = None
     frame_id: str | None = None
+    # Order of points: columns or points.
+    sort: str | None = None
 
     def joined(self, log: CheckLog, where: str, other: RunMetadata) -> RunMetadata:
         """Both together; contradictions are violations at `where`."""
@@ -98,7 +102,7 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
         log.ok("metadata")
         if numbers[key] is None:
             log.fail("metadata", f"{where} {key}", "a number", text or "nothing")
-    for key in ("rate_hz", "timescale", "frame_id"):
+    for key in ("rate_hz", "timescale", "frame_id", "sort"):
         if key not in grid:
             log.fail("metadata", f"{where} {key}", "a text", "nothing")
     try:
@@ -115,6 +119,7 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
         sensors=None if names is None else tuple(map(str, names)),
         timescale=grid.get("timescale"),
         frame_id=grid.get("frame_id"),
+        sort=grid.get("sort"),
     )
 
 
@@ -198,6 +203,7 @@ class Document:
             t_init_ns=self.number("grid", "t_init_ns"),
             sensors=tuple(name or "" for name in names),
             timescale=self.text("timescale"),
+            sort=self.text("grid", "sort"),
         )
 
     def check_number(self, expected: int, *path: str | int) -> None:
@@ -362,9 +368,26 @@ def check_ledgers(report: Document) -> None:
         if None not in outcomes.values():
             known = {name: count or 0 for name, count in outcomes.items()}
             _check_sum(report, (*path, "slots"), (*path, _OUTCOMES[0]), known)
+        _check_clipped(report, path)
     for i in range(report.length("messages")):
         path = ("messages", i)
         _check_sum(report, (*path, "read"), (*path, "written"), report.counts(*path, "dropped"))
+
+
+def _check_clipped(report: Document, points: Keys) -> None:
+    """Clipped points of a sensor are among its written ones."""
+    clipped = _clipped(report, points)
+    written = report.number(*points, "written")
+    report.log.ok("ledger")
+    if written is not None and clipped > written:
+        name = report.name(*points, "clipped")
+        report.log.fail("ledger", name, f"at most {written} written points", clipped)
+
+
+def _clipped(report: Document, points: Keys) -> int:
+    """Clipped points of a sensor; 0 where the report is of a version that did not count them."""
+    path = (*points, "clipped")
+    return 0 if report.at(*path) is None else report.number(*path) or 0
 
 
 def _check_sum(report: Document, total: Keys, good: Keys, others: dict[str, int]) -> None:
@@ -446,6 +469,12 @@ def check_report(
         log.equal("report", f"{name}, all", totals.columns, total)
     for i in range(count):
         _check_slots(report, totals, i)
+    # A clipped intensity is a limit of its field.
+    clipped = sum(_clipped(report, ("sensors", i, "points")) for i in range(sensors))
+    log.ok("report")
+    if clipped > totals.at_limit:
+        name = report.name("sensors", "points", "clipped")
+        log.fail("report", f"{name}, all", f"at most {totals.at_limit}", clipped)
     if table is not None:
         _check_table(report, table)
         if grid is not None:
@@ -477,11 +506,41 @@ def _check_table(report: Document, table: Table) -> None:
     report.check_number(len(table), "scans", "written")
     report.check_number(int(table.points.sum()), "scans", "points")
     report.check_number(int(np.count_nonzero(~table.complete)), "scans", "incomplete")
+    _check_fill(report, table)
     for i in range(min(report.length("sensors"), len(table.sensors))):
         written = int(table.columns_of[:, i].sum())
         report.check_number(written, "sensors", i, "columns", "written")
     span_ms: F64Array = (table.last_ns - table.first_ns) / _NS_PER_MS
     _check_quantiles(report, "span_ms", span_ms)
+
+
+def _check_fill(report: Document, table: Table) -> None:
+    """Check underfilled scans, and those without columns of a sensor; head and tail do not count.
+
+    The tail is at most the last line.
+    """
+    if table.fill is None:
+        return
+    whole = table.index >= 0
+    low = np.any(table.fill < _UNDERFILLED, axis=1) & whole
+    _check_count(report, low, "underfilled")
+    for name in ("without", "underfilled_by_sensor"):
+        said = report.counts("scans", name)
+        for i, sensor in enumerate(table.sensors):
+            none = table.columns_of[:, i] == 0
+            lacking = none if name == "without" else table.fill[:, i] < _UNDERFILLED
+            if sensor in said or (lacking & whole)[:-1].any():
+                _check_count(report, lacking & whole, name, sensor)
+
+
+def _check_count(report: Document, rows: BoolArray, *path: str) -> None:
+    """Check a number of rows, in which the last one may not count."""
+    said = report.number("scans", *path)
+    most = int(np.count_nonzero(rows))
+    least = int(np.count_nonzero(rows[:-1]))
+    report.log.ok("report")
+    if said is not None and not least <= said <= most:
+        report.log.fail("report", report.name("scans", *path), most, said)
 
 
 def _check_windows(report: Document, table: Table, grid: Grid) -> None:

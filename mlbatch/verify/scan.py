@@ -30,6 +30,8 @@ class StoredScan:
     slice: int | None = None
     complete: bool | None = None
     intensity: F32Array | None = None
+    # Instead of `intensity` in layouts that store 8 bits of it.
+    byte_intensity: U8Array | None = None
     range_m: F32Array | F64Array | None = None
     # Distance from the origin of the sensor, exact to a float32.
     distance_m: F32Array | None = None
@@ -48,6 +50,10 @@ class StoredScan:
     column_stamp_ns: I64Array | None = None
     # (n,)
     column_lidar_id: U8Array | None = None
+    # (s,) by sensor of the run, or of the only sensor; NaN: unknown.
+    fill: F32Array | None = None
+    # Points by time instead of by column.
+    by_time: bool = False
 
     @property
     def point(self) -> str:

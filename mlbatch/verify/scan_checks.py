@@ -183,8 +183,9 @@ class DuplicateColumns:
         candidates[1:] |= same
         candidates[:-1] |= same
         counts: Counter[tuple[int, int, bytes]] = Counter()
+        by_column = _by_column(scan)
         for column in np.flatnonzero(candidates).tolist():
-            content = _content(scan, column)
+            content = _content(scan, column, by_column)
             if not content:
                 continue
             sensor = int(owner[column])
@@ -206,16 +207,25 @@ class DuplicateColumns:
             self.usual[sensor] = min(often, self.usual.get(sensor, often))
 
 
-def _content(scan: StoredScan, column: int) -> bytes:
-    """The points of a column as bytes, empty without points."""
-    rows: slice | int
+def _by_column(scan: StoredScan) -> I64Array | None:
+    """Points in the order of their columns; None if that is how they are stored."""
+    if scan.column is None or not scan.by_time:
+        return None
+    order: I64Array = scan.column.argsort(kind="stable")
+    return order
+
+
+def _content(scan: StoredScan, column: int, by_column: I64Array | None) -> bytes:
+    """The points of a column as bytes, empty without points; by_column: of all points."""
+    rows: slice | int | I64Array
     if scan.column is None:
         rows = column
         if not bool(np.isfinite(scan.xyz[column]).any()):
             return b""
     else:
-        begin, end = np.searchsorted(scan.column, [column, column + 1]).tolist()
-        rows = slice(begin, end)
+        bounds = [column, column + 1]
+        begin, end = np.searchsorted(scan.column, bounds, sorter=by_column).tolist()
+        rows = slice(begin, end) if by_column is None else by_column[begin:end]
         if begin == end:
             return b""
     parts: list[F32Array | F64Array] = [scan.xyz[rows]]
@@ -303,14 +313,15 @@ def check_times(log: CheckLog, scan: StoredScan, points: Points, span_ns: int) -
 
 
 def _check_steps_back(log: CheckLog, scan: StoredScan, where: str, time_ns: I64Array) -> None:
-    """Times step back by less than the duration of a column."""
+    """Times step back by less than the duration of a column, or not at all if sorted by time."""
     newest: I64Array = np.maximum.accumulate(time_ns)
     back = newest - time_ns
+    most_ns = 1 if scan.by_time else COLUMN_NS
     log.none(
         "order",
         where,
-        back >= COLUMN_NS + scan.time_step_ns,
-        f"a time less than {COLUMN_NS} ns before earlier ones",
+        back >= most_ns + scan.time_step_ns,
+        f"a time less than {most_ns} ns before earlier ones",
         lambda at: f"{int(back[at])} ns before",
     )
 
@@ -335,17 +346,19 @@ def _check_offsets(log: CheckLog, scan: StoredScan, points: Points, time_ns: I64
 def _check_point_order(
     log: CheckLog, scan: StoredScan, column: I64Array, time_ns: I64Array
 ) -> None:
-    """By column, then time, then ring."""
+    """By column, then time, then ring; if sorted by time: by time, then column, then ring."""
     step = np.diff(column)
     later = np.diff(time_ns)
-    back: BoolArray = (step < 0) | ((step == 0) & (later < 0))
+    first, second = (later, step) if scan.by_time else (step, later)
+    back: BoolArray = (first < 0) | ((first == 0) & (second < 0))
     if scan.ring is not None:
         back |= (step == 0) & (later == 0) & (scan.ring[1:] < scan.ring[:-1])
+    order = "time, then column" if scan.by_time else "column, then time"
     log.none(
         "order",
         f"{scan.point} after",
         back,
-        "points by column, then time, then ring",
+        f"points by {order}, then ring",
         lambda at: f"columns {column[at : at + 2].tolist()}, ns {time_ns[at : at + 2].tolist()}",
     )
 

@@ -6,11 +6,12 @@ Columns that later versions add are ignored.
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.verify.scan import COLUMN_NS, Points, StoredScan
 from mlbatch.verify.scan_checks import Grid
 from mlbatch.verify.verdict import CheckLog
@@ -19,10 +20,14 @@ _FIRST = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_
 _COUNTS = ("points", "columns")
 _COLUMNS = "columns_"
 _GAP = "max_gap_ns_"
+_FILL = "fill_"
+# Of a float32, relative.
+_FILL_ERROR = 1e-6
 _WORDS = {"true": True, "false": False}
 # Below and above all times.
 _EARLY_NS = -(2**62)
 _LATE_NS = 2**62
+_MAX_U8 = 255
 
 
 @dataclass(slots=True)
@@ -46,6 +51,8 @@ class Table:
     columns_of: I64Array
     # (n, s): longest time without a column.
     gap_ns: I64Array
+    # (n, s) float64: columns present / columns expected, NaN: unknown; None in older tables.
+    fill: F64Array | None
     # (n,) bool
     complete: BoolArray
     _rows: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -112,6 +119,9 @@ def _parsed(
         if cell not in _WORDS:
             log.fail("table", f"{where} line {row + 2} complete", "true or false", cell)
             return None
+    fill = _fills(
+        log, where, [cells[name] for name in map(_FILL.__add__, sensors) if name in cells]
+    )
     return Table(
         where=where,
         sensors=sensors,
@@ -125,6 +135,7 @@ def _parsed(
         columns=number["columns"],
         columns_of=np.stack([number[_COLUMNS + name] for name in sensors], axis=1),
         gap_ns=np.stack([number[_GAP + name] for name in sensors], axis=1),
+        fill=fill if fill is not None and fill.shape[1] == len(sensors) else None,
         complete=np.array([_WORDS[cell] for cell in cells["complete"]]),
     )
 
@@ -137,6 +148,16 @@ def _integers(log: CheckLog, where: str, name: str, cells: tuple[str, ...]) -> I
         log.fail("table", f"{where} line {row + 2} {name}", "a number", cells[row])
         return None
     return np.array(values, np.int64)
+
+
+def _fills(log: CheckLog, where: str, columns: list[tuple[str, ...]]) -> F64Array | None:
+    """The columns of fill, (n, s); None if there are none, or a cell is no share (a violation)."""
+    try:
+        found = [[float(cell) if cell else math.nan for cell in cells] for cells in columns]
+    except ValueError as err:
+        log.fail("table", f"{where} fill", "numbers from 0 to 1", err)
+        return None
+    return np.array(found, np.float64).T if found else None
 
 
 def _integer(cell: str) -> int | None:
@@ -183,7 +204,7 @@ class _RowChecks:
         name: str,
         bad: BoolArray,
         expected: str,
-        values: I64Array | BoolArray,
+        values: I64Array | F64Array | BoolArray,
         skipped: int = 0,
     ) -> None:
         """Check that no row is bad; `skipped`: rows before the first one in `bad`."""
@@ -215,12 +236,30 @@ class _RowChecks:
         expected = "the sum of the sensors, above 0"
         self.none("table", "columns", bad, expected, table.columns)
         self.none("table", "points", table.points < 0, "0 or more", table.points)
-        # Steps between columns of one sensor add up to at most the span.
-        span_ns = (table.last_ns - table.first_ns)[:, None]
-        wide: BoolArray = np.any((table.gap_ns < 0) | (table.gap_ns > span_ns), axis=1)
-        widest: I64Array = table.gap_ns.max(axis=1)
-        expected = "a step no longer than from first to last stamp"
-        self.none("table", "max_gap_ns", wide, expected, widest)
+        # A sensor without a column has none from start to end.
+        length_ns = np.where(table.columns_of == 0, (table.end_ns - table.start_ns)[:, None], 0)
+        narrow: BoolArray = np.any(table.gap_ns < length_ns, axis=1)
+        expected = "0 or more; the window's length without a column"
+        self.none("table", "max_gap_ns", narrow, expected, table.gap_ns.min(axis=1))
+        self.check_fill()
+
+    def check_fill(self) -> None:
+        """Check fills against columns: of a whole number of expected ones."""
+        fill = self.table.fill
+        if fill is None:
+            return
+        count = self.table.columns_of
+        outside = (fill < 0) | (fill > 1)
+        zero = (fill == 0) != (count == 0)
+        # Without a column the fill may be unknown as well.
+        zero &= ~np.isnan(fill)
+        inside = (fill > 0) & (fill < 1)
+        expected = np.divide(count, fill, out=np.zeros_like(fill), where=inside)
+        broken = inside & (np.abs(expected - np.rint(expected)) > _FILL_ERROR * expected)
+        bad: BoolArray = np.any(outside | zero | broken, axis=1)
+        at = np.argmax(outside | zero | broken, axis=1)
+        shown = np.take_along_axis(fill, at[:, None], axis=1)[:, 0]
+        self.none("table", "fill", bad, "columns / a whole number, from 0 to 1", shown)
 
 
 # -- sums of the scans ----------------------------------------------------------------------------
@@ -273,7 +312,13 @@ class _RowTotals:
         self.points = np.zeros(count, np.int64)
         self.columns = np.zeros(count, np.int64)
         self.columns_of = np.zeros((count, sensors), np.int64)
+        # Widest step between columns, first and last column of a sensor.
         self.gap_ns = np.zeros((count, sensors), np.int64)
+        self.first_of_ns = np.full((count, sensors), _LATE_NS)
+        self.last_of_ns = np.full((count, sensors), _EARLY_NS)
+        # Fills, where a scan has them.
+        self.fill = np.full((count, sensors), np.nan)
+        self.has_fill = np.zeros((count, sensors), bool)
         # Stamps of columns.
         self.first_ns = np.full(count, _LATE_NS)
         self.last_ns = np.full(count, _EARLY_NS)
@@ -295,6 +340,7 @@ class _RowTotals:
             self.newest_ns[row] = max(self.newest_ns[row], newest_ns)
         if columns_of is not None:
             self.columns_of[row] += columns_of
+        self._add_fill(row, scan)
         stamps = scan.column_stamp_ns
         owner = scan.column_lidar_id
         if stamps is None or owner is None or not len(stamps):
@@ -303,9 +349,21 @@ class _RowTotals:
         self.last_ns[row] = max(self.last_ns[row], int(stamps.max()))
         for sensor in range(self.gap_ns.shape[1]):
             own = stamps[owner == sensor]
-            if len(own) > 1:
-                gap_ns = int(np.diff(own).max())
-                self.gap_ns[row, sensor] = max(self.gap_ns[row, sensor], gap_ns)
+            if not len(own):
+                continue
+            gap_ns = int(np.diff(own).max(initial=0))
+            self.gap_ns[row, sensor] = max(self.gap_ns[row, sensor], gap_ns)
+            self.first_of_ns[row, sensor] = int(own.min())
+            self.last_of_ns[row, sensor] = int(own.max())
+
+    def _add_fill(self, row: int, scan: StoredScan) -> None:
+        if scan.fill is None:
+            return
+        is_all = len(scan.fill) == self.fill.shape[1]
+        sensors = slice(None) if is_all else slice(scan.sensor, (scan.sensor or 0) + 1)
+        if is_all or (len(scan.fill) == 1 and scan.sensor is not None):
+            self.fill[row, sensors] = scan.fill
+            self.has_fill[row, sensors] = True
 
 
 class OutputTotals:
@@ -317,6 +375,8 @@ class OutputTotals:
         self.columns = 0
         # By sensor, (s,).
         self.points_of = np.zeros(sensors, np.int64)
+        # Points whose 8-bit intensity is 0 or 255.
+        self.at_limit = 0
         self.columns_of = np.zeros(sensors, np.int64)
         self.rings = Rings(np.full(sensors, _LATE_NS), np.full(sensors, -1))
         # What all scans of the output show.
@@ -337,6 +397,10 @@ class OutputTotals:
         self.scans += 1
         self.points += points.count
         self.knows_points &= self._add_points(scan, points)
+        if scan.byte_intensity is not None:
+            valid = ... if points.valid is None else points.valid
+            values = scan.byte_intensity[valid]
+            self.at_limit += int(np.count_nonzero((values == 0) | (values == _MAX_U8)))
         self.knows_complete &= scan.complete is not None
         self.knows_times &= points.time_ns is not None
         self.time_step_ns = max(self.time_step_ns, scan.time_step_ns)
@@ -405,14 +469,47 @@ class OutputTotals:
             for sensor, name in enumerate(table.sensors):
                 columns = table.columns_of[:, sensor]
                 checks.equal(f"{_COLUMNS}{name}", columns, rows.columns_of[:, sensor])
-                checks.equal(f"{_GAP}{name}", table.gap_ns[:, sensor], rows.gap_ns[:, sensor])
+                self._check_gaps(checks, rows, sensor)
         elif self.knows_columns:
             checks.equal("columns", table.columns, rows.columns)
         if self.knows_complete:
             bad = table.complete == rows.incomplete
             checks.none("table", "complete", bad, "the value in the scan", table.complete)
+        if table.fill is not None:
+            apart = np.abs(rows.fill - table.fill) > _FILL_ERROR
+            apart |= np.isnan(rows.fill) != np.isnan(table.fill)
+            for sensor, name in enumerate(table.sensors):
+                bad = (apart & rows.has_fill)[:, sensor]
+                at = int(bad.argmax()) if bad.any() else 0
+                expected = f"{rows.fill[at, sensor]:.6g} of the scan"
+                checks.none("table", f"{_FILL}{name}", bad, expected, table.fill[:, sensor])
         if self.knows_times:
             self._check_times(checks, rows)
+
+    def _check_gaps(self, checks: _RowChecks, rows: _RowTotals, sensor: int) -> None:
+        """Widest gaps of a sensor: from its last column before a window to the window's end.
+
+        Between lines that do not follow each other there may be columns that were not written.
+        """
+        table = checks.table
+        count = len(table)
+        has_columns = rows.columns_of[:, sensor] > 0
+        line = np.arange(count)
+        # The last line before with columns of the sensor.
+        newest = np.maximum.accumulate(np.where(has_columns, line, -1))
+        before = np.concatenate([[-1], newest[:-1]])
+        part = np.concatenate([[0], np.cumsum(table.start_ns[1:] != table.end_ns[:-1])])
+        is_known = (before >= 0) & (part[before] == part)
+        before_ns = np.where(is_known, rows.last_of_ns[before, sensor], table.start_ns)
+        first_ns = np.where(has_columns, rows.first_of_ns[:, sensor], table.end_ns)
+        last_ns = np.where(has_columns, rows.last_of_ns[:, sensor], before_ns)
+        inside_ns = rows.gap_ns[:, sensor]
+        least_ns = np.maximum(np.maximum(first_ns - before_ns, table.end_ns - last_ns), inside_ns)
+        said_ns = table.gap_ns[:, sensor]
+        bad = (said_ns < least_ns) | (is_known & (said_ns > least_ns))
+        at = int(bad.argmax()) if bad.any() else 0
+        name = f"{_GAP}{table.sensors[sensor]}"
+        checks.none("table", name, bad, f"{least_ns[at]} by the scans", said_ns)
 
     def _check_times(self, checks: _RowChecks, rows: _RowTotals) -> None:
         """Points begin and end with the stamps of their columns."""

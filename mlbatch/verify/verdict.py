@@ -34,6 +34,7 @@ CHECKS = {
     "ledger": "every packet, column and point is written or counted",
     "report": "counts and figures of the report agree with the output",
     "tf_static": "one message before all others places every sensor",
+    "frames": "every frame that a message names is in the tree of /tf_static",
     "imu": "IMU messages are in order of time, at the time of their header",
     "messages": "the counts of forwarded messages agree with the report",
 }

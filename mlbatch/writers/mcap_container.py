@@ -49,9 +49,9 @@ Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]
 CHUNK_BYTES = 4 * 2**20
 # A message of this size ends its chunk; smaller ones are collected.
 LARGE_BYTES = 2**20
-# Levels of the zstd library, and its default.
+# Levels of the zstd library; the default takes 0.58 of the CPU of level 3 for 4 % more bytes.
 _ZSTD_LEVELS = range(1, 23)
-_ZSTD_DEFAULT = 3
+_ZSTD_DEFAULT = 1
 
 # Opcode, length of what follows, channel, sequence, log time, publish time.
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -318,6 +318,7 @@ class McapContainer:
         """Add the metadata records and scans.csv, complete and close the file."""
         self._write_all_chunks()
         self._write_metadata("mlbatch.grid", grid)
+        self._write_metadata("mlbatch.fill", summary.fill)
         self._write_metadata("mlbatch.report", {"json": summary.report_json})
         log_ns = summary.t_init_ns or 0
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -28,6 +28,8 @@ from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_
 # Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
 WAITING_SAMPLES = 65536
 WAITING_BYTES = 16 << 20
+# Memory of a message in addition to its bytes.
+_MESSAGE_BYTES = 400
 _TF_STATIC = "/tf_static"
 
 # sensor_msgs/Imu: -1 in the covariance means no orientation; a covariance of zeros is unknown.
@@ -120,6 +122,7 @@ class MessageWriter:
         """opener: opens the file at the path of the partial output; folder: in that folder."""
         # Before anything is created, as it may be refused.
         self._layout = _layout_of(options)
+        _refuse_same_frames(target, info)
         keep = options.kept_bytes is not None
         self._output = prepare(target, options.overwrite, folder, keep, options.fsync)
         self._info = info
@@ -228,7 +231,7 @@ class MessageWriter:
                 return
             self._waiting.append(item)
             if isinstance(item, Message):
-                self._waiting_bytes += len(item.data)
+                self._waiting_bytes += len(item.data) + _MESSAGE_BYTES
             else:
                 self._waiting_samples += len(item.stamp_ns)
             if self._waiting_samples >= WAITING_SAMPLES or self._waiting_bytes >= WAITING_BYTES:
@@ -258,7 +261,7 @@ class MessageWriter:
             return
         name = self._info.sensors[item.sensor].name
         for row in range(len(item.stamp_ns)):
-            message = imu_message(item, row, f"{name}_imu", self._wire)
+            message = imu_message(item, row, imu_frame(name), self._wire)
             self._file.send(f"/{name}/imu", "sensor_msgs/Imu", int(item.stamp_ns[row]), message)
 
     def _grid(self, summary: Summary) -> dict[str, str]:
@@ -270,6 +273,7 @@ class MessageWriter:
             "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
             "timescale": info.timescale,
             "frame_id": info.frame_id,
+            "sort": info.sort,
         }
 
 
@@ -383,15 +387,56 @@ def imu_message(samples: ImuSamples, row: int, frame_id: str, wire: NewWire) -> 
 
 
 def static_transforms(info: RunInfo, stamp_ns: int, wire: NewWire) -> bytes:
-    """Return the tf2_msgs/TFMessage with the pose of every sensor in the body frame."""
+    """Return the tf2_msgs/TFMessage of the frames that messages may name.
+
+    Sensors and frames of the recording in the body frame, IMUs in the frame of their sensor.
+    """
+    edges = static_edges(info)
     message = wire()
-    message.put("I", len(info.sensors))
-    for sensor in info.sensors:
-        pose = sensor.body_from_sensor
-        message.header(stamp_ns, info.frame_id)
-        message.text(sensor.name)
+    message.put("I", len(edges))
+    for parent, child, pose in edges:
+        message.header(stamp_ns, parent)
+        message.text(child)
         message.put("d", *pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
     return bytes(message.data)
+
+
+def static_edges(info: RunInfo) -> list[tuple[str, str, F64Array]]:
+    """Return parent, child and (4, 4) parent_from_child of all transforms, m.
+
+    A sensor whose own frame is the body frame has no transform: no frame is its own child.
+    """
+    edges = [
+        (info.frame_id, sensor.name, sensor.body_from_sensor)
+        for sensor in info.sensors
+        if sensor.name != info.frame_id
+    ]
+    edges += [
+        (sensor.name, imu_frame(sensor.name), sensor.sensor_from_imu)
+        for sensor in info.sensors
+        if sensor.sensor_from_imu is not None
+    ]
+    # Own frames describe the scans; a recorded one of the same name is left out.
+    own = {info.frame_id, *(child for _, child, _ in edges)}
+    edges += [(info.frame_id, name, pose) for name, pose in info.frames if name not in own]
+    return edges
+
+
+def imu_frame(sensor: str) -> str:
+    """Return the frame of a sensor's IMU messages."""
+    return f"{sensor}_imu"
+
+
+def _refuse_same_frames(target: Path, info: RunInfo) -> None:
+    """Raise ExportError if two frames of the output have one name."""
+    frames = Counter(child for _, child, _ in static_edges(info))
+    frames[info.frame_id] += 1
+    for frame, count in frames.items():
+        if count > 1:
+            raise ExportError(
+                f"{target}: expected frames of different names, found {frame} for a sensor and for "
+                "an IMU or the body; rename the sensor or body_frame in the rig"
+            )
 
 
 def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.errors import ExportError
-from mlbatch.types import Scan, SensorInfo
+from mlbatch.types import BYTE_INTENSITY, Scan, SensorInfo
 from mlbatch.units import MM_PER_M, NS_PER_S
 
 Values: TypeAlias = npt.NDArray[np.generic]
@@ -212,7 +212,8 @@ class Layout:
     name: str
     step: int  # bytes of a record
     fields: tuple[Field, ...]
-    extras: frozenset[str] = frozenset()  # members of `types.EXTRAS` that the fields need
+    # Members of `types.EXTRAS` that the fields need; BYTE_INTENSITY.
+    extras: frozenset[str] = frozenset()
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -316,8 +317,35 @@ def _range_mm(points: Points) -> Values:
     return range_mm
 
 
+def _byte_intensity(points: Points) -> F32Array | U16Array:
+    """Return what 8-bit layouts store as intensity: reflectivity where a sensor has it.
+
+    Reflectivity has the range of 8 bits; the signal of the same sensors exceeds it.
+    """
+    if points.reflectivity is None:
+        return points.intensity
+    has_reflectivity = np.array([sensor.has_reflectivity for sensor in points.sensors])
+    if has_reflectivity.all():
+        return points.reflectivity
+    reflectivity = points.reflectivity.astype(np.float32)
+    return np.where(has_reflectivity[points.lidar_id], reflectivity, points.intensity)
+
+
 def _intensity_u8(points: Points) -> Values:
-    return np.clip(np.nan_to_num(points.intensity), 0, _MAX_U8)
+    value: Values = np.clip(np.nan_to_num(_byte_intensity(points)), 0, _MAX_U8)
+    return value
+
+
+def clipped_points(scan: Scan) -> list[int]:
+    """Return the number of points, by sensor, whose intensity is outside the range of 8 bits."""
+    points = points_of(scan)
+    intensity = _byte_intensity(points)
+    # Empty slots of organized scans are NaN, which compares as False.
+    outside = (intensity < 0) | (intensity > _MAX_U8)
+    counts: list[int] = np.bincount(
+        points.lidar_id[outside], minlength=len(points.sensors)
+    ).tolist()
+    return counts
 
 
 def _seconds_absolute(points: Points) -> Values:
@@ -399,7 +427,7 @@ CLOUD_LAYOUTS = {
         Layout("velodyne", 22, _VELODYNE),
         Layout("ouster", 48, _OUSTER, frozenset({"reflectivity", "range_m"})),
         Layout("hesai", 26, _HESAI),
-        Layout("autoware", 32, _AUTOWARE),
+        Layout("autoware", 32, _AUTOWARE, frozenset({"reflectivity", BYTE_INTENSITY})),
         Layout("kiss-icp", 16, (*_XYZ, _time(12))),
         Layout("minimal", 12, _XYZ),
     )

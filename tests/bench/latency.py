@@ -1,6 +1,6 @@
 """Latency from the receive time of a packet to the sub-scan that it completes.
 
-    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine numba
+    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine native
 
 Packets are pushed one by one, as from a driver on the vehicle, through the classes of a conversion:
 `Ingest.columns`, `Batcher.push`, `DecodeWorker.decode`. Garbage collection is on. CPU time of the
@@ -21,8 +21,8 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.decode.kernels import ENGINES
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.native import ENGINES
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import DecodePool
 from mlbatch.pipeline.job import Job

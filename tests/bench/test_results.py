@@ -133,7 +133,7 @@ def test_floors_of_an_output() -> None:
 
 
 def test_changes_are_ratios_of_medians() -> None:
-    rows = [row("numpy", [run(1.0), run(2.0), run(9.0)]), row("numba", [run(1.0)])]
+    rows = [row("numpy", [run(1.0), run(2.0), run(9.0)]), row("native", [run(1.0)])]
     lists = {"cpu_s": [8.0, 4.0, 3.0], "own_cpu_s": [0.5], "wall_s": [1.0], "rss_mb": [0.0]}
     found = {one.of: one for one in changes(rows, {("dual-4", "numpy"): lists})}
     # The earlier document has no memory.

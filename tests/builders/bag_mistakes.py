@@ -7,21 +7,17 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "clouds only": (
         "clouds.db3",
         1,
-        "clouds.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
-        "the lidar's driver publishes its packets (clouds.db3: /points: 1 clouds could not be "
-        "read; the first: expected a message of little-endian CDR (00 01 00 00), found 00 00 00 "
-        "00; convert the recording to that encoding)",
+        "clouds.db3: /points: expected a message of little-endian CDR (00 01 00 00), found 00 00 "
+        "00 00; convert the recording to that encoding, or leave the topic out with --ignore "
+        "/points",
     ),
     "clouds without times": (
         "timeless.db3",
         1,
-        "timeless.db3: no lidar packets; expected raw UDP packets of a supported lidar (see "
-        "`mlbatch sensors`), found /points (sensor_msgs/PointCloud2); record the topic on which "
-        "the lidar's driver publishes its packets (timeless.db3: /points: 1 clouds could not be "
-        "read; the first: expected the time of each point in a field t, time, timestamp, "
-        "time_stamp, timestamps, offset_time or ts, found x, y, z; record the raw packets, or "
-        "clouds with times)",
+        "timeless.db3: /points: expected the time of each point in a field t, time, timestamp, "
+        "time_stamp, timestamps, offset_time or ts, found x, y, z; name it in the rig (points: "
+        "{time: FIELD}), record the raw packets, or clouds with times, or leave the topic out with "
+        "--ignore /points",
     ),
     "one of two lidars": (
         "drive.mcap --rig one.yaml",

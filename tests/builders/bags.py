@@ -29,6 +29,14 @@ _STAMPED = "Header header\nstring child_frame_id\ngeometry_msgs/Transform transf
 TEXTS: dict[str, tuple[str, dict[str, str]]] = {
     "PacketMsg": ("uint8[] buf\n", {}),
     "String": ("string data\n", {}),
+    "RobosenseScan": (
+        "Header header\nrobosense_msgs/RobosensePacket[] packets\n",
+        {
+            "robosense_msgs/RobosensePacket": (
+                "builtin_interfaces/Time stamp\nuint8 is_difop\nuint8[1500] data\nuint32 size\n"
+            )
+        },
+    ),
     "UInt8MultiArray": (
         "MultiArrayLayout layout\nuint8[] data\n",
         {

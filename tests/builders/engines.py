@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
-from mlbatch.decode import numba_engine
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
-from mlbatch.decode.kernels import is_installed
+from mlbatch.native.library import trouble
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import excluded_boxes_m, limits
 from mlbatch.types import EXTRAS, Scan
 from mlbatch.units import rate_text
 
-needs_numba = pytest.mark.skipif(
-    not is_installed(), reason="numba is not installed: pip install mlbatch[fast]"
+needs_native = pytest.mark.skipif(
+    bool(trouble()), reason="the engine native is not installed: no C compiler was found"
 )
-ENGINES = ("numpy", "numba")
-# A kernel is made for a number of channels; with one for all numbers a third has to be compiled.
-_CHANNELS = 128
+ENGINES = ("numpy", "native")
 
 # Layers of space, in which every sensor has some points.
 BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
@@ -39,20 +33,6 @@ WANTED = (
     Job((), extras=EXTRAS, layout="organized", keep_repeated=True),
     replace(_CUT, extras=frozenset({"reflectivity"}), layout="organized"),
 )
-
-
-@contextlib.contextmanager
-def few_kernels(factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Kernels are kept in a folder of the session, and are made for 128 channels or more."""
-    base = factory.getbasetemp()
-    # Processes that share the tests of a session have folders of their own in one of all.
-    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    own = os.environ | {"XDG_CACHE_HOME": str(session / "kernels")}
-    with (
-        patch.dict(os.environ, own),
-        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
-    ):
-        yield
 
 
 class Pair:

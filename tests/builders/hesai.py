@@ -167,7 +167,7 @@ def directions(spec: HesaiSpec, beams: Beams, columns: int, *, turning: bool = T
     rotor = np.repeat(azimuths_deg(spec, columns)[:, None], spec.row.channels, axis=1)
     if turning:
         offsets = np.where(fires(spec, columns), offsets_ns(spec, columns), 0)
-        rotor += offsets * (spec.rpm * 6e-9)
+        rotor += (offsets + spec.row.azimuth_lag_ns) * (spec.rpm * 6e-9)
     azimuth, elevation = (np.radians(angle) for angle in beams.aim(rotor))
     flat = np.cos(elevation)
     return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=-1)

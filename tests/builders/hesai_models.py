@@ -60,7 +60,7 @@ class HesaiModel:
 
     head: without return type, unit and flags; unit: bytes of a channel; counts_back: groups are
     counted from the packet's last one; checked: with checksums; flags: those it has; grows: its
-    channels do with flags.
+    channels do with flags; azimuth_lag_ns: a block's time minus that of its azimuth.
     """
 
     channels: int
@@ -80,6 +80,7 @@ class HesaiModel:
     units_per_deg: int = 100
     speed_units_per_rpm: int = 1
     grows: bool = False
+    azimuth_lag_ns: int = 0
 
     @property
     def stride(self) -> int:
@@ -113,7 +114,9 @@ _QT128C2X = HesaiModel(
     checked=True,
     flags=SEQUENCE | SAFETY | SIGNATURE | CONFIDENCE,
 )
-_XT32 = HesaiModel(32, 8, "eeff06010000200800000200", _XT, 5632, Fraction(50000))
+_XT32 = HesaiModel(
+    32, 8, "eeff06010000200800000200", _XT, 5632, Fraction(50000), azimuth_lag_ns=5632
+)
 _E128 = HesaiModel(
     128,
     2,

@@ -224,9 +224,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "start after the end": (
         "uptime/drive.pcap --start +60",
         1,
-        "uptime/drive.pcap: no scan: expected a whole window of 100 ms with all sensors, found "
-        "ouster_111 from 1000.000000 to 1000.299805 s; choose another --start/--end, or a "
-        "recording where all sensors run together",
+        "uptime/drive.pcap: no scan: expected --start in the recording, from 1000 s to "
+        "1000.299804687 s, found 1060.1 s; choose another",
     ),
     "clock": (
         f"{FIX} --clock gps",
@@ -252,7 +251,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "engine": (
         f"{FIX} --engine cuda",
         2,
-        "--engine: expected auto or numpy or numba, found 'cuda'; choose one of them",
+        "--engine: expected auto or numpy or native, found 'cuda'; choose one of them",
     ),
     "jobs": (
         f"{FIX} --jobs 0",
@@ -302,8 +301,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/two_lidars.pcap --rig misspelt.yaml",
         1,
         "misspelt.yaml:2: sensors[0].extrinsic: expected a key of name, model, stream, metadata, "
-        "extrinsics, clock, min_range_m, max_range_m, optional, decode, found 'extrinsic'; the "
-        "nearest known key is extrinsics",
+        "extrinsics, clock, min_range_m, max_range_m, optional, decode, points, found 'extrinsic'; "
+        "the nearest known key is extrinsics",
     ),
     "rig sensor of no stream": (
         "fix/two_lidars.pcap --rig fix/astray.yaml",

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from mlbatch.verify.messages import PRESETS
+from tests.builders.rosbag1 import definition_of
 from tests.builders.verify_outputs import Edit
 
 Records = npt.NDArray[Any]
@@ -109,7 +110,7 @@ def bag(change: Change) -> Edit:
             for old, log_ns, data in found:
                 if old.topic not in connections:
                     connections[old.topic] = writer.add_connection(
-                        old.topic, old.msgtype, msgdef=old.msgdef.data, md5sum=old.digest
+                        old.topic, old.msgtype, msgdef=definition_of(old), md5sum=old.digest
                     )
                 number = counts[old.topic] = counts.get(old.topic, -1) + 1
                 for new in change(Sent(old.topic, number, log_ns, log_ns, data)):

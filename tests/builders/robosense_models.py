@@ -234,6 +234,11 @@ def _plus(
     )
 
 
+def _early_plus(plus: RobosenseModel, kind: int) -> RobosenseModel:
+    """Type and model a byte earlier, as in the header of rs_driver."""
+    return replace(plus, marks={0: SECOND, 4: b"\x00\x01", 30: bytes((5, kind))})
+
+
 _PLUS_80_US = _grouped(
     _PLUS_US + _PLUS_LATER_US + " 42.683 50.603 52.187 53.771", "4423222222224444444444221132"
 )
@@ -245,10 +250,21 @@ MODELS: Mapping[str, RobosenseModel] = {
         _BPEARL_V3,
         _BPEARL_V4,
         _HELIOS_32,
+        # Seen on a real unit: the type where rs_driver has it, and no model.
+        replace(
+            _HELIOS_32,
+            name="Helios 32, early type",
+            marks={0: SECOND, 4: b"\x00\x01", 30: b"\x06\x00\x00"},
+        ),
         replace(_HELIOS_32, name="Helios 32-31", marks={**_HELIOS_32.marks, 32: b"\x02"}),
         replace(_HELIOS_32, name="Helios 32-26", marks={**_HELIOS_32.marks, 32: b"\x04"}),
         _HELIOS_16,
         replace(_HELIOS_16, name="Helios 1615", marks={**_HELIOS_16.marks, 31: b"\x07\x00"}),
+        replace(
+            _HELIOS_16,
+            name="Helios 16, early type",
+            marks={0: SECOND, 4: b"\x00\x01", 30: b"\x06\x00\x00"},
+        ),
         _AIRY_96,
         replace(
             _AIRY_96,
@@ -263,6 +279,8 @@ MODELS: Mapping[str, RobosenseModel] = {
         _plus(_RUBY_128, "Ruby Plus 128", _RUBY_PLUS_128_US, 0),
         _plus(_RUBY_80, "Ruby Plus 80", _PLUS_80_US, 2),
         _plus(_RUBY_80, "Ruby Plus 80v", _grouped(_PLUS_US, "4"), 3),
+        _early_plus(_plus(_RUBY_80, "Ruby Plus 80, early type", _PLUS_80_US, 2), 2),
+        _early_plus(_plus(_RUBY_80, "Ruby Plus 80v, early type", _grouped(_PLUS_US, "4"), 3), 3),
         _plus(_RUBY_48, "Ruby Plus 48", _grouped(_PLUS_US + _PLUS_LATER_US, "2"), 0),
     )
 }

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
 
 from tests.builders.bags import Recorded, definition
@@ -14,6 +15,12 @@ from tests.builders.bags import Recorded, definition
 MESSAGE = 2
 CONNECTION = 7
 CHUNK = 5
+
+
+def definition_of(connection: Connection) -> str:
+    """Definition of a type: a text before rosbags 0.10, an object with a text since."""
+    text: object = connection.msgdef
+    return str(getattr(text, "data", text))
 
 
 def write_rosbag1(

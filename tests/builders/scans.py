@@ -63,7 +63,9 @@ def dense_scan(index: int = 0, points: int = 1000, columns: int = 50, seed: int 
         column_lidar_id=column_lidar,
         points=points,
         columns_per_sensor=per_sensor,
+        points_per_sensor=(int((lidar_id == 0).sum()), int((lidar_id == 1).sum())),
         max_gap_ns=(5, 6),
+        fill=np.array([1.0, 0.75], np.float32),
     )
 
 
@@ -129,4 +131,9 @@ def run_job(job: ScanJob) -> None:
     job.commit()
 
 
-SUMMARY = Summary(START_NS, '{"schema": "mlbatch.report/1"}\n', "index,slice\n0,0\n")
+SUMMARY = Summary(
+    START_NS,
+    '{"schema": "mlbatch.report/1"}\n',
+    "index,slice\n0,0\n",
+    {"underfilled": "0", "fill": '{"left": 1.0, "right": 0.75}', "without": "{}"},
+)

@@ -279,7 +279,7 @@ VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
         "vlp16/drive.pcap --decode nonsense=1",
         2,
         "--decode: expected one of crc, firing_azimuth, optical_centre, packet_stamp, "
-        "vertical_offset, found 'nonsense'; write --decode crc=check",
+        "range_unit, vertical_offset, found 'nonsense'; write --decode crc=check",
     ),
     "decoder option of the rig": (
         "vlp16/drive.pcap --rig firing.yaml",

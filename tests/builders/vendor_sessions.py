@@ -100,6 +100,16 @@ def rslidar_messages(payloads: Payloads, topic: str = "/rslidar_packets") -> lis
     ]
 
 
+def robosense_scan(payloads: Payloads) -> bytes:
+    """A robosense_msgs/RobosenseScan of a branch of Nebula: packets of 1500 bytes and a size."""
+    body = Body("cdr").header(payloads[0][0], "robosense").put("I", len(payloads))
+    for host_ns, payload in payloads:
+        is_difop = payload.startswith(robosense.DIFOP_MAGIC)
+        body.time(host_ns).put("B", is_difop).raw(payload.ljust(1500, b"\0"))
+        body.put("I", len(payload))
+    return body.done()
+
+
 def ouster(turns: int = 3) -> Unit:
     """An Ouster that begins with the others."""
     return Unit(begin_ns=BEGIN_NS, turns=turns)

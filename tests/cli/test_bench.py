@@ -81,7 +81,7 @@ def test_a_failed_conversion_is_reported_at_the_end(
         (
             ("--engine", "abacus"),
             2,
-            "--engine: expected one of all, numpy, numba, auto, found 'abacus'",
+            "--engine: expected one of all, numpy, native, auto, found 'abacus'",
         ),
         (("--case", "none"), 2, "--case: expected one of dual-4, "),
         (("--against", "/no/file"), 1, "/no/file: expected an earlier result"),
@@ -106,11 +106,11 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_without_numba_only_numpy_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(options, "COMPILER", "no-such-distribution")
+def test_without_the_library_only_numpy_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mlbatch.native.library_path", lambda: None)
     engines, notes = options.engines_to_measure("all")
     assert engines == ("numpy",)
-    assert notes == ("engine numba was not measured: pip install mlbatch[fast]",)
+    assert notes == ("engine native was not measured: its library is not installed",)
 
 
 def test_a_case_that_is_named_twice_is_measured_once() -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import mlbatch
+from mlbatch.native import choose_engine
 from tests.builders.sessions import FIXTURE, REPOSITORY, Report, Shell, names, report_of
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
@@ -36,7 +37,7 @@ def without_timing(report: Report) -> Report:
 def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     outcome = shell(f"convert {FIX} -o out")
     assert (outcome.code, outcome.err) == (0, "")
-    head, left, right, scans, speed, wrote = outcome.out.splitlines()
+    head, left, right, scans, first, speed, wrote = outcome.out.splitlines()
     assert head.split() == [
         "sensor",
         "model",
@@ -53,6 +54,8 @@ def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     assert scans == (
         f"7 scans at 10 Hz (0 incomplete, 0 empty windows), {7 * POINTS} points, clock utc"
     )
+    # The first bound after the first stamps (SOURCE.md).
+    assert first == "first scan at 2026-05-04T08:00:00.100Z"
     assert speed.startswith("0.8 s recorded in ")
     assert wrote == "wrote out, report out/report.json"
 
@@ -65,7 +68,7 @@ def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
     assert first.startswith("left: OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16, calibration ")
     assert first.endswith("left.json, extrinsics from rig")
     assert second.startswith("right: OS-1-32-U1 512x10 RNG15_RFL8_NIR8, calibration ")
-    assert third == "decoded by numpy"
+    assert third == f"decoded by {choose_engine('auto')}"
 
 
 def test_warnings_go_to_stderr_and_into_the_report(shell: Shell) -> None:
@@ -154,6 +157,7 @@ def test_progress_is_shown_on_a_terminal_only(shell: Shell, tmp_path: Path) -> N
 
 SLOW = """\
 import time
+from mlbatch.native import choose_engine
 from mlbatch import cli
 from mlbatch.pipeline import conversion, resume
 tasks = conversion.Conversion.tasks

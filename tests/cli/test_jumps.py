@@ -147,9 +147,13 @@ def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path
     assert [one["scans"]["empty"] for one in reports] == [0, 0]
 
 
+# A clock 0.9 s behind that of the capture host, which steps to 0.9 s ahead of it.
+NEAR_HOST = (Unit(host_ns=900 * NS_PER_MS), 1_800 * NS_PER_MS)
+
+
 def test_passed_messages_go_to_one_part(shell: Shell, tmp_path: Path) -> None:
     """The metadata are recorded at the start, and used for both."""
-    one, two = _pieces(Unit(), FORWARD)
+    one, two = _pieces(*NEAR_HOST)
     messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
     first_ns = messages[0].log_ns
     last_ns = messages[-1].log_ns
@@ -204,7 +208,7 @@ def test_what_teaches_passes_to_later_parts_only_if_it_is_latched(
     shell: Shell, tmp_path: Path
 ) -> None:
     """A part is a recording of its own: what late subscribers get belongs in it, `/tf` does not."""
-    one, two = _pieces(Unit(), FORWARD)
+    one, two = _pieces(*NEAR_HOST)
     messages = unit_messages(one, "top") + unit_messages(two, "top")[1:]
     first_ns = messages[0].log_ns
     still = transforms_message("cdr", [("base_link", "camera", (1, 0, 0), (0, 0, 0, 1))])

@@ -44,22 +44,31 @@ def test_metadata_that_are_missing_are_asked_for_first(shell: Shell, tmp_path: P
     assert "give the sensor's with --metadata FILE" in outcome.err
 
 
-def test_a_lidar_without_decoder_beside_others_is_told(shell: Shell, tmp_path: Path) -> None:
+def test_a_lidar_without_decoder_among_others_is_refused_unless_ignored(
+    shell: Shell, tmp_path: Path
+) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
     outcome = shell(f"convert {capture} -o out")
+    assert outcome.code == 1
+    assert outcome.err == (
+        f"mlbatch: error: {capture}: {WHERE}: {WHAT}; {ADVICE}; leave it out with --ignore "
+        "10.0.0.8:6699\n"
+    )
+    outcome = shell(f"convert {capture} -o out --ignore 10.0.0.8:6699 --strict")
     assert outcome.code == 0, outcome.err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    (warning,) = report["warnings"]
-    assert warning["code"] == "no_decoder"
-    unassigned = "its packets are counted as unassigned"
-    assert warning["message"] == f"{WHERE}: {WHAT}; {unassigned}; {ADVICE}"
+    assert report["warnings"] == []
     assert [(one["stream"], one["packets"]) for one in report["unassigned"]] == [(WHERE, 20)]
 
 
 @pytest.mark.parametrize("stream", ["{source_ip: 10.0.0.8, port: 6699}", "{port: 6699}"])
-def test_a_sensor_of_the_rig_without_decoder(shell: Shell, tmp_path: Path, stream: str) -> None:
+@pytest.mark.parametrize("model", ["", "    model: Helios 32\n"])
+def test_a_sensor_of_the_rig_without_decoder(
+    shell: Shell, tmp_path: Path, stream: str, model: str
+) -> None:
     capture = write_session(tmp_path, Unit(), more=_m1())
-    (tmp_path / "rig.yaml").write_text(f"sensors:\n  - name: front\n    stream: {stream}\n")
+    text = f"sensors:\n  - name: front\n    stream: {stream}\n{model}"
+    (tmp_path / "rig.yaml").write_text(text)
     outcome = shell(f"convert {capture} --rig rig.yaml -o out")
     assert outcome.code == 1
     selector = stream[1:-1].replace(":", "")

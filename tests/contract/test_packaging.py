@@ -47,6 +47,19 @@ def test_the_command_is_what_it_says() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", mlbatch.__version__)
 
 
+def test_the_lowest_versions_are_those_that_are_tested() -> None:
+    extras = _settings("project", "optional-dependencies")
+    lists = (_settings("project")["dependencies"], *extras.values())
+    requirements = [text for one in lists for text in cast(list[str], one)]
+    found = [re.match(r"([\w-]+)>=([\d.]+)", text) for text in requirements]
+    bounds = {one[1]: one[2] for one in found if one is not None}
+    lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8").splitlines()
+    tested = dict(line.split("==") for line in lines if not line.startswith("#"))
+    needed = [*cast(list[str], lists[0]), *cast(list[str], extras["fast"]), "dpkt"]
+    names = [re.split(r"[^\w-]", text, maxsplit=1)[0] for text in needed]
+    assert tested == {name: bounds[name] for name in names}
+
+
 def test_the_package_needs_exactly_what_it_imports() -> None:
     needed = _modules_of(cast(list[str], _settings("project")["dependencies"]))
     fast = _modules_of(cast(list[str], _settings("project", "optional-dependencies")["fast"]))

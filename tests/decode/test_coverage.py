@@ -1,26 +1,18 @@
-"""Column statistics by the kernel equal those by numpy, for any columns."""
+"""Column statistics by the compiled loops equal those by numpy, for any columns."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from mlbatch.decode.coverage import ColumnStatistics, ColumnStats
-from mlbatch.decode.numba_engine import CompiledColumnStatistics
+from mlbatch.decode.native_engine import NativeColumnStatistics
 from mlbatch.decode.scan_buffer import WindowColumns
-from tests.builders.engines import few_kernels, needs_numba
+from tests.builders.engines import needs_native
 
-pytestmark = needs_numba
+pytestmark = needs_native
 
 POSITIONS = (1024, None, 512)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with few_kernels(tmp_path_factory):
-        yield
 
 
 def columns(seed: int, count: int, most: int) -> WindowColumns:
@@ -37,7 +29,7 @@ def columns(seed: int, count: int, most: int) -> WindowColumns:
 @pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
 @pytest.mark.parametrize("seed", range(4))
 def test_column_statistics_equal_those_of_numpy(seed: int, count: int) -> None:
-    compiled = CompiledColumnStatistics(POSITIONS)
+    compiled = NativeColumnStatistics(POSITIONS)
     plain = ColumnStatistics(POSITIONS)
     for again in range(3):
         due = columns(seed * 10 + again, count, 500)
@@ -45,7 +37,7 @@ def test_column_statistics_equal_those_of_numpy(seed: int, count: int) -> None:
 
 
 def test_numpy_measures_positions_beyond_the_revolution() -> None:
-    compiled = CompiledColumnStatistics(POSITIONS)
+    compiled = NativeColumnStatistics(POSITIONS)
     plain = ColumnStatistics(POSITIONS)
     due = columns(1, 5000, 2000)
     assert (due.encoder[due.sensor == 2] >= 512).any()
@@ -54,7 +46,7 @@ def test_numpy_measures_positions_beyond_the_revolution() -> None:
     assert compiled.measure(fine) == plain.measure(fine)
 
 
-@pytest.mark.parametrize("statistics", [ColumnStatistics, CompiledColumnStatistics])
+@pytest.mark.parametrize("statistics", [ColumnStatistics, NativeColumnStatistics])
 def test_column_statistics_by_hand(statistics: type[ColumnStatistics]) -> None:
     # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
     stamp_ns = np.array([0, 10, 40, 45, 50, 51])

@@ -41,6 +41,7 @@ class Stored:
         self.ring = PacketRing(
             self.packet_size, Records(self.record_start, self.record_size, self.record_size)
         )
+        self.ring.keep_sums()
 
     def store(self, count: int, gap: int = 0) -> U8Array:
         """Store packets that are `gap` bytes apart in a batch; return the view of the ring."""
@@ -138,6 +139,7 @@ def test_every_change_of_a_byte_changes_the_checksum(size: int) -> None:
         np.uint8,
     )
     ring = PacketRing(size, Records(0, size, size))
+    ring.keep_sums()
     data = np.concatenate([packet, changed.reshape(-1)])
     start = np.arange(len(changed) + 1, dtype=np.int64) * size
     _, place = ring.store(data, start, None)

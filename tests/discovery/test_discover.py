@@ -147,7 +147,7 @@ def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
     for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
         found = _discover(capture, selection)
         assert [sensor.name for sensor in found.sensors] == ["ouster_222"]
-        assert len(found.ignored) == 1
+        assert len(found.ignored.sensors) == 1
     with pytest.raises(UsageError, match="one of ouster_111, ouster_222, found 'front'"):
         _discover(capture, SensorSelection(only=("front",)))
 
@@ -166,7 +166,7 @@ def test_a_sensor_of_the_rig_that_is_silent_at_first_is_noted(tmp_path: Path) ->
     rig.write_text(
         'sensors:\n- {name: front, stream: {serial: "111"}, extrinsics: {translation_m: [0, 0, 0]}}'
         "\n- {name: rear, stream: {source_ip: 10.0.0.2}, metadata: 111.json, "
-        "extrinsics: {translation_m: [0, 0, 0]}}\n"
+        "extrinsics: {translation_m: [1, 0, 0]}}\n"
     )
     (note,) = _discover(capture, SensorSelection(rig=rig)).notes
     assert (note.code, note.sensor) == ("not_seen_yet", "rear")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
-from mlbatch.discovery.extrinsics import Extrinsics, ExtrinsicsSources, Transform
+from mlbatch.discovery.extrinsics import Extrinsics, ExtrinsicsSources, RigExtrinsics, Transform
+from mlbatch.discovery.types import Note
 from mlbatch.errors import RigError
 from mlbatch.frames.naming import Candidate, candidates
 from mlbatch.frames.transforms import compose, from_rpy_deg, quaternion
+from mlbatch.rig.rig import UnknownExtrinsics
 
 Frames = Mapping[str, Sequence[Candidate]]
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -60,7 +62,7 @@ class Given:
     static: Sequence[Transform] = ()
     tf: Sequence[Transform] = ()
     urdf: Sequence[str] = ()
-    rig: Mapping[str, F64Array | str] = field(default_factory=dict)
+    rig: Mapping[str, RigExtrinsics] = field(default_factory=dict)
     metadata: Mapping[str, F64Array] = field(default_factory=dict)
     body: str | None = None
     identity: bool = False
@@ -364,6 +366,77 @@ def test_where_a_contradiction_begins(moved_m: float, rotated_deg: float, is_not
     other = from_rpy_deg((0.0, 1.0 + moved_m, 2.0), (0.0, 0.0, rotated_deg))
     found = Given(static=SIDES, metadata={"left": other}).resolve()
     assert [note.sensor for note in found.notes] == ["left"] * is_noted
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "rotated_deg", "is_noted"),
+    [
+        (0.0, 0.0, True),
+        (0.001, 0.0, True),
+        (0.0011, 0.0, False),
+        (0.0, 0.1, True),
+        (0.0, 0.11, False),
+        (0.0, 180.0, False),
+    ],
+)
+@pytest.mark.parametrize("source", ["rig", "tf_static", "metadata"])
+def test_where_two_sensors_share_a_pose(
+    source: str, apart_m: float, rotated_deg: float, is_noted: bool
+) -> None:
+    poses = {
+        "left": from_rpy_deg((0.0, 1.0, 2.0), (0.0, 0.0, 30.0)),
+        "right": from_rpy_deg((0.0, 1.0 + apart_m, 2.0), (0.0, 0.0, 30.0 + rotated_deg)),
+    }
+    edges = [_transform("base_link", f"{name}/os_sensor", pose) for name, pose in poses.items()]
+    given_ = {
+        "rig": Given(rig=poses),
+        "tf_static": Given(static=edges),
+        "metadata": Given(metadata=poses),
+    }[source]
+    for identity in (False, True):
+        found = replace(given_, identity=identity).resolve()
+        text = (
+            f"sensor right: expected a pose of its own, found that of left ({source}); correct its "
+            "extrinsics, or leave out those of both and give --identity-extrinsics if their points "
+            "are in the body frame already"
+        )
+        assert list(found.notes) == [Note("same_pose", "right", text)] * is_noted
+
+
+def test_sensors_at_the_body_origin_by_request_share_no_pose() -> None:
+    assert Given(identity=True).resolve().notes == ()
+    one_known = Given(rig={"left": _shifted(0.0)}, identity=True)
+    assert one_known.resolve().notes == ()
+
+
+PLACE = UnknownExtrinsics("rig.yaml:7: sensors[1].extrinsics")
+
+
+def test_unknown_in_the_rig_is_refused_with_its_place() -> None:
+    one = Given(rig={"left": _shifted(1.0), "right": PLACE})
+    start = (
+        "rig.yaml:7: sensors[1].extrinsics: expected the pose of right, required for every sensor "
+        "when there are two or more, found unknown; "
+    )
+    end = ", or accept the body origin with --identity-extrinsics"
+    assert one.refusal() == f"{start}measure it and give translation_m and a rotation{end}"
+    # Although another source knows it: the rig is the first source.
+    other = replace(one, static=SIDES, body="base_link")
+    found = "tf_static: base_link -> right/os_sensor"
+    assert other.refusal() == f"{start}remove the key to use that of {found}{end}"
+    placed = replace(one, identity=True).resolve()
+    assert placed.poses["right"].source == "identity"
+    placed = replace(other, identity=True).resolve()
+    assert placed.poses["right"].describe() == found
+
+
+@pytest.mark.parametrize("body", [None, "base_link"])
+def test_a_single_sensor_of_unknown_pose_keeps_its_own_frame(body: str | None) -> None:
+    single = Given(SINGLE, rig={"ouster_1": PLACE}, body=body)
+    assert single.resolve().body_frame == "ouster_1"
+    # The body origin, where the user says so.
+    there = replace(single, identity=True).resolve().body_frame
+    assert there == ("ouster_1" if body is None else body)
 
 
 POSES = st.builds(

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mlbatch
+from mlbatch.errors import RigError
 from mlbatch.rig.rig import read_rig
+from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     FIXTURE,
     NO_RECORDINGS,
@@ -21,7 +24,9 @@ from tests.builders.sessions import (
     SMALL,
     Shell,
     Unit,
+    arrays,
     twin,
+    write_metadata,
     write_session,
 )
 
@@ -101,6 +106,16 @@ def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
     )
 
 
+def test_a_second_lidar_at_one_address_is_noted(shell: Shell, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(), twin(Unit(), 333, Unit().ip))
+    (tmp_path / "333.json").unlink()
+    outcome = shell(f"inspect {capture}")
+    assert outcome.out.splitlines()[-1] == (
+        "note: 10.0.0.1 > port 7502: Ouster lidar, serial 333, 1280 bytes: needs its metadata as "
+        "well; 96 packets are of no sensor; give its --metadata"
+    )
+
+
 def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     capture.write_bytes(capture.read_bytes()[:-100])
@@ -128,15 +143,36 @@ def test_extrinsics_of_the_metadata_are_shown_and_written(shell: Shell, tmp_path
     np.testing.assert_array_equal(sensor.extrinsics, np.reshape(pose, (4, 4)))
 
 
-def test_the_rig_is_accepted_and_gives_the_same_scans(shell: Shell) -> None:
+def test_extrinsics_nobody_gave_are_written_as_unknown_and_refused(shell: Shell) -> None:
     written = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
     assert (written.code, written.err) == (0, "")
     assert written.out.splitlines()[-1] == "wrote rig.yaml"
-    text = Path("rig.yaml").read_text()
-    assert text.count("# extrinsics unknown: measure them") == 2
-    zero = "extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}"
-    assert text.count(zero) == 2
-    with_rig = shell(f"convert {CAPTURE} --rig rig.yaml -o with-rig")
+    lines = Path("rig.yaml").read_text().splitlines()
+    places = [number for number, line in enumerate(lines, 1) if line == "    extrinsics: unknown"]
+    assert len(places) == 2
+    comment = (
+        "  # extrinsics not known: measure them and replace `unknown` by "
+        "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
+    )
+    assert lines.count(comment) == 2
+    refused = shell(f"convert {CAPTURE} --rig rig.yaml -o out")
+    assert (refused.code, refused.out) == (1, "")
+    assert refused.err == (
+        f"mlbatch: error: rig.yaml:{places[0]}: sensors[0].extrinsics: expected the pose of "
+        f"{LEFT}, required for every sensor when there are two or more, found unknown (also of "
+        f"{RIGHT}); measure it and give translation_m and a rotation, or accept the body origin "
+        "with --identity-extrinsics\n"
+    )
+    assert not Path("out").exists()
+    with pytest.raises(RigError, match=rf"rig.yaml:{places[0]}: sensors\[0\].extrinsics: "):
+        next(mlbatch.scans(CAPTURE, rig="rig.yaml"))
+    # Poses play no part in a comparison.
+    assert shell(f"compare {CAPTURE} --rig rig.yaml").code == 0
+
+
+def test_the_rig_gives_the_same_scans(shell: Shell) -> None:
+    assert shell(f"inspect {CAPTURE} --write-rig rig.yaml").code == 0
+    with_rig = shell(f"convert {CAPTURE} --rig rig.yaml --identity-extrinsics -o with-rig")
     assert (with_rig.code, with_rig.err) == (0, "")
     found = shell(f"convert {CAPTURE} --identity-extrinsics -o found")
     assert (found.code, found.err) == (0, "")
@@ -145,6 +181,29 @@ def test_the_rig_is_accepted_and_gives_the_same_scans(shell: Shell) -> None:
         if name != "report.json":
             assert Path("with-rig", name).read_bytes() == Path("found", name).read_bytes()
     assert names.count("000006.npz") == 1
+
+
+def test_a_single_lidar_of_unknown_extrinsics_stays_in_its_own_frame(
+    shell: Shell, tmp_path: Path
+) -> None:
+    capture = write_session(tmp_path, Unit())
+    assert shell(f"inspect {capture} --write-rig rig.yaml").code == 0
+    assert "    extrinsics: unknown\n" in Path("rig.yaml").read_text()
+    assert shell(f"convert {capture} -o found").code == 0
+    done = shell(f"convert {capture} --rig rig.yaml -o with-rig")
+    assert (done.code, done.err) == (0, "")
+    found = arrays("found/000000.npz")
+    with_rig = arrays("with-rig/000000.npz")
+    assert str(with_rig["frame_id"]) == "ouster_111"
+    assert found.keys() == with_rig.keys()
+    for key in found:
+        np.testing.assert_array_equal(found[key], with_rig[key])
+    # One of two, too.
+    capture = write_session(tmp_path / "two", Unit(), twin(Unit(), 222))
+    assert shell(f"inspect {capture} --write-rig two.yaml").code == 0
+    assert shell(f"convert {capture} --rig two.yaml -o out").code == 1
+    assert shell(f"convert {capture} --rig two.yaml --only ouster_222 -o out").code == 0
+    assert str(arrays("out/000000.npz")["frame_id"]) == "ouster_222"
 
 
 def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
@@ -177,7 +236,7 @@ def test_a_rig_of_legacy_lidars_names_their_addresses(shell: Shell, tmp_path: Pa
     first, second = read_rig(Path("rig.yaml")).sensors
     assert (first.name, str(first.stream)) == ("ouster_111", "source_ip 10.0.0.1, port 7502")
     assert (second.name, str(second.stream)) == ("ouster_222", "source_ip 10.0.0.2, port 7502")
-    assert shell(f"convert {capture} --rig rig.yaml -o out").code == 0
+    assert shell(f"convert {capture} --rig rig.yaml --identity-extrinsics -o out").code == 0
 
 
 def test_the_order_of_sensors_is_that_of_serial_numbers(shell: Shell, tmp_path: Path) -> None:
@@ -243,3 +302,67 @@ def test_two_real_sensors_on_one_port(shell: Shell, kind: str) -> None:
         expected |= {(*first, 48), (*second, 48)}
     assert found == expected
     assert all("same_ports" in s["calibration"] for s in streams if s["bytes"] > 48)
+
+
+# -- the whole recording ------------------------------------------------------------------------
+
+
+def _long_session(folder: Path) -> Path:
+    """12.8 s of a lidar that loses 5 packets after 11 s; others that begin after 10.5 s."""
+    unit = Unit(turns=128)
+    records = unit.records
+    begin_ns = unit.begin_ns
+    late_ns = begin_ns + 10_500 * NS_PER_MS
+    # 320 packets a second.
+    kept = [one for number, one in enumerate(records) if not 3600 <= number < 3605]
+    foreign = [
+        (late_ns + number * 100 * NS_PER_MS, udp_frame(b"x" * 100, "10.0.0.9", dport=9000)[0])
+        for number in range(11)
+    ]
+    other = twin(replace(unit, begin_ns=late_ns, turns=10), 222)
+    return write_session(folder, more=[*kept, *foreign, *other.records])
+
+
+@pytest.fixture(scope="module")
+def long_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("long")
+    write_metadata(folder / "111.json", SMALL)
+    return _long_session(folder)
+
+
+def test_all_figures_are_of_the_whole_recording(shell: Shell, long_session: Path) -> None:
+    outcome = shell(f"inspect {long_session} --whole --json")
+    document = json.loads(outcome.out)
+    assert document["whole"] is True
+    streams = {one["stream"]: one for one in document["streams"]}
+    lidar = streams["10.0.0.1 > port 7502"]
+    assert (lidar["packets"], lidar["lost"]) == (128 * 32 - 5, 5)
+    span_s = (lidar["last_host_ns"] - lidar["first_host_ns"]) / NS_PER_S
+    # From the first packet to the last of 4096, 3.125 ms apart.
+    assert span_s == pytest.approx(4095 * 0.003125, abs=1e-6)
+    assert lidar["rate_hz"] == pytest.approx((128 * 32 - 6) / span_s)
+    foreign = streams["10.0.0.9 > port 9000"]
+    assert (foreign["packets"], foreign["what"], foreign["sensor"]) == (11, "unknown", "")
+    assert foreign["rate_hz"] == pytest.approx(10)
+    other = streams["10.0.0.2 > port 7502"]
+    assert (other["packets"], other["sensor"]) == (320, "")
+    (note,) = document["notes"]
+    assert note.startswith("10.0.0.2 > port 7502: Ouster")
+    assert "it started after the first 10 s" in note
+
+
+def test_without_the_option_all_figures_are_of_ten_seconds(
+    shell: Shell, long_session: Path
+) -> None:
+    document = json.loads(shell(f"inspect {long_session} --json").out)
+    assert (document["whole"], document["notes"]) == (False, [])
+    (lidar,) = document["streams"]
+    assert lidar["lost"] == 0
+    assert 3150 < lidar["packets"] < 3250
+    assert lidar["last_host_ns"] - lidar["first_host_ns"] < 10.1 * NS_PER_S
+
+
+def test_the_whole_of_a_short_recording_is_its_first_seconds(shell: Shell) -> None:
+    ten = json.loads(shell(f"inspect {CAPTURE} --json").out)
+    whole = json.loads(shell(f"inspect {CAPTURE} --whole --json").out)
+    assert {**ten, "whole": True} == whole

@@ -39,8 +39,7 @@ def convert(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Convert:
     """The report of a dry run."""
-    monkeypatch.chdir(tmp_path)
-    shell = Shell(monkeypatch, capsys)
+    shell = _shell(monkeypatch, capsys, tmp_path)
 
     def run(arguments: str) -> Report:
         outcome = shell(f"convert {arguments} --dry-run --keep-partial")
@@ -51,14 +50,30 @@ def convert(
     return run
 
 
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    return _shell(monkeypatch, capsys, tmp_path)
+
+
+def _shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
+) -> Shell:
+    monkeypatch.chdir(folder)
+    return Shell(monkeypatch, capsys)
+
+
 def _read(report: Report) -> dict[str, int]:
     return {sensor["name"]: sensor["packets"]["read"] for sensor in report["sensors"]}
 
 
 def _rig(folder: Path, sensors: Sequence[str]) -> Path:
     rig = folder / "rig.yaml"
-    origin = "extrinsics: {translation_m: [0, 0, 0]}"
-    lines = [f"- {{{sensor}, {origin}}}\n" for sensor in sensors]
+    lines = [
+        f"- {{{sensor}, extrinsics: {{translation_m: [{x_m}, 0, 0]}}}}\n"
+        for x_m, sensor in enumerate(sensors)
+    ]
     rig.write_text("sensors:\n" + "".join(lines))
     return rig
 
@@ -121,32 +136,88 @@ CASES = {
         ),
         {"ouster_111": 3 * PACKETS},
     ),
-    "one without metadata": Case(
-        (ONE, twin(ONE, 333)),
-        {"ouster_111": PACKETS},
-        without=(333,),
-        unassigned=(
-            (
-                "10.0.0.2 > port 7502",
-                PACKETS,
-                f"{NEEDS_METADATA.format(333)} (1280 bytes)",
+    **{
+        f"one without metadata, {option}": Case(
+            (ONE, twin(ONE, 333)),
+            {"ouster_111": PACKETS},
+            without=(333,),
+            options=option,
+            unassigned=(
+                (
+                    "10.0.0.2 > port 7502",
+                    PACKETS,
+                    f"ignored: {NEEDS_METADATA.format(333)} (1280 bytes)",
+                ),
             ),
-        ),
-        warnings=(
-            (
-                "no_metadata",
-                "",
-                f"10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected metadata that "
-                "match, found only 111.json; its packets are counted as unassigned; give "
-                "--metadata FILE",
-            ),
-        ),
-    ),
+        )
+        for option in (
+            "--ignore 10.0.0.2:7502",
+            "--ignore 333",
+            "--only ouster_111",
+        )
+    },
     "an unknown serial number on the stream of a lidar": Case(
         (ONE, twin(ONE, 333, ONE.ip)),
         {"ouster_111": PACKETS},
         without=(333,),
         unassigned=(("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),),
+        warnings=(
+            (
+                "unassigned",
+                "",
+                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
+                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
+                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
+                "SERIAL",
+            ),
+        ),
+    ),
+    **{
+        f"a lidar that the user leaves out, as {word}": Case(
+            (ONE, twin(ONE, 333, ip)),
+            {"ouster_111": PACKETS},
+            without=(333,),
+            options=f"--strict --ignore {word}",
+            unassigned=((f"{ip} > port 7502", PACKETS, "ignored: Ouster lidar, serial 333"),),
+        )
+        for ip, word in (
+            (ONE.ip, "333"),
+            ("10.0.0.2", "333"),
+            ("10.0.0.2", "10.0.0.2"),
+            ("10.0.0.2", "10.0.0.2:7502"),
+        )
+    },
+    "one of two from one address is left out": Case(
+        (ONE, twin(ONE, 222, ONE.ip)),
+        {"ouster_111": PACKETS},
+        options="--strict --ignore ouster_222",
+        unassigned=(("10.0.0.1 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),),
+    ),
+    "a sensor that is left out by its address": Case(
+        (ONE, twin(ONE, 222)),
+        {"ouster_111": PACKETS},
+        options="--strict --ignore 10.0.0.2",
+        unassigned=(("10.0.0.2 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),),
+    ),
+    "three from one address, one is left out, one has no metadata": Case(
+        (ONE, twin(ONE, 222, ONE.ip), twin(ONE, 333, ONE.ip)),
+        {"ouster_111": PACKETS},
+        without=(333,),
+        options="--ignore 222",
+        unassigned=(
+            ("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),
+            ("10.0.0.1 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),
+        ),
+        warnings=(
+            (
+                "unassigned",
+                "",
+                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
+                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
+                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
+                "SERIAL",
+            ),
+        ),
     ),
     "one that begins late": Case(
         (ONE, replace(twin(ONE, 222), begin_ns=AFTER_12_S)),
@@ -206,6 +277,26 @@ CASES = {
             ("10.0.0.2 > port 7502", PACKETS, "not_in_rig: Ouster lidar, serial 222"),
             ("10.0.0.4 > port 7502", PACKETS, "not seen in the first 10 s: Ouster lidar"),
         ),
+        warnings=tuple(
+            (
+                "not_in_rig",
+                "",
+                f"{ip} > port 7502: {NEEDS_METADATA.format(serial)}; expected a sensor of the rig, "
+                "found none for it; its packets are counted as unassigned; add it to the rig, or "
+                f"leave it out with --ignore {ip}",
+            )
+            for ip, serial in (("10.0.0.2", 222), ("10.0.0.4", 444))
+        ),
+    ),
+    "lidars that are not in the rig and left out": Case(
+        (ONE, twin(ONE, 222), replace(twin(ONE, 444, "10.0.0.4"), begin_ns=AFTER_12_S)),
+        {"front": PACKETS},
+        rig=('name: front, stream: {serial: "111"}',),
+        options="--strict --ignore 222 --ignore 10.0.0.4",
+        unassigned=(
+            ("10.0.0.2 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),
+            ("10.0.0.4 > port 7502", PACKETS, "ignored: not seen in the first 10 s: Ouster lidar"),
+        ),
     ),
     **{
         f"one of the rig that begins late, by {stream}": Case(
@@ -253,7 +344,8 @@ def test_packets_are_assigned(convert: Convert, tmp_path: Path, name: str) -> No
         assert found["what"].startswith(start)
     noted = [(one["code"], one["sensor"], one["message"]) for one in report["warnings"]]
     # Rejected packets are asserted by their counts.
-    assert [one for one in noted if one[0] != "rejected"] == list(case.warnings)
+    # Lidars of which packets are missing have a warning of their own.
+    assert [one for one in noted if one[0] not in ("rejected", "loss")] == list(case.warnings)
     for sensor in sensors:
         assert (sensor["columns"]["written"] > 0) == (sensor["packets"]["read"] > 0)
 
@@ -281,10 +373,35 @@ def test_the_extra_byte_of_old_drivers_is_accepted(
 def test_given_metadata_replace_the_search(convert: Convert, tmp_path: Path) -> None:
     capture = write_session(tmp_path, ONE, twin(ONE, 222))
     other = write_metadata(tmp_path / "elsewhere.json", replace(SMALL, serial=222))
-    report = convert(f"{capture} --metadata {other}")
+    report = convert(f"{capture} --metadata {other} --ignore 111")
     assert _read(report) == {"ouster_222": PACKETS}
     assert report["sensors"][0]["calibration"].endswith("elsewhere.json")
-    assert [warning["code"] for warning in report["warnings"]] == ["no_metadata"]
+    assert report["warnings"] == []
+
+
+@pytest.mark.parametrize("option", ["", "--strict"])
+def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option: str) -> None:
+    capture = write_session(tmp_path, ONE, twin(ONE, 333))
+    (tmp_path / "333.json").unlink()
+    outcome = shell(f"convert {capture} -o {tmp_path / 'out'} {option}")
+    assert outcome.code == 1
+    assert outcome.err == (
+        f"mlbatch: error: {capture}: 10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected "
+        "metadata that match, found only 111.json; give --metadata FILE, or leave it out with "
+        "--ignore 10.0.0.2:7502\n"
+    )
+    assert not (tmp_path / "out").exists()
+    # Without a conversion it is a row of the table.
+    assert "metadata" in shell(f"inspect {capture}").out
+
+
+def test_of_a_rig_other_lidars_are_counted(convert: Convert, tmp_path: Path) -> None:
+    capture = write_session(tmp_path, ONE, twin(ONE, 333))
+    (tmp_path / "333.json").unlink()
+    rig = _rig(tmp_path, ['name: front, stream: {serial: "111"}'])
+    report = convert(f"{capture} --rig {rig}")
+    (other,) = report["unassigned"]
+    assert other["what"].startswith("not_in_rig: Ouster lidar, serial 333")
 
 
 def test_foreign_files_in_the_directory_are_ignored(convert: Convert, tmp_path: Path) -> None:

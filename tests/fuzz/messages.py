@@ -143,7 +143,7 @@ def _read(data: bytes, folder: Path) -> None:
         yield Portion(whole, end - size, end, log_ns, np.zeros(len(size), np.int64))
 
     bag = BagRecording(folder, "bag", 0, table, portions, topics=(topic,))
-    recordings = with_clouds([bag], table, {topic.name})
+    recordings, _ = with_clouds([bag], table, None, ())
     sampler, collector = probe(recordings, table)
     for recording in recordings:
         for batch in recording.packets():

@@ -6,20 +6,18 @@ import contextlib
 import gzip
 import importlib
 import itertools
-import os
 import random
 import struct
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import zstandard
 
-from mlbatch.decode.kernels import is_installed
 from mlbatch.errors import MlbatchError
+from mlbatch.native.library import trouble
 from mlbatch.readers import open_recording
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, Recording, StreamTable
@@ -37,7 +35,6 @@ from tests.builders.captures import (
 )
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.traffic import frames
-from tests.contract.tree import ROOT
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 
@@ -90,8 +87,7 @@ def _both_engines(data: bytes, folder: Path) -> None:
     """Compiled loops find in a capture what numpy finds."""
     path = folder / "a.pcap"
     path.write_bytes(data)
-    with kernels_kept():
-        one, other = (_read(path, engine) for engine in ("numpy", "numba"))
+    one, other = (_read(path, engine) for engine in ("numpy", "native"))
     if one != other:
         raise BrokenLaw("compiled loops read other packets than numpy")
 
@@ -115,20 +111,6 @@ def _read(path: Path, engine: str) -> list[object]:
     except MlbatchError as err:
         found.append(str(err))
     return [*found, recording.counts, recording.notes]
-
-
-@contextlib.contextmanager
-def kernels_kept() -> Iterator[None]:
-    """Compiled kernels are kept from run to run, in a folder of their own."""
-    with patch.dict(os.environ, XDG_CACHE_HOME=str(ROOT / "build" / "fuzz" / "kernels")):
-        yield
-
-
-def _warm_pcaps() -> Seeds:
-    """To compile kernels takes longer than an input may."""
-    with tempfile.TemporaryDirectory() as folder:
-        _both_engines(_pcaps()[0], Path(folder))
-    return _pcaps()
 
 
 # -- captures -------------------------------------------------------------------------------------
@@ -344,15 +326,11 @@ def _file_target(
 TARGETS: Sequence[Target] = (
     _file_target("pcap", _pcaps, share=14),
     _file_target("pcapng", _pcapngs, share=14),
-    *(
-        (Target("read pcap, compiled", _warm_pcaps, _both_engines, mutated, 8),)
-        if is_installed()
-        else ()
-    ),
+    *((Target("read pcap, compiled", _pcaps, _both_engines, mutated, 8),) if not trouble() else ()),
     _file_target("compressed", _containers, _compressed),
     _file_target("mcap", _mcaps, mutated_mcap, share=14),
     _file_target("bag", _bags, share=12),
     _file_target("db3", _databases, share=12),
     Target("read folder", _metadata, _read_folder, mutated_text, 3),
 )
-__all__ = ["TARGETS", "check_batch", "kernels_kept", "mutated_mcap", "read_all"]
+__all__ = ["TARGETS", "check_batch", "mutated_mcap", "read_all"]

@@ -1,28 +1,23 @@
 """Targets: whole conversions of mutated packets in sound frames, with every law of a run checked.
 
-Threads and compiled kernels read and write at places from arrays: they must give the same bytes.
+Threads and compiled loops read and write at places from arrays: they must give the same bytes.
 """
 
 from __future__ import annotations
 
-import contextlib
 import random
 import re
 import shutil
-import tempfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from unittest.mock import patch
 
-from mlbatch.decode import numba_engine
-from mlbatch.decode.kernels import is_installed
-from mlbatch.decode.kernels.native import Constant, Kernel, load
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
+from mlbatch.native.library import trouble
 from mlbatch.pipeline.job import Job
 from mlbatch.verify import verify
 from tests.builders.captures import udp_frame, write_pcap
@@ -31,12 +26,10 @@ from tests.fuzz.framing import joined, mutated_parts, parts_of
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds
 from tests.fuzz.packets import CALIBRATION, DEVICE_PORT, NAMES, seeds_of
-from tests.fuzz.readers import kernels_kept
 from tests.property.test_damage import check_ledgers, check_output
 
 _SOURCE, _HOST = "192.168.1.201", "192.168.1.10"
 _EVERY = 5
-_CHANNELS = 128
 _JOBS = (
     Job((), keep_partial=True),
     Job((), keep_partial=True, keep_repeated=True, layout="organized"),
@@ -162,59 +155,9 @@ def _share(data: bytes, folder: Path) -> None:
     _compare(job, replace(job, jobs=2))
 
 
-class _UnknownKernelError(Exception):
-    """An input that needs a kernel which its seeds do not."""
-
-
-@lru_cache(maxsize=1)
-def _kernels() -> set[tuple[Constant, ...]]:
-    """Kernels of the seeds, compiled: that takes longer than an input may."""
-    known: set[tuple[Constant, ...]] = set()
-
-    def remembering(source: str, *constants: Constant) -> Kernel:
-        known.add((source, *constants))
-        return load(source, *constants)
-
-    with _few_kernels(remembering), tempfile.TemporaryDirectory() as folder:
-        for seed in _compiled_seeds():
-            in_memory(replace(_job(seed, Path(folder)), engine="numba"))
-    return known
-
-
-@contextlib.contextmanager
-def _few_kernels(loading: Callable[..., Kernel]) -> Iterator[None]:
-    """Kernels are made for 128 channels or more, and kept from run to run."""
-    with (
-        kernels_kept(),
-        patch.object(numba_engine, "LEAST_PAD", _CHANNELS),
-        patch.object(numba_engine, "load", loading),
-    ):
-        yield
-
-
 def _compile(data: bytes, folder: Path) -> None:
-    known = _kernels()
-
-    def loading(source: str, *constants: Constant) -> Kernel:
-        if (source, *constants) not in known:
-            raise _UnknownKernelError
-        return load(source, *constants)
-
     job = replace(_job(data, folder), engine="numpy")
-    with _few_kernels(loading), contextlib.suppress(_UnknownKernelError):
-        _compare(job, replace(job, engine="numba"))
-
-
-@lru_cache(maxsize=1)
-def _compiled_seeds() -> Seeds:
-    """Few: every kind of packets and number of returns takes a kernel, and seconds to make it."""
-    vendors = ("velodyne", "hesai", "robosense", "ouster")
-    return tuple(seed for vendor in vendors for seed in seeds_of(vendor)[:: 2 * _EVERY])
-
-
-def _warm_seeds() -> Seeds:
-    _kernels()
-    return _compiled_seeds()
+    _compare(job, replace(job, engine="native"))
 
 
 # A pcap counts seconds in 32 bits.
@@ -224,9 +167,5 @@ TARGETS: Sequence[Target] = (
     Target("sessions", _seeds, _convert, mutated_parts, 2),
     Target("sessions, verified", _described_seeds, _verified, _mutated_geometry, 2),
     Target("sessions of two jobs", _seeds, _share, mutated_parts, 2),
-    *(
-        (Target("sessions, compiled", _warm_seeds, _compile, mutated_parts, 2),)
-        if is_installed()
-        else ()
-    ),
+    *((Target("sessions, compiled", _seeds, _compile, mutated_parts, 2),) if not trouble() else ()),
 )

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import io
 import itertools
 import json
@@ -31,6 +30,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.cli import main
+from mlbatch.native.library import trouble
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
     CONTAINERS,
@@ -44,7 +44,7 @@ _HERE = Path(__file__).resolve().parent
 _REPOSITORY = _HERE.parents[1]
 _DIGESTS = _HERE / "digests.json"
 _WORDING = _HERE / "wording.json"
-_NO_NUMBA = "numba is not installed: pip install mlbatch[fast]"
+_NO_NATIVE = "the engine native is not installed: no C compiler was found"
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 
 
@@ -64,7 +64,7 @@ class Run:
     @property
     def can_run(self) -> bool:
         """Whether its engine is here."""
-        return self.engine != "numba" or importlib.util.find_spec("numba") is not None
+        return self.engine != "native" or not trouble()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,44 +86,44 @@ class Case:
 # recording, format, layout, compression, container, jobs, engine
 ROWS = """
 two_lidars mcap organized zstd bag 3 numpy
-two_lidars npz dense none pcapng 3 numba
-two_lidars ply dense none mcap 1 numba
-two_lidars rosbag1 dense none pcap 1 numba
-two_lidars rosbag2 organized zstd db3 1 numba
+two_lidars npz dense none pcapng 3 native
+two_lidars ply dense none mcap 1 native
+two_lidars rosbag1 dense none pcap 1 native
+two_lidars rosbag2 organized zstd db3 1 native
 four_makers mcap dense zstd mcap 1 numpy
 four_makers npz dense none pcap 3 numpy
 four_makers ply dense none db3 3 numpy
 four_makers rosbag1 organized none bag 1 numpy
-four_makers rosbag2 organized none pcapng 3 numba
-ouster mcap dense zstd pcapng 1 numba
-ouster npz dense none bag 1 numba
-ouster ply dense none pcap 3 numba
+four_makers rosbag2 organized none pcapng 3 native
+ouster mcap dense zstd pcapng 1 native
+ouster npz dense none bag 1 native
+ouster ply dense none pcap 3 native
 ouster rosbag1 organized none db3 3 numpy
 ouster rosbag2 organized zstd mcap 3 numpy
-velodyne mcap organized zstd db3 1 numba
-velodyne npz organized none mcap 1 numba
+velodyne mcap organized zstd db3 1 native
+velodyne npz organized none mcap 1 native
 velodyne ply dense none bag 3 numpy
 velodyne rosbag1 dense none pcapng 3 numpy
 velodyne rosbag2 dense none pcap 3 numpy
-hesai mcap organized none pcap 3 numba
+hesai mcap organized none pcap 3 native
 hesai npz organized none bag 3 numpy
-hesai ply dense none pcapng 3 numba
-hesai rosbag1 organized none mcap 3 numba
+hesai ply dense none pcapng 3 native
+hesai rosbag1 organized none mcap 3 native
 hesai rosbag2 dense zstd db3 1 numpy
 robosense mcap organized zstd pcap 3 numpy
 robosense npz dense none db3 3 numpy
-robosense ply dense none bag 1 numba
+robosense ply dense none bag 1 native
 robosense rosbag1 dense none pcapng 1 numpy
-robosense rosbag2 organized zstd mcap 1 numba
+robosense rosbag2 organized zstd mcap 1 native
 livox mcap organized zstd pcapng 1 numpy
 livox npz dense none pcapng 3 numpy
 livox ply dense none pcapng 1 numpy
 livox rosbag1 organized none pcap 3 numpy
-livox rosbag2 organized zstd pcap 1 numba
-clouds mcap dense none db3 3 numba
-clouds npz organized none mcap 1 numba
-clouds ply dense none bag 1 numba
-clouds rosbag1 organized none db3 1 numba
+livox rosbag2 organized zstd pcap 1 native
+clouds mcap dense none db3 3 native
+clouds npz organized none mcap 1 native
+clouds ply dense none bag 1 native
+clouds rosbag1 organized none db3 1 native
 clouds rosbag2 dense zstd bag 3 numpy
 """
 _FACTORS: tuple[Sequence[str], ...] = (
@@ -133,11 +133,11 @@ _FACTORS: tuple[Sequence[str], ...] = (
     ("none", "zstd"),
     CONTAINERS,
     ("1", "3"),
-    ("numpy", "numba"),
+    ("numpy", "native"),
 )
-_NUMBA = Run(engine="numba")
+_NATIVE = Run(engine="native")
 _PASSED = ("--pass", "/*/ouster/metadata")
-_THREE_NUMBA = Run(jobs=3, engine="numba")
+_THREE_NATIVE = Run(jobs=3, engine="native")
 
 
 def _row_cases() -> dict[str, Case]:
@@ -146,14 +146,14 @@ def _row_cases() -> dict[str, Case]:
         recording, format_, layout, compression, container, jobs, engine = row.split()
         options = ("--layout", layout, "--compression", compression)
         own = Run(container, int(jobs), engine)
-        runs = (own,) if engine == "numba" else (own, _NUMBA)
+        runs = (own,) if engine == "native" else (own, _NATIVE)
         name = f"{recording} {format_} {layout} {compression}"
         cases[name] = Case(recording, options, format_, runs)
     return cases
 
 
 def _case(
-    recording: str, *options: str, format: str = "npz", runs: tuple[Run, ...] = (_NUMBA,)
+    recording: str, *options: str, format: str = "npz", runs: tuple[Run, ...] = (_NATIVE,)
 ) -> Case:
     return Case(recording, options, format, runs)
 
@@ -162,17 +162,17 @@ def _option_cases() -> dict[str, Case]:
     two = "two_lidars"
     four = "four_makers"
     cases = {
-        "split": _case(two, "--split", runs=(_THREE_NUMBA, Run("db3"))),
-        "split mcap": _case(four, "--split", format="mcap", runs=(_THREE_NUMBA, Run("mcap"))),
-        "slices": _case(two, "--slices", "4", format="mcap", runs=(_THREE_NUMBA, Run("bag"))),
-        "slices npz": _case(four, "--slices", "4", runs=(_THREE_NUMBA,)),
+        "split": _case(two, "--split", runs=(_THREE_NATIVE, Run("db3"))),
+        "split mcap": _case(four, "--split", format="mcap", runs=(_THREE_NATIVE, Run("mcap"))),
+        "slices": _case(two, "--slices", "4", format="mcap", runs=(_THREE_NATIVE, Run("bag"))),
+        "slices npz": _case(four, "--slices", "4", runs=(_THREE_NATIVE,)),
         "split slices rosbag2": _case(two, "--split", "--slices", "4", format="rosbag2"),
-        "keep partial": _case(two, "--keep-partial", runs=(_THREE_NUMBA, Run("mcap"))),
+        "keep partial": _case(two, "--keep-partial", runs=(_THREE_NATIVE, Run("mcap"))),
         "keep partial ply": _case(four, "--keep-partial", format="ply"),
         "drop incomplete": _case(
             two, "--keep-partial", "--drop-incomplete", "90", "--fault", "stall:left:0.3s-0.5s"
         ),
-        "align clocks": _case(two, "--align-clocks", runs=(_NUMBA, Run("pcapng"))),
+        "align clocks": _case(two, "--align-clocks", runs=(_NATIVE, Run("pcapng"))),
         "align clocks to first": _case(
             two, "--align-clocks", "--align-to", "first", "--fault", "drift:right:80ppm"
         ),
@@ -210,7 +210,7 @@ def _option_cases() -> dict[str, Case]:
             ),
             *("--fault", "reorder:right:3%", "--fault", "truncate:right:1%", "--fault-seed", "5"),
             *("--keep-partial", "--fault", "delay:roof:60ms"),
-            runs=(_THREE_NUMBA,),
+            runs=(_THREE_NATIVE,),
         ),
         "early": _case(four, "--fault", "early:left:0.1s", "--keep-partial"),
         "stall": _case(two, "--fault", "stall:right:0.2s-0.7s", "--max-wait", "0.1"),
@@ -223,7 +223,7 @@ def _option_cases() -> dict[str, Case]:
         ),
         "resumed rosbag1": _case(two, format="rosbag1", runs=(Run(interrupt="size:2000000"),)),
         # Messages that pass through keep the QoS and the definitions of their recording.
-        "bag mcap": _case("bag_mcap", *_PASSED, format="mcap", runs=(_THREE_NUMBA,)),
+        "bag mcap": _case("bag_mcap", *_PASSED, format="mcap", runs=(_THREE_NATIVE,)),
         "bag rosbag1": _case("bag_mcap", *_PASSED, format="rosbag1"),
         "bag rosbag2": _case("bag_mcap", *_PASSED, format="rosbag2", runs=(Run(jobs=3),)),
         "db3 bag rosbag2": _case("bag_db3", *_PASSED, format="rosbag2"),
@@ -233,7 +233,7 @@ def _option_cases() -> dict[str, Case]:
     }
     for preset in ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal"):
         options = ("--point-layout", preset)
-        cases[f"points {preset}"] = _case(four, *options, format="mcap", runs=(_NUMBA,))
+        cases[f"points {preset}"] = _case(four, *options, format="mcap", runs=(_NATIVE,))
         cases[f"points {preset} organized"] = _case(
             four, *options, "--layout", "organized", format="rosbag1", runs=()
         )
@@ -462,7 +462,7 @@ def test_outputs_are_what_they_were(
                 shown = f"{name}: {words_of(case, run)}"
                 assert not lines, f"{shown} (was: {kept[name]['about']['baseline']})"
     if not all(run.can_run for run in case.runs):
-        pytest.skip(f"the digests of numpy are equal; {_NO_NUMBA}")
+        pytest.skip(f"the digests of numpy are equal; {_NO_NATIVE}")
 
 
 @pytest.mark.parametrize("name", QUERIES)
@@ -540,7 +540,7 @@ def _write() -> int:
         entry["about"] = {"baseline": found.about}
         for run in case.runs:
             if not run.can_run:
-                raise SystemExit(_NO_NUMBA)
+                raise SystemExit(_NO_NATIVE)
             other = digests_of(case, run)
             entry.setdefault(_context_key(case, run), other.context)
             for line in run_differences(case, run, other, entry):

@@ -6,7 +6,7 @@ What the engine `numpy` gives is checked elsewhere (`test_every_model.py` and ot
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,23 +16,17 @@ from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.report.report import report_text
 from tests.builders import four_makers
-from tests.builders.engines import WANTED, check_conversion, few_kernels, needs_numba
+from tests.builders.engines import WANTED, check_conversion, needs_native
 from tests.builders.run import FIXTURE, command, in_memory, prints
 from tests.golden.test_every_model import CASES, Sent, job_of
 
-pytestmark = needs_numba
+pytestmark = needs_native
 
 MAKERS = Job(
     (four_makers.FOLDER / "four_makers.pcap",),
     SensorSelection(rig=four_makers.FOLDER / "rig.yaml"),
     keep_partial=True,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with few_kernels(tmp_path_factory):
-        yield
 
 
 @pytest.mark.parametrize(
@@ -71,22 +65,22 @@ def test_rigs(job: Job) -> None:
 @pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
 def test_whole_conversions(job: Job, change: dict[str, int]) -> None:
     job = replace(job, **change)  # type: ignore[arg-type]
-    one, other = (in_memory(replace(job, engine=engine)) for engine in ("numpy", "numba"))
+    one, other = (in_memory(replace(job, engine=engine)) for engine in ("numpy", "native"))
     assert prints(one) == prints(other)
     assert report_text(one.report, machine=False) == report_text(other.report, machine=False)
     assert other.report.timing is not None
-    assert other.report.timing.engine == "numba"
+    assert other.report.timing.engine == "native"
 
 
 @pytest.mark.parametrize("suffix", ["mcap", "bag", "folder"])
 def test_outputs_do_not_tell_the_engine(suffix: str, tmp_path: Path) -> None:
     (recording,) = FIXTURE.recordings
-    for engine in ("numpy", "numba"):
+    for engine in ("numpy", "native"):
         target: list[str | Path] = ["-o", tmp_path / f"{engine}.{suffix}"]
         words = [*target, "--engine", engine, "--quiet"]
         outcome = command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words)
         assert (outcome.code, outcome.err) == (0, "")
-    one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "numba"))
+    one, other = (contents(tmp_path / f"{name}.{suffix}") for name in ("numpy", "native"))
     assert one == other
 
 
@@ -100,6 +94,6 @@ def contents(output: Path) -> dict[str, bytes]:
 def test_the_report_tells_the_engine(tmp_path: Path) -> None:
     (recording,) = FIXTURE.recordings
     report = tmp_path / "report.json"
-    words: list[str | Path] = ["--dry-run", "--engine", "numba", "--report", report]
+    words: list[str | Path] = ["--dry-run", "--engine", "native", "--report", report]
     assert command("convert", recording, "--rig", FIXTURE.selection.rig or "", *words).code == 0
-    assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "numba"
+    assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "native"

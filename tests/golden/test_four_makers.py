@@ -223,7 +223,9 @@ def organized(folder: Path, *words: str) -> dict[str, Any]:
     start_ns = np.repeat(
         [scan["start_ns"] for scan in scans], [len(scan["time_ns"]) for scan in scans]
     )
-    grid = {key: np.concatenate([scan[key] for scan in scans]) for key in keys if key != "sensors"}
+    # By sensor, not by column.
+    keys = [key for key in keys if key not in ("sensors", "fill")]
+    grid = {key: np.concatenate([scan[key] for scan in scans]) for key in keys}
     return {**grid, "at_ns": grid["time_ns"] + start_ns[:, None]}
 
 

@@ -53,8 +53,9 @@ SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 # Checks with values in each format, of merged scans at the standard layout.
 MESSAGES = set(CHECKS) - {"names", "geometry", "duplicates", "messages"}
 CHECKED = {
-    "npz": set(CHECKS) - {"stamps", "tf_static", "imu", "messages"},
-    "ply": set(CHECKS) - {"stamps", "tf_static", "imu", "messages", "geometry", "duplicates"},
+    "npz": set(CHECKS) - {"stamps", "tf_static", "frames", "imu", "messages"},
+    "ply": set(CHECKS)
+    - {"stamps", "tf_static", "frames", "imu", "messages", "geometry", "duplicates"},
     "mcap": MESSAGES,
     "rosbag2": MESSAGES | {"names"},
     "rosbag1": MESSAGES,

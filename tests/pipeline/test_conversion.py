@@ -34,7 +34,7 @@ def _rig(folder: Path, *clocks: str) -> Path:
     rig = folder / "rig.yaml"
     lines = [
         f'- {{name: s{serial}, stream: {{serial: "{serial}"}}, metadata: {serial}.json, '
-        f"extrinsics: {{translation_m: [0, 0, 0]}}, clock: {clock}}}\n"
+        f"extrinsics: {{translation_m: [{serial}, 0, 0]}}, clock: {clock}}}\n"
         for serial, clock in zip((111, 222), clocks, strict=True)
     ]
     rig.write_text("sensors:\n" + "".join(lines))
@@ -91,7 +91,7 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     assert [(note.code, note.message) for note in run.notes[:1]] == [
         ("timescale", "sensors differ in timescale: utc, unknown")
     ]
-    assert [note.code for note in run.notes[1:]] == ["clocks"]
+    assert [note.code for note in run.notes[1:]] == ["clock_epoch", "clocks"]
 
 
 # -- progress and report ---------------------------------------------------------------------------

@@ -18,13 +18,15 @@ from tests.builders.run import Cloud
 from tests.builders.traffic import read_pcap
 from tests.builders.velodyne_tables import MODELS
 from tests.recordings.references import (
+    HOUR_NS,
     US_NS,
     apart,
     assert_same_points,
     converted,
     heading_deg,
+    turned_deg,
 )
-from tests.recordings.velodyne import BELIED, CASES, DUAL, GAPS, GPS, Case
+from tests.recordings.velodyne import BELIED, CASES, DUAL, FOLDER, GAPS, GPS, Case
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder)
 
@@ -38,15 +40,19 @@ def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_pa
 
 @pytest.mark.parametrize("case", [DUAL, GAPS], ids=lambda case: case.folder)
 def test_every_point_with_the_file_next_to_the_bag(case: Case, tmp_path: Path) -> None:
-    """The file, found automatically, has the vendor's angles, but no heights of the origins."""
-    made = converted(case.path, tmp_path / "found")
-    assert made.sensor["calibration"] == case.file
-    check(case, made.cloud, added_m=case.heights_m)
-    built_in = converted(
-        case.alone(tmp_path), tmp_path / "alone", "--decode", "vertical_offset=off"
-    )
-    assert built_in.sensor["calibration"] == "built in"
-    assert np.abs(built_in.cloud.xyz - made.cloud.xyz).max() < 1e-4
+    """The file, found automatically, has the vendor's angles, and 0 for the heights of all lasers.
+
+    The built-in heights are kept.
+    """
+    alone = case.alone(tmp_path)
+    for words, added_m in (((), 0.0), (("--decode", "vertical_offset=off"), 1.0)):
+        made = converted(case.path, tmp_path / f"found {added_m}", *words)
+        assert made.sensor["calibration"] == case.file
+        assert ("vertical offsets of all lasers are 0" in made.err) == (not words)
+        check(case, made.cloud, added_m=added_m * case.heights_m)
+        built_in = converted(alone, tmp_path / f"alone {added_m}", *words)
+        assert built_in.sensor["calibration"] == "built in"
+        assert np.abs(built_in.cloud.xyz - made.cloud.xyz).max() < 1e-4
 
 
 def check(case: Case, ours: Cloud, added_m: F64Array) -> None:
@@ -87,11 +93,16 @@ def test_the_report(case: Case, tmp_path: Path) -> None:
     both = converted(case.path, tmp_path / "both", "--keep-repeated").sensor["points"]
     assert both["repeated"] == 0
     assert both["written"] == len(theirs.ring) + twice
-    warnings = [one["message"] for one in made.report["warnings"]]
-    assert len(warnings) == made.err.count("\n") == (case is BELIED)
-    if warnings:
-        assert "VLP-16" in warnings[0]
-        assert "product byte says HDL-32E" in warnings[0]
+    warnings = {one["code"]: one["message"] for one in made.report["warnings"]}
+    assert len(warnings) == made.err.count("\n")
+    assert ("calibration" in warnings) == (case is BELIED or case.file != "")
+    # More than 2 s off: the hour is known, but not the time past it.
+    assert ("clock_epoch" in warnings) == (case.timescale == "unknown")
+    if case is BELIED:
+        assert "VLP-16" in warnings["calibration"]
+        assert "product byte says HDL-32E" in warnings["calibration"]
+    if case.file:
+        assert "vertical offsets of all lasers are 0" in warnings["calibration"]
 
 
 @pytest.mark.parametrize("decode", ["on", "off"])
@@ -139,3 +150,30 @@ def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None
     whole = converted(case.path, tmp_path / "whole").cloud
     for number, words in enumerate((("--rate", "29.97"), ("--rate", "5", "--slices", "7"))):
         assert_same_points(converted(case.path, tmp_path / str(number), *words).cloud, whole)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "native"])
+def test_an_azimuth_of_36000_costs_no_packet(engine: str, tmp_path: Path) -> None:
+    """Data packet 1750 has it; the reference has packets 1600 to 1901."""
+    folder = FOLDER / "vlp16_azimuth-36000"
+    recording = folder / "vlp-16-test-90deg-1-50-frames.pcap"
+    made = converted(recording, tmp_path / "out", "--engine", engine)
+    assert made.sensor["model"] == "VLP-16"
+    assert made.sensor["packets"]["rejected"] == {}
+    assert made.sensor["points"]["written"] == 700_400
+    ours = made.cloud
+    packet = ours.column.astype(np.int64) // 24
+    with np.load(folder / "reference.npz") as theirs:
+        wanted = {key: theirs[key] for key in theirs.files}
+    late = packet >= 1600
+    order = np.lexsort((ours.at_ns[late], packet[late]))
+    past_hour_ns = ours.at_ns[late][order] % HOUR_NS
+    assert np.array_equal(packet[late][order], wanted["data_packet"])
+    assert np.array_equal(past_hour_ns, wanted["time_past_hour_ns"])
+    assert np.array_equal(ours.ring[late][order], wanted["ring"])
+    assert np.array_equal(ours.intensity[late][order], wanted["intensity"])
+    xyz = ours.xyz[late][order]
+    turn_deg = np.abs(turned_deg(heading_deg(xyz), heading_deg(wanted["xyz_m"])))
+    # That decoder rounds to 0.01 degrees.
+    assert turn_deg.max() < 0.0051
+    assert np.abs(xyz[:, 2] - wanted["xyz_m"][:, 2]).max() < 5e-5

@@ -82,7 +82,7 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
 
 
 def test_files_of_the_vendors_angles_change_nothing() -> None:
-    """Nebula's files have the manual's angles, and no offsets."""
+    """Nebula's files have the manual's angles and no heights: the built-in ones are kept."""
     for name, file in ((DUAL, "VLP16.yaml"), (GAPS, "VLP32.yaml")):
         path = FOLDER / name.split("/")[0] / file
         read = velodyne.read_calibration(path, path.read_bytes())
@@ -92,7 +92,9 @@ def test_files_of_the_vendors_angles_change_nothing() -> None:
         lidar, table = read.lidar({}, one.evidence), one.lidar
         assert lidar.model == table.model
         assert np.abs(lidar.beams.direction - table.beams.direction).max() < 1e-5
-        assert not lidar.beams.origin.any()
+        assert np.array_equal(lidar.beams.origin, table.beams.origin)
+        (note,) = lidar.notes
+        assert note.startswith(f"{path}: the vertical offsets of all lasers are 0; those of a ")
         assert (lidar.channel == table.channel).all()
         assert lidar.calibration == str(path)
 

@@ -66,7 +66,9 @@ def run() -> RunReport:
     clock = ClockReport("sensor", "ptp", 12.5, None, ("notes",))
     sensor = SensorReport(
         *("left", "OS1-4", 0, "10.0.0.1 > port 7502", "1024x10"),
-        *(ledger(), clock, "rig", np.eye(4), "left.json"),
+        ledger(),
+        0.75,
+        *(clock, "rig", np.eye(4), "left.json"),
     )
     return RunReport(
         inputs=(InputReport("/data/a.pcap", 1000, "pcap"),),
@@ -74,6 +76,7 @@ def run() -> RunReport:
         rate_hz="10",
         t_init_ns=START_NS,
         slices=1,
+        sort="columns",
         capture=capture,
         sensors=(sensor,),
         scans=table.statistics(empty=3),
@@ -144,14 +147,14 @@ def test_table_of_scans_by_hand() -> None:
         "index,slice,start_ns,end_ns,first_stamp_ns,last_stamp_ns,points,columns,"
         "columns_left,columns_right,complete,max_gap_ns_left,max_gap_ns_right,"
         "coverage_left,coverage_right,overlap_left,overlap_right,missing_left,missing_right,"
-        "ready_host_ns"
+        "fill_left,fill_right,ready_host_ns"
     )
     start = START_NS
     end = START_NS + PERIOD_NS
     last = start + 75_000_000  # four columns, 25 ms apart
     times = [start, end, start, last]
-    # Nothing is known of rotors here, nor of what the sensors should have sent.
-    rest = [*["0.000"] * 4, "", ""]
+    # Nothing is known of rotors here, nor of what the sensors should have sent; see `dense_scan`.
+    rest = [*["0.000"] * 4, "", "", 1.0, 0.75]
     assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, *rest, end + 7]))
     times = [start - PERIOD_NS, start, start - PERIOD_NS, start - PERIOD_NS]
     assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, *rest, start + 7]))
@@ -178,7 +181,7 @@ def test_sensors_of_one_window_share_a_row() -> None:
     table.add(replace(right, complete=False))
     _, row = csv.reader(io.StringIO(table.text()))
     last = START_NS + 85_000_000
-    turns = ["0.750", "1.000", "0.250", "0.500", 3, 0]
+    turns = ["0.750", "1.000", "0.250", "0.500", 3, 0, 1.0, 0.75]
     assert row[4:] == list(
         map(str, [START_NS, last, 4, 8, 4, 4, "false", 8, 9, *turns, START_NS + PERIOD_NS + 7])
     )
@@ -214,6 +217,7 @@ def test_report_has_the_contract_s_form() -> None:
         "period_ns": "100000000",
         "t_init_ns": START_NS,
         "slices": 1,
+        "sort": "columns",
     }
     assert list(report["capture"]["skipped"].items()) == [("not_ip", 7), ("fragment_lost", 3)]
     [sensor] = report["sensors"]
@@ -226,7 +230,7 @@ def test_report_has_the_contract_s_form() -> None:
     }
     assert list(sensor["packets"]["rejected"]) == ["bad_size", "duplicate"]
     assert sensor["columns"] == {"decoded": 1600, "written": 1500, "dropped": {"late": 100}}
-    assert list(sensor["points"].values()) == [6000, 1000, 300, 200, 0, 4500]
+    assert list(sensor["points"].values()) == [6000, 1000, 300, 200, 0, 4500, 0]
     assert sensor["clock"]["offset_to_host_ms"] == 12.5
     assert sensor["extrinsics"] == {"source": "rig", "body_from_sensor": np.eye(4).tolist()}
     assert report["scans"]["empty"] == 3
@@ -246,7 +250,7 @@ def test_a_period_that_is_no_whole_number_is_a_fraction() -> None:
 def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
     text = report_text(run(), machine=False)
     moved = (InputReport("/elsewhere/b.pcap", 1000, "pcap"),)
-    other = replace(run(), inputs=moved, timing=Timing(9, 8, 7, 6, 5, 4, 3, 2, 1, "numba"))
+    other = replace(run(), inputs=moved, timing=Timing(9, 8, 7, 6, 5, 4, 3, 2, 1, "native"))
     assert report_text(other, machine=False) == text
     assert "timing" not in text
     assert "path" not in text

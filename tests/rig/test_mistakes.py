@@ -57,8 +57,10 @@ def two(first: str, second: str) -> str:
 S = "sensors[0]"
 X = f"{S}.extrinsics"
 SENSOR_KEYS = (
-    "name, model, stream, metadata, extrinsics, clock, min_range_m, max_range_m, optional, decode"
+    "name, model, stream, metadata, extrinsics, clock, min_range_m, max_range_m, optional, "
+    "decode, points"
 )
+STREAM_KEYS = "source_ip, port, topic, serial, frame_id, lidar_id"
 X_KEYS = "translation_m, rotation_rpy_deg, rotation_xyzw, matrix, frame"
 NUMBER = "expected a finite number"
 PLAIN_NUMBER = "write a decimal number, without quotes or unit"
@@ -107,7 +109,7 @@ MISTAKES: list[tuple[str, str]] = [
      f"3: {X}.rotation_rpy: expected a key of {X_KEYS}, found 'rotation_rpy'; "
      "the nearest known key is rotation_rpy_deg"),
     (one("stream:\n      ip: 10.0.0.1"),
-     f"4: {S}.stream.ip: expected a key of source_ip, port, topic, serial, found 'ip'; "
+     f"4: {S}.stream.ip: expected a key of {STREAM_KEYS}, found 'ip'; "
      "the nearest known key is source_ip"),
     (one("name: right"),
      f"3: {S}.name: expected each key once, found it again (first on line 2); remove one of "
@@ -156,8 +158,28 @@ MISTAKES: list[tuple[str, str]] = [
      "1: body_frame: expected a frame name of letters, digits, _ and / that does not start "
      "with a digit, "
      f"found 'base-link'; {FIX}"),
+    # Clouds.
+    (one("stream: {topic: /a}\n    points: {tme: t}"),
+     f"4: {S}.points.tme: expected a key of time, unit, from, ring, found 'tme'; "
+     "the nearest known key is time"),
+    (one("stream: {topic: /a}\n    points:\n      unit: min"),
+     f"5: {S}.points.unit: expected s or ms or us or ns, found 'min'; use one of these words"),
+    (one("stream: {topic: /a}\n    points: {from: middle}"),
+     f"4: {S}.points.from: expected start or end or absolute, found 'middle'; "
+     "use one of these words"),
+    (one("stream: {topic: /a}\n    points: {}"),
+     f"4: {S}.points: expected at least one of time, unit, from, ring, found none; "
+     "add one of them"),
+    (one("points: {unit: us}"),
+     f"3: {S}.points: expected a sensor on a topic, found none; "
+     "give the topic of its clouds as stream: {topic: ...}, or remove points"),
+    (one("stream: {port: 1, frame_id: a}"),
+     f"3: {S}.stream.frame_id: expected frame_id with topic, found no topic; add the topic"),
+    (one("stream: {topic: /a, lidar_id: -1}"),
+     f"3: {S}.stream.lidar_id: expected a whole number from 0 to 65535, found '-1'; "
+     "correct it or remove the key"),
     # Streams.
-    (one("stream: {}"), f"3: {S}.stream: expected at least one of source_ip, port, topic, serial, "
+    (one("stream: {}"), f"3: {S}.stream: expected at least one of {STREAM_KEYS}, "
                         "found none; add one of them"),
     (one("stream: {source_ip: 10.5.5}"), f"3: {S}.stream.source_ip: expected an IP address, "
                                          "found '10.5.5'; write it as 192.168.1.201"),

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
+from mlbatch.ros.point_times import PointRule
 from mlbatch.types import Stream
 
 FULL = """\
@@ -165,8 +166,9 @@ UNIT_QUATERNIONS = (
     .filter(lambda xyzw: math.hypot(*xyzw) > 0.01)
     .map(lambda xyzw: tuple(part / math.hypot(*xyzw) for part in xyzw))
 )
-EXTRINSICS: st.SearchStrategy[F64Array | str | None] = st.one_of(
+EXTRINSICS: st.SearchStrategy[F64Array | str | UnknownExtrinsics | None] = st.one_of(
     st.none(),
+    st.builds(UnknownExtrinsics),
     WORDS,
     st.builds(from_quaternion, COORDINATES, UNIT_QUATERNIONS),
     st.builds(from_rpy_deg, COORDINATES, st.tuples(*[st.integers(-180, 180)] * 3)),
@@ -199,7 +201,11 @@ def _facts(rig: Rig) -> list[object]:
     """All fields of a rig, comparable to the last bit."""
     facts: list[object] = [rig.body_frame, rig.rate, rig.exclude_boxes_m.tobytes()]
     for s in rig.sensors:
-        pose = s.extrinsics.tobytes() if isinstance(s.extrinsics, np.ndarray) else s.extrinsics
+        pose: object = s.extrinsics
+        if isinstance(s.extrinsics, np.ndarray):
+            pose = s.extrinsics.tobytes()
+        elif isinstance(s.extrinsics, UnknownExtrinsics):
+            pose = UnknownExtrinsics
         facts += [s.name, s.model, s.stream, s.metadata, pose, s.clock, s.offset_ns]
         facts += [s.min_range_m, s.max_range_m, s.optional, s.decode]
     return facts
@@ -245,3 +251,28 @@ sensors:
     # extrinsics: {translation_m: [0.0, 0.0, 0.0], rotation_rpy_deg: [0.0, 0.0, 0.0]}
 """
     )
+
+
+def test_points_and_lidars_of_a_topic_are_read_back(tmp_path: Path) -> None:
+    text = """\
+sensors:
+  - name: front
+    stream: {topic: /points, frame_id: /lidar_front}
+    points: {time: t, unit: us, from: end, ring: line}
+  - name: rear
+    stream: {topic: /points, lidar_id: 0}
+    points: {from: absolute}
+"""
+    rig = _read(tmp_path, text)
+    front, rear = rig.sensors
+    assert front.stream == StreamSelector(topic="/points", frame_id="lidar_front")
+    assert rear.stream == StreamSelector(topic="/points", lidar_id=0)
+    assert str(rear.stream) == "topic /points, lidar_id 0"
+    assert front.points == PointRule(time="t", unit_ns=1000, origin="end", ring="line")
+    assert rear.points == PointRule(origin="absolute")
+    assert rear.stream.selects(Stream(topic="/points", lidar_id=0))
+    assert not rear.stream.selects(Stream(topic="/points", lidar_id=1))
+    again = _read(tmp_path, write_rig(rig, tmp_path))
+    assert [(one.stream, one.points) for one in again.sensors] == [
+        (one.stream, one.points) for one in rig.sensors
+    ]

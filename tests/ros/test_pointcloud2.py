@@ -210,7 +210,8 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
     "no time": (
         cloud_message(OUSTER[:4], [(1, 2, 3, 9)]),
         "expected the time of each point in a field t, time, timestamp, time_stamp, timestamps, "
-        "offset_time or ts, found x, y, z, intensity; record the raw packets, or clouds with times",
+        "offset_time or ts, found x, y, z, intensity; name it in the rig (points: {time: FIELD}), "
+        "record the raw packets, or clouds with times",
     ),
     "no z": (
         cloud_message((*XYZ[:2], ("t", "uint32")), [(1, 2, 3)]),
@@ -260,27 +261,27 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
     "unit": (
         cloud_message(TIMES, [(1, 2, 3, 1e5)]),
         "field time (float32): expected s after the header's stamp (below 1000), or float64 s "
-        "or ns since 1970, found 100000; its unit is not known, record the raw packets",
+        "or ns since 1970, found 100000; give its unit in the rig (points: {unit: us})",
     ),
     "float32 since 1970": (
         cloud_message(TIMES, [(1, 2, 3, 1.7e9)]),
         "field time (float32): expected s after the header's stamp (below 1000), or float64 s "
-        "or ns since 1970, found 1.7e+09; its unit is not known, record the raw packets",
+        "or ns since 1970, found 1.7e+09; give its unit in the rig",
     ),
     "far too late": (
         cloud_message(SECONDS, [(1, 2, 3, 1e300)]),
         "field time (float64): expected s after the header's stamp (below 1000), or float64 s "
-        "or ns since 1970, found 1e+300; its unit is not known, record the raw packets",
+        "or ns since 1970, found 1e+300; give its unit in the rig",
     ),
     "milliseconds": (
         cloud_message(TIMES, [(1, 2, 3, 0), (1, 2, 3, 100)]),
-        "field time (float32): expected times of one cloud within 10 s, found 100 s; its unit "
-        "is not known, record the raw packets",
+        "field time (float32): expected times of one cloud within 10 s, found 100 s; give "
+        "its unit in the rig (points: {unit: us}), or record the raw packets",
     ),
     "far too early": (
         cloud_message(SECONDS, [(1, 2, 3, -1e300), (1, 2, 3, 0.5)]),
-        "field time (float64): expected times of one cloud within 10 s, found 1e+300 s; its "
-        "unit is not known, record the raw packets",
+        "field time (float64): expected times of one cloud within 10 s, found 1e+300 s; "
+        "give its unit in the rig",
     ),
     "other CDR": (
         b"\0\0" + cloud_message(OUSTER, ONE)[2:],
@@ -323,3 +324,10 @@ def test_no_cut_and_no_wrong_byte_is_more_than_a_line(kind: str, encoding: str) 
     for data in damaged:
         outcome = _outcome(data, kind, encoding)
         assert outcome in range(4) if isinstance(outcome, int) else "\n" not in outcome
+
+
+def test_one_time_for_more_points_than_a_column_has_is_refused() -> None:
+    points = [(1, 2, 3, 9, 5, 4)] * 1025
+    with pytest.raises(CloudError, match="expected times of the points, found one for all 1025"):
+        _read(cloud_message(OUSTER, points))
+    assert len(_read(cloud_message(OUSTER, points[:1024])).points) == 1024

@@ -44,6 +44,16 @@ REPORT: dict[str, Case] = {
         "report",
         "sensors.0.points.written",
     ),
+    "more clipped points than written": (
+        report("sensors", 0, "points", "clipped", to=10**9),
+        "ledger",
+        "sensors.0.points.clipped",
+    ),
+    "clipped points without 8 bits": (
+        report("sensors", 0, "points", "clipped", to=1),
+        "report",
+        "sensors.points.clipped, all",
+    ),
     "columns that are not there": (
         both(
             report("sensors", 0, "columns", "written", to=lambda n: n + 5),

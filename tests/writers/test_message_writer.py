@@ -12,7 +12,7 @@ import pytest
 from mlbatch.errors import ExportError
 from mlbatch.types import IMU, Message, Summary
 from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
-from mlbatch.writers.message_writer import quaternion
+from mlbatch.writers.message_writer import quaternion, static_edges
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -105,6 +105,21 @@ def test_static_transforms_are_the_poses(name: str, tmp_path: Path) -> None:
     assert found == pytest.approx((0, 0, HALF, HALF))
 
 
+def test_two_frames_of_one_name_are_refused(tmp_path: Path) -> None:
+    info = run_info()
+    left, right = info.sensors
+    same = replace(
+        info, sensors=(replace(left, sensor_from_imu=np.eye(4)), replace(right, name="left_imu"))
+    )
+    with pytest.raises(ExportError, match="found left_imu for a sensor and for an IMU"):
+        open_writer("mcap", tmp_path / "scans.mcap", same, WriterOptions("standard"))
+    assert list(tmp_path.iterdir()) == []
+    # A frame of the recording does not replace an own one.
+    recorded = replace(info, frames=(("gps", np.eye(4)), ("left", np.eye(4))))
+    children = [child for _, child, _ in static_edges(recorded)]
+    assert children == ["left", "right", "gps"]
+
+
 @each_container
 def test_imu_messages_have_the_samples(name: str, tmp_path: Path) -> None:
     found = read_back(written(name, tmp_path / OUTPUTS[name], SCANS))
@@ -148,7 +163,10 @@ def test_a_run_without_scans(name: str, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
     writer.write_imu(imu_samples(count=0))
     writer.finish(Summary(None, "{}", "index\n"))
-    assert [(r.topic, r.log_ns) for r in read_back(tmp_path / OUTPUTS[name])] == [("/tf_static", 0)]
+    path = tmp_path / OUTPUTS[name]
+    # rosbags before 0.10 passes over messages at 0 in the MCAP of a bag.
+    path = path / f"{path.name}_0.mcap" if path.is_dir() else path
+    assert [(r.topic, r.log_ns) for r in read_back(path)] == [("/tf_static", 0)]
 
 
 @each_container

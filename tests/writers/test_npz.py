@@ -36,8 +36,9 @@ TYPES = {
     "slice": "<i8",
     "slices": "<i8",
     "complete": "|b1",
+    "fill": "<f4",
 }
-WORDS = ("sensors", "frame_id", "rate_hz", "timescale", "schema")
+WORDS = ("sensors", "frame_id", "rate_hz", "timescale", "sort", "schema")
 
 
 def written(folder: Path, *scans: Scan) -> Path:
@@ -63,7 +64,7 @@ def test_every_key_comes_back_as_it_was(tmp_path: Path) -> None:
         assert loaded["xyz"].flags.c_contiguous
         assert loaded["sensors"].tolist() == ["left", "right"]
         words = [str(loaded[key][()]) for key in WORDS[1:]]
-        assert words == ["base_link", "10", "utc", "mlbatch.scan/1"]
+        assert words == ["base_link", "10", "utc", "columns", "mlbatch.scan/1"]
         assert loaded["slices"] == 1
 
 

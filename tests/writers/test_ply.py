@@ -39,6 +39,8 @@ def test_one_vertex_by_hand(tmp_path: Path) -> None:
         "comment end_ns 1700000000200000000",
         "comment index 0 slice 0 of 1",
         "comment complete true",
+        "comment fill 1.0 0.75",
+        "comment sort columns",
         "comment timescale utc",
         "comment rate_hz 10",
         "comment frame_id base_link",

@@ -11,6 +11,7 @@ import pytest
 from mlbatch.errors import ExportError
 from mlbatch.types import Message
 from mlbatch.writers import WriterOptions, open_writer
+from tests.builders.rosbag1 import definition_of
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -81,8 +82,8 @@ def test_connections_are_what_ros_1_expects(tmp_path: Path) -> None:
     assert {t: c.digest for t, c in connections.items() if t in MD5} == MD5
     latched = {t for t, c in connections.items() if c.ext.latching}
     assert latched == {"/tf_static", "/note"}
-    assert connections["/points"].msgdef.data.count("=" * 80) == 2
-    assert connections["/odd"].msgdef.data == ODD_TEXT
+    assert definition_of(connections["/points"]).count("=" * 80) == 2
+    assert definition_of(connections["/odd"]) == ODD_TEXT
     assert b"type=sensor_msgs/PointCloud2" in path.read_bytes()
 
 

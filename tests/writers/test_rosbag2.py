@@ -118,7 +118,7 @@ def test_the_file_inside_is_a_whole_mcap(tmp_path: Path) -> None:
         reader = make_reader(file, validate_crcs=True)
         found = list(reader.iter_messages(log_time_order=False))
         assert {record.name for record in reader.iter_metadata()} == {
-            *("mlbatch.grid", "mlbatch.report")
+            *("mlbatch.grid", "mlbatch.fill", "mlbatch.report")
         }
         assert [attached.name for attached in reader.iter_attachments()] == ["scans.csv"]
     assert found[0][1].topic == "/tf_static"

@@ -9,14 +9,14 @@ Counts: a packet is a frame with a datagram; an unreadable cloud is one frame, `
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mlbatch.arrays import U8Array
-from mlbatch.ros.encoding import ENCODINGS
-from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
+from mlbatch.readers.bag.cloud_topics import CloudTopics
+from mlbatch.ros.point_packets import CloudError, Points, layout_of, pack
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, read_cloud
 from mlbatch.types import (
     Message,
@@ -24,7 +24,6 @@ from mlbatch.types import (
     Recording,
     Stream,
     StreamTable,
-    Topic,
     WrappedRecording,
 )
 
@@ -32,19 +31,12 @@ from mlbatch.types import (
 _BATCH_BYTES = 8 << 20
 
 
-def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """The topics of decoded clouds, in order."""
-    return tuple(
-        topic for topic in topics if topic.type in CLOUD_TYPES and topic.encoding in ENCODINGS
-    )
-
-
 @dataclass(slots=True)
 class _TopicCounts:
     """Clouds and points of a topic; points: of all clouds that could be read."""
 
-    # How the times of points are encoded; empty before the first cloud.
-    time_meaning: str = ""
+    # How the times of points are encoded.
+    time_meanings: dict[str, None] = field(default_factory=dict)
     points: int = 0
     # Points with coordinates that are NaN or zero.
     without_place: int = 0
@@ -59,7 +51,8 @@ class _TopicCounts:
 
     def add(self, cloud: Cloud) -> None:
         """Count a cloud that was read."""
-        self.time_meaning = self.time_meaning or cloud.time_meaning
+        if cloud.time_meaning:
+            self.time_meanings.setdefault(cloud.time_meaning)
         self.points += len(cloud.points) + cloud.without_place + cloud.without_time
         self.without_place += cloud.without_place
         self.without_time += cloud.without_time
@@ -69,8 +62,8 @@ class _TopicCounts:
         self.faults += 1
         self.first_fault = self.first_fault or why
 
-    def verdict(self, layout: Layout | None) -> str:
-        """Meaning of the time field, layout of the packets, points left out; "" without points."""
+    def verdict(self, layouts: str) -> str:
+        """Meaning of the time field, layouts of the packets, points left out; "" without points."""
         if not self.points:
             return ""
         reasons = (
@@ -79,53 +72,53 @@ class _TopicCounts:
             (self.beyond_rings, "on rings beyond those of the first cloud"),
         )
         left_out = ", ".join(f"{count} {why}" for count, why in reasons if count) or "none"
-        start = f"times of points from {self.time_meaning}; {layout}; " if self.time_meaning else ""
+        meanings = " or ".join(self.time_meanings)
+        start = f"times of points from {meanings}; {layouts}; " if meanings else ""
         return f"{start}left out of {self.points} points: {left_out}"
 
 
 @dataclass(slots=True)
 class _Packed:
-    """Packets (n, size) of one message."""
+    """Packets (n, size) of one lidar in a message."""
 
     message: Message
+    stream: Stream
     packets: U8Array
 
 
 class CloudRecording(WrappedRecording):
     """A recording whose decoded clouds come as packets, too.
 
-    topics_of_clouds: as given by `cloud_topics`; layouts: of the packets of each topic, shared by
-    the recordings of a session, since a topic may be spread over several; frames: frame_id of the
-    first cloud of each topic. Messages of cloud topics are passed on only if `keep` names them.
+    clouds: shared by the recordings of a session. Messages of cloud topics are passed on only if
+    `keep` names them.
     """
 
-    __slots__ = ("_counts", "frames", "layouts", "streams", "topics_of_clouds")
+    __slots__ = ("_counts", "clouds", "streams")
 
-    def __init__(
-        self,
-        inner: Recording,
-        streams: StreamTable,
-        topics_of_clouds: Sequence[Topic],
-        layouts: dict[str, Layout] | None = None,
-    ) -> None:
+    def __init__(self, inner: Recording, streams: StreamTable, clouds: CloudTopics) -> None:
         super().__init__(inner)
         self.streams = streams
-        self.topics_of_clouds = topics_of_clouds
-        self.layouts = {} if layouts is None else layouts
-        self.frames: dict[str, str] = {}
+        self.clouds = clouds
         self._counts: dict[str, _TopicCounts] = {}
 
     @property
     def verdicts(self) -> list[str]:
         """Per topic: the meaning of its time field, and the points left out; one line each."""
         texts = (
-            (name, counts.verdict(self.layouts.get(name))) for name, counts in self._counts.items()
+            (name, counts.verdict(self._layouts_of(name))) for name, counts in self._counts.items()
         )
         return [f"{name}: {text}" for name, text in texts if text]
 
+    def _layouts_of(self, topic: str) -> str:
+        """Layouts of the packets of a topic, by lidar if there are several."""
+        found = {s: layout for s, layout in self.clouds.layouts.items() if s.topic == topic}
+        if len(found) < 2:
+            return "".join(map(str, found.values()))
+        return ", ".join(f"{stream}: {layout}" for stream, layout in found.items())
+
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, those of clouds among them; each call is a new pass."""
-        self._counts = {topic.name: _TopicCounts() for topic in self.topics_of_clouds}
+        self._counts = {topic.name: _TopicCounts() for topic in self.clouds.topics}
         self.inner.keep = self.keep | self._counts.keys()
         batches = self.inner.packets()
         try:
@@ -154,9 +147,7 @@ class CloudRecording(WrappedRecording):
         latest_ns = 0
         for message in clouds:
             latest_ns = max(latest_ns, message.host_ns)
-            packets = self._packets_of(message)
-            if packets is not None:
-                packed.append(_Packed(message, packets))
+            packed += self._packets_of(message)
             if sum(one.packets.nbytes for one in packed) >= _BATCH_BYTES:
                 stop = int(np.searchsorted(receive_ns, latest_ns, side="right"))
                 part = self._joined(batch.take(slice(done, stop)), packed)
@@ -166,36 +157,56 @@ class CloudRecording(WrappedRecording):
                 messages = ()
         yield replace(self._joined(batch.take(slice(done, None)), packed), messages=messages)
 
-    def _packets_of(self, message: Message) -> U8Array | None:
-        """The packets (n, size) of a cloud; None where it has none or cannot be read."""
+    def _packets_of(self, message: Message) -> list[_Packed]:
+        """The packets of a cloud, by lidar; none where it has none or cannot be read."""
         name = message.topic.name
         counts = self.inner.counts
         try:
-            cloud = read_cloud(message)
-            packets = self._pack(message, cloud.points) if len(cloud.points) else None
+            cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame))
+            packed = [
+                _Packed(message, stream, packets)
+                for stream, points in self._by_lidar(name, cloud)
+                if (packets := self._pack(message, stream, points)) is not None
+            ]
         except CloudError as err:
             self._counts[name].add_fault(str(err))
             counts.frames += 1
             counts.skip("truncated")
-            return None
+            return []
         self._counts[name].add(cloud)
-        self.frames.setdefault(name, cloud.frame)
-        if packets is not None:
-            counts.frames += len(packets)
-            counts.datagrams += len(packets)
-        return packets
+        for one in packed:
+            self.clouds.frames.setdefault(one.stream, cloud.frame)
+            counts.frames += len(one.packets)
+            counts.datagrams += len(one.packets)
+        return packed
 
-    def _pack(self, message: Message, points: Points) -> U8Array | None:
+    def _by_lidar(self, topic: str, cloud: Cloud) -> Iterator[tuple[Stream, Points]]:
+        """The points of each lidar, and its stream; none without points."""
+        lidars = self.clouds.lidars[topic]
+        ids = cloud.lidar_id
+        if not len(cloud.points):
+            return
+        if ids is None or bool((ids == ids[0]).all()):
+            yield (
+                lidars.stream(topic, cloud.frame, None if ids is None else int(ids[0])),
+                cloud.points,
+            )
+            return
+        # Whichever of several lidars comes first in the points.
+        for lidar_id in np.unique(ids).tolist():
+            yield lidars.stream(topic, cloud.frame, lidar_id), cloud.points.take(ids == lidar_id)
+
+    def _pack(self, message: Message, stream: Stream, points: Points) -> U8Array | None:
         """The packets of points that all have a place and a time."""
-        name = message.topic.name
-        layout = self.layouts.get(name)
+        layouts = self.clouds.layouts
+        layout = layouts.get(stream)
         if layout is None:
-            layout = self.layouts[name] = layout_of(points, CLOUD_TYPES[message.topic.type])
+            layout = layouts[stream] = layout_of(points, CLOUD_TYPES[message.topic.type])
         if layout.by_ring:
             if points.ring is None:
                 raise CloudError("expected rings as in the first cloud, found none")
             known = points.ring < layout.slots
-            self._counts[name].beyond_rings += len(points) - int(np.count_nonzero(known))
+            self._counts[stream.topic].beyond_rings += len(points) - int(np.count_nonzero(known))
             points = points.take(known)
         return pack(points, layout, len(message.data)) if len(points) else None
 
@@ -214,7 +225,7 @@ class CloudRecording(WrappedRecording):
             part = np.empty((5, count), np.int64)
             part[0] = end + np.arange(count) * size
             part[1] = size
-            part[2] = self._stream(one.message.topic)
+            part[2] = self._number(one.stream)
             part[3:] = one.message.host_ns
             parts.append(part)
             data.append(one.packets.reshape(-1))
@@ -223,8 +234,8 @@ class CloudRecording(WrappedRecording):
         columns = columns[:, np.argsort(columns[4], kind="stable")]
         return PacketBatch(np.concatenate(data), columns[0], columns[1], columns[2], columns[3])
 
-    def _stream(self, topic: Topic) -> int:
-        """Number of a topic's stream; its packets have no receive time of their own."""
-        number = self.streams.number(Stream(topic=topic.name))
+    def _number(self, stream: Stream) -> int:
+        """Number of a stream; its packets have no receive time of their own."""
+        number = self.streams.number(stream)
         self.streams.untimed.add(number)
         return number

@@ -8,6 +8,7 @@ same length and the same lengths inside are read by adding the offsets of the fi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from mlbatch.ros.definitions import (
     Field,
     definitions_of,
     type_key,
+    variants_of,
 )
 from mlbatch.ros.encoding import ENCODINGS, EncapsulationError, MessageError, MessageReader
 from mlbatch.types import Topic
@@ -37,7 +39,8 @@ class Envelope:
     payload: field of the bytes; inside: field of the message(s) that contain it, "" for the message
     itself; size: field with the number of valid bytes; stamp: field of the receive time at the
     host; stamped_by: encodings whose drivers fill it; corrections: a calibration may be among the
-    packets; padded: short packets may be in a field of fixed length.
+    packets; padded: short packets may be in a field of fixed length; may_lack_size: some
+    definitions have no `size`.
     """
 
     payload: str
@@ -47,13 +50,16 @@ class Envelope:
     stamped_by: tuple[str, ...] = ENCODINGS
     corrections: bool = False
     padded: bool = False
+    may_lack_size: bool = False
 
 
 _OUSTER = Envelope("buf")
 # The ROS 1 driver of pandar_msgs leaves its stamps empty, or fills them while replaying.
 _PANDAR = Envelope("data", size="size", stamp="stamp", stamped_by=("cdr",))
 _HESAI = Envelope("data", size="size", stamp="stamp")
-_ROBOSENSE = Envelope("data", stamp="stamp", padded=True)
+_OLD_ROBOSENSE = Envelope("data", stamp="stamp", padded=True)
+# A branch of Nebula has longer fields, with a size.
+_ROBOSENSE = replace(_OLD_ROBOSENSE, size="size", may_lack_size=True)
 
 PACKET_TYPES: Mapping[str, Envelope] = {
     "ouster_ros/PacketMsg": _OUSTER,
@@ -73,10 +79,10 @@ PACKET_TYPES: Mapping[str, Envelope] = {
     # Its header has the sensor's time, or nothing.
     "rslidar_msg/RslidarPacket": Envelope("data"),
     "rslidar_msgs/rslidarScan": Envelope("data", "packets", stamp="stamp", padded=True),
-    "rslidar_msgs/rslidarPacket": _ROBOSENSE,
-    "robosense_msgs/RobosenseScan": Envelope("data", "packets", stamp="stamp", padded=True),
+    "rslidar_msgs/rslidarPacket": _OLD_ROBOSENSE,
+    "robosense_msgs/RobosenseScan": replace(_ROBOSENSE, inside="packets"),
     "robosense_msgs/RobosensePacket": _ROBOSENSE,
-    "robosense_msgs/RobosenseInfoPacket": Envelope("data", "packet", stamp="stamp", padded=True),
+    "robosense_msgs/RobosenseInfoPacket": replace(_ROBOSENSE, inside="packet"),
     "udp_msgs/UdpPacket": Envelope("data"),
 }
 
@@ -109,7 +115,7 @@ class Shape:
     """Places in messages of one shape, counted from their first byte.
 
     word, value: (w,) int64, places and values of all lengths; start, room: (p,) int64, payloads;
-    size_at, stamp_at: (p,) int64, or (0,) where there is none.
+    size_at, stamp_at: (p,) int64, or (0,) where there is none; rest: bytes behind the packets.
     """
 
     word: I64Array
@@ -118,6 +124,7 @@ class Shape:
     room: I64Array
     size_at: I64Array
     stamp_at: I64Array
+    rest: int
 
     def fits(self, data: U8Array, begin: I64Array) -> BoolArray:
         """Which of the messages of this shape's length that begin at `begin` have the shape."""
@@ -157,8 +164,7 @@ class Tracer:
         self._types = types
         self._encoding = encoding
         self._root = root
-        self._envelope = envelope
-        self._holder = _holder(types, root, envelope)
+        self._holder, self._envelope = _holder(types, root, envelope)
         self.many = self._holder is not None and self._holder.count is not None
         self.stamped = bool(envelope.stamp) and encoding in envelope.stamped_by
         packet_type = root if self._holder is None else self._holder.type
@@ -186,9 +192,8 @@ class Tracer:
                 f"expected a size and a stamp of each packet in {self._root}, found a definition "
                 "with several; this variant of the message is not supported"
             )
-        return Shape(
-            word - begin, u32(data, word), start - begin, room, size_at - begin, stamp_at - begin
-        )
+        places_at = (start - begin, room, size_at - begin, stamp_at - begin)
+        return Shape(word - begin, u32(data, word), *places_at, end - reader.at)
 
     def _packets(self, reader: MessageReader, one: Field, places: _Places) -> None:
         """The packets of a field; those of fixed length follow each other at a constant stride."""
@@ -220,14 +225,19 @@ class Tracer:
         reader.leave()
 
 
-def _holder(types: Definitions, root: str, envelope: Envelope) -> Field | None:
-    """The field that contains the packets, None if the message is one; checks all fields."""
+def _holder(types: Definitions, root: str, envelope: Envelope) -> tuple[Field | None, Envelope]:
+    """The field that contains the packets, None if the message is one; checks all fields.
+
+    The envelope is returned without a size if the definition has none and may lack it.
+    """
     fields = {one.name: one for one in types.get(root, ())}
     inner = fields
     holder = None
     if envelope.inside:
         holder = fields.get(envelope.inside)
         inner = {one.name: one for one in types.get(holder.type, ())} if holder else {}
+    if envelope.may_lack_size and envelope.size not in inner:
+        envelope = replace(envelope, size="")
     payload = inner.get(envelope.payload)
     expected = ((envelope.size, ("uint32", "int32")), (envelope.stamp, ("time",)))
     absent = Field("", "")
@@ -241,7 +251,7 @@ def _holder(types: Definitions, root: str, envelope: Envelope) -> Field | None:
             f"expected packets in the field {path} of {root}, found a definition with "
             f"{', '.join(fields) or 'no field'}; this variant of the message is not supported"
         )
-    return holder
+    return holder, envelope
 
 
 def _fixed_alignment(
@@ -267,6 +277,8 @@ def _fixed_alignment(
 # -- packets --------------------------------------------------------------------------------------
 
 _MOST_SHAPES = 64
+# Middleware may fill messages up to a multiple of it.
+_END_PADDING = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,8 +317,10 @@ class Unpacker:
                 f"found {topic.encoding!r}; convert the recording"
             )
         try:
-            types = definitions_of(topic)
-            self._tracer = Tracer(types, topic.encoding, root, self._envelope)
+            self._tracer = Tracer(definitions_of(topic), topic.encoding, root, self._envelope)
+            self._variants = [
+                Tracer(types, topic.encoding, root, self._envelope) for types in variants_of(topic)
+            ]
         except MessageError as err:
             raise MessageError(f"{topic.name}: {err}") from err
         # By length of the message.
@@ -349,7 +363,7 @@ class Unpacker:
     def _new_shape(self, data: U8Array, begin: int, end: int) -> Shape:
         """The shape of a message that has none of the known ones; it is added to them."""
         try:
-            shape = self._tracer.trace(data, begin, end)
+            shape = self._trace(data, begin, end)
         except EncapsulationError as err:
             # A topic that begins in another encoding has no other messages.
             if not self._known:
@@ -360,6 +374,21 @@ class Unpacker:
         self._known += 1
         self._shapes.setdefault(end - begin, []).append(shape)
         return shape
+
+    def _trace(self, data: U8Array, begin: int, end: int) -> Shape:
+        """The shape of a message; of several forms of its type, by that which fills it."""
+        if not self._variants:
+            return self._tracer.trace(data, begin, end)
+        for tracer in (self._tracer, *self._variants):
+            with suppress(MessageError):
+                shape = tracer.trace(data, begin, end)
+                if shape.rest < _END_PADDING:
+                    return shape
+        rest = self._tracer.trace(data, begin, end).rest
+        raise MessageError(
+            f"expected packets up to the end of a message, found {rest} bytes behind them; it was "
+            "cut off, or is of another type"
+        )
 
     def _packets(
         self, data: U8Array, begin: I64Array, row: I64Array, shape: Shape, log_ns: I64Array

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
-from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import copy_runs, records
 from mlbatch.readers.capture.frames import UDP, Datagrams, Fragments, in_order
 from mlbatch.types import CaptureCounts
@@ -180,7 +180,7 @@ class Reassembler:
 
     counts: CaptureCounts
     together: bool = True
-    kernel: CaptureKernel | None = None
+    loops: CaptureLoops | None = None
     sets: SetTable = field(init=False)
 
     def __post_init__(self) -> None:
@@ -200,7 +200,7 @@ class Reassembler:
             return self._one_by_one(data, fragments, host_ns, every, 0)
         self.sets.expire(int(host_ns[0]))
         usable = self._undisturbed(chains, fragments)
-        copy = copy_runs if self.kernel is None else self.kernel.copy_runs
+        copy = copy_runs if self.loops is None else self.loops.copy_runs
         done, end = _assemble(data, fragments, chains, usable, copy)
         lengths = chains.stop - chains.start
         self.counts.skip("fragment", int((lengths[usable] - 1).sum()))

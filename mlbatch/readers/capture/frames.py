@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
-from mlbatch.decode.kernels.reading import CaptureKernel
+from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import Records, records
 from mlbatch.readers.capture import ipv6, link_types
 from mlbatch.types import Stream, StreamTable
@@ -145,21 +145,21 @@ class Dissection:
 
 
 def dissect(
-    data: U8Array, frames: Frames, addresses: Addresses, kernel: CaptureKernel | None = None
+    data: U8Array, frames: Frames, addresses: Addresses, loops: CaptureLoops | None = None
 ) -> Dissection:
     """Find the UDP content of all frames; datagrams and fragments come in file order."""
     if bool((frames.link == _ETHERNET).all()):
-        found = _by_kernel(kernel, data, frames, addresses) if kernel else _plain(data, frames)
+        found = _by_loops(loops, data, frames, addresses) if loops else _plain(data, frames)
         if found is not None:
             return found
     return _dissect(data, frames, addresses)
 
 
-def _by_kernel(
-    kernel: CaptureKernel, data: U8Array, frames: Frames, addresses: Addresses
+def _by_loops(
+    loops: CaptureLoops, data: U8Array, frames: Frames, addresses: Addresses
 ) -> Dissection | None:
     """Content of Ethernet frames; None if some have content that the compiled loops do not read."""
-    found = kernel.dissect(data, frames.start, frames.captured, frames.original)
+    found = loops.dissect(data, frames.start, frames.captured, frames.original)
     rest = _dissect(data, frames.take(found.others), addresses)
     if len(rest.datagrams.frame) or len(rest.fragments):
         return None

@@ -15,8 +15,9 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
+from mlbatch.native.capture import CaptureLoops
+from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture import link_types
 from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
 from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
@@ -27,6 +28,8 @@ from mlbatch.types import CaptureCounts, PacketBatch, Recording, StreamTable
 _ARENA_EXTRA_BYTES = 1 << 20
 # The largest snapshot length of libpcap; a longer frame is a damaged record header.
 MAX_FRAME_BYTES = 1 << 18
+# Read at the end of a file: more than the packets of some lidars in 100 ms.
+_TAIL_BYTES = 1 << 20
 # Blocks that must be complete are a little longer than the longest frame.
 MAX_BLOCK_BYTES = 1 << 20
 
@@ -59,19 +62,47 @@ class Walker(Protocol):
 class CaptureRecording(Recording):
     """A capture file.
 
-    walker: makes the Walker of a pass, with compiled loops or None; engine: `numba` for compiled
+    walker: makes the Walker of a pass, with compiled loops or None; engine: `native` for compiled
     loops. For tests: buffer_bytes, and together (False: fragments one at a time). Results do not
     depend on engine, buffer_bytes and together.
     """
 
-    walker: Callable[[CaptureKernel | None], Walker]
+    walker: Callable[[CaptureLoops | None], Walker]
     streams: StreamTable
     buffer_bytes: int = BUFFER_BYTES
     together: bool = True
     engine: str = "numpy"
+    # Start of the first record in the last bytes of a file (True: all its records), and bytes of
+    # the file before records.
+    first_record: Callable[[U8Array, bool], int | None] | None = None
+    head_bytes: int = 0
+
+    def last_packets(self, streams: StreamTable) -> PacketBatch | None:
+        """Return packets in the last bytes; None for compressed files and unknown records."""
+        with Source(self.path) as source:
+            if self.first_record is None or not source.is_plain:
+                return None
+        with self.path.open("rb") as file:
+            head = file.read(self.head_bytes)
+            at = max(self.head_bytes, self.size_bytes - _TAIL_BYTES)
+            file.seek(at)
+            tail = np.frombuffer(file.read(_TAIL_BYTES), np.uint8)
+        begin = self.first_record(tail, at == self.head_bytes)
+        if begin is None:
+            return None
+        end = len(head) + len(tail) - begin
+        data = np.zeros(end + SLACK, np.uint8)
+        data[: len(head)] = np.frombuffer(head, np.uint8)
+        data[len(head) : end] = tail[begin:]
+        frames = self.walker(None).walk(data, 0, end).frames
+        addresses = Addresses()
+        datagrams = dissect(data, frames, addresses).datagrams
+        stream = StreamNumbers(addresses, streams).numbers(datagrams.source, datagrams.port)
+        host_ns = frames.host_ns[datagrams.frame]
+        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns)
 
     def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `numba` from the next pass on."""
+        """Read by `numpy` or `native` from the next pass on."""
         self.engine = engine
 
     def packets(self) -> Generator[PacketBatch, None, None]:
@@ -93,11 +124,11 @@ class _Pass:
 
     def __init__(self, recording: CaptureRecording) -> None:
         self.recording = recording
-        self.kernel = CaptureKernel() if recording.engine == "numba" else None
-        self.walker = recording.walker(self.kernel)
+        self.loops = CaptureLoops() if recording.engine == "native" else None
+        self.walker = recording.walker(self.loops)
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
-        self.reassembler = Reassembler(recording.counts, recording.together, self.kernel)
+        self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
         self.arena_bytes = recording.buffer_bytes + _ARENA_EXTRA_BYTES
         self.unknown_link: int | None = None
         self.has_known_link = False
@@ -138,7 +169,7 @@ class _Pass:
     def _batch(self, data: U8Array, frames: Frames) -> PacketBatch:
         """The packets that these frames contain or complete; all other frames are counted."""
         self._note_links(frames.link)
-        found = dissect(data, frames, self.addresses, self.kernel)
+        found = dissect(data, frames, self.addresses, self.loops)
         counts = self.recording.counts
         counts.frames += len(frames)
         for reason, count in found.skipped.items():

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array, U32Array
-from mlbatch.decode.kernels.capture import NO_ROOM, TOO_LONG
-from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
+from mlbatch.native.capture import NO_ROOM, TOO_LONG, CaptureLoops
 from mlbatch.readers.byte_records import records
 from mlbatch.readers.capture import link_types
 from mlbatch.readers.capture.frames import Frames
@@ -38,6 +37,8 @@ _FILE_HEADER_BYTES = 24
 _LINK_AT = 20
 _RECORD_BYTES = 16
 _LENGTH_AT = 8
+# Shorter than the headers of any UDP packet.
+_LEAST_FRAME = 14
 # After this many frames of one length in a row, more are likely.
 _ALIKE = 16
 
@@ -65,21 +66,61 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
     if link not in link_types.LINKS:
         raise RecordingError(f"{path}: {link_types.unknown_link(link)}")
     walker = partial(_Walker, order, unit_ns, link)
-    return CaptureRecording(path, CONTAINER, path.stat().st_size, walker, streams)
+    return CaptureRecording(
+        path,
+        CONTAINER,
+        path.stat().st_size,
+        walker,
+        streams,
+        first_record=partial(_first_record, order, unit_ns),
+        head_bytes=_FILE_HEADER_BYTES,
+    )
+
+
+def _first_record(order: str, unit_ns: int, tail: U8Array, is_all: bool) -> int | None:
+    """Start of a record near the start of the last bytes of a file; None if there is none.
+
+    Every record begins where the one before ends, and the last one ends with the file. is_all: the
+    first record begins with the bytes.
+    """
+    count = len(tail) - _RECORD_BYTES + 1
+    if count < 1:
+        return None
+    word = np.dtype(order + "u4")
+    fraction, captured, original = (
+        np.ndarray(count, word, tail.data, at, (1,)) for at in (4, _LENGTH_AT, 12)
+    )
+    is_record = (captured >= _LEAST_FRAME) & (captured <= original)
+    is_record &= (original <= MAX_FRAME_BYTES) & (fraction < NS_PER_S // unit_ns)
+    # From the end: the next start in the chain, for each start that reaches the end of the file.
+    after = {len(tail): len(tail)}
+    first = len(tail)
+    for start in np.flatnonzero(is_record)[::-1].tolist():
+        end = start + _RECORD_BYTES + int(captured[start])
+        if end in after:
+            after[start] = end
+            first = start
+    if is_all:
+        return 0 if first == 0 else None
+    if first >= MAX_FRAME_BYTES + _RECORD_BYTES:
+        return None
+    # Bytes of a frame may look like the first header.
+    second = after[first]
+    return second if second < len(tail) else None
 
 
 class _Walker:
     """Steps from record to record."""
 
     def __init__(
-        self, order: str, unit_ns: int, link: int, kernel: CaptureKernel | None = None
+        self, order: str, unit_ns: int, link: int, loops: CaptureLoops | None = None
     ) -> None:
         names = ("seconds", "fraction", "captured", "original")
         self.layout = np.dtype([(name, order + "u4") for name in names])
         self.length = struct.Struct(order + "I")
         self.unit_ns = unit_ns
         self.link = link
-        self.kernel = kernel
+        self.loops = loops
         self.is_swapped = order == ">"
         self.skip = _FILE_HEADER_BYTES
 
@@ -87,8 +128,8 @@ class _Walker:
         """The frames in `data[begin:end]`, as far as their records are complete."""
         begin += self.skip
         self.skip = 0
-        if self.kernel is not None:
-            return self._walk_by(self.kernel, data, begin, end)
+        if self.loops is not None:
+            return self._walk_by(self.loops, data, begin, end)
         starts = self._starts(data, begin, end)
         record = records(data, self.layout, starts)
         captured = record["captured"].astype(np.int64)
@@ -111,9 +152,9 @@ class _Walker:
         more = int(captured[count]) if count < len(starts) else 0
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
-    def _walk_by(self, kernel: CaptureKernel, data: U8Array, begin: int, end: int) -> Walk:
+    def _walk_by(self, loops: CaptureLoops, data: U8Array, begin: int, end: int) -> Walk:
         """The same by compiled loops; at most as many frames as they have room for."""
-        records, place, why = kernel.walk(
+        records, place, why = loops.walk(
             data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
         )
         start, captured, original, host_ns = records
@@ -154,7 +195,10 @@ class _Walker:
     def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
         """Places of the next records as long as their frames have this length; none to many."""
         step = _RECORD_BYTES + length
-        count = max(0, (end - _RECORD_BYTES - begin) // step + 1)
+        if begin > end - _RECORD_BYTES:
+            # The last record ends behind the buffer, perhaps behind its array as well.
+            return np.zeros(0, np.int64)
+        count = (end - _RECORD_BYTES - begin) // step + 1
         at = begin + _LENGTH_AT
         lengths: U32Array = np.ndarray(count, self.layout["captured"], data.data, at, (step,))
         others = (lengths != length).nonzero()[0]

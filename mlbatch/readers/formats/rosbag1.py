@@ -13,6 +13,7 @@ import struct
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.readers.byte_records import records, single
-from mlbatch.readers.source import Decompressor, Source, Window, read_head
+from mlbatch.readers.source import BUFFER_BYTES, Decompressor, Source, Window, read_head
 from mlbatch.ros.definitions import type_key
 from mlbatch.types import Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
@@ -51,8 +52,11 @@ def recognises(head: bytes) -> bool:
     return head.startswith(_NAME)
 
 
-def open_packets(path: Path, streams: StreamTable) -> Recording:
-    """Open a bag; its payloads come from streams (topic)."""
+def open_packets(path: Path, streams: StreamTable, buffer_bytes: int = BUFFER_BYTES) -> Recording:
+    """Open a bag; its payloads come from streams (topic).
+
+    buffer_bytes: for tests, results do not depend on it.
+    """
     head = read_head(path)
     if not head.startswith(_MAGIC):
         version = head[: len(_MAGIC)].split(b"\n")[0].decode("latin-1")
@@ -62,22 +66,23 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
         )
     with Source(path) as source:
         size_bytes = source.size_bytes
-        topics, note = _indexed_topics(source, path)
+        topics, note = _indexed_topics(source, path, buffer_bytes)
     opening_notes = (note,) if note else ()
+    portions = partial(_portions, buffer_bytes)
     recording = BagRecording(
-        path, CONTAINER, size_bytes, streams, _portions, opening_notes, topics=topics
+        path, CONTAINER, size_bytes, streams, portions, opening_notes, topics=topics
     )
     if not topics:
         # A connection precedes its first message: all messages have to be read.
-        for _ in _portions(recording):
+        for _ in portions(recording):
             pass
             recording.notes = list(opening_notes)
     return recording
 
 
-def _indexed_topics(source: Source, path: Path) -> tuple[tuple[Topic, ...], str]:
+def _indexed_topics(source: Source, path: Path, buffer_bytes: int) -> tuple[tuple[Topic, ...], str]:
     """Topics by the index at a bag's end, or none and why (a note, if something is wrong)."""
-    window = Window(source)
+    window = Window(source, buffer_bytes)
     window.begin = len(_MAGIC)
     try:
         while not len((walked := _walk(window.data, window.begin, window.end)).head):
@@ -371,10 +376,10 @@ def _claims_too_much(window: Window) -> str:
     return ""
 
 
-def _portions(recording: BagRecording) -> Generator[Portion, None, None]:
+def _portions(buffer_bytes: int, recording: BagRecording) -> Generator[Portion, None, None]:
     """One pass over a bag."""
     with Source(recording.path) as source:
-        yield from _Pass(recording, source).portions()
+        yield from _Pass(recording, source).portions(buffer_bytes)
 
 
 class _Pass:
@@ -389,9 +394,9 @@ class _Pass:
         self._topics: dict[int, int] = {}
         self._cut = False
 
-    def portions(self) -> Generator[Portion, None, None]:
+    def portions(self, buffer_bytes: int) -> Generator[Portion, None, None]:
         """All selected messages."""
-        window = Window(self._source)
+        window = Window(self._source, buffer_bytes)
         window.begin = len(_MAGIC)
         window.refill()
         while True:

@@ -10,6 +10,7 @@ assigned to the model whose beams fire at the times of a Pandar40P at these elev
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -65,6 +66,7 @@ class Timing:
     """Firing times of blocks, ns after the packet's time: base + step * k / divisor.
 
     counts_back: k is 0 for the last firing group and negative before it; else 0 for the first.
+    azimuth_ns: when the rotor is at a block's azimuth, after the block's time.
     slower: factor of the step in each operation mode.
     """
 
@@ -72,6 +74,7 @@ class Timing:
     step_ns: int
     divisor: int = 1
     counts_back: bool = True
+    azimuth_ns: int = 0
     slower: tuple[int, ...] = (1, 1, 1, 1)
 
 
@@ -136,6 +139,14 @@ def _by_state(times: Mapping[tuple[str, int], I64Array]) -> tuple[I64Array, I64A
     return np.stack([times[name] for name in names]), rows
 
 
+def _clockwise(point: tuple[float, float, float], angle_deg: float) -> tuple[float, float, float]:
+    """A point rotated about z, seen from above; x right, y forward."""
+    x, y, z = point
+    cosine = math.cos(math.radians(angle_deg))
+    sine = math.sin(math.radians(angle_deg))
+    return x * cosine + y * sine, y * cosine - x * sine, z
+
+
 _TAIL_40P = Tail(22, date_at=16, us_at=10, mode_at=14, rpm_at=8)
 _TAIL_QT64 = Tail(24, date_at=18, us_at=12, mode_at=16, rpm_at=10)
 _TAIL_XT = Tail(24, date_at=13, us_at=19, mode_at=10, rpm_at=11)
@@ -149,7 +160,9 @@ _TAIL_AT128 = Tail(32, 26, 20, mode_at=24, rpm_at=18, rpm_is_signed=True, has_cr
 _TAIL_JT16 = Tail(74, date_at=6, us_at=12, sequence_bytes=2, has_crc=True)
 
 _TO_15_DEG = (-25.0, 15.0)
-_XT_BACK = Timing(5632, 50000)
+# The SDK rotates an XT by its firing-time file, which begins at 6 us (5632 + 368 ns): the azimuth
+# of a block is that of 5632 ns before the time of the block (section 6).
+_XT_BACK = Timing(5632, 50000, azimuth_ns=-5632)
 
 PANDAR40P = Model(
     "Pandar40P",
@@ -310,7 +323,8 @@ JT16 = Model(
     tail=_TAIL_JT16,
     timing=Timing(0, 0),
     firing_ns=np.zeros((1, 16), np.int64),
-    centre_mm=(-6.25, 10.955, 3.911),
+    # Its angles are 190 deg ahead of the axes of the centre (section 6).
+    centre_mm=_clockwise((-6.25, 10.955, 3.911), 190.0),
     elevation_deg=None,
     verified="one source",
     header=16,

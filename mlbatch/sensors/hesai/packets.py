@@ -1,9 +1,9 @@
 """HESAI packets to timestamps, rotor positions and ranges, for all models.
 
 Source: docs/sources/hesai.md sections 2 to 5 (dates: 4) and 7. A column is a firing group: one
-block for each return, all of one azimuth. Azimuth and time of a block are those of firing offset 0;
-some models count offsets back from there, so timestamp and angle of a column are those of its
-earliest firing.
+block for each return, all of one azimuth. Time of a block is that of firing offset 0, and so is its
+azimuth, but for XT models (`Timing.azimuth_ns`); some models count offsets back from there, so
+timestamp and angle of a column are those of its earliest firing.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class PacketReader:
         offset_ns = timing.base_ns + step_ns[:, None] * group // timing.divisor
         revolutions = self._azimuths(body)[:, :: layout.mode.returns] / layout.model.ticks
         speed = np.broadcast_to(self._revolutions_per_s(body)[:, None], revolutions.shape)
-        revolutions += speed * (first_ns * _S_PER_NS)
+        revolutions += speed * ((first_ns - timing.azimuth_ns) * _S_PER_NS)
         return ColumnHeaders(
             packet_ns[:, None] + offset_ns + first_ns,
             rotor_words(revolutions, speed, table),
@@ -280,4 +280,4 @@ def _record_dtype(layout: Layout) -> np.dtype[np.void]:
             "itemsize": layout.stride,
         }
     )
-    return np.dtype([("block", block, layout.mode.returns)])
+    return np.dtype([("block", block, (layout.mode.returns,))])

@@ -32,6 +32,7 @@ from mlbatch.sensors.livox.packets import (
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import most_common
 from mlbatch.types import ColumnHeaders, ImuSamples, Pixels
+from mlbatch.units import NS_PER_S
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
 
@@ -124,9 +125,17 @@ class LivoxLidar(BaseLidar):
         self.timestamp_mode = _CLOCKS.get(most_common(headers(packets)["time_type"]), "")
         self.sequence_modulus = _COUNTER_MODULUS if _is_continuous(packets) else 0
         self.notes = (_SHARED_STAMP,) if _share_stamps(packets) else ()
+        # No rotor, hence no dark sectors.
+        self.lit_share = 1.0
+        self._packets_per_s = 0.0 if self.notes else _packets_per_s(packets)
         self.last_xyz_m: F64Array = np.empty((0, 3))
         self._kind = kind
         self._check_crc = check_crc
+
+    @property
+    def columns_per_s(self) -> float:
+        """Points sent in a second, by the first packets."""
+        return self.columns_per_packet * self._packets_per_s
 
     def faults(self, packets: U8Array) -> U8Array:
         """(P,) index into FAULTS."""
@@ -156,6 +165,10 @@ class LivoxLidar(BaseLidar):
     def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
         """Samples of IMU packets (P, size)."""
         return read_imu(payloads, sensor)
+
+    def sensor_from_imu(self) -> F64Array:
+        """Identity: livox_ros_driver2 publishes points and IMU data in one frame."""
+        return np.eye(4)
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
         """Transform of the last points read into the body frame."""
@@ -196,6 +209,16 @@ def _is_continuous(packets: U8Array) -> bool:
     expected = np.cumsum(steps_ns) / median(next_ns)
     away = np.abs(np.cumsum(steps) - expected)
     return bool((away <= _COUNTER_SHARE * np.abs(expected) + _COUNTER_SLACK).all())
+
+
+def _packets_per_s(packets: U8Array) -> float:
+    """Packets in a second by the timestamps of consecutive ones; 0: unknown."""
+    head = headers(packets)
+    steps_ns = np.diff(head["stamp_ns"].astype(np.int64))
+    counter: I64Array = head["counter"].astype(np.int64)
+    is_next = (counter[1:] - counter[:-1]) % _COUNTER_MODULUS == 1
+    next_ns = steps_ns[is_next & (steps_ns > 0)]
+    return NS_PER_S / median(next_ns) if len(next_ns) else 0.0
 
 
 def _share_stamps(packets: U8Array) -> bool:

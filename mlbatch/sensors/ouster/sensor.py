@@ -161,6 +161,7 @@ class OusterLidar:
         self.packet_size = layout.packet_size
         self.columns_per_packet = layout.columns
         self.column_period_ns = _column_period_ns(described)
+        self.lit_share: float | None = _lit_share(described)
         self.records = Records(layout.record_start, layout.record_size, layout.record_size)
         self.pixel_layout = (VENDOR, layout.profile.name, layout.beams, described.strongest_first)
         # The type of dual returns follows from their order, see `typed_by`.
@@ -188,6 +189,11 @@ class OusterLidar:
         self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
         self._packets_per_frame = in_window
         self.sequence_modulus = self._frame_ids * in_window
+
+    @property
+    def columns_per_s(self) -> float:
+        """Columns sent in a second, within the azimuth window."""
+        return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether packets carry this sensor's serial number, or none."""
@@ -278,6 +284,13 @@ def _column_period_ns(described: Metadata) -> float:
     if not revolutions_per_s.isdigit() or not int(revolutions_per_s):
         return 0.0
     return NS_PER_S / (described.columns_per_frame * int(revolutions_per_s))
+
+
+def _lit_share(described: Metadata) -> float:
+    """Share of the columns of a revolution that the azimuth window contains."""
+    first, last = described.column_window
+    columns = described.columns_per_frame
+    return ((last - first) % columns + 1) / columns
 
 
 def _packet_ranks(described: Metadata) -> tuple[I64Array, int]:

@@ -16,9 +16,18 @@ from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.packet_bytes import has_bytes, most_common, number
-from mlbatch.sensors.robosense.identify import identify, is_difop, returns_of
+from mlbatch.sensors.robosense.identify import (
+    Identity,
+    identify,
+    is_difop,
+    point_packets,
+    returns_of,
+    ruby_type,
+)
 from mlbatch.sensors.robosense.models import (
     AIRY_LAYOUT,
+    HELIOS_16,
+    HELIOS_32,
     HELIOS_LAYOUT,
     OTHER,
     ROWS,
@@ -39,7 +48,7 @@ _INSTALLATION_AT = 289
 _SERIAL = slice(292, 298)
 _MODE_AT = 300
 _SYNC_AT = 302
-_REVERSED_AT = 337
+_REVERSAL_AT = 337
 _SYNC_STATES = {0: "not synchronised", 1: "GPS", 2: "PTP"}
 # Channels of all models; a csv file has as many lines.
 _CHANNELS = tuple(sorted({row.channels for row in ROWS}))
@@ -60,6 +69,7 @@ class Difop:
 
     firmware: bytes 41 to 43, which are 0 in early units.
     sync: state in words.
+    reversal: byte 337, not 0 if the rotor is set to reverse.
     """
 
     payload: U8Array
@@ -67,7 +77,7 @@ class Difop:
     mode: int
     sync: str
     installation: int
-    is_reversed: bool
+    reversal: int
     firmware: int
 
     def angles(self, model: Model) -> Angles | None:
@@ -151,7 +161,7 @@ def _difop(packets: U8Array) -> Difop:
         mode=int(median_packet[_MODE_AT]),
         sync=_SYNC_STATES.get(int(median_packet[_SYNC_AT]), ""),
         installation=int(median_packet[_INSTALLATION_AT]),
-        is_reversed=bool(median_packet[_REVERSED_AT] == 1),
+        reversal=int(median_packet[_REVERSAL_AT]),
         firmware=int.from_bytes(median_packet[_FIRMWARE].tobytes(), "big"),
     )
 
@@ -206,12 +216,27 @@ def _number(text: str) -> float:
 
 COUNTER_MODULUS = 1 << 32
 _COUNTED_PACKETS = 16
-# Helios, byte 17: distance unit, here as units in a metre.
+# Helios: option and values in units per metre; byte that was 0 for 5 mm in early manuals.
+RANGE_UNIT = "range_unit"
+_UNITS_PER_M = {"2.5mm": 400, "5mm": 200}
 _STEP_AT = 17
-_STEPS_PER_M = {0: 200, 1: 400}
-# Ruby Plus 80: offset of the model byte, on which sources disagree.
-_VARIANT_BYTES = (31, 32)
 _PLUS_80V = 3
+
+
+def identify_unit(evidence: Evidence) -> Identity | None:
+    """Identify the point packets of a unit, by its return mode where they do not suffice."""
+    found = identify(point_packets(evidence.sample))
+    if found is None or found.other is not HELIOS_16:
+        return found
+    try:
+        difop = find_difop(evidence)
+    except RigError:
+        return found
+    stated = None if difop is None else HELIOS_32.modes.get(difop.mode)
+    if stated is None:
+        return found
+    row = HELIOS_16 if stated.returns == 2 else HELIOS_32
+    return Identity(row.name, row)
 
 
 def return_mode(
@@ -228,16 +253,19 @@ def return_mode(
     return ReturnMode(1, OTHER), (note,)
 
 
-def units_per_m(points: U8Array, row: Model) -> tuple[int, tuple[str, ...]]:
-    """Raw distance units in a metre; and notes."""
-    if row.layout is not HELIOS_LAYOUT or not len(points):
+def units_per_m(points: U8Array, row: Model, chosen: str) -> tuple[int, tuple[str, ...]]:
+    """Raw distance units in a metre; and notes. chosen: of the option `range_unit`, or ""."""
+    if row.layout is not HELIOS_LAYOUT:
         return row.units_per_m, ()
-    code = most_common(number(points, _STEP_AT, 1))
-    found = _STEPS_PER_M.get(code, row.units_per_m)
-    if found == row.units_per_m:
-        return found, ()
-    note = "according to byte 17 of its packets distances count in 5 mm; other units use 2.5 mm"
-    return found, (note,)
+    if chosen:
+        return _UNITS_PER_M[chosen], ()
+    if not len(points) or most_common(number(points, _STEP_AT, 1)):
+        return row.units_per_m, ()
+    note = (
+        "byte 17 of its packets is 0: ranges count in 2.5 mm as in current manuals, in early ones "
+        "in 5 mm; check a known distance, and give --decode range_unit=2.5mm or range_unit=5mm"
+    )
+    return row.units_per_m, (note,)
 
 
 def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
@@ -246,7 +274,7 @@ def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
     if row.layout is AIRY_LAYOUT and difop is not None:
         chosen = difop.installation
     elif row is RUBY_PLUS_80 and len(points):
-        chosen = int(_PLUS_80V in {most_common(number(points, at, 1)) for at in _VARIANT_BYTES})
+        chosen = int(ruby_type(points)[1] == _PLUS_80V)
     known = row.firing_ns[chosen] if chosen < len(row.firing_ns) else row.firing_ns[0]
     return np.array([known], np.int64) - min(known)
 
@@ -261,19 +289,27 @@ def is_counted(points: U8Array, row: Model) -> bool:
 
 
 def notes_on_model(
-    points: U8Array, row: Model, difop: Difop | None, *, is_named: bool
+    found: Identity | None, row: Model, difop: Difop | None, *, is_named: bool
 ) -> tuple[str, ...]:
-    """Notes on what packets leave open; is_named: the rig names the model."""
+    """Notes on what packets leave open.
+
+    found: identity of the packets; is_named: the rig names the model.
+    """
     texts = []
-    found = identify(points)
-    if found is not None and found.other is not None and not is_named:
+    if found is not None and found.model and found.other and not is_named:
+        names = " or ".join(sorted((found.model.name, found.other.name)))
         texts.append(
-            f"packets fit {found.name}: decoded as {row.name}; name the sensor's model in the rig "
-            "if it is the other (times differ by up to 34 us)"
+            f"packets fit {names}: decoded as {row.name}; name the sensor's model in the rig if it "
+            f"is the other ({found.doubt})"
         )
     if row in (RS16, RS32) and difop is not None and difop.firmware == 0:
         texts.append(
             "DIFOP states no firmware: early firmware counted distances in 1 cm, not in 5 mm as "
             "decoded here; check a known distance"
+        )
+    if row.mirrors and difop is not None and difop.reversal > 1:
+        texts.append(
+            f"expected DIFOP byte 337 to be 0 or 1, found {difop.reversal}: azimuths are mirrored "
+            "as for a reversed rotor, as rs_driver does; check left and right"
         )
     return tuple(texts)

@@ -6,7 +6,7 @@ Source: docs/sources/robosense.md sections 1 to 4 and 7.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,14 +24,14 @@ from mlbatch.sensors.packet_bytes import (
 )
 from mlbatch.sensors.robosense import models as rows
 from mlbatch.sensors.robosense.models import SECOND_KIND, VENDOR, Layout, Model
+from mlbatch.sensors.robosense.packets import in_time_form
 
 _SOLID_STATE = bytes.fromhex("55aa5aa5")
 DIFOP = bytes.fromhex("a5ff005a11115555")
 _IMU = bytes.fromhex("aa555a05")
 _IMU_SIZE = 51
-_OLD_TYPE_AT = 30
-_TYPE_AT = 31
-_MODEL_AT = 32
+# Bytes of type and model, which sources place differently (section 2).
+_TYPE_BYTES = (30, 31, 32)
 _MINUTE_US = 60_000_000
 _PACE_TOLERANCE = 0.1
 _SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812: "EM"}
@@ -43,23 +43,29 @@ class Identity:
 
     name: in words.
     model: its row, None without a decoder.
-    other: another model with the same type bytes.
+    other: another model that packets may be of; doubt: why, and what differs.
     """
 
     name: str
     model: Model | None
     other: Model | None = None
+    doubt: str = ""
 
 
-_OLD_TYPES = {
+# First kind, by type: byte 30, else 31.
+_FIRST_TYPES = {
     1: Identity("RS-LiDAR-16", rows.RS16),
     2: Identity("RS-LiDAR-32", rows.RS32),
     3: Identity("RS-Bpearl v3", rows.BPEARL_V3),
 }
+_BPEARL = 3
 _BPEARL_V4 = Identity("RS-Bpearl v4", rows.BPEARL_V4)
-_BPEARL_V4_TYPE = 3
-_BPEARL_V4_MODELS = (0, 4)
-# Second kind, by type and model; None: any model.
+_BPEARL_V4_MODEL = 4
+_BPEARL_DOUBT = (
+    "packets of type 3 and model 0 are those of an RS-Bpearl v4 in its manual and of a v3 in "
+    "rs_driver; ranges differ by a factor of 2"
+)
+# Second kind, by bytes 31 and 32; None: any model.
 _TYPES: Mapping[tuple[int, int | None], Identity] = {
     (6, 1): Identity("Helios 32, 70 degrees", rows.HELIOS_32),
     (6, 2): Identity("Helios 32, 31 degrees", rows.HELIOS_32),
@@ -70,13 +76,23 @@ _TYPES: Mapping[tuple[int, int | None], Identity] = {
     (0x31, 2): Identity("Airy 96", rows.AIRY_96),
     (0x31, 3): Identity("Airy 192", None),
 }
+# Without a model byte: rs_driver has the type at byte 30, some manuals have it at 31.
+_HELIOS = 6
+_HELIOS_16 = 7
+_HELIOS_DOUBT = (
+    "packets of a Helios 32 with one return and of a Helios 16 with two are alike; channels differ"
+)
 # Ruby: by readings per block.
 _RUBIES = {
     128: (rows.RUBY_128, rows.RUBY_PLUS_128),
     80: (rows.RUBY_80, rows.RUBY_PLUS_80),
     48: (rows.RUBY_48, rows.RUBY_PLUS_48),
 }
+_RUBY_TYPES = (4, 5)
 _RUBY_PLUS_TYPE = 5
+# Ruby Plus 80 and 80v, where rs_driver has the model: byte 31.
+_PLUS_80_MODELS = (2, 3)
+_RUBY_DOUBT = "type bytes do not distinguish them; times differ by up to 34 us"
 MODE_WORDS = {0: "", 1: "single return", 2: "dual return"}
 
 
@@ -128,24 +144,66 @@ def identify(packets: U8Array) -> Identity | None:
 
 
 def _identity(packets: U8Array, layout: Layout) -> Identity:
-    old, kind, model = (
-        most_common(number(packets, at, 1)) for at in (_OLD_TYPE_AT, _TYPE_AT, _MODEL_AT)
-    )
-    rubies = _RUBIES.get(layout.per_block) if layout.block_id == b"\xfe" else None
-    if rubies is not None:
-        name = f"{rubies[0].name} or {rubies[1].name}"
-        own, other = rubies[::-1] if kind == _RUBY_PLUS_TYPE else rubies
-        return Identity(name, own, other)
+    if layout.block_id == b"\xfe":
+        return _ruby(packets, layout)
+    old, kind, model = _type_bytes(packets)
     if layout.magic == SECOND_KIND:
         found = _TYPES.get((kind, model)) or _TYPES.get((kind, None))
-        shown = f"{kind:02X} {model:02X}"
+        if found is None and layout is rows.HELIOS_LAYOUT and {_HELIOS, _HELIOS_16} & {old, kind}:
+            found = _helios(packets, kind if kind in (_HELIOS, _HELIOS_16) else old)
     else:
-        is_v4 = kind == _BPEARL_V4_TYPE and model in _BPEARL_V4_MODELS
-        found = _BPEARL_V4 if is_v4 else _OLD_TYPES.get(old)
-        shown = f"{old:02X} {kind:02X}"
+        found = _FIRST_TYPES.get(old) or _FIRST_TYPES.get(kind)
+        if kind == _BPEARL and model in (0, _BPEARL_V4_MODEL):
+            found = _bpearl(packets, model)
     if found is None or (found.model is not None and found.model.layout != layout):
-        return Identity(f"of unknown model (type bytes {shown})", None)
+        return Identity(f"of unknown model (type bytes {old:02X} {kind:02X} {model:02X})", None)
     return found
+
+
+def _type_bytes(packets: U8Array) -> tuple[int, int, int]:
+    old, kind, model = (most_common(number(packets, at, 1)) for at in _TYPE_BYTES)
+    return old, kind, model
+
+
+def _bpearl(packets: U8Array, model: int) -> Identity:
+    """Bpearl of type 3: model 4 is a v4; model 0 is either, distinguished by the form of times."""
+    if model == _BPEARL_V4_MODEL:
+        return _BPEARL_V4
+    versions = [_BPEARL_V4, _FIRST_TYPES[_BPEARL]]
+    if in_time_form(packets, rows.BPEARL_V4).is_calendar:
+        versions.reverse()
+    return replace(versions[0], other=versions[1].model, doubt=_BPEARL_DOUBT)
+
+
+def _helios(packets: U8Array, kind: int) -> Identity:
+    """Helios of a type without model byte, distinguished by the time a block takes.
+
+    A block is one round of 32 lines, or two rounds of 16 (one round with two returns).
+    """
+    narrow = Identity("Helios 16", rows.HELIOS_16)
+    wide = Identity("Helios 32", rows.HELIOS_32)
+    if kind == _HELIOS_16 or returns_of(packets, rows.HELIOS_16) == 1:
+        return narrow
+    if returns_of(packets, rows.HELIOS_32) == 2:
+        return wide
+    return replace(wide, other=rows.HELIOS_16, doubt=_HELIOS_DOUBT)
+
+
+def ruby_type(packets: U8Array) -> tuple[int, int, bool]:
+    """Type and model of Ruby packets, and whether they are at bytes 30 and 31, not 31 and 32."""
+    old, kind, model = _type_bytes(packets)
+    if old not in _RUBY_TYPES and kind in _RUBY_TYPES:
+        return kind, model, False
+    return old, kind, True
+
+
+def _ruby(packets: U8Array, layout: Layout) -> Identity:
+    ruby, plus = _RUBIES[layout.per_block]
+    kind, model, is_early = ruby_type(packets)
+    if is_early and layout is rows.RUBY_80_LAYOUT and model in _PLUS_80_MODELS:
+        return Identity(plus.name, plus)
+    own, other = (plus, ruby) if kind == _RUBY_PLUS_TYPE else (ruby, plus)
+    return Identity(f"{ruby.name} or {plus.name}", own, other, _RUBY_DOUBT)
 
 
 def returns_of(packets: U8Array, model: Model) -> int:

@@ -138,7 +138,7 @@ class Model:
     range_mask: their bits.
     lens_m: radius and height of the lens.
     nominal_deg: elevations to assume without the unit's.
-    mirrors: azimuths count backwards if the rotor is set to reverse.
+    mirrors: azimuths count backwards if the rotor is set to reverse (DIFOP byte 337).
     has_sync: DIFOP bytes 301 and 302 are the state of synchronisation.
     """
 
@@ -244,6 +244,7 @@ BPEARL_V3 = replace(
     angles=AngleOffsets(468, 564, 0.01),
     counter_at=12,
     has_sync=True,
+    mirrors=True,
 )
 BPEARL_V4 = replace(
     BPEARL_V3,
@@ -255,7 +256,6 @@ BPEARL_V4 = replace(
     modes=_NEW_MODES,
     is_calendar=False,
     nominal_deg=_BPEARL_V4_DEG,
-    mirrors=True,
 )
 HELIOS_32 = Model(
     "Helios 32",

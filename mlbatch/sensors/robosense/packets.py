@@ -6,7 +6,7 @@ round; a block carries the rotor's angle at the begin of its (first) round.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array, med
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import FAULTS, Records
 from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.packet_bytes import has_bytes, number
+from mlbatch.sensors.packet_bytes import has_bytes, majority, number
 from mlbatch.sensors.robosense.models import READING, Layout, Model
 from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import NS_PER_S, NS_PER_US
@@ -97,6 +97,19 @@ def times_ns(packets: U8Array, model: Model) -> tuple[I64Array, BoolArray]:
     days = months.astype("datetime64[D]").astype(np.int64) + day - 1
     seconds = ((days * 24 + hour) * 60 + minute) * 60 + second
     return seconds * NS_PER_S + (milli * 1000 + micro) * NS_PER_US, good
+
+
+def in_time_form(packets: U8Array, model: Model) -> Model:
+    """The model with times in the form that most packets (k, size) have: calendar or seconds.
+
+    A time is seldom valid in both forms: seconds up to 2106 begin with two bytes 0, where calendar
+    times have the month.
+    """
+    other = replace(model, is_calendar=not model.is_calendar)
+    own_form, other_form = (
+        majority(packets, times_ns(packets, one)[1]) is not None for one in (model, other)
+    )
+    return other if other_form and not own_form else model
 
 
 class PacketReader:
@@ -185,7 +198,9 @@ class PacketReader:
         shape = self._shape
         at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
         azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
-        return azimuth, (azimuth < _CDEG_PER_REVOLUTION) & _has_ids(packets, at, layout)
+        # Sensors round the last angles of a revolution up to 360 degrees.
+        good = (azimuth <= _CDEG_PER_REVOLUTION) & _has_ids(packets, at, layout)
+        return azimuth % _CDEG_PER_REVOLUTION, good
 
     def _steps(self, azimuth: I64Array, good: BoolArray) -> tuple[F64Array, I64Array]:
         """Speed (P,) of the rotor, 0.01 degree/s, and begin (P, rows) of the rows, ns.

@@ -23,10 +23,12 @@ from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import majority, number
 from mlbatch.sensors.robosense.difop import (
     COUNTER_MODULUS,
+    RANGE_UNIT,
     Angles,
     Difop,
     find_difop,
     firing_ns,
+    identify_unit,
     is_counted,
     notes_on_model,
     read_angles,
@@ -35,14 +37,14 @@ from mlbatch.sensors.robosense.difop import (
 )
 from mlbatch.sensors.robosense.identify import (
     MODE_WORDS,
+    Identity,
     describe,
     fits,
-    identify,
     is_difop,
     point_packets,
 )
-from mlbatch.sensors.robosense.models import ROWS, VENDOR, Model
-from mlbatch.sensors.robosense.packets import PacketReader, shape_of, times_ns
+from mlbatch.sensors.robosense.models import FIRST_LAYOUT, ROWS, VENDOR, Model
+from mlbatch.sensors.robosense.packets import PacketReader, in_time_form, shape_of, times_ns
 from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import RAD_PER_DEG
 
@@ -93,12 +95,12 @@ class DifopCalibration:
 
     def match_score(self, evidence: Evidence) -> int:
         """Match score: point packets name this model, or can at least be decoded as it."""
-        points = point_packets(evidence.sample)
-        found = identify(points)
+        found = identify_unit(evidence)
         if found is not None and found.model is self._row:
             return _FITS_MODEL
         if found is not None and found.other is self._row and self._is_named:
             return _FITS_MODEL
+        points = point_packets(evidence.sample)
         chosen = majority(points, fits(points, self._row.layout))
         if chosen is None:
             return 0
@@ -177,7 +179,11 @@ class CsvCalibration:
                 "its unit"
             )
         difop = find_difop(evidence)
-        is_named = self._named is not None
+        found = identify_unit(evidence)
+        # The number of lines decides as well.
+        is_named = self._named is not None or (
+            found is not None and found.other is not None and len(self._fitting(found)) == 1
+        )
         lidar = RobosenseLidar(row, self._angles, options, evidence, difop, is_named=is_named)
         lidar.calibration = str(self.path)
         return lidar
@@ -185,9 +191,13 @@ class CsvCalibration:
     def _row(self, evidence: Evidence) -> Model | None:
         if self._named is not None:
             return self._named if DifopCalibration(self._named).match_score(evidence) else None
-        found = identify(point_packets(evidence.sample))
-        row = None if found is None else found.model
-        return row if row and row.channels == len(self._angles.elevation_deg) else None
+        found = identify_unit(evidence)
+        return None if found is None else next(iter(self._fitting(found)), None)
+
+    def _fitting(self, found: Identity) -> list[Model]:
+        """Models that packets may be of, with a channel for each line of the file."""
+        lines = len(self._angles.elevation_deg)
+        return [row for row in (found.model, found.other) if row and row.channels == lines]
 
 
 BUILT_IN: tuple[Calibration, ...] = tuple(DifopCalibration(row) for row in ROWS)
@@ -214,10 +224,11 @@ class RobosenseLidar(BaseLidar):
         """is_named: the rig names the model."""
         points = point_packets(evidence.sample)
         points = points[fits(points, row.layout)]
-        returned, mode_notes = return_mode(points, row, difop)
-        steps_per_m, unit_notes = units_per_m(points, row)
+        timed, time_notes = _timed(points, row)
+        returned, mode_notes = return_mode(points, timed, difop)
+        steps_per_m, unit_notes = units_per_m(points, row, options.get(RANGE_UNIT, ""))
         shape = shape_of(row, returned.returns)
-        mirrored = row.mirrors and difop is not None and difop.is_reversed
+        mirrored = row.mirrors and difop is not None and difop.reversal != 0
         self.vendor = VENDOR
         self.model = row.name
         self.serial = "" if difop is None else difop.serial
@@ -231,6 +242,7 @@ class RobosenseLidar(BaseLidar):
         self.packet_size = evidence.size
         self.columns_per_packet = shape.rows * shape.columns
         self.column_period_ns = float(row.round_ns)
+        self._columns_per_round = returned.returns if shape.is_split else 1
         self.records = shape.records
         self.return_types = (returned.type,) * shape.returns
         self.channel = np.arange(row.channels)
@@ -248,13 +260,18 @@ class RobosenseLidar(BaseLidar):
             shape.returns,
         )
         self.calibration = ""
-        doubtful = notes_on_model(points, row, difop, is_named=is_named)
-        self.notes = (*mode_notes, *unit_notes, *doubtful)
+        doubtful = notes_on_model(identify_unit(evidence), row, difop, is_named=is_named)
+        self.notes = (*time_notes, *mode_notes, *unit_notes, *doubtful)
         self._row = row
         moving = options.get("firing_azimuth") != "off"
-        self._packets = PacketReader(row, shape, steps_per_m, mirrored=mirrored, moving=moving)
+        self._packets = PacketReader(timed, shape, steps_per_m, mirrored=mirrored, moving=moving)
         self._packets.learn_speed(points)
         self.pixels = self._packets.pixels()
+
+    @property
+    def columns_per_s(self) -> float:
+        """Columns sent in a second: one a round, or one for each of its returns."""
+        return self._columns_per_round * super().columns_per_s
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) True for point packets, False for device packets on the same topic."""
@@ -279,6 +296,21 @@ class RobosenseLidar(BaseLidar):
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, record size) into `out`."""
         self._packets.read(records, which, out)
+
+
+def _timed(points: U8Array, row: Model) -> tuple[Model, tuple[str, ...]]:
+    """The model with the form of times that packets have; and notes."""
+    if row.layout is not FIRST_LAYOUT or not len(points):
+        return row, ()
+    timed = in_time_form(points, row)
+    if timed.is_calendar == row.is_calendar:
+        return row, ()
+    forms = {True: "dates", False: "seconds since 1970"}
+    note = (
+        f"expected {forms[row.is_calendar]} in the packets of an {row.name}, found "
+        f"{forms[timed.is_calendar]}, which are used; check the model"
+    )
+    return timed, (note,)
 
 
 def beam_table(row: Model, angles: Angles, *, mirrored: bool) -> BeamTable:

@@ -81,7 +81,7 @@ def identify(size: int, packets: U8Array) -> Identity | None:
         return None
     flags = block_flags(packets)
     azimuth = block_azimuths(packets, 0, STRIDE, BLOCKS, "<")
-    one_bank = (flags == BANK_FLAGS[1][0]).all(axis=1) & (azimuth < CIRCLE_CDEG).all(axis=1)
+    one_bank = (flags == BANK_FLAGS[1][0]).all(axis=1) & (azimuth <= CIRCLE_CDEG).all(axis=1)
     return (
         _four_banks(packets, flags, azimuth)
         or _two_banks(packets, flags, azimuth)
@@ -102,7 +102,7 @@ def describe(size: int, sample: U8Array) -> str | None:
         return "LSLIDAR device packet"
     if size == _LSLIDAR_SIZE:
         azimuth = block_azimuths(packets, 0, STRIDE, BLOCKS, "<")
-        alike = (block_flags(packets) == BANK_FLAGS[1][0]) & (azimuth < CIRCLE_CDEG)
+        alike = (block_flags(packets) == BANK_FLAGS[1][0]) & (azimuth <= CIRCLE_CDEG)
         look_alike = majority(packets, alike.all(axis=1)) is not None
         return f"LSLIDAR-like, {size} bytes: not supported" if look_alike else None
     seen = identify(size, packets)
@@ -129,7 +129,7 @@ def _four_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identit
         expected = expected_flags(4, returns)
         used = len(expected)
         good = (flags[:, :used] == expected).all(axis=1)
-        good &= (azimuth[:, :used] < CIRCLE_CDEG).all(axis=1) & _within_the_hour(packets)
+        good &= (azimuth[:, :used] <= CIRCLE_CDEG).all(axis=1) & _within_the_hour(packets)
         chosen = majority(packets, good)
         if chosen is not None:
             mode = MODES.get(most_common(number(chosen, MODE_AT, 1)), "")
@@ -141,7 +141,7 @@ def _four_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identit
 def _two_banks(packets: U8Array, flags: I64Array, azimuth: I64Array) -> Identity | None:
     """HDL-64E: alternating upper and lower blocks; dual returns have four equal azimuths."""
     good = (flags == expected_flags(2, 1)).all(axis=1)
-    good &= (azimuth < CIRCLE_CDEG).all(axis=1)
+    good &= (azimuth <= CIRCLE_CDEG).all(axis=1)
     if majority(packets, good) is None:
         return None
     return Identity(HDL_64E, UNSET_MODES[in_pairs(azimuth[good][:, 0::2])], banks=2)

@@ -26,6 +26,7 @@ STAMP_AT = 1200
 MODE_AT = 1204
 _BLOCK_HEAD = 4
 _READING = 3
+# Packets may have this azimuth, which is that of 0.
 CIRCLE_CDEG = 36000
 # Block flags as numbers; a firing sequence has a block of each bank.
 BANK_FLAGS = {1: (0xEEFF,), 2: (0xEEFF, 0xDDFF), 4: (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)}

@@ -211,7 +211,7 @@ def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:
     flags = expected_flags(model.banks, returns)
     used = len(flags)
     blocks = _block_words(packets, 0, used) == flags
-    blocks &= _block_words(packets, _AZIMUTH_AT, used) < CIRCLE_CDEG
+    blocks &= _block_words(packets, _AZIMUTH_AT, used) <= CIRCLE_CDEG
     good = blocks.all(axis=1)
     good &= top_of_hour_ns(packets) < HOUR_NS
     if model.banks == 1:  # Other models differ by flags; the HDL-64E has its status there.
@@ -220,8 +220,13 @@ def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:
 
 
 def first_azimuths(packets: U8Array, where: Layout) -> I64Array:
-    """(P, sequences) azimuths, 0.01 degree, of the first block of every firing sequence."""
-    return _block_words(packets, _AZIMUTH_AT, where.sequences, where.blocks)
+    """(P, sequences) azimuths of the first block of every firing sequence.
+
+    0.01 degree, from 0 to 35999: packets may have 36000 for 0.
+    """
+    azimuth = _block_words(packets, _AZIMUTH_AT, where.sequences, where.blocks)
+    azimuth[azimuth == CIRCLE_CDEG] = 0
+    return azimuth
 
 
 def _block_words(packets: U8Array, at: int, count: int, every: int = 1) -> I64Array:

@@ -7,6 +7,7 @@ but the HDL-64E have built-in tables, which a file of angles (YAML or db.xml) re
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from mlbatch.sensors.velodyne.packets import (
     mean_step,
     steps,
 )
-from mlbatch.units import RAD_PER_DEG
+from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "VelodyneCalibration", "describe", "read_calibration"]
 
@@ -114,16 +115,21 @@ class VelodyneCalibration:
                 f"{self.row.reported_as}: expected its calibration, found none; give the unit's "
                 "YAML or db.xml with --metadata or as `metadata:` in the rig"
             )
+        has_heights = chosen["vertical_offset"] == "on"
         measured, notes = _measure(self.row, evidence)
-        if self.file is not None:
-            notes += [*self.file.notes, *_file_notes(self)]
+        file = self.file
+        if file is not None:
+            notes += [*file.notes, *_file_notes(self)]
+            if has_heights and self.row.height_mm and not file.vert_offset_m.any():
+                file, note = _with_built_in_heights(file, self.row)
+                notes.append(note)
         return VelodyneLidar(
             self.row,
-            self.file,
+            file,
             measured,
             Options(
                 firing_azimuth=chosen["firing_azimuth"] == "on",
-                vertical_offset=chosen["vertical_offset"] == "on",
+                vertical_offset=has_heights,
                 stamp_is_end=chosen["packet_stamp"] == "end",
             ),
             tuple(notes),
@@ -184,6 +190,20 @@ def _file_notes(calibration: VelodyneCalibration) -> list[str]:
                 f"in {unit_m:g} m, which is used"
             )
     return notes
+
+
+def _with_built_in_heights(file: VelodyneFile, row: Model) -> tuple[VelodyneFile, str]:
+    """The file with the heights of the model, and a note.
+
+    ROS drivers write 0 for all lasers where they do not know the heights (docs/sources/velodyne.md
+    sections 5 and 9).
+    """
+    height_m = np.array(row.height_mm) * M_PER_MM
+    note = (
+        f"{file.path}: the vertical offsets of all lasers are 0; those of a {row.name} are used, "
+        f"up to {np.abs(row.height_mm).max():.1f} mm (vertical_offset=off: none)"
+    )
+    return replace(file, vert_offset_m=height_m), note
 
 
 def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]]:

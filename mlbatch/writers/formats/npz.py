@@ -55,13 +55,17 @@ def extras(options: WriterOptions) -> frozenset[str]:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of npz files."""
-    return FolderWriter(target, info, options, FORMAT, lambda: NpzEncoder(info))
+    return FolderWriter(
+        target, info, options, FORMAT, lambda: NpzEncoder(info, split=options.split)
+    )
 
 
 class NpzEncoder:
     """Encodes scans of one run; owns the buffers that make arrays contiguous."""
 
-    def __init__(self, info: RunInfo) -> None:
+    def __init__(self, info: RunInfo, *, split: bool = False) -> None:
+        """split: every scan is of one sensor."""
+        self._split = split
         self._packed: dict[str, Array] = {}
         self._constant: dict[str, Array] = {
             "slices": np.array(info.slices, dtype=np.int64),
@@ -69,6 +73,7 @@ class NpzEncoder:
             "frame_id": np.array(info.frame_id, dtype=np.str_),
             "rate_hz": np.array(info.rate_hz, dtype=np.str_),
             "timescale": np.array(info.timescale, dtype=np.str_),
+            "sort": np.array(info.sort, dtype=np.str_),
             "schema": np.array(SCHEMA, dtype=np.str_),
         }
 
@@ -97,6 +102,7 @@ class NpzEncoder:
             "index": np.array(scan.index, dtype=np.int64),
             "slice": np.array(scan.slice, dtype=np.int64),
             "complete": np.array(scan.complete, dtype=np.bool_),
+            "fill": scan.fill[scan.column_lidar_id[:1]] if self._split else scan.fill,
         }
         return {key: array for key, array in arrays.items() if array is not None}
 

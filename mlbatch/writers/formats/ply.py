@@ -6,6 +6,7 @@ Source: G. Turk, "The PLY Polygon File Format", 1994, and docs/sources/outputs.m
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,8 @@ def header(scan: Scan, count: int) -> str:
         f"comment end_ns {scan.end_ns}",
         f"comment index {scan.index} slice {scan.slice} of {scan.slices}",
         f"comment complete {str(scan.complete).lower()}",
+        f"comment fill {' '.join(map(_share, scan.fill.tolist()))}",
+        f"comment sort {info.sort}",
         f"comment timescale {info.timescale}",
         f"comment rate_hz {info.rate_hz}",
         # Frame names come from recordings and may contain line ends.
@@ -79,3 +82,8 @@ def header(scan: Scan, count: int) -> str:
         "end_header",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _share(fill: float) -> str:
+    """Return a fill as text, as in scans.csv."""
+    return "unknown" if math.isnan(fill) else str(np.float32(fill))

@@ -117,8 +117,18 @@ class _Rosbag1File:
         # The library collects messages in memory: the file grows when a chunk is complete.
         if self._file.tell() > self._written[1]:
             self._file.flush()
+            self._forget_places()
             # One assignment: `written` is called while another scan is appended.
             self._written = (self._written[0] + 1, self._file.tell())
+
+    def _forget_places(self) -> None:
+        """Replace the times and places of messages in written chunks, of which the number is used.
+
+        The library keeps all of them to the end.
+        """
+        written = self._bag.chunks[-2].connections
+        for number, places in written.items():
+            written[number] = cast("list[tuple[int, int]]", range(len(places)))
 
     def _forwarded(self, topic: Topic) -> Connection:
         """Return a new connection with the type that the recording has for a topic."""

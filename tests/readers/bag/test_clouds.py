@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.readers import merge, open_recording
-from mlbatch.readers.bag.clouds import CloudRecording, cloud_topics
+from mlbatch.readers.bag.cloud_topics import CloudTopics, cloud_topics
+from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.report.ledger import check_capture
-from mlbatch.ros.point_packets import Layout
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
 from tests.builders.points import (
@@ -40,7 +40,7 @@ def _bag(folder: Path, messages: Sequence[Recorded], encoding: str = "cdr") -> P
 def _open(path: Path) -> tuple[CloudRecording, StreamTable]:
     table = StreamTable()
     inner = open_recording(path, table)
-    return CloudRecording(inner, table, cloud_topics(inner.topics)), table
+    return CloudRecording(inner, table, CloudTopics(cloud_topics(inner.topics))), table
 
 
 def _payloads(batches: Iterator[PacketBatch]) -> list[tuple[int, int, bytes]]:
@@ -88,7 +88,7 @@ def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
         ]
     assert table.streams == [Stream(topic="/left/points")]
     assert table.untimed == {0}
-    assert recording.frames == {"/left/points": "lidar"}
+    assert recording.clouds.frames == {Stream(topic="/left/points"): "lidar"}
     assert recording.container == recording.inner.container
 
 
@@ -191,14 +191,14 @@ def test_large_clouds_come_in_parts_and_lose_nothing(
 
 def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
     table = StreamTable()
-    layouts: dict[str, Layout] = {}
-    recordings = []
+    opened = []
     for number, data in enumerate([_sweep(0), cloud_message(OUSTER, [(1, 2, 3, 9, 5, 0)])]):
         (tmp_path / str(number)).mkdir()
         (sent,) = write_points("/points", [data])
         sent = replace(sent, log_ns=sent.log_ns + number * 10**8)
-        inner = open_recording(_bag(tmp_path / str(number), [sent]), table)
-        recordings.append(CloudRecording(inner, table, cloud_topics(inner.topics), layouts))
+        opened.append(open_recording(_bag(tmp_path / str(number), [sent]), table))
+    clouds = CloudTopics(cloud_topics(opened[0].topics))
+    recordings = [CloudRecording(inner, table, clouds) for inner in opened]
     packets = _payloads(merge(recordings))
     assert {len(data) for _, _, data in packets} == {HEAD_BYTES + 2 * 20}
     assert len(packets) == 4

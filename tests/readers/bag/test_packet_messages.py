@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
+from mlbatch.ros.definitions import definition_text
 from mlbatch.ros.encoding import MessageError
 from mlbatch.types import Topic
 from tests.builders.bags import Body
@@ -48,6 +49,7 @@ AROUND = {
     "robosense_msgs/RobosenseScan": "robosense_msgs/RobosensePacket",
 }
 INFO = "robosense_msgs/RobosenseInfoPacket"
+ROBOSENSE_SCAN = "robosense_msgs/RobosenseScan"
 # Types whose packets carry their receive time (section 3); pandar_msgs does only in ROS 2.
 STAMPED = {name for name, text in OWN.items() if text.startswith("time")} | {*AROUND, INFO}
 FIXED = {"velodyne": 1206, "pandar_msgs/PandarS": 1500, "pandar_msgs/PandarP": 1500}
@@ -212,6 +214,65 @@ def test_the_embedded_definition_wins() -> None:
         body.time(STAMP_NS).blob(payload).put("I", len(payload))
     topic = Topic("/t", "pandar_msgs/PandarScan", "ros1", text, "ros1msg")
     assert find(topic, body.done())[1] == [b"first one", b"second"]
+
+
+ROBOSENSE_HEADS = {
+    "point": b"\x55\xaa\x05\x5a" + b"\1" * 1244,
+    "device": b"\xa5\xff\x00\x5a" + b"\2" * 1244,
+}
+LONG_ROBOSENSE = (
+    "std_msgs/Header header\nrobosense_msgs/RobosensePacket[] packets\n"
+    f"{'=' * 80}\nMSG: robosense_msgs/RobosensePacket\n"
+    "builtin_interfaces/Time stamp\nuint8 is_difop\nuint8[1500] data\nuint32 size\n"
+)
+
+
+def long_robosense(count: int, frame: str = "lidar") -> tuple[bytes, list[bytes]]:
+    """A scan of a branch of Nebula, the last of its packets a DIFOP; and the payloads."""
+    kinds = ["point"] * (count - 1) + ["device"] * min(count, 1)
+    body = Body("cdr").header(STAMP_NS, frame).put("I", count)
+    for number, kind in enumerate(kinds):
+        payload = ROBOSENSE_HEADS[kind]
+        body.time(STAMP_NS + number).put("B", kind == "device")
+        body.raw(payload.ljust(1500, b"\x99")).put("I", len(payload))
+    return body.done(), [ROBOSENSE_HEADS[kind] for kind in kinds]
+
+
+@pytest.mark.parametrize("stored", ["", LONG_ROBOSENSE, definition_text(ROBOSENSE_SCAN)])
+@pytest.mark.parametrize("frame", ["", "a", "ab", "abc"])
+@pytest.mark.parametrize("count", [0, 1, 2, 151])
+def test_robosense_scans_with_sized_packets(count: int, frame: str, stored: str) -> None:
+    """Also without a definition, and with the one that is assumed for bags without any."""
+    topic = Topic("/t", ROBOSENSE_SCAN, "cdr", stored, "ros2msg" if stored else "")
+    data, sent = long_robosense(count, frame)
+    found, read_back = find(topic, data, pad=count % 4)
+    assert read_back == sent
+    assert found.host_ns.tolist() == [STAMP_NS + number for number in range(count)]
+
+
+def test_both_forms_of_robosense_scans_on_a_topic_without_definition() -> None:
+    short = [payload[:1248] for payload in ROBOSENSE_HEADS.values()] * 3
+    long, sent = long_robosense(7)
+    data = [
+        serialised(ROBOSENSE_SCAN, "cdr", short),
+        long,
+        serialised(ROBOSENSE_SCAN, "cdr", short),
+    ]
+    end = np.cumsum([len(message) for message in data])
+    array: U8Array = np.frombuffer(b"".join(data), np.uint8)
+    topic = Topic("/t", ROBOSENSE_SCAN, "cdr")
+    found = Unpacker(topic).find_many(array, end - [len(one) for one in data], end, end * 0)
+    assert not found.faults
+    assert cut(array, found) == short + sent + short
+
+
+@pytest.mark.parametrize("stored", ["", LONG_ROBOSENSE])
+@pytest.mark.parametrize("lost", [1, 3, 1400, 3000])
+def test_a_robosense_scan_that_is_cut_off_is_a_fault(lost: int, stored: str) -> None:
+    """Read in the other form, it would have enough bytes for all packets."""
+    data, _ = long_robosense(9)
+    with pytest.raises(RecordingError, match=r"expected .* it was cut off, or is of another type"):
+        find(Topic("/t", ROBOSENSE_SCAN, "cdr", stored, "ros2msg"), data[:-lost])
 
 
 IDL = f"""\

@@ -8,23 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.decode.kernels.reading import CaptureKernel
 from mlbatch.errors import RecordingError
+from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
-from tests.builders.engines import few_kernels, needs_numba
+from tests.builders.engines import needs_native
 from tests.builders.reading import Seen, open_capture, read
 from tests.readers.capture.test_recording import damaged, mixed_file
 
-pytestmark = needs_numba
+pytestmark = needs_native
 
 BUFFERS = (64, 700, 4096, 65_536)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kernels(tmp_path_factory: pytest.TempPathFactory) -> object:
-    with few_kernels(tmp_path_factory):
-        yield
 
 
 def outcome(
@@ -51,7 +45,7 @@ def test_captures_whole_and_damaged(tmp_path: Path, seed: int) -> None:
         except RecordingError:
             continue
         buffer_bytes = pick.choice(BUFFERS)
-        assert outcome(path, "numba", buffer_bytes) == outcome(path, "numpy", buffer_bytes)
+        assert outcome(path, "native", buffer_bytes) == outcome(path, "numpy", buffer_bytes)
 
 
 def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
@@ -66,23 +60,23 @@ def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
                 one[place] = value
                 changed.append((len(changed), bytes(one)))
         path.write_bytes(pcap_bytes(changed))
-        assert outcome(path, "numba", 65_536) == outcome(path, "numpy", 65_536)
+        assert outcome(path, "native", 65_536) == outcome(path, "numpy", 65_536)
 
 
 def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcap"
     frames = [(number, b"\x00" * (number % 3)) for number in range(40_000)]
     path.write_bytes(pcap_bytes([*frames, *((1, one) for one in udp_frame(b"last"))]))
-    found = outcome(path, "numba", 4 << 20)
+    found = outcome(path, "native", 4 << 20)
     assert found == outcome(path, "numpy", 4 << 20)
     assert [one.payload for one in found[0]] == [b"last"]
 
 
 def test_frames_that_claim_to_lie_elsewhere_are_left_to_others() -> None:
-    kernel, data = CaptureKernel(), np.zeros(100, np.uint8)
+    loops, data = CaptureLoops(), np.zeros(100, np.uint8)
     start = np.array([-1, 101, 90, 2**62, 0, 0])
     captured = np.array([42, 42, 42, 2**62, -5, 2**62])
-    found = kernel.dissect(data, start, captured, captured)
+    found = loops.dissect(data, start, captured, captured)
     assert found.others.tolist() == list(range(6))
     assert not found.datagrams.size
     assert not found.fragments.size
@@ -96,7 +90,7 @@ def test_runs_are_copied() -> None:
     place = np.cumsum(size) - size
     one, other = np.zeros(5000, np.uint8), np.zeros(5000, np.uint8)
     copy_runs(source, start, size, one, place)
-    CaptureKernel().copy_runs(source, start, size, other, place)
+    CaptureLoops().copy_runs(source, start, size, other, place)
     assert one.tobytes() == other.tobytes()
 
 
@@ -109,10 +103,10 @@ def test_runs_beyond_their_arrays_are_refused(start: int, size: int, place: int)
     run = (np.array([one]) for one in (start, size, place))
     first, count, at = run
     with pytest.raises(IndexError):
-        CaptureKernel().copy_runs(source, first, count, out, at)
+        CaptureLoops().copy_runs(source, first, count, out, at)
 
 
 @pytest.mark.parametrize(("begin", "end"), [(-1, 10), (0, 101), (2**40, 2**41)])
 def test_bytes_beyond_the_buffer_are_not_walked(begin: int, end: int) -> None:
     with pytest.raises(IndexError):
-        CaptureKernel().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)
+        CaptureLoops().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)

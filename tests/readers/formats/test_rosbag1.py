@@ -25,7 +25,7 @@ from tests.builders.bags import (
     packet_message,
 )
 from tests.builders.reading import Seen, assert_balanced, seen_of
-from tests.builders.rosbag1 import open_chunk, without_index, write_rosbag1
+from tests.builders.rosbag1 import definition_of, open_chunk, without_index, write_rosbag1
 
 PACKETS = [Seen(host_ns, topic, payload) for topic, host_ns, payload in fixture_packets()]
 
@@ -82,8 +82,7 @@ def test_topics_are_those_that_rosbags_finds(tmp_path: Path) -> None:
         expected = {
             connection.topic: (
                 connection.msgtype.replace("/msg/", "/"),
-                # A text before rosbags 0.10, an object with a text since.
-                getattr(connection.msgdef, "data", connection.msgdef),
+                definition_of(connection),
                 bool(getattr(connection.ext, "latching", 0)),
             )
             for connection in reader.connections

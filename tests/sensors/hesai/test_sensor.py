@@ -273,6 +273,7 @@ def test_optical_centre(body: F64Array | None) -> None:
 
 
 def test_optical_centre_of_a_jt16_is_where_its_ranges_begin() -> None:
+    """190 degrees before the angles of the file, as in the SDK: (4.2527, -11.8739) mm."""
     packets, _, _ = _encoded(HesaiSpec("JT16"))
     lidar = decode(packets, angles_csv([0.0] * 16, [0.0] * 16), {"optical_centre": "on"}).lidar
     assert lidar.projection(np.eye(4), 1) is None
@@ -280,7 +281,7 @@ def test_optical_centre_of_a_jt16_is_where_its_ranges_begin() -> None:
     points = np.empty((1, 16, 3), np.float32)
     projection.prepare(np.zeros(1, np.int64), np.array([1 << 30]))  # 90 degrees to the right
     projection.project(np.full((1, 16), 2.0, np.float32), points)
-    assert points[0, 3].tolist() == pytest.approx([2.010955, 0.00625, 0.003911], abs=1e-6)
+    assert points[0, 3].tolist() == pytest.approx([1.9881261, -0.0042527, 0.003911], abs=1e-6)
 
 
 def test_files_are_identified_by_content() -> None:

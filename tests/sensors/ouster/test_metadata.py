@@ -193,7 +193,7 @@ def test_options_of_this_and_other_vendors() -> None:
         {"crc": "check", "firing_azimuth": "on", "vertical_offset": "off", "optical_centre": "on"},
         None,
     )
-    known = "crc, firing_azimuth, optical_centre, packet_stamp, vertical_offset"
+    known = "crc, firing_azimuth, optical_centre, packet_stamp, range_unit, vertical_offset"
     with pytest.raises(
         UsageError, match=f"--decode colour=red: expected one of {known}, found colour"
     ):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RigError, UsageError
+from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import NAMED_ONLY, Evidence, ModelFile, NeighbourStream
 from mlbatch.sensors import models
 from mlbatch.sensors.robosense import sensor as robosense
@@ -17,7 +18,7 @@ from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, RS16, RS32, Mod
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
 from tests.builders.robosense import RobosenseSpec, angles_csv, difop, fan, msop
-from tests.builders.robosense_decoded import DIFOP, built_in, evidence_of
+from tests.builders.robosense_decoded import DIFOP, built_in, decoded, evidence_of
 from tests.builders.robosense_models import DUAL, LAST, STRONGEST
 
 MAGIC, TAIL = bytes.fromhex("a5ff005a11115555"), b"\x0f\xf0"
@@ -214,6 +215,134 @@ def test_a_rig_distinguishes_ruby_and_ruby_plus(model: str) -> None:
         lidar = named.lidar({}, evidence)
         assert (lidar.model, lidar.notes) == (model, ())
         assert one.for_model("Ruby 128") is None
+
+
+@pytest.mark.parametrize("value", [2, 255])
+@pytest.mark.parametrize("name", ["Bpearl v3", "Bpearl v4"])
+def test_an_unusual_reversal_is_noted(name: str, value: int) -> None:
+    """rs_driver mirrors by any value but 0."""
+    spec = RobosenseSpec(name, start_deg=30.0)
+    evidence = evidence_of(_sent(spec), [difop(spec, fan(spec), parts={337: bytes((value,))})])
+    lidar = built_in(evidence).lidar({}, evidence)
+    angle_rad, _, _ = read_rotor_words(
+        lidar.column_headers(evidence.sample, evidence.host_ns).encoder[0]
+    )
+    assert np.degrees(angle_rad[0]) % 360 == pytest.approx(330.0)
+    (note,) = lidar.notes
+    assert f"byte 337 to be 0 or 1, found {value}" in note
+
+
+@pytest.mark.parametrize("name", ["Helios 32", "Ruby Plus 80"])
+def test_other_models_are_not_mirrored(name: str) -> None:
+    spec = RobosenseSpec(name, start_deg=30.0)
+    evidence = evidence_of(_sent(spec), [difop(spec, fan(spec), parts={337: b"\1"})])
+    lidar = built_in(evidence).lidar({}, evidence)
+    angle_rad, _, _ = read_rotor_words(
+        lidar.column_headers(evidence.sample, evidence.host_ns).encoder[0]
+    )
+    assert np.degrees(angle_rad[0]) == pytest.approx(30.0)
+
+
+def _with_types(payloads: list[bytes], types: str) -> list[bytes]:
+    """Packets with other bytes 30 to 32."""
+    return [payload[:30] + bytes.fromhex(types) + payload[33:] for payload in payloads]
+
+
+def _named(model: str) -> robosense.DifopCalibration:
+    (known,) = [one for one in robosense.BUILT_IN if one.model == model]
+    assert isinstance(known, robosense.DifopCalibration)
+    named = known.for_model(model)
+    assert named is not None
+    return named
+
+
+@pytest.mark.parametrize(
+    ("name", "is_calendar", "unit_m"), [("Bpearl v4", False, 0.0025), ("Bpearl v3", True, 0.005)]
+)
+def test_bpearl_of_model_0(name: str, is_calendar: bool, unit_m: float) -> None:
+    """A v4 by its manual, a v3 in rs_driver: a note, until the rig names it."""
+    spec = RobosenseSpec(name)
+    packets = _with_types(_sent(spec), "00 03 00")
+    evidence = evidence_of(packets, [difop(spec, fan(spec))])
+    own = built_in(evidence)
+    assert own.model == f"RS-{name}"
+    (note,) = own.lidar({}, evidence).notes
+    assert "packets fit RS-Bpearl v3 or RS-Bpearl v4" in note
+    assert "rs_driver" in note
+    lidar = _named(f"RS-{name}").lidar({}, evidence)
+    assert lidar.notes == ()
+    assert decoded(lidar, evidence.sample).range_m[0, 0, 0] == np.float32(unit_m)
+
+
+def test_a_rig_names_a_bpearl_of_model_0() -> None:
+    """As a v3, with times in the form that the packets have."""
+    spec = RobosenseSpec("Bpearl v4")
+    evidence = evidence_of(_with_types(_sent(spec), "00 03 00"), [difop(spec, fan(spec))])
+    named = _named("RS-Bpearl v3")
+    assert named.match_score(evidence) == 100
+    lidar = named.lidar({}, evidence)
+    assert not lidar.faults(evidence.sample).any()
+    found = decoded(lidar, evidence.sample)
+    assert found.range_m[0, 0, 0] == np.float32(0.005)
+    assert found.time_ns[0, 0] == spec.start_ns
+    (note,) = lidar.notes
+    assert note.startswith("expected dates in the packets of an RS-Bpearl v3, found seconds")
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "model"),
+    [
+        ("Helios 32", STRONGEST, "Helios 32"),
+        ("Helios 32", DUAL, "Helios 32"),
+        ("Helios 16", STRONGEST, "Helios 16"),
+        ("Helios 16", DUAL, "Helios 16"),
+    ],
+)
+@pytest.mark.parametrize("types", ["06 00 00", "00 06 00"])
+def test_helios_without_a_model_by_its_device_packet(
+    name: str, mode: str, model: str, types: str
+) -> None:
+    """Its return mode distinguishes 32 lines with one return from 16 with two."""
+    spec = RobosenseSpec(name, mode)
+    evidence = evidence_of(_with_types(_sent(spec), types), [difop(spec, fan(spec))])
+    lidar = built_in(evidence).lidar({}, evidence)
+    assert (lidar.model, lidar.notes) == (model, ())
+    assert lidar.mode.startswith("dual" if mode == DUAL else "single")
+
+
+@pytest.mark.parametrize(("name", "mode"), [("Helios 32", STRONGEST), ("Helios 16", DUAL)])
+def test_helios_without_a_model_by_the_lines_of_its_file(name: str, mode: str) -> None:
+    evidence = evidence_of(_with_types(_sent(RobosenseSpec(name, mode)), "06 00 00"))
+    file = robosense.read_calibration(Path("a.csv"), _csv(name))
+    assert file is not None
+    assert file.match_score(evidence) == 200
+    lidar = file.lidar({}, evidence)
+    assert (lidar.model, lidar.notes) == (name, ())
+    assert lidar.mode.startswith("dual" if mode == DUAL else "single")
+
+
+def test_helios_without_a_model_or_a_usable_mode() -> None:
+    spec = RobosenseSpec("Helios 32")
+    unknown = difop(spec, fan(spec), parts={300: b"\x09"})
+    evidence = evidence_of(_with_types(_sent(spec), "06 00 00"), [unknown])
+    lidar = built_in(evidence).lidar({}, evidence)
+    assert lidar.model == "Helios 32"
+    (note,) = lidar.notes
+    assert "packets fit Helios 16 or Helios 32: decoded as Helios 32" in note
+    assert _named("Helios 16").match_score(evidence) == 100
+    assert _named("Helios 16").lidar({}, evidence).model == "Helios 16"
+    assert _named("Helios 32").lidar({}, evidence).notes == ()
+
+
+@pytest.mark.parametrize("types", ["05 02 00", "05 03 00", "00 02 00"])
+def test_ruby_plus_80_in_the_layout_of_rs_driver(types: str) -> None:
+    """No note; its second byte chooses the firing times of the 80v."""
+    spec = RobosenseSpec("Ruby Plus 80v" if types[4] == "3" else "Ruby Plus 80")
+    evidence = evidence_of(_with_types(_sent(spec), types), [difop(spec, fan(spec))])
+    lidar = built_in(evidence).lidar({}, evidence)
+    assert (lidar.model, lidar.notes) == ("Ruby Plus 80", ())
+    np.testing.assert_array_equal(lidar.firing_ns[0], spec.firing_ns)
+    assert _named("Ruby 80").match_score(evidence) == NAMED_ONLY
 
 
 def test_the_first_firmware_is_not_decoded_silently() -> None:

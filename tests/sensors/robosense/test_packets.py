@@ -299,16 +299,82 @@ def test_mounts_of_airy_choose_its_times(mount: str) -> None:
     np.testing.assert_array_equal(lidar.firing_ns[0], spec.firing_ns)
 
 
-@pytest.mark.parametrize("name", ["Helios 32", "Helios 16"])
-def test_distances_of_older_helios_count_in_5_mm(name: str) -> None:
-    spec = RobosenseSpec(name, unit_m=0.005)
+@pytest.mark.parametrize("name", ["Helios 32", "Helios 16", "Helios 32, early type"])
+@pytest.mark.parametrize(
+    ("byte_17", "option", "unit_m", "is_noted"),
+    [
+        (1, "", 0.0025, False),
+        (0, "", 0.0025, True),  # reserved in current manuals
+        (7, "", 0.0025, False),
+        (0, "5mm", 0.005, False),
+        (1, "5mm", 0.005, False),
+        (0, "2.5mm", 0.0025, False),
+    ],
+)
+def test_range_unit_of_helios(
+    name: str, byte_17: int, option: str, unit_m: float, is_noted: bool
+) -> None:
+    spec = RobosenseSpec(name)
     raw, levels = _readings(spec, packets=8)
-    sent = msop(spec, raw, levels)
-    evidence = evidence_of([payload for _, payload in sent], [difop(spec, fan(spec))])
-    lidar = built_in(evidence).lidar({}, evidence)
+    sent = [bytearray(payload) for _, payload in msop(spec, raw, levels)]
+    for payload in sent:
+        payload[17] = byte_17
+    evidence = evidence_of([bytes(payload) for payload in sent], [difop(spec, fan(spec))])
+    options = {"range_unit": option} if option else {}
+    lidar = built_in(evidence).lidar(options, evidence)
     found = decoded(lidar, evidence.sample)
-    np.testing.assert_array_equal(found.range_m, (raw / 200).astype(np.float32))
-    assert "5 mm" in " ".join(lidar.notes)
+    np.testing.assert_array_equal(found.range_m, (raw / round(1 / unit_m)).astype(np.float32))
+    assert ["range_unit=5mm" in note for note in lidar.notes] == [True] * is_noted
+
+
+@pytest.mark.parametrize("name", ["RS-32", "Bpearl v4", "Airy 96", "Ruby 128"])
+def test_range_units_of_other_models_are_their_own(name: str) -> None:
+    evidence = evidence_of(_sent(RobosenseSpec(name), 8), [difop_of(name)])
+    own, other = (
+        decoded(built_in(evidence).lidar(options, evidence), evidence.sample)
+        for options in ({}, {"range_unit": "2.5mm"})
+    )
+    np.testing.assert_array_equal(own.range_m, other.range_m)
+
+
+def difop_of(name: str) -> bytes:
+    """A device packet."""
+    spec = RobosenseSpec(name)
+    return difop(spec, fan(spec))
+
+
+@pytest.mark.parametrize("mode", [STRONGEST, DUAL])
+@pytest.mark.parametrize("name", ["RS-16", "RS-32", "Helios 32", "Airy 96", "Ruby 80", "Ruby 128"])
+def test_an_azimuth_of_36000_is_0(name: str, mode: str) -> None:
+    """Packets that pass through 0 exactly, written as 36000 and as 0."""
+    spec = RobosenseSpec(name, mode, start_deg=0.0)
+    sent = [bytearray(payload) for _, payload in msop(spec, *_readings(spec, packets=8))]
+    evidence = evidence_of([bytes(payload) for payload in sent], [difop(spec, fan(spec))])
+    lidar = built_in(evidence).lidar({}, evidence)
+    changed = evidence.sample.copy()
+    stride = 4 + 3 * spec.row.slots
+    for block in range(spec.row.blocks):
+        at = slice(spec.row.header + block * stride + 2, spec.row.header + block * stride + 4)
+        if not changed[0, at].any():
+            changed[0, at] = np.frombuffer(struct.pack(">H", 36000), np.uint8)
+    assert (changed != evidence.sample).any()
+    assert not lidar.faults(changed).any()
+    expected, found = (
+        lidar.column_headers(packets, evidence.host_ns) for packets in (evidence.sample, changed)
+    )
+    assert found.valid.all()
+    np.testing.assert_array_equal(found.encoder, expected.encoder)
+    np.testing.assert_array_equal(found.stamp_ns, expected.stamp_ns)
+
+
+def test_an_azimuth_above_36000_is_damaged() -> None:
+    spec = RobosenseSpec("Helios 32")
+    evidence = evidence_of(_sent(spec, 2), [difop(spec, fan(spec))])
+    lidar = built_in(evidence).lidar({}, evidence)
+    changed = evidence.sample.copy()
+    changed[1, 44:46] = np.frombuffer(struct.pack(">H", 36001), np.uint8)
+    valid = lidar.column_headers(changed, evidence.host_ns).valid
+    assert valid[1].tolist() == [False] + [True] * 11
 
 
 @pytest.mark.parametrize("mode", [STRONGEST, DUAL])
@@ -332,9 +398,10 @@ def test_a_gap_in_the_field_of_view_takes_its_time(name: str, rpm: int, mode: st
     assert np.abs((turned_deg + 180) % 360 - 180).max() < 2 * MOST_DEG
 
 
-def test_a_bpearl_that_turns_the_other_way() -> None:
+@pytest.mark.parametrize("name", ["Bpearl v3", "Bpearl v4"])
+def test_a_bpearl_that_turns_the_other_way(name: str) -> None:
     """The driver takes all of the azimuth backwards: the rotor's and the corrections."""
-    spec = RobosenseSpec("Bpearl v4", start_deg=40.0, is_reversed=True)
+    spec = RobosenseSpec(name, start_deg=40.0, is_reversed=True)
     raw, levels = _readings(spec, packets=6)
     angles, sent = fan(spec), msop(spec, raw, levels)
     evidence = evidence_of([payload for _, payload in sent], [difop(spec, angles)])
@@ -342,8 +409,10 @@ def test_a_bpearl_that_turns_the_other_way() -> None:
     found, columns = decoded(lidar, evidence.sample), np.arange(len(raw))
     np.testing.assert_array_equal(found.time_ns, firing_times_ns(spec, columns))
     mirrored = Angles(angles.elevation_deg, -angles.azimuth_deg)
-    wanted_m = (raw[..., :1] / 400) * directions(spec, mirrored, columns) + origins(spec, columns)
-    assert np.abs(found.xyz_m[:, :, 0] - wanted_m).max() < 164 * np.radians(MOST_DEG)
+    range_m = raw[..., :1] * spec.range_unit_m
+    wanted_m = range_m * directions(spec, mirrored, columns) + origins(spec, columns)
+    assert np.abs(found.xyz_m[:, :, 0] - wanted_m).max() < range_m.max() * np.radians(MOST_DEG)
+    assert lidar.notes == ()
 
 
 def test_without_motion_all_beams_of_a_column_share_its_angle() -> None:

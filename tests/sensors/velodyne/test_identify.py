@@ -135,7 +135,7 @@ def test_the_mode_byte_of_a_vls_128_may_be_unset() -> None:
     "parts",
     [
         {200: EE, 300: b"\x00\x01"},  # a lone flag
-        {100 * n: EE + struct.pack("<H", 36000) for n in range(12)},  # no such azimuth
+        {100 * n: EE + struct.pack("<H", 36001) for n in range(12)},  # no such azimuth
         {**{100 * n: EE for n in range(12)}, 1200: struct.pack("<I", 3_600_000_000)},
     ],
 )

@@ -14,6 +14,7 @@ from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import FAULTS, NAMED_ONLY, Evidence, ModelFile
 from mlbatch.sensors.velodyne import sensor as velodyne
 from tests.builders.velodyne import (
+    Sent,
     VelodyneSpec,
     directions,
     encode,
@@ -72,6 +73,36 @@ class TestEveryModel:
             assert late_ns.max() < 40_000
             direction, _ = pointing(seen.lidar, angle)
             assert apart_deg(direction, directions(spec, seen.columns)) < ANGLE_DEG
+
+    def test_an_azimuth_of_36000_is_0(self, model: str, mode: str) -> None:
+        """Units send both; 36001 is damage."""
+        plain = VelodyneSpec(model, mode)
+        # 600 rpm are 0.0036 degrees/us: the third azimuth is 0.
+        seen = made_of(replace(plain, start_azimuth_deg=-2 * 0.0036 * plain.row_us))
+        used = 8 if (model, mode) == ("VLS-128", "dual") else 12
+        at = np.arange(used) * 100 + 2
+        words = seen.sent.payloads[:, at] | seen.sent.payloads[:, at + 1].astype(np.int64) << 8
+        rows, blocks = (words == 0).nonzero()
+        assert len(rows) == plain.returns * len(plain.table.flags)
+
+        def rewritten(cdeg: int) -> Sent:
+            payloads = seen.sent.payloads.copy()
+            payloads[rows, at[blocks]] = cdeg & 0xFF
+            payloads[rows, at[blocks] + 1] = cdeg >> 8
+            return Sent(payloads, seen.sent.host_ns)
+
+        full = rewritten(36000)
+        lidar = calibration(model).lidar({}, evidence(full))
+        assert not lidar.faults(full.payloads).any()
+        found = lidar.column_headers(full.payloads, full.host_ns)
+        expected = seen.lidar.column_headers(seen.sent.payloads, full.host_ns)
+        assert (found.stamp_ns == expected.stamp_ns).all()
+        assert (found.encoder == expected.encoder).all()
+        # Alone, too, it is a packet of this model.
+        only = full.payloads[rows[:1]]
+        assert velodyne.describe(1206, only) is not None
+        faults = lidar.faults(rewritten(36001).payloads)
+        assert faults.nonzero()[0].tolist() == np.unique(rows).tolist()
 
     def test_attributes(self, model: str, mode: str) -> None:
         seen = made_of(VelodyneSpec(model, mode))
@@ -228,7 +259,7 @@ def test_damaged_packets_are_reported() -> None:
     good = made_of(VelodyneSpec("VLP-16", "dual"))
     spoiled = {
         "flag": (300, b"\xff\xdd"),
-        "azimuth": (102, (36000).to_bytes(2, "little")),
+        "azimuth": (102, (36001).to_bytes(2, "little")),
         "stamp": (1200, (3_600_000_000).to_bytes(4, "little")),
         "another mode": (1204, b"\x37"),
     }
@@ -341,6 +372,39 @@ def test_its_angles_and_offsets_are_used() -> None:
     assert origin[0, 3] == pytest.approx(
         [0.02 * math.sin(0.01), 0.02 * math.cos(0.01), table.vertical_m[3]]
     )
+
+
+@pytest.mark.parametrize("model", PLAIN)
+def test_a_file_without_heights_keeps_the_built_in_ones(model: str) -> None:
+    """ROS drivers write 0 for all lasers, or nothing."""
+    table = MODELS[model]
+    seen = evidence(made_of(VelodyneSpec(model)).sent)
+    lines = calibration_yaml(model).splitlines()
+    missing = "\n".join(one for one in lines if "vert_offset" not in one)
+    zeros = missing.replace("  dist_corr", "  vert_offset_correction: 0.0\n  dist_corr")
+    highest_mm = max(abs(value) for value in table.vertical_m) * 1000
+    for content in (missing, zeros):
+        read = velodyne.read_calibration(Path("unit.yaml"), content.encode())
+        assert read is not None
+        lidar = read.lidar({}, seen)
+        heights_m = lidar.beams.origin[2, :, 2]
+        assert np.abs(heights_m - np.array(table.vertical_m)).max() < 1e-5
+        assert lidar.notes == (
+            f"unit.yaml: the vertical offsets of all lasers are 0; those of a {model} are used, "
+            f"up to {highest_mm:.1f} mm (vertical_offset=off: none)",
+        )
+        lowered = read.lidar({"vertical_offset": "off"}, seen)
+        assert lowered.notes == ()
+        assert not lowered.beams.origin.any()
+    # A single value is the unit's own.
+    one_value = zeros.splitlines()
+    first = next(n for n, one in enumerate(one_value) if "vert_offset" in one)
+    one_value[first] = "  vert_offset_correction: 0.003"
+    read = velodyne.read_calibration(Path("unit.yaml"), "\n".join(one_value).encode())
+    assert read is not None
+    lidar = read.lidar({}, seen)
+    assert lidar.notes == ()
+    assert lidar.beams.origin[2, :, 2].tolist() == [0.003] + [0.0] * (len(table.vertical_m) - 1)
 
 
 def test_another_unit_of_range_is_named_and_not_used() -> None:

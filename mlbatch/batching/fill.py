@@ -1,0 +1,126 @@
+"""Fill of a scan: columns present / columns expected, by sensor.
+
+Expected is what a sensor sends in a window without loss: its rate times the length of the window,
+less what it does not measure because its rotor passes a dark sector (an azimuth window that the
+sensor is set to). A dark sector that the mode does not name is learned: sectors of a revolution in
+which the sensor never had a column so far. See docs/batching.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F32Array, I64Array, median
+from mlbatch.lidar.geometry import SECTORS, rotor_ticks, sectors
+from mlbatch.units import NS_PER_S
+
+# Of fewer expected columns one more or less, by jitter, would be a large share.
+LEAST_EXPECTED = 2
+UNKNOWN = math.nan
+_TICKS = 2.0**32
+# Relative error of an expectation: rotor positions are rounded.
+_ROUNDING = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Columns that a sensor sends.
+
+    columns_per_s: while it measures, 0: unknown; lit_share: share of a revolution in which it
+    measures, None: to be learned; positions: rotor positions of a revolution, None: columns have
+    rotor words.
+    """
+
+    columns_per_s: float
+    lit_share: float | None
+    positions: int | None
+
+
+UNKNOWN_PACE = Pace(0.0, None, None)
+
+
+class FillMeter:
+    """Fill of windows, which come in the order of time: dark sectors are learned from earlier ones.
+
+    The result does not depend on how packets are grouped.
+    """
+
+    def __init__(self, paces: Sequence[Pace]) -> None:
+        self._sensors = [_Expectation(pace) for pace in paces]
+
+    def measure(
+        self, length_ns: int, stamp_ns: I64Array, sensor: I64Array, encoder: I64Array
+    ) -> F32Array:
+        """Fill (s,) of a window of this length, from its columns (n,); NaN: unknown."""
+        counts = np.bincount(sensor, minlength=len(self._sensors)).tolist()
+        fill = np.empty(len(self._sensors), np.float32)
+        for number, one in enumerate(self._sensors):
+            if one.learns and counts[number]:
+                own = np.flatnonzero(sensor == number)
+                one.learn(stamp_ns[own], encoder[own])
+            fill[number] = _share(counts[number], one.columns(length_ns))
+        return fill
+
+
+def _share(count: int, expected: float) -> float:
+    """The fill; expected: NaN if the rate of the sensor is unknown."""
+    if math.isnan(expected):
+        # Whatever the rate is, there should be columns.
+        return UNKNOWN if count else 0.0
+    whole = math.floor(expected * (1 + _ROUNDING))
+    return UNKNOWN if whole < LEAST_EXPECTED else min(1.0, count / whole)
+
+
+@dataclass(slots=True)
+class _Expectation:
+    """What is expected of one sensor, as far as known."""
+
+    pace: Pace
+    # (SECTORS,) bool: in which the sensor had a column.
+    _seen: BoolArray = field(default_factory=lambda: np.zeros(SECTORS, np.bool_))
+    _lit_share: float = 0.0
+    _revolution_ns: float = 0.0
+
+    @property
+    def learns(self) -> bool:
+        """False once all is known: at once, or after a revolution, except with dark sectors."""
+        return self.pace.columns_per_s > 0 and self._share < 1.0
+
+    @property
+    def _share(self) -> float:
+        known = self.pace.lit_share
+        return self._lit_share if known is None else known
+
+    def learn(self, stamp_ns: I64Array, encoder: I64Array) -> None:
+        """Update dark sectors and the speed of the rotor by columns (n,) of a window."""
+        positions = self.pace.positions
+        self._seen[np.clip(sectors(encoder, positions), 0, SECTORS - 1)] = True
+        self._lit_share = int(np.count_nonzero(self._seen)) / SECTORS
+        ticks = rotor_ticks(encoder) if positions is None else encoder
+        turned = np.diff(ticks) / (_TICKS if positions is None else positions)
+        turned -= np.rint(turned)
+        passed_ns = np.diff(stamp_ns)
+        moving = passed_ns > 0
+        if moving.any():
+            speed = abs(median(turned[moving] / passed_ns[moving]))
+            self._revolution_ns = 1 / speed if speed else 0.0
+
+    def columns(self, length_ns: int) -> float:
+        """Columns that any window of this length has at least, without loss; NaN: unknown."""
+        if not self.pace.columns_per_s:
+            return UNKNOWN
+        columns = self.pace.columns_per_s * length_ns / NS_PER_S
+        share = self._share
+        # Nothing is known of a sensor without a column so far, but that it should send.
+        if share >= 1.0 or not self._seen.any():
+            return columns
+        if not self._revolution_ns:
+            return UNKNOWN
+        whole, part = divmod(length_ns / self._revolution_ns, 1.0)
+        # The worst place of the window: its part of a revolution contains all of the dark sectors.
+        lit = whole * share + max(0.0, part - (1.0 - share))
+        return columns * lit / (whole + part)

@@ -1,0 +1,534 @@
+"""The engine `native`: decodes groups of sensors by compiled loops (`native/decode.c`).
+
+The loops do the float32 operations of `projector.py` in the same order, column by column instead
+of array by array. Sensors without a pixel layout for them are decoded by numpy and copied.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.arrays import F32Array, I64Array
+from mlbatch.decode.coverage import ColumnStatistics, ColumnStats
+from mlbatch.decode.engine import EngineSetup
+from mlbatch.decode.numpy_engine import NumpyEngine
+from mlbatch.decode.projector import Projector
+from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
+from mlbatch.lidar.geometry import SECTORS, Tabled, Turning, rotor_angles
+from mlbatch.lidar.interface import Lidar
+from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
+from mlbatch.native.library import Field, Group, Ring, Scan, address, library
+
+# As in `native.h`.
+_TABLED, _TURNING, _COPIED = range(3)
+_TYPED_BY = {"": 0, "order": 1, "level": 2}
+_MOST_BEAMS = 256
+_MOST_RETURNS = 3
+_MOST_WORDS = 3
+_WORD_BYTES = 4
+# Beams of a plane are a multiple of this.
+_BEAMS_TOGETHER = 16
+_COUNTS = 5
+_FIGURES = 6
+_UNSURE = np.float32(2)
+_FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
+# The return type in a label.
+_TYPE_BITS = np.uint64(0xFF << 48)
+
+
+class NativeEngine:
+    """Decodes all sensors in one call a window."""
+
+    def __init__(self, setup: EngineSetup) -> None:
+        self._library = library()
+        self._extras = setup.extras
+        self._copies: list[_CopiedGroup] = []
+        self._groups: list[_DecodedGroup] = []
+        self._organized_numpy: list[NumpyEngine] = []
+        sensors = len(setup.seat)
+        self._group_of = np.full(sensors, -1, np.int64)
+        self._member_of = np.zeros(sensors, np.int64)
+        by_group = _indices_by_group(setup.projectors)
+        self._structs = (Group * len(by_group))()
+        for number, indices in enumerate(by_group):
+            own = [setup.projectors[index] for index in indices]
+            members = _members(setup.projectors, indices, setup.seat)
+            if is_decoded(own[0]):
+                self._groups.append(_DecodedGroup(own, self._structs[number]))
+            else:
+                seat = np.stack([np.minimum(members, 0), members], axis=1)
+                engine = NumpyEngine(replace(setup, projectors=own, seat=seat))
+                if setup.organized_slots:
+                    # numpy writes its rows itself.
+                    self._organized_numpy.append(engine)
+                    continue
+                copied = _CopiedGroup(
+                    engine, own[0].slots, setup.tile_columns, self._structs[number]
+                )
+                self._copies.append(copied)
+            self._group_of[members >= 0] = number
+            self._member_of[members >= 0] = members[members >= 0]
+        self._turning = self._turning_sensors()
+        boxes_m = setup.projectors[0].boxes_m
+        self._arrays = (self._group_of, self._member_of, np.ascontiguousarray(boxes_m))
+        self._scan = Scan(
+            group_of=address(self._group_of),
+            member_of=address(self._member_of),
+            group_count=len(by_group),
+            groups=ctypes.addressof(self._structs),
+            box_count=len(boxes_m),
+            boxes_m=address(self._arrays[2]),
+            row_slots=setup.organized_slots,
+        )
+        # Columns in one call: what numpy decodes is copied from a buffer.
+        self._most_columns = setup.tile_columns if self._copies else None
+
+    def column_statistics(self, positions: Sequence[int | None]) -> ColumnStatistics:
+        """See `Engine`."""
+        return NativeColumnStatistics(positions)
+
+    def decode(
+        self, columns: WindowColumns, start_ns: int, first_number: int, out: ScanBuffer
+    ) -> int:
+        """See `Engine.decode`."""
+        scan = self._scan
+        # Kept until the call returns: another thread may let a ring grow.
+        kept = [group.use_rings() for group in self._groups]
+        self._use_outputs(out)
+        scan.start_ns = start_ns
+        most = self._most_columns or max(len(columns), 1)
+        row = 0
+        for begin in range(0, len(columns), most):
+            some = columns.take(slice(begin, begin + most)) if most < len(columns) else columns
+            kept.append(self._use_columns(some))
+            scan.first_number = first_number + begin
+            scan.first_row = row
+            for copied in self._copies:
+                copied.decode(some, start_ns, scan.first_number)
+            row = self._library.mlbatch_decode(ctypes.byref(scan))
+        for group in self._groups:
+            group.add_counts()
+        for engine in self._organized_numpy:
+            row += engine.decode(columns, start_ns, first_number, out)
+        return row
+
+    def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
+        """Point the struct to the columns; return the arrays to keep."""
+        arrays: list[npt.NDArray[Any]] = [
+            np.ascontiguousarray(array, np.int64)
+            for array in (columns.stamp_ns, columns.sensor, columns.ring_index, columns.encoder)
+        ]
+        scan = self._scan
+        scan.columns = len(columns)
+        scan.stamp_ns, scan.sensor, scan.ring_index, scan.encoder = map(address, arrays)
+        if self._turning is not None:
+            angles = self._angles(arrays[1], arrays[3])
+            for group in self._groups:
+                if group.struct.kind == _TURNING:
+                    group.struct.cosine, group.struct.sine = map(address, angles)
+            arrays += angles
+        return arrays
+
+    def _angles(self, sensor: I64Array, encoder: I64Array) -> list[npt.NDArray[Any]]:
+        """Return cosines and sines of all columns; undefined for sensors without rotor words."""
+        if self._turning is None or self._turning.all():
+            return list(native_angles(encoder))
+        own = self._turning[sensor]
+        angles = np.zeros((2, len(encoder)), np.float32)
+        angles[:, own] = native_angles(encoder[own])
+        return [angles[0], angles[1]]
+
+    def _turning_sensors(self) -> npt.NDArray[np.bool_] | None:
+        """Mask of the sensors with rotor words that the loops decode; None if there are none."""
+        kinds = np.array([struct.kind for struct in self._structs] + [_COPIED])
+        turning = np.asarray(kinds[self._group_of] == _TURNING)
+        return turning if turning.any() else None
+
+    def _use_outputs(self, out: ScanBuffer) -> None:
+        """Point the struct to the arrays of a scan; organized rows are written as a whole."""
+        scan = self._scan
+        extras = self._extras
+        scan.point = address(out.point)
+        scan.label = address(out.label)
+        wants_range = out.is_organized or "range_m" in extras
+        wants_reflectivity = out.is_organized or "reflectivity" in extras
+        wants_column = "column" in extras and not out.is_organized
+        scan.range_m = address(out.range_m) if wants_range else None
+        scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
+        scan.column = address(out.column) if wants_column else None
+
+
+class _DecodedGroup:
+    """Sensors that the loops decode, and the arrays that their struct points to."""
+
+    def __init__(self, projectors: Sequence[Projector], struct: Group) -> None:
+        """projectors: with equal `_group_key`; struct: to be filled."""
+        lidar = projectors[0].lidar
+        table = lidar.pixels
+        if table is None:
+            raise ValueError(f"no pixel layout for {lidar.model}")
+        self._rings = [source.ring for one in projectors for source in one.sources]
+        self._counters = [counts for one in projectors for counts in one.counts]
+        self._slots = projectors[0].slots
+        self._counts = np.zeros((len(self._counters), _COUNTS), np.int64)
+        self._arrays: list[Any] = []
+        self.struct = struct
+        struct.beams = lidar.channels
+        struct.width = _width(lidar)
+        struct.returns = lidar.returns
+        struct.slots = self._slots
+        struct.step = table.step
+        struct.counts = self._kept(self._counts)
+        self._set_pixels(projectors[0], table)
+        projection = projectors[0].projection
+        if isinstance(projection, Tabled):
+            self._set_angle_table(projectors[0], projection)
+        else:
+            rotors = [one.projection for one in projectors]
+            self._set_rotors([one for one in rotors if isinstance(one, Turning)], lidar.channels)
+        self._set_slots(projectors[0])
+        self._set_labels(projectors)
+        if any(one.is_limited for one in projectors):
+            limits_m = np.concatenate([one.limits_m for one in projectors])
+            self.struct.limits_m = self._kept(limits_m)
+
+    def use_rings(self) -> list[Any]:
+        """Point the struct to the rings as they are; return the arrays to keep."""
+        pieces = [ring.pieces for ring in self._rings]
+        # Arrays of columns (rows, columns of a row).
+        rings = (Ring * len(pieces))(
+            *(Ring(one.ctypes.data, *one.shape, *one.strides) for one in pieces)
+        )
+        self.struct.rings = ctypes.addressof(rings)
+        self._counts[:] = 0
+        return [pieces, rings]
+
+    def add_counts(self) -> None:
+        """Add the counts since `use_rings` to the point counters."""
+        slots = self._slots
+        for counts, row in zip(self._counters, self._counts.tolist(), strict=True):
+            columns, found, distinct, in_range, outside = row
+            counts.slots += columns * slots
+            counts.no_return += columns * slots - found
+            counts.repeated += found - distinct
+            counts.range += distinct - in_range
+            counts.box += in_range - outside
+            counts.written += outside
+
+    def _kept(self, array: npt.NDArray[Any]) -> int:
+        """Return the address of an array that lives as long as the group."""
+        array = np.ascontiguousarray(array)
+        self._arrays.append(array)
+        return address(array)
+
+    def _set_pixels(self, projector: Projector, table: PixelTable) -> None:
+        lidar = projector.lidar
+        runs = [
+            [(run.first_byte, run.channel, run.channels) for run in layout.runs]
+            for layout in table.returns
+        ]
+        layouts = [_fields(layout) for layout in table.returns]
+        fields = [field for _, own in layouts for field in own]
+        structs = (Field * len(fields))(*(Field(*field) for field in fields))
+        self._arrays.append(structs)
+        struct = self.struct
+        struct.run_count = len(runs[0])
+        struct.runs = self._kept(np.array(runs, np.int64))
+        struct.word_count = len(layouts[0][0])
+        struct.word_bytes = self._kept(np.array(layouts[0][0], np.int64))
+        struct.fields = ctypes.addressof(structs)
+        struct.scale = self._kept(np.array([table.factor, table.divisor], np.float32))
+        struct.silent = table.silent
+        struct.dark_count = len(table.dark)
+        struct.dark = self._kept(np.array(table.dark, np.int64))
+        struct.has_reflectivity = (
+            lidar.has_reflectivity
+            and "reflectivity" in projector.extras
+            and table.returns[0].reflectivity is not None
+        )
+
+    def _set_angle_table(self, projector: Projector, projection: Tabled) -> None:
+        width = self.struct.width
+        shape = (len(projector.sources), projector.lidar.channels)
+        struct = self.struct
+        struct.kind = _TABLED
+        struct.direction = self._kept(_padded(projection.vectors, width))
+        struct.cosine = self._kept(projection.cosine)
+        struct.sine = self._kept(projection.sine)
+        struct.origin = self._kept(projection.origin)
+        struct.first_row = self._kept(projection.first_position)
+        struct.rows = len(projection.cosine)
+        reach_m = np.broadcast_to(projection.reaches_m, shape)
+        struct.reach = self._kept(_padded(reach_m, width))
+        struct.tables = 1
+
+    def _set_rotors(self, members: Sequence[Turning], channels: int) -> None:
+        first = members[0]
+        struct = self.struct
+        width = struct.width
+        struct.kind = _TURNING
+        struct.direction = self._kept(_padded(np.stack([one.direction for one in members]), width))
+        struct.origin = self._kept(_padded(np.stack([one.origin for one in members]), width))
+        struct.used = self._kept(np.array([_used_vectors(one) for one in members], np.int64))
+        struct.tables = len(first.firing_ns)
+        if first.has_reach:
+            reaches_m = [np.broadcast_to(one.reach_m, (channels,)) for one in members]
+            struct.reach = self._kept(_padded(np.stack(reaches_m), width))
+        if not first.fires_at_once:
+            firing_ns = np.concatenate([one.firing_ns for one in members])
+            struct.firing_ns = self._kept(_padded(firing_ns, width))
+
+    def _set_slots(self, projector: Projector) -> None:
+        lidar = projector.lidar
+        struct = self.struct
+        element = _elements(projector)
+        number = np.zeros(lidar.returns * struct.width, np.int64)
+        number[element] = projector.number
+        struct.slot = self._kept(number)
+        if projector.order is not None:
+            struct.order = self._kept(element[projector.order])
+        elif lidar.returns > 1:
+            struct.order = self._kept(element)
+        has_orders = projector.order is not None and len(projector.order) > 1
+        struct.order_step = projector.slots if has_orders else 0
+        struct.typed = _typed_by(lidar)
+        struct.sends_twice = lidar.sends_twice
+        struct.drops_repeated = projector.drops_duplicates
+
+    def _set_labels(self, projectors: Sequence[Projector]) -> None:
+        first = projectors[0]
+        words = np.concatenate([one.labels for one in projectors])
+        if _typed_by(first.lidar):
+            # The loops add the types of dual returns.
+            words &= ~_TYPE_BITS
+        labels = np.zeros((len(words), first.lidar.returns * self.struct.width), np.int64)
+        labels[:, _elements(first)] = words.view(np.int64)
+        self.struct.labels = self._kept(labels)
+
+
+class _CopiedGroup:
+    """Sensors that numpy decodes to a buffer, from which the loops copy."""
+
+    def __init__(self, engine: NumpyEngine, slots: int, columns: int, struct: Group) -> None:
+        """slots: of a column; columns: most in one call; struct: to be filled."""
+        self._engine = engine
+        self._decoded = ScanBuffer(columns * slots, None)
+        self._points = np.zeros(columns, np.int64)
+        self._cursor = np.zeros(1, np.int64)
+        decoded = self._decoded
+        struct.kind = _COPIED
+        struct.points = address(self._points)
+        struct.cursor = address(self._cursor)
+        struct.copied_point = address(decoded.point)
+        struct.copied_label = address(decoded.label)
+        struct.copied_range = address(decoded.range_m)
+        struct.copied_reflectivity = address(decoded.reflectivity)
+
+    def decode(self, columns: WindowColumns, start_ns: int, first_number: int) -> None:
+        """Decode the own ones of some columns to the buffer."""
+        self._cursor[0] = 0
+        points = self._points[: len(columns)]
+        points[:] = 0
+        self._engine.decode(columns, start_ns, first_number, self._decoded, points)
+
+
+class NativeColumnStatistics(ColumnStatistics):
+    """Column statistics of every sensor in one pass."""
+
+    def __init__(self, positions: Sequence[int | None]) -> None:
+        super().__init__(positions)
+        self._library = library()
+        self._figures = np.zeros((len(positions), _FIGURES), np.int64)
+        self._position_counts = np.array([one or 0 for one in positions], np.int64)
+        self._entered = np.zeros((len(positions), SECTORS), np.int64)
+
+    def measure(self, columns: WindowColumns) -> list[ColumnStats]:
+        """See `ColumnStatistics`; numpy measures if a position is beyond the revolution."""
+        arrays = [
+            np.ascontiguousarray(array, np.int64)
+            for array in (columns.stamp_ns, columns.sensor, columns.encoder)
+        ]
+        if self._library.mlbatch_statistics(
+            len(columns),
+            *map(address, arrays),
+            len(self._figures),
+            SECTORS,
+            address(self._position_counts),
+            address(self._entered),
+            address(self._figures),
+        ):
+            return super().measure(columns)
+        return [
+            ColumnStats(count, gap_ns, passed / SECTORS, passed_again / SECTORS)
+            for count, gap_ns, passed, passed_again, *_ in self._figures.tolist()
+        ]
+
+
+def native_angles(words: I64Array) -> tuple[F32Array, F32Array]:
+    """Return the result of `rotor_angles` for rotor words (n,), equal to the last bit."""
+    words = np.ascontiguousarray(words)
+    cosine, sine = np.empty((2, len(words)), np.float32)
+    if library().mlbatch_angles(len(words), address(words), address(cosine), address(sine)):
+        unsure = cosine == _UNSURE
+        cosine[unsure], sine[unsure] = rotor_angles(words[unsure])
+    return cosine, sine
+
+
+# -- which sensors the loops decode, and in which groups ------------------------------------------
+
+
+def is_decoded(projector: Projector) -> bool:
+    """Return whether the loops can decode the sensors of a projector."""
+    lidar = projector.lidar
+    projection = projector.projection
+    if isinstance(projection, Tabled):
+        is_known = projection.origin.shape[2] == 1
+    else:
+        is_known = isinstance(projection, Turning)
+    fits = lidar.returns <= _MOST_RETURNS and _width(lidar) <= _MOST_BEAMS
+    # numpy raises an error for a slot beyond the row; the loops would write there.
+    fits &= int(projector.number.max()) < projector.slots
+    return is_known and fits and lidar.pixels is not None and _is_inside(lidar, lidar.pixels)
+
+
+def _is_inside(lidar: Lidar, table: PixelTable) -> bool:
+    """Return whether all pixels are inside of the records and of the channels."""
+    if any(channel >= lidar.channels for channel in table.dark):
+        return False
+    words = {tuple(_fields(layout)[0]) for layout in table.returns}
+    runs = {len(layout.runs) for layout in table.returns}
+    if len(words) != 1 or len(runs) != 1 or len(next(iter(words))) > _MOST_WORDS:
+        return False
+    return all(_is_inside_return(lidar, table, layout) for layout in table.returns)
+
+
+def _is_inside_return(lidar: Lidar, table: PixelTable, layout: ReturnLayout) -> bool:
+    fields = [layout.distance, layout.intensity]
+    if layout.reflectivity is not None:
+        fields.append(layout.reflectivity)
+    last = max(field.first + _FIELD_BITS[field.word] // 8 for field in fields)
+    return all(
+        run.first_byte + (run.channels - 1) * table.step + last <= lidar.records.size
+        and run.channel + run.channels <= lidar.channels
+        for run in layout.runs
+    )
+
+
+def _fields(layout: ReturnLayout) -> tuple[list[int], list[tuple[int, int, int, bool]]]:
+    """Return the words to read from a pixel, by first byte, and each field in them, as `Field`."""
+    words: list[int] = []
+    fields = []
+    for field in (layout.distance, layout.intensity, layout.reflectivity):
+        if field is None:
+            fields.append((0, 0, 0, False))
+            continue
+        number = next(
+            (number for number, first in enumerate(words) if _is_in_word(field, first)), len(words)
+        )
+        if number == len(words):
+            words.append(field.first)
+        bits = _FIELD_BITS[field.word]
+        shift = 8 * (field.first - words[number]) + field.shift
+        is_big = field.word[0] == ">"
+        if is_big and field.shift:
+            raise ValueError("expected no shift in a big-endian field")
+        # Of a field that is narrower than the word, the other bits are another field's.
+        mask = field.mask & ((1 << bits) - 1) >> field.shift
+        fields.append((number, shift, mask, is_big))
+    return words, fields
+
+
+def _is_in_word(field: BitField, first: int) -> bool:
+    end = field.first + _FIELD_BITS[field.word] // 8
+    return first <= field.first and end <= first + _WORD_BYTES
+
+
+def _width(lidar: Lidar) -> int:
+    """Return the beams of a plane."""
+    return -(-lidar.channels // _BEAMS_TOGETHER) * _BEAMS_TOGETHER
+
+
+def _indices_by_group(projectors: Sequence[Projector]) -> list[list[int]]:
+    """Return the projectors of each group; one that numpy decodes has a group of its own."""
+    groups: dict[Hashable, list[int]] = {}
+    for number, projector in enumerate(projectors):
+        is_native = is_decoded(projector)
+        key = _group_key(projector) if is_native else number
+        groups.setdefault((is_native, key), []).append(number)
+    return list(groups.values())
+
+
+def _group_key(projector: Projector) -> Hashable:
+    """Return a key that is equal for projectors whose sensors can share a struct.
+
+    With rotor words, directions, labels and limits are stored by member; all else is shared and
+    is in the key.
+    """
+    lidar = projector.lidar
+    projection = projector.projection
+    if not isinstance(projection, Turning):
+        return id(projector)
+    return (
+        lidar.pixels,
+        lidar.records,
+        lidar.channels,
+        lidar.returns,
+        lidar.has_reflectivity,
+        lidar.typed_by,
+        lidar.sends_twice,
+        projector.drops_duplicates,
+        projection.has_reach,
+        projection.fires_at_once,
+        len(projection.firing_ns),
+        None if projector.order is None else projector.order.tobytes(),
+        projector.number.tobytes(),
+    )
+
+
+def _members(projectors: Sequence[Projector], indices: Sequence[int], seat: I64Array) -> I64Array:
+    """Return the member of the group of some projectors by sensor: (sensors,), -1 for others."""
+    member = np.full(len(seat), -1)
+    count = 0
+    for index in indices:
+        own = seat[:, 0] == index
+        member[own] = seat[own, 1] + count
+        count += len(projectors[index].sources)
+    return member
+
+
+def _used_vectors(projection: Turning) -> int:
+    """Return bits of the vectors that are not zero, by axis; `Group.used`."""
+    bits = _nonzero_axes(projection.direction[:2])
+    bits |= _nonzero_axes(projection.direction[2:]) << 3
+    if projection.origin_turns:
+        bits |= _nonzero_axes(projection.origin[:2]) << 6
+    bits |= _nonzero_axes(projection.origin[2:]) << 9
+    return bits
+
+
+def _nonzero_axes(vectors: F32Array) -> int:
+    """Return bits of the axes in which vectors (k, 3, B) are not zero for all beams."""
+    return sum(1 << axis for axis in range(3) if vectors[:, axis].any())
+
+
+def _elements(projector: Projector) -> I64Array:
+    """Return the element of each slot: `return * width + beam`."""
+    slot = np.arange(projector.slots)
+    returns = projector.lidar.returns
+    return slot % returns * _width(projector.lidar) + slot // returns
+
+
+def _typed_by(lidar: Lidar) -> int:
+    return _TYPED_BY[lidar.typed_by] if lidar.returns == 2 else 0
+
+
+def _padded(values: F32Array, width: int) -> F32Array:
+    """Pad the last axis with zeros to `width` beams."""
+    missing = width - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values

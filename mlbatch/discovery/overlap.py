@@ -1,0 +1,212 @@
+"""Do the recordings of a session belong together: receive times of the lidars in each.
+
+A window can contain the columns of two lidars only if they were recorded at the same time.
+Recordings with a lidar in common may follow each other, as the parts of a split recording do, but
+not at any distance.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch import sensors
+from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.errors import MlbatchError
+from mlbatch.readers import open_recording
+from mlbatch.types import PacketBatch, Recording, Stream, StreamTable
+from mlbatch.units import NS_PER_S
+
+# Largest time between recordings with a lidar in common: a break in a day of work, but not a day.
+MAX_BREAK_NS = 24 * 3600 * NS_PER_S
+# Packets of a kind that are described.
+_CHECKED = 16
+
+
+@dataclass(slots=True)
+class LidarSpan:
+    """The lidars of one recording, and when their packets were received, ns.
+
+    first_ns: None before the first; is_whole: no later packet can come.
+    """
+
+    path: Path
+    lidars: set[str] = field(default_factory=set)
+    first_ns: int | None = None
+    last_ns: int = 0
+    is_whole: bool = False
+
+    def add(self, lidar: str, first_ns: int, last_ns: int) -> None:
+        """Add packets of a lidar."""
+        self.lidars.add(lidar)
+        self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
+        self.last_ns = max(self.last_ns, last_ns)
+
+
+@dataclass(slots=True)
+class _Group:
+    """Recordings that share lidars, by first receive time."""
+
+    spans: list[LidarSpan]
+
+    @property
+    def lidars(self) -> set[str]:
+        return {lidar for span in self.spans for lidar in span.lidars}
+
+    @property
+    def first_ns(self) -> int:
+        return self.spans[0].first_ns or 0
+
+    @property
+    def last_ns(self) -> int:
+        return max(span.last_ns for span in self.spans)
+
+    @property
+    def is_whole(self) -> bool:
+        return all(span.is_whole for span in self.spans)
+
+    def __str__(self) -> str:
+        # Of a long series the names would fill pages.
+        more = f" and {len(self.spans) - 1} more" if len(self.spans) > 1 else ""
+        return f"{self.spans[0].path}{more} ({iso(self.first_ns)} to {iso(self.last_ns)})"
+
+
+def problem(
+    spans: Sequence[LidarSpan], optional: Iterable[str] = (), *, are_all_known: bool = True
+) -> tuple[str, bool]:
+    """Why recordings are no session, or "", and True if only optional lidars are concerned.
+
+    optional: lidars that may be absent; are_all_known: False while more lidars may be found in the
+    recordings.
+    """
+    groups = _groups(spans)
+    for group in groups:
+        text = _long_break(group.spans)
+        if text:
+            return text, False
+    found = ""
+    for number, late in enumerate(groups if are_all_known else ()):
+        for early in groups[:number]:
+            if not early.is_whole or early.last_ns >= late.first_ns:
+                continue
+            text = (
+                f"{early}, {late}: expected recordings of different lidars that overlap in receive "
+                "time, found none that do, so that no scan has all lidars; convert each alone, or "
+                "correct the receive times (editcap -t SECONDS) (no_overlap)"
+            )
+            if not (early.lidars <= set(optional) or late.lidars <= set(optional)):
+                return text, False
+            found = text
+    return found, bool(found)
+
+
+def _groups(spans: Sequence[LidarSpan]) -> list[_Group]:
+    """Recordings in groups that share no lidar, by first receive time."""
+    known = [span for span in spans if span.first_ns is not None]
+    above: dict[str, str] = {}
+
+    def top(lidar: str) -> str:
+        while (higher := above.setdefault(lidar, lidar)) != lidar:
+            above[lidar] = above[higher]
+            lidar = higher
+        return lidar
+
+    for span in known:
+        first, *others = span.lidars
+        for other in others:
+            above[top(other)] = top(first)
+    groups: dict[str, _Group] = {}
+    for span in sorted(known, key=lambda span: span.first_ns or 0):
+        groups.setdefault(top(next(iter(span.lidars))), _Group([])).spans.append(span)
+    return list(groups.values())
+
+
+def _long_break(spans: Sequence[LidarSpan]) -> str:
+    """Error text if recordings of one lidar are too far apart, else ""."""
+    before = spans[0]
+    for span in spans[1:]:
+        if before.is_whole and (span.first_ns or 0) - before.last_ns > MAX_BREAK_NS:
+            return (
+                f"{_Group([before])}, {_Group([span])}: expected recordings of one session at most "
+                "a day apart, found more; convert each alone, or correct the receive times "
+                "(editcap -t SECONDS) (no_overlap)"
+            )
+        if span.last_ns >= before.last_ns or not span.is_whole:
+            before = span
+    return ""
+
+
+def iso(host_ns: int) -> str:
+    """Receive time as ISO 8601 in UTC, to the millisecond; in seconds where no date has it."""
+    try:
+        moment = datetime.datetime.fromtimestamp(host_ns // NS_PER_S, datetime.timezone.utc)
+    except (OverflowError, ValueError, OSError):
+        return f"{host_ns / NS_PER_S:.3f} s"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{host_ns % NS_PER_S // 10**6:03d}Z"
+
+
+# -- captures -------------------------------------------------------------------------------------
+
+
+def spans_of_captures(
+    recordings: Sequence[Recording], is_wanted: Callable[[Stream, str], bool]
+) -> list[LidarSpan]:
+    """Lidars of captures, by their first and last packets; nothing between is read.
+
+    Empty if one of the recordings does not show its end: then the run finds out. is_wanted: by
+    stream and description.
+    """
+    spans = []
+    for recording in recordings:
+        try:
+            span = _span(recording, is_wanted)
+        except MlbatchError:
+            # Its damage is an error of the run.
+            span = None
+        if span is None:
+            return []
+        spans.append(span)
+    return spans
+
+
+def _span(recording: Recording, is_wanted: Callable[[Stream, str], bool]) -> LidarSpan | None:
+    table = StreamTable()
+    last = recording.last_packets(table)
+    if last is None or not len(last):
+        return None
+    span = LidarSpan(recording.path, is_whole=True)
+    with contextlib.closing(open_recording(recording.path, table).packets()) as packets:
+        first = next(packets, None)
+        if first is None or not len(first):
+            return None
+        # Lidars may begin after other packets, and end before them.
+        first_ns = int(first.host_ns.min())
+        last_ns = int(last.host_ns.max())
+        for batch in (first, last):
+            for lidar in _lidars(batch, table, is_wanted):
+                span.add(lidar, first_ns, last_ns)
+    return span
+
+
+def _lidars(
+    batch: PacketBatch, table: StreamTable, is_wanted: Callable[[Stream, str], bool]
+) -> Iterator[str]:
+    """Lidars whose packets are in a batch."""
+    for kind, index in split_by_kind(batch):
+        stream = table.streams[kind.stream]
+        packets = batch.data[batch.start[index[:_CHECKED], None] + np.arange(kind.size)]
+        what = sensors.describe(kind.size, packets)
+        if what is not None and "lidar" in what and is_wanted(stream, what):
+            yield lidar_name(stream, what)
+
+
+def lidar_name(stream: Stream, what: str) -> str:
+    """Name of a lidar without a sensor: its serial number, which may move, else its stream."""
+    serial = re.search(r"serial \w+", what)
+    return serial[0] if serial else str(stream)

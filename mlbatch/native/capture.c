@@ -1,0 +1,150 @@
+/* Captures: records of a pcap file to frames, frames to datagrams and fragments.
+
+   Layouts: draft-ietf-opsawg-pcap, section 5; RFC 791 (IPv4); RFC 768 (UDP). The same verdicts as
+   `readers/capture/frames.py`, to which everything unusual is left. */
+#include <string.h>
+
+#include "native.h"
+
+enum { RECORD_BYTES = 16, ETHERNET_BYTES = 14, IP_BYTES = 20, UDP_BYTES = 8 };
+enum { IPV4_TYPE = 0x0800, UDP = 17, MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF };
+/* Why a walk ends: `native/capture.py`. */
+enum { NO_ROOM, CUT, TOO_LONG };
+
+static int64_t low(const uint8_t *byte)
+{
+    return byte[0] | byte[1] << 8 | byte[2] << 16 | (int64_t)byte[3] << 24;
+}
+
+static int64_t high(const uint8_t *byte)
+{
+    return (int64_t)byte[0] << 24 | byte[1] << 16 | byte[2] << 8 | byte[3];
+}
+
+static int64_t high2(const uint8_t *byte)
+{
+    return byte[0] << 8 | byte[1];
+}
+
+static int64_t word(const uint8_t *byte, int64_t is_swapped)
+{
+    return is_swapped ? high(byte) : low(byte);
+}
+
+/* Frames of the records in data[begin:end]: first byte, captured and original length, receive
+   time, as columns (4, room). Return their number; stop: where the next record begins, and why the
+   walk ended there. */
+EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
+                            int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
+                            int64_t *stop)
+{
+    int64_t count = 0, place = begin, why = NO_ROOM;
+    for (; count < room; count++) {
+        if (place + RECORD_BYTES > end) {
+            why = CUT;
+            break;
+        }
+        const uint8_t *record = data + place;
+        const int64_t size = word(record + 8, is_swapped);
+        if (size > most_bytes) {
+            why = TOO_LONG;
+            break;
+        }
+        if (place + RECORD_BYTES + size > end) {
+            why = CUT;
+            break;
+        }
+        columns[count] = place + RECORD_BYTES;
+        columns[room + count] = size;
+        columns[2 * room + count] = word(record + 12, is_swapped);
+        columns[3 * room + count] =
+            word(record, is_swapped) * INT64_C(1000000000) + word(record + 4, is_swapped) * unit_ns;
+        place += RECORD_BYTES + size;
+    }
+    stop[0] = place;
+    stop[1] = why;
+    return count;
+}
+
+/* A whole datagram: frame, first byte, size, source address, destination port. */
+static int add_datagram(const uint8_t *data, int64_t frame, int64_t packet, int64_t body,
+                        int64_t stop, int64_t room, int64_t *out)
+{
+    const int64_t size = high2(data + body + 4);
+    if (size < UDP_BYTES || body + size > stop)
+        return 0;
+    out[0] = frame;
+    out[room] = body + UDP_BYTES;
+    out[2 * room] = size - UDP_BYTES;
+    out[3 * room] = high(data + packet + 12);
+    out[4 * room] = high2(data + body + 2);
+    return 1;
+}
+
+/* A fragment: frame, source, destination, identification, offset, more follow, first byte, size. */
+static int add_fragment(const uint8_t *data, int64_t frame, int64_t packet, int64_t body,
+                        int64_t stop, int64_t room, int64_t *out)
+{
+    const int64_t end = packet + high2(data + packet + 2), place = high2(data + packet + 6);
+    if (end <= body || end > stop)
+        return 0;
+    out[0] = frame;
+    out[room] = high(data + packet + 12);
+    out[2 * room] = high(data + packet + 16);
+    out[3 * room] = high2(data + packet + 4);
+    out[4 * room] = (place & FRAGMENT_OFFSET) * 8;
+    out[5 * room] = (place & MORE_FRAGMENTS) != 0;
+    out[6 * room] = body;
+    out[7 * room] = end - body;
+    return 1;
+}
+
+/* Frames of Ethernet, IPv4 and UDP to datagrams (5, frames) and fragments (8, frames); others:
+   numbers of all other frames. Return the number of datagrams; found: fragments, others. */
+EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t frames,
+                               const int64_t *start, const int64_t *captured,
+                               const int64_t *original, int64_t *datagrams, int64_t *fragments,
+                               int64_t *others, int64_t *found)
+{
+    int64_t whole = 0, parts = 0, rest = 0;
+    for (int64_t frame = 0; frame < frames; frame++) {
+        const int64_t first = start[frame], size = captured[frame];
+        const int is_inside = first >= 0 && size >= ETHERNET_BYTES + IP_BYTES + UDP_BYTES
+            && first <= data_bytes && size <= data_bytes - first && original[frame] <= size;
+        int is_usual = 0;
+        if (is_inside) {
+            const int64_t packet = first + ETHERNET_BYTES, stop = first + size;
+            const int64_t body = packet + (data[packet] & 15) * 4;
+            const int is_udp = high2(data + first + 12) == IPV4_TYPE && data[packet] >> 4 == 4
+                && data[packet + 9] == UDP && packet + IP_BYTES <= body && body + UDP_BYTES <= stop;
+            if (is_udp && (high2(data + packet + 6) & (MORE_FRAGMENTS | FRAGMENT_OFFSET))) {
+                is_usual =
+                    add_fragment(data, frame, packet, body, stop, frames, fragments + parts);
+                parts += is_usual;
+            } else if (is_udp) {
+                is_usual =
+                    add_datagram(data, frame, packet, body, stop, frames, datagrams + whole);
+                whole += is_usual;
+            }
+        }
+        if (!is_usual)
+            others[rest++] = frame;
+    }
+    found[0] = parts;
+    found[1] = rest;
+    return whole;
+}
+
+/* Copy source[source_at[i] : + bytes[i]] to target[target_at[i] : ...] for all i; source and
+   target may be parts of one buffer, runs do not overlap. */
+EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
+                         const int64_t *bytes, uint8_t *target, const int64_t *target_at)
+{
+    for (int64_t run = 0; run < runs; run++)
+        memmove(target + target_at[run], source + source_at[run], (size_t)bytes[run]);
+}
+
+EXPORT int64_t mlbatch_abi(void)
+{
+    return MLBATCH_ABI;
+}

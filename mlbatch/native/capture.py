@@ -1,0 +1,98 @@
+"""Compiled loops over captures: frames in records, datagrams and fragments in frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.native.library import address, library
+
+# Why a walk ended: no room for more frames, no whole record, a frame that is too long.
+NO_ROOM, CUT, TOO_LONG = range(3)
+# Room for frames of one walk.
+_ROOM = 1 << 14
+
+
+@dataclass(slots=True)
+class Found:
+    """Rows of Ethernet frames: columns of datagrams (5, n) and fragments (8, n); other frames."""
+
+    datagrams: I64Array
+    fragments: I64Array
+    others: I64Array
+
+
+class CaptureLoops:
+    """The loops over captures; the same results as numpy's."""
+
+    def __init__(self) -> None:
+        self._library = library()
+
+    def walk(
+        self, data: U8Array, begin: int, end: int, is_swapped: bool, unit_ns: int, most_bytes: int
+    ) -> tuple[I64Array, int, int]:
+        """Return the records of `data[begin:end]`, where they end, and why there.
+
+        The records are columns (4, n): first byte, captured and original length, receive time.
+        """
+        if begin < 0 or end > len(data):
+            raise IndexError(f"bytes {begin} to {end} of {len(data)}")
+        columns = np.empty((4, _ROOM), np.int64)
+        stop = np.empty(2, np.int64)
+        count = self._library.mlbatch_walk(
+            address(data),
+            begin,
+            end,
+            is_swapped,
+            unit_ns,
+            most_bytes,
+            _ROOM,
+            address(columns),
+            address(stop),
+        )
+        place, why = stop.tolist()
+        return columns[:, :count], place, why
+
+    def dissect(
+        self, data: U8Array, start: I64Array, captured: I64Array, original: I64Array
+    ) -> Found:
+        """Return what Ethernet frames (n,) contain that are IPv4 without tags, and the others."""
+        count = len(start)
+        inputs = [np.ascontiguousarray(column) for column in (start, captured, original)]
+        datagrams = np.empty((5, count), np.int64)
+        fragments = np.empty((8, count), np.int64)
+        others = np.empty(count, np.int64)
+        found = np.empty(2, np.int64)
+        whole = self._library.mlbatch_dissect(
+            address(data),
+            len(data),
+            count,
+            *map(address, inputs),
+            *map(address, (datagrams, fragments, others, found)),
+        )
+        parts, rest = found.tolist()
+        return Found(datagrams[:, :whole], fragments[:, :parts], others[:rest])
+
+    def copy_runs(
+        self, source: U8Array, start: I64Array, size: I64Array, out: U8Array, at_byte: I64Array
+    ) -> None:
+        """Copy `source[start[i] : start[i] + size[i]]` to `out[at_byte[i] : ...]` for all i."""
+        if not len(start):
+            return
+        start, size, at_byte = map(np.ascontiguousarray, (start, size, at_byte))
+        if bool(_is_outside(source, start, size).any() | _is_outside(out, at_byte, size).any()):
+            raise IndexError("runs outside of their arrays")
+        self._library.mlbatch_copy(
+            len(start),
+            address(source),
+            address(start),
+            address(size),
+            address(out),
+            address(at_byte),
+        )
+
+
+def _is_outside(data: U8Array, start: I64Array, size: I64Array) -> BoolArray:
+    return np.asarray((start < 0) | (size < 0) | (size > len(data)) | (start > len(data) - size))

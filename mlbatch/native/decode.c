@@ -1,0 +1,646 @@
+/* Columns of a window to points of a scan: every pixel is read once and written to its final row.
+
+   The same float32 operations as `decode/projector.py` and `lidar/geometry.py`, column by column.
+   A column is decoded to planes, one value a beam, which fit into the first cache; an element is
+   `return * width + beam`. Beams beyond those of the lidar have no return. */
+#include <string.h>
+
+#include "native.h"
+
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
+#define MOST_ELEMENTS (MOST_BEAMS * MOST_RETURNS)
+#define TYPE_BIT 48
+#define LIDAR_ID_BIT 56
+/* Rotor words: `lidar/geometry.py`. */
+#define SPEED_BIT 32
+#define SPEED_SIGN (INT64_C(1) << 23)
+#define TABLE_BIT 56
+
+/* Planes of one column. */
+typedef struct {
+    _Alignas(64) float range_m[MOST_ELEMENTS];
+    _Alignas(64) float level[MOST_ELEMENTS];
+    _Alignas(64) float x[MOST_ELEMENTS];
+    _Alignas(64) float y[MOST_ELEMENTS];
+    _Alignas(64) float z[MOST_ELEMENTS];
+    _Alignas(64) int64_t label[MOST_ELEMENTS];
+    _Alignas(64) uint32_t words[MOST_WORDS][MOST_BEAMS];
+    _Alignas(64) uint16_t reflectivity[MOST_ELEMENTS];
+    _Alignas(64) uint8_t keep[MOST_ELEMENTS];
+} Planes;
+
+/* -- pixels ------------------------------------------------------------------------------------ */
+
+/* Words of pixels that are `step` bytes apart. Words of short pixels reach up to 3 bytes beyond
+   them; rings have that much room behind their last column. */
+static inline void gather_every(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
+{
+    for (int64_t pixel = 0; pixel < count; pixel++)
+        memcpy(out + pixel, from + pixel * step, 4);
+}
+
+static void gather(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
+{
+    /* With constant steps the compiler vectorises. */
+    switch (step) {
+    case 3: gather_every(from, 3, count, out); break;
+    case 4: gather_every(from, 4, count, out); break;
+    case 8: gather_every(from, 8, count, out); break;
+    case 12: gather_every(from, 12, count, out); break;
+    case 16: gather_every(from, 16, count, out); break;
+    default: gather_every(from, step, count, out);
+    }
+}
+
+/* Swap the two bytes of a big-endian field; other bits of the words stay. */
+static void swap_bytes(uint32_t *words, const Field *field, int64_t width)
+{
+    const int shift = (int)field->shift;
+    const uint32_t others = ~(UINT32_C(0xFFFF) << shift);
+    for (int64_t beam = 0; beam < width; beam++) {
+        const uint32_t value = words[beam] >> shift;
+        const uint32_t swapped = (value & 0xFF) << 8 | (value >> 8 & 0xFF);
+        words[beam] = (words[beam] & others) | swapped << shift;
+    }
+}
+
+static void to_ranges(const uint32_t *restrict words, const Field *field, int32_t silent,
+                      const float *scale, int64_t width, float *restrict range_m)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    const float factor = scale[0], divisor = scale[1];
+    for (int64_t beam = 0; beam < width; beam++) {
+        const int32_t value = (int32_t)(words[beam] >> shift & mask);
+        /* A mask instead of a branch, which would not be vectorised; 0 gives exactly 0 m. */
+        range_m[beam] = (float)(value & -(int32_t)(value > silent)) * factor / divisor;
+    }
+}
+
+static void to_levels(const uint32_t *restrict words, const Field *field, int64_t width,
+                      float *restrict levels)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    for (int64_t beam = 0; beam < width; beam++)
+        levels[beam] = (float)(int32_t)(words[beam] >> shift & mask);
+}
+
+static void to_reflectivities(const uint32_t *restrict words, const Field *field, int64_t width,
+                              uint16_t *restrict reflectivity)
+{
+    const int shift = (int)field->shift;
+    const uint32_t mask = (uint32_t)field->mask;
+    for (int64_t beam = 0; beam < width; beam++)
+        reflectivity[beam] = (uint16_t)(words[beam] >> shift & mask);
+}
+
+/* Words of the pixels of one return, of all channels; distances in little-endian order, 0 for
+   channels without returns. */
+static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+{
+    const int64_t *run = group->runs + which * group->run_count * 3;
+    for (int64_t number = 0; number < group->run_count; number++, run += 3)
+        for (int64_t word = 0; word < group->word_count; word++)
+            gather(record + run[0] + group->word_bytes[word], group->step, run[2],
+                   planes->words[word] + run[1]);
+    const Field *distance = group->fields + which * FIELDS + DISTANCE;
+    uint32_t *words = planes->words[distance->word];
+    if (distance->is_big)
+        swap_bytes(words, distance, group->width);
+    for (int64_t number = 0; number < group->dark_count; number++)
+        words[group->dark[number]] &= ~((uint32_t)distance->mask << (int)distance->shift);
+}
+
+/* Range, level and reflectivity of one return of a column. */
+static void read_return(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+{
+    const int64_t width = group->width, first = which * width;
+    const Field *fields = group->fields + which * FIELDS;
+    read_words(group, record, which, planes);
+    to_ranges(planes->words[fields[DISTANCE].word], fields + DISTANCE, (int32_t)group->silent,
+              group->scale, width, planes->range_m + first);
+    to_levels(planes->words[fields[INTENSITY].word], fields + INTENSITY, width,
+              planes->level + first);
+    if (group->has_reflectivity)
+        to_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY, width,
+                          planes->reflectivity + first);
+}
+
+/* -- points ------------------------------------------------------------------------------------ */
+
+/* Row of the table of a TABLED group. */
+static int64_t table_row(const Group *group, int64_t member, int64_t encoder)
+{
+    const int64_t row = encoder + group->first_row[member];
+    return row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
+}
+
+/* One coordinate: (r + reach) * (cos * V1 + sin * V2 + V3) + origin. */
+static inline void place(const float *restrict range_m, const float *restrict reach,
+                         const float *restrict vectors, int64_t width, float cosine, float sine,
+                         float origin, float *restrict out)
+{
+    const float *restrict second = vectors + 3 * width;
+    const float *restrict third = vectors + 6 * width;
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float direction = cosine * vectors[beam] + sine * second[beam] + third[beam];
+        out[beam] = (range_m[beam] + reach[beam]) * direction + origin;
+    }
+}
+
+/* Tabled: all beams at the angle of a row of the table. */
+static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
+{
+    const int64_t width = group->width;
+    const int64_t row = table_row(group, member, encoder);
+    const float *restrict vectors = group->direction + member * 9 * width;
+    const float *restrict reach = group->reach + member * width;
+    const float *origin = group->origin + row * 3;
+    const float cosine = group->cosine[row], sine = group->sine[row];
+    for (int64_t which = 0; which < group->returns; which++) {
+        const float *range_m = planes->range_m + which * width;
+        float *planes_of[] = {planes->x, planes->y, planes->z};
+        for (int64_t axis = 0; axis < 3; axis++)
+            place(range_m, reach, vectors + axis * width, width, cosine, sine, origin[axis],
+                  planes_of[axis] + which * width);
+    }
+}
+
+/* cos * V1 + sin * V2 + V3 of one axis; as in numpy, vectors that are zero are left out. */
+static void combine(const float *restrict vectors, int64_t width, int64_t used,
+                    const float *restrict cosine, const float *restrict sine, float *restrict out)
+{
+    const float *restrict first = vectors;
+    const float *restrict second = vectors + 3 * width;
+    const float *restrict third = vectors + 6 * width;
+    const int rotates = used & 1, is_constant = used >> 3 & 1;
+    if (!rotates) {
+        memcpy(out, third, (size_t)width * sizeof *out);
+    } else if (!is_constant) {
+        for (int64_t beam = 0; beam < width; beam++)
+            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam];
+    } else {
+        for (int64_t beam = 0; beam < width; beam++)
+            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam] + third[beam];
+    }
+}
+
+/* Turning: each beam fires at its own angle of the rotor. */
+static void project_turning(const Group *group, int64_t member, int64_t encoder, int64_t table,
+                            int64_t column, Planes *planes)
+{
+    _Alignas(64) float cosine[MOST_BEAMS], sine[MOST_BEAMS];
+    _Alignas(64) float direction[3][MOST_BEAMS], origin[3][MOST_BEAMS];
+    const int64_t width = group->width;
+    const int64_t field = encoder >> SPEED_BIT & (2 * SPEED_SIGN - 1);
+    /* Radians in a ns; the constant is 2 pi / 2**48 as Python computes it. */
+    const float speed =
+        (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
+    for (int64_t beam = 0; beam < width; beam++) {
+        cosine[beam] = group->cosine[column];
+        sine[beam] = group->sine[column];
+    }
+    if (group->firing_ns && speed != 0.0f) {
+        const float *restrict firing_ns = group->firing_ns + table * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            const float before = cosine[beam], across = sine[beam];
+            const float turned = speed * firing_ns[beam];
+            const float half = turned * 0.5f;
+            cosine[beam] = before - (half * before + across) * turned;
+            sine[beam] = across + (before - half * across) * turned;
+        }
+    }
+    const float *directions = group->direction + member * 9 * width;
+    const float *origins = group->origin + member * 9 * width;
+    const int64_t used = group->used[member];
+    for (int64_t axis = 0; axis < 3; axis++) {
+        combine(directions + axis * width, width, used >> axis, cosine, sine, direction[axis]);
+        combine(origins + axis * width, width, used >> (6 + axis), cosine, sine, origin[axis]);
+    }
+    for (int64_t which = 0; which < group->returns; which++) {
+        const float *restrict range_m = planes->range_m + which * width;
+        if (group->reach) {
+            const float *restrict reach = group->reach + member * width;
+            for (int64_t beam = 0; beam < width; beam++)
+                cosine[beam] = range_m[beam] + reach[beam];
+            range_m = cosine;
+        }
+        float *restrict x = planes->x + which * width;
+        float *restrict y = planes->y + which * width;
+        float *restrict z = planes->z + which * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            x[beam] = range_m[beam] * direction[0][beam] + origin[0][beam];
+            y[beam] = range_m[beam] * direction[1][beam] + origin[1][beam];
+            z[beam] = range_m[beam] * direction[2][beam] + origin[2][beam];
+        }
+    }
+}
+
+/* -- which slots become points ----------------------------------------------------------------- */
+
+static int64_t count_kept(const uint8_t *keep, int64_t elements)
+{
+    int64_t total = 0;
+    for (int64_t element = 0; element < elements; element++)
+        total += keep[element];
+    return total;
+}
+
+/* Mark the elements to keep; count those left after each step. */
+static void mark(const Scan *scan, const Group *group, int64_t member, Planes *planes)
+{
+    const int64_t width = group->width, elements = group->returns * width;
+    const float *restrict range_m = planes->range_m;
+    uint8_t *restrict keep = planes->keep;
+    int64_t *counts = group->counts + member * COUNTS;
+    for (int64_t element = 0; element < elements; element++)
+        keep[element] = range_m[element] > 0.0f;
+    int64_t left = count_kept(keep, elements);
+    counts[FOUND] += left;
+    if (group->drops_repeated) {
+        for (int64_t which = 1; which < group->returns; which++)
+            for (int64_t earlier = 0; earlier < which; earlier++)
+                for (int64_t beam = 0; beam < width; beam++)
+                    keep[which * width + beam] &=
+                        range_m[which * width + beam] != range_m[earlier * width + beam];
+        left = count_kept(keep, elements);
+    }
+    counts[DISTINCT] += left;
+    if (group->limits_m) {
+        const float low = group->limits_m[2 * member], high = group->limits_m[2 * member + 1];
+        for (int64_t element = 0; element < elements; element++)
+            keep[element] &= (range_m[element] >= low) & (range_m[element] <= high);
+        left = count_kept(keep, elements);
+    }
+    counts[IN_RANGE] += left;
+    for (int64_t number = 0; number < scan->box_count; number++) {
+        const float *box = scan->boxes_m + 6 * number;
+        const float *restrict x = planes->x;
+        const float *restrict y = planes->y;
+        const float *restrict z = planes->z;
+        for (int64_t element = 0; element < elements; element++) {
+            const int inside = (x[element] >= box[0]) & (x[element] <= box[3])
+                & (y[element] >= box[1]) & (y[element] <= box[4])
+                & (z[element] >= box[2]) & (z[element] <= box[5]);
+            keep[element] &= (uint8_t)!inside;
+        }
+    }
+    if (scan->box_count)
+        left = count_kept(keep, elements);
+    counts[OUTSIDE_BOXES] += left;
+}
+
+/* Labels of all elements; types of dual returns: docs/sources/outputs.md section 3. */
+static void label(const Group *group, int64_t row, int64_t offset_ns, Planes *planes)
+{
+    enum { FIRST_STRONG = 3, SINGLE = 7, SUM_OF_TYPES = 9 };
+    const int64_t width = group->width, elements = group->returns * width;
+    const int64_t *restrict words = group->labels + row * elements;
+    int64_t *restrict labels = planes->label;
+    for (int64_t element = 0; element < elements; element++)
+        labels[element] = words[element] + offset_ns;
+    if (group->typed == NOT_TYPED)
+        return;
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float first_m = planes->range_m[beam], second_m = planes->range_m[width + beam];
+        int64_t kind = FIRST_STRONG + (first_m > second_m);
+        if (group->typed == TYPED_BY_LEVEL)
+            kind += 2 * (planes->level[beam] < planes->level[width + beam]);
+        int is_single = (first_m == 0.0f) | (second_m == 0.0f);
+        if (group->sends_twice)
+            is_single |= first_m == second_m;
+        const int64_t single = is_single ? SINGLE : 0;
+        labels[beam] |= (kind | single) << TYPE_BIT;
+        labels[width + beam] |= ((SUM_OF_TYPES - kind) | single) << TYPE_BIT;
+    }
+}
+
+/* -- rows -------------------------------------------------------------------------------------- */
+
+static inline void put_point(float *point, const Planes *planes, int64_t element)
+{
+    point[0] = planes->x[element];
+    point[1] = planes->y[element];
+    point[2] = planes->z[element];
+    point[3] = planes->level[element];
+}
+
+#if defined(__SSE2__)
+/* Store the points and labels of the lanes in `kept` to rows from `row`; others are overwritten by
+   the next point. p0 to p3: x, y, z, level of four beams. Return the next row. */
+static inline int64_t store_kept(const Scan *scan, int64_t row, int kept, __m128 p0, __m128 p1,
+                                 __m128 p2, __m128 p3, __m128i low, __m128i high)
+{
+    float *point = scan->point + 4 * row;
+    int64_t *labels = scan->label + row;
+    _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
+    if (kept == 15) {
+        _mm_storeu_ps(point, p0);
+        _mm_storeu_ps(point + 4, p1);
+        _mm_storeu_ps(point + 8, p2);
+        _mm_storeu_ps(point + 12, p3);
+        _mm_storeu_si128((__m128i *)labels, low);
+        _mm_storeu_si128((__m128i *)(labels + 2), high);
+        return row + 4;
+    }
+    _mm_storeu_ps(point, p0);
+    _mm_storel_epi64((__m128i *)labels, low);
+    int64_t next = kept & 1;
+    _mm_storeu_ps(point + 4 * next, p1);
+    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(low, low));
+    next += kept >> 1 & 1;
+    _mm_storeu_ps(point + 4 * next, p2);
+    _mm_storel_epi64((__m128i *)(labels + next), high);
+    next += kept >> 2 & 1;
+    _mm_storeu_ps(point + 4 * next, p3);
+    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(high, high));
+    return row + next + (kept >> 3);
+}
+#endif
+
+/* Points of one return in wire order without filters, whose planes are ready; labels are made on
+   the way. Return the next row. */
+static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *words,
+                          int64_t offset_ns, int64_t row, const Planes *planes)
+{
+    int64_t beam = 0;
+#if defined(__SSE2__)
+    const __m128i offsets = _mm_set1_epi64x(offset_ns);
+    for (; beam + 4 <= group->slots; beam += 4) {
+        const int kept = _mm_movemask_ps(
+            _mm_cmpgt_ps(_mm_load_ps(planes->range_m + beam), _mm_setzero_ps()));
+        if (!kept)
+            continue;
+        const __m128i *own = (const __m128i *)(words + beam);
+        row = store_kept(scan, row, kept, _mm_load_ps(planes->x + beam),
+                         _mm_load_ps(planes->y + beam), _mm_load_ps(planes->z + beam),
+                         _mm_load_ps(planes->level + beam),
+                         _mm_add_epi64(_mm_loadu_si128(own), offsets),
+                         _mm_add_epi64(_mm_loadu_si128(own + 1), offsets));
+    }
+#endif
+    for (; beam < group->slots; beam++) {
+        put_point(scan->point + 4 * row, planes, beam);
+        scan->label[row] = words[beam] + offset_ns;
+        row += planes->range_m[beam] > 0.0f;
+    }
+    return row;
+}
+
+#if defined(__SSE2__)
+/* The usual case in one pass over the beams: TABLED, one return, wire order, no filters. Writes
+   ranges and reflectivities to the planes only for `emit_extras`. Return the next row. */
+static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member, int64_t encoder,
+                            const uint8_t *record, const int64_t *words, int64_t offset_ns,
+                            int64_t row, Planes *planes)
+{
+    const int64_t width = group->width, at = table_row(group, member, encoder);
+    const Field *fields = group->fields;
+    const Field distance = fields[DISTANCE], level = fields[INTENSITY];
+    read_words(group, record, 0, planes);
+    const uint32_t *distances = planes->words[distance.word], *levels = planes->words[level.word];
+    const float *vectors = group->direction + member * 9 * width;
+    const float *reach = group->reach + member * width, *origin = group->origin + at * 3;
+    const __m128i mask = _mm_set1_epi32((int32_t)distance.mask);
+    const __m128i level_mask = _mm_set1_epi32((int32_t)level.mask);
+    const __m128i shift = _mm_cvtsi32_si128((int32_t)distance.shift);
+    const __m128i level_shift = _mm_cvtsi32_si128((int32_t)level.shift);
+    const __m128i silent = _mm_set1_epi32((int32_t)group->silent);
+    const __m128 factor = _mm_set1_ps(group->scale[0]), divisor = _mm_set1_ps(group->scale[1]);
+    const __m128 cosine = _mm_set1_ps(group->cosine[at]), sine = _mm_set1_ps(group->sine[at]);
+    const __m128i offsets = _mm_set1_epi64x(offset_ns);
+    /* Padded beams have no return: whole planes are the same as the slots. */
+    for (int64_t beam = 0; beam + 4 <= group->slots; beam += 4) {
+        __m128i value = _mm_load_si128((const __m128i *)(distances + beam));
+        value = _mm_and_si128(_mm_srl_epi32(value, shift), mask);
+        const __m128i found = _mm_cmpgt_epi32(value, silent);
+        const int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
+        if (!kept)
+            continue;
+        const __m128 range_m =
+            _mm_div_ps(_mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), factor), divisor);
+        const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(reach + beam));
+        __m128 xyz[3];
+        for (int axis = 0; axis < 3; axis++) {
+            const float *own = vectors + axis * width + beam;
+            const __m128 direction = _mm_add_ps(
+                _mm_add_ps(_mm_mul_ps(cosine, _mm_loadu_ps(own)),
+                           _mm_mul_ps(sine, _mm_loadu_ps(own + 3 * width))),
+                _mm_loadu_ps(own + 6 * width));
+            xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), _mm_set1_ps(origin[axis]));
+        }
+        const __m128i signal = _mm_and_si128(
+            _mm_srl_epi32(_mm_load_si128((const __m128i *)(levels + beam)), level_shift),
+            level_mask);
+        const __m128i *own_words = (const __m128i *)(words + beam);
+        row = store_kept(scan, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(signal),
+                         _mm_add_epi64(_mm_loadu_si128(own_words), offsets),
+                         _mm_add_epi64(_mm_loadu_si128(own_words + 1), offsets));
+    }
+    return row;
+}
+#endif
+
+/* Kept elements in order of output. Returns the next row. */
+static int64_t emit_ordered(const Scan *scan, const Group *group, const int64_t *order,
+                            int64_t first_row, const Planes *planes)
+{
+    int64_t row = first_row;
+    for (int64_t number = 0; number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        put_point(scan->point + 4 * row, planes, element);
+        scan->label[row] = planes->label[element];
+        row += planes->keep[element];
+    }
+    return row;
+}
+
+/* Ranges and reflectivities of the kept elements, in order of output. */
+static void emit_extras(const Scan *scan, const Group *group, const int64_t *order,
+                        int64_t first_row, const Planes *planes)
+{
+    int64_t row = first_row;
+    for (int64_t number = 0; scan->range_m && number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        scan->range_m[row] = planes->range_m[element];
+        row += planes->keep[element];
+    }
+    row = first_row;
+    for (int64_t number = 0; scan->reflectivity && number < group->slots; number++) {
+        const int64_t element = order ? order[number] : number;
+        scan->reflectivity[row] = planes->reflectivity[element];
+        row += planes->keep[element];
+    }
+}
+
+/* A row of an organized scan: every kept element to its slot, the others empty. */
+static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
+                              const Planes *planes)
+{
+    const uint32_t nan_bits = 0x7FC00000;
+    float nan;
+    memcpy(&nan, &nan_bits, sizeof nan);
+    const int64_t row = number * scan->row_slots, width = group->width;
+    float *point = scan->point + 4 * row, *range_m = scan->range_m + row;
+    int64_t *labels = scan->label + row;
+    uint16_t *reflectivity = scan->reflectivity + row;
+    const int64_t lidar_id =
+        (int64_t)((uint64_t)planes->label[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+    for (int64_t slot = 0; slot < scan->row_slots; slot++) {
+        for (int64_t axis = 0; axis < 4; axis++)
+            point[4 * slot + axis] = nan;
+        labels[slot] = lidar_id;
+        range_m[slot] = nan;
+        reflectivity[slot] = 0;
+    }
+    int64_t count = 0;
+    for (int64_t which = 0; which < group->returns; which++)
+        for (int64_t element = which * width; element < which * width + group->beams; element++)
+            if (planes->keep[element]) {
+                const int64_t slot = group->slot[element];
+                put_point(point + 4 * slot, planes, element);
+                labels[slot] = planes->label[element];
+                range_m[slot] = planes->range_m[element];
+                reflectivity[slot] = planes->reflectivity[element];
+                count++;
+            }
+    return count;
+}
+
+/* -- columns ----------------------------------------------------------------------------------- */
+
+static const uint8_t *record_of(const Scan *scan, const Group *group, int64_t column)
+{
+    const Ring *ring = group->rings + scan->member_of[scan->sensor[column]];
+    const int64_t index = scan->ring_index[column];
+    const int64_t row = index / ring->per_row;
+    return ring->first + row % ring->rows * ring->row_bytes
+        + (index - row * ring->per_row) * ring->column_bytes;
+}
+
+static inline void prefetch(const void *from, int64_t bytes)
+{
+#if defined(__SSE2__)
+    for (int64_t byte = 0; byte < bytes; byte += 64)
+        _mm_prefetch((const char *)from + byte, _MM_HINT_T0);
+#else
+    (void)from;
+    (void)bytes;
+#endif
+}
+
+/* Ask for what a later column needs: neighbours in a scan are far apart in memory. */
+static void prefetch_column(const Scan *scan, int64_t column)
+{
+    if (column >= scan->columns)
+        return;
+    const int64_t number = scan->group_of[scan->sensor[column]];
+    if (number < 0 || scan->groups[number].kind == COPIED)
+        return;
+    const Group *group = scan->groups + number;
+    prefetch(record_of(scan, group, column), group->step * group->beams);
+}
+
+/* Copy the points that numpy decoded of a column. Return the next row. */
+static int64_t copy_column(const Scan *scan, const Group *group, int64_t column, int64_t row)
+{
+    const int64_t from = *group->cursor;
+    const size_t count = (size_t)group->points[column];
+    memcpy(scan->point + 4 * row, group->copied_point + 4 * from, 16 * count);
+    memcpy(scan->label + row, group->copied_label + from, 8 * count);
+    if (scan->range_m)
+        memcpy(scan->range_m + row, group->copied_range + from, 4 * count);
+    if (scan->reflectivity)
+        memcpy(scan->reflectivity + row, group->copied_reflectivity + from, 2 * count);
+    *group->cursor += group->points[column];
+    return row + group->points[column];
+}
+
+static int64_t decode_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                             const uint8_t *record, int64_t row, Planes *planes)
+{
+    const int64_t encoder = scan->encoder[column];
+    int64_t table = encoder >> TABLE_BIT;
+    table = table < 0 ? 0 : table >= group->tables ? group->tables - 1 : table;
+    const int64_t known = member * group->tables + table;
+    const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
+    const int64_t *words = group->labels + known * group->returns * group->width;
+    const int is_plain = !group->order && !group->limits_m && !scan->box_count && !scan->row_slots;
+    int64_t *counts = group->counts + member * COUNTS;
+    counts[COLUMNS]++;
+#if defined(__SSE2__)
+    /* A distance above 0 is a range above 0, unless it is scaled to less than a float. */
+    if (is_plain && group->kind == TABLED && group->slots % 4 == 0 && !scan->range_m
+        && !scan->reflectivity) {
+        const int64_t next =
+            decode_fused(scan, group, member, encoder, record, words, offset_ns, row, planes);
+        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
+            counts[step] += next - row;
+        return next;
+    }
+#endif
+    for (int64_t which = 0; which < group->returns; which++)
+        read_return(group, record, which, planes);
+    if (group->kind == TABLED)
+        project_tabled(group, member, encoder, planes);
+    else
+        project_turning(group, member, encoder, known, column, planes);
+    if (is_plain) {
+        const int64_t next = emit_plain(scan, group, words, offset_ns, row, planes);
+        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
+            counts[step] += next - row;
+        if (scan->range_m || scan->reflectivity) {
+            for (int64_t beam = 0; beam < group->width; beam++)
+                planes->keep[beam] = planes->range_m[beam] > 0.0f;
+            emit_extras(scan, group, 0, row, planes);
+        }
+        return next;
+    }
+    mark(scan, group, member, planes);
+    label(group, known, offset_ns, planes);
+    if (scan->row_slots)
+        return row + emit_organized(scan, group, scan->first_number + column, planes);
+    const int64_t *order = group->order ? group->order + table * group->order_step : 0;
+    emit_extras(scan, group, order, row, planes);
+    return emit_ordered(scan, group, order, row, planes);
+}
+
+/* Decode all columns of a scan, in their order; return the row after the last point (organized:
+   the number of points). Sensors of no group are skipped. */
+EXPORT int64_t mlbatch_decode(const Scan *scan)
+{
+    enum { AHEAD = 2 };
+    Planes planes;
+    memset(planes.words, 0, sizeof planes.words);
+    memset(planes.reflectivity, 0, sizeof planes.reflectivity);
+    int64_t row = scan->first_row, last_group = -1;
+    for (int64_t column = 0; column < scan->columns; column++) {
+        prefetch_column(scan, column + AHEAD);
+        const int64_t sensor = scan->sensor[column];
+        const int64_t number = scan->group_of[sensor];
+        if (number < 0)
+            continue;
+        const Group *group = scan->groups + number;
+        const int64_t first = row;
+        if (group->kind == COPIED) {
+            row = copy_column(scan, group, column, row);
+        } else {
+            if (number != last_group && last_group >= 0) {
+                /* What another group left in beams that this one does not have. */
+                memset(planes.words, 0, sizeof planes.words);
+                memset(planes.reflectivity, 0, sizeof planes.reflectivity);
+            }
+            last_group = number;
+            row = decode_column(scan, group, scan->member_of[sensor], column,
+                                record_of(scan, group, column), row, &planes);
+        }
+        if (scan->column)
+            for (int64_t place = first; place < row; place++)
+                scan->column[place] = (uint32_t)(scan->first_number + column);
+    }
+    return row;
+}

@@ -1,0 +1,159 @@
+"""The compiled library and its structs; the declarations are those of `native.h`."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy.typing as npt
+
+from mlbatch.native import library_path
+
+_ABI = 1
+_WORD = ctypes.c_int64
+_ADDRESS = ctypes.c_void_p
+_COLUMNS = (_WORD, *[_ADDRESS] * 3)
+# Arguments of the functions that return a number.
+_FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
+    "mlbatch_abi": (),
+    "mlbatch_decode": (_ADDRESS,),
+    "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
+    "mlbatch_statistics": (*_COLUMNS, _WORD, _WORD, _ADDRESS, _ADDRESS, _ADDRESS),
+    "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
+    "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
+}
+
+
+class Ring(ctypes.Structure):
+    """Where the columns of a sensor are."""
+
+    _fields_: ClassVar = [
+        ("first", _ADDRESS),
+        ("rows", _WORD),
+        ("per_row", _WORD),
+        ("row_bytes", _WORD),
+        ("column_bytes", _WORD),
+    ]
+
+
+class Field(ctypes.Structure):
+    """An integer in a word of a pixel."""
+
+    _fields_: ClassVar = [
+        ("word", _WORD),
+        ("shift", _WORD),
+        ("mask", _WORD),
+        ("is_big", _WORD),
+    ]
+
+
+class Group(ctypes.Structure):
+    """Sensors that are decoded alike."""
+
+    _fields_: ClassVar = [
+        ("kind", _WORD),
+        ("beams", _WORD),
+        ("width", _WORD),
+        ("returns", _WORD),
+        ("step", _WORD),
+        ("run_count", _WORD),
+        ("runs", _ADDRESS),
+        ("word_count", _WORD),
+        ("word_bytes", _ADDRESS),
+        ("fields", _ADDRESS),
+        ("scale", _ADDRESS),
+        ("silent", _WORD),
+        ("dark_count", _WORD),
+        ("dark", _ADDRESS),
+        ("has_reflectivity", _WORD),
+        ("rings", _ADDRESS),
+        ("direction", _ADDRESS),
+        ("origin", _ADDRESS),
+        ("first_row", _ADDRESS),
+        ("rows", _WORD),
+        ("used", _ADDRESS),
+        ("reach", _ADDRESS),
+        ("firing_ns", _ADDRESS),
+        ("tables", _WORD),
+        ("cosine", _ADDRESS),
+        ("sine", _ADDRESS),
+        ("slots", _WORD),
+        ("labels", _ADDRESS),
+        ("order", _ADDRESS),
+        ("order_step", _WORD),
+        ("slot", _ADDRESS),
+        ("typed", _WORD),
+        ("sends_twice", _WORD),
+        ("drops_repeated", _WORD),
+        ("limits_m", _ADDRESS),
+        ("counts", _ADDRESS),
+        ("points", _ADDRESS),
+        ("cursor", _ADDRESS),
+        ("copied_point", _ADDRESS),
+        ("copied_label", _ADDRESS),
+        ("copied_range", _ADDRESS),
+        ("copied_reflectivity", _ADDRESS),
+    ]
+
+
+class Scan(ctypes.Structure):
+    """A scan under construction."""
+
+    _fields_: ClassVar = [
+        ("columns", _WORD),
+        ("stamp_ns", _ADDRESS),
+        ("sensor", _ADDRESS),
+        ("ring_index", _ADDRESS),
+        ("encoder", _ADDRESS),
+        ("start_ns", _WORD),
+        ("first_number", _WORD),
+        ("first_row", _WORD),
+        ("group_of", _ADDRESS),
+        ("member_of", _ADDRESS),
+        ("group_count", _WORD),
+        ("groups", _ADDRESS),
+        ("box_count", _WORD),
+        ("boxes_m", _ADDRESS),
+        ("row_slots", _WORD),
+        ("point", _ADDRESS),
+        ("label", _ADDRESS),
+        ("range_m", _ADDRESS),
+        ("reflectivity", _ADDRESS),
+        ("column", _ADDRESS),
+    ]
+
+
+def address(array: npt.NDArray[Any]) -> int:
+    """Return the address of a C-contiguous array; the caller keeps the array."""
+    if not array.flags.c_contiguous:
+        raise ValueError("expected a C-contiguous array")
+    return int(array.ctypes.data)
+
+
+@lru_cache(maxsize=1)
+def library() -> Any:
+    """Return the loaded library; OSError if it is missing, or was built from other sources."""
+    path = library_path()
+    if path is None:
+        raise OSError("none, since no C compiler was found when it was installed")
+    loaded = ctypes.CDLL(str(path))
+    for name, arguments in _FUNCTIONS.items():
+        function = getattr(loaded, name)
+        function.argtypes = arguments
+        function.restype = _WORD
+    loaded.mlbatch_copy.argtypes = (_WORD, *[_ADDRESS] * 5)
+    loaded.mlbatch_copy.restype = None
+    if loaded.mlbatch_abi() != _ABI:
+        raise OSError(f"{path.name} of another version")
+    return loaded
+
+
+@lru_cache(maxsize=1)
+def trouble() -> str:
+    """Return why the library cannot be used; "" if it can."""
+    try:
+        library()
+    except (OSError, AttributeError) as err:
+        return " ".join(str(err).split())
+    return ""

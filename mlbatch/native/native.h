@@ -1,0 +1,154 @@
+/* Interface of the engine `native`: plain C11 functions, called through ctypes.
+
+   `library.py` and `decode/native_engine.py` mirror the structs below, member by member: all
+   members are 8 bytes, so that there is no padding. Arrays are C-contiguous and belong to the
+   caller; no function allocates, keeps a pointer, or checks what its caller guarantees.
+   Floating point: float32 operations in the order of the numpy code, no contraction, so that both
+   engines give the same bytes. */
+#ifndef MLBATCH_NATIVE_H
+#define MLBATCH_NATIVE_H
+
+#include <stdint.h>
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the engine native reads little-endian words"
+#endif
+
+/* To be changed with every change of a struct or of a signature. */
+#define MLBATCH_ABI 1
+
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+/* Limits of the scratch arrays. */
+#define MOST_BEAMS 256
+#define MOST_RETURNS 3
+#define MOST_WORDS 3
+
+/* Where the columns of a sensor are: `lidar/interface.py`, Records, in the ring of its packets. */
+typedef struct {
+    const uint8_t *first; /* column 0 of row 0 */
+    int64_t rows;
+    int64_t per_row;
+    int64_t row_bytes;
+    int64_t column_bytes;
+} Ring;
+
+/* An integer in a word of a pixel: `(word >> shift) & mask`, its two bytes swapped if is_big. */
+typedef struct {
+    int64_t word;
+    int64_t shift;
+    int64_t mask;
+    int64_t is_big;
+} Field;
+
+enum { DISTANCE, INTENSITY, REFLECTIVITY, FIELDS };
+
+enum { TABLED, TURNING, COPIED };
+
+enum { NOT_TYPED, TYPED_BY_ORDER, TYPED_BY_LEVEL };
+
+/* Slots of a member that are left after each step, and its columns. */
+enum { COLUMNS, FOUND, DISTINCT, IN_RANGE, OUTSIDE_BOXES, COUNTS };
+
+/* Sensors that are decoded alike (the members). E: elements, returns * width; T: firing tables. */
+typedef struct {
+    int64_t kind; /* TABLED, TURNING, COPIED */
+    int64_t beams;
+    int64_t width; /* beams, rounded up to a multiple of 16 */
+    int64_t returns;
+    /* Pixels: step bytes apart, in runs of channels; words of 4 bytes are read from them. */
+    int64_t step;
+    int64_t run_count;
+    const int64_t *runs; /* (returns, run_count, 3): first byte, first channel, channels */
+    int64_t word_count;
+    const int64_t *word_bytes; /* (word_count,): first bytes in a pixel */
+    const Field *fields;       /* (returns, FIELDS) */
+    const float *scale;        /* (2,): factor, divisor */
+    int64_t silent;            /* distances up to this one are no return */
+    int64_t dark_count;
+    const int64_t *dark; /* (dark_count,): channels without returns */
+    int64_t has_reflectivity;
+    const Ring *rings; /* (members,) */
+    /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
+       TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
+       TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
+       of the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from bit 3) of the direction
+       are not zero; from bit 6 the same of the origin. */
+    const float *direction;
+    const float *origin;
+    const int64_t *first_row;
+    int64_t rows;
+    const int64_t *used;
+    const float *reach;     /* (members, width) or NULL: added to ranges */
+    const float *firing_ns; /* (members * T, width) or NULL */
+    int64_t tables;         /* T */
+    const float *cosine;
+    const float *sine;
+    /* Slots. */
+    int64_t slots;
+    const int64_t *labels; /* (members * T, E): words of 8 bytes, time 0 */
+    const int64_t *order;  /* (T, slots) or NULL: elements in order of output */
+    int64_t order_step;    /* from table to table; 0: one for all */
+    const int64_t *slot;   /* (E,): slot in an organized row */
+    int64_t typed;
+    int64_t sends_twice;
+    int64_t drops_repeated;
+    const float *limits_m; /* (members, 2) or NULL */
+    int64_t *counts;       /* (members, COUNTS), added to */
+    /* COPIED: what numpy decoded; points (columns of the scan,) of each column; cursor: row of the
+       next point there, moved on. */
+    const int64_t *points;
+    int64_t *cursor;
+    const float *copied_point;
+    const int64_t *copied_label;
+    const float *copied_range;
+    const uint16_t *copied_reflectivity;
+} Group;
+
+/* A scan under construction. */
+typedef struct {
+    int64_t columns;
+    const int64_t *stamp_ns; /* (columns,) */
+    const int64_t *sensor;
+    const int64_t *ring_index;
+    const int64_t *encoder;
+    int64_t start_ns;
+    int64_t first_number; /* number of column 0 in the scan */
+    int64_t first_row;    /* row of the first point */
+    const int64_t *group_of;  /* (sensors,): -1 for sensors that are skipped */
+    const int64_t *member_of; /* (sensors,) */
+    int64_t group_count;
+    const Group *groups;
+    int64_t box_count;
+    const float *boxes_m; /* (box_count, 6) */
+    int64_t row_slots;    /* organized: slots of a row; 0: dense */
+    /* Outputs, as in `decode/scan_buffer.py`; NULL: none. A dense scan has room for all
+       slots of its columns. */
+    float *point;
+    int64_t *label;
+    float *range_m;
+    uint16_t *reflectivity;
+    uint32_t *column;
+} Scan;
+
+EXPORT int64_t mlbatch_abi(void);
+EXPORT int64_t mlbatch_decode(const Scan *scan);
+EXPORT int64_t mlbatch_angles(int64_t count, const int64_t *words, float *cosine, float *sine);
+EXPORT int64_t mlbatch_statistics(int64_t columns, const int64_t *stamp_ns, const int64_t *sensor,
+                                  const int64_t *encoder, int64_t sensors, int64_t sectors,
+                                  const int64_t *positions, int64_t *entered, int64_t *figures);
+EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
+                            int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
+                            int64_t *stop);
+EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t frames,
+                               const int64_t *start, const int64_t *captured,
+                               const int64_t *original, int64_t *datagrams, int64_t *fragments,
+                               int64_t *others, int64_t *found);
+EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
+                         const int64_t *bytes, uint8_t *target, const int64_t *target_at);
+
+#endif

@@ -1,0 +1,155 @@
+"""`--fail-on`: limits of a run's report that turn a complete output into exit code 3."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+from mlbatch.errors import UsageError
+
+# A part and the whole that it is a share of; 0: it is a share of nothing.
+Amount: TypeAlias = tuple[int, int]
+# report.json as parsed or built.
+Report: TypeAlias = Mapping[str, object]
+
+_LIMIT = re.compile(r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", re.ASCII)
+_EXAMPLE = "write loss>0.1%,underfilled>0"
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit of one quantity: a number, or a share in percent."""
+
+    text: str
+    quantity: str
+    most: float
+    is_percent: bool
+
+    def exceeded(self, report: Report) -> str:
+        """What exceeds the limit, as text; "" if nothing does."""
+        quantity = _QUANTITIES[self.quantity]
+        for owner, (part, whole) in quantity.amounts(report):
+            share = 100 * part / whole if whole else 0.0
+            if (share if self.is_percent else part) > self.most:
+                found = f"{part} of {whole} ({share:.4g} %)" if quantity.is_share else str(part)
+                sensor = f"{owner}: " if owner else ""
+                return f"{self.text}: found {sensor}{found} {quantity.unit}"
+        return ""
+
+
+def parse_limits(texts: Sequence[str]) -> tuple[Limit, ...]:
+    """Values of `--fail-on`, each one limit or several, separated by commas."""
+    return tuple(_parsed(part) for text in texts for part in text.split(","))
+
+
+def exceeded(limits: Sequence[Limit], report: Report) -> list[str]:
+    """What exceeds limits, a line each; report: report.json."""
+    return [line for limit in limits if (line := limit.exceeded(report))]
+
+
+def _parsed(text: str) -> Limit:
+    found = _LIMIT.fullmatch(text)
+    if found is None:
+        raise UsageError(
+            f"--fail-on: expected NAME>NUMBER or NAME>NUMBER%, found {text!r}; {_EXAMPLE}"
+        )
+    name, number, percent = found.groups()
+    quantity = _QUANTITIES.get(name)
+    if quantity is None:
+        raise UsageError(
+            f"--fail-on: expected one of {', '.join(_QUANTITIES)}, found {name!r}; {_EXAMPLE}"
+        )
+    if percent and not quantity.is_share:
+        raise UsageError(
+            f"--fail-on: expected a number of {quantity.unit}, found {text.strip()!r}; "
+            f"write {name}>{number}"
+        )
+    return Limit(text.strip(), name, float(number), bool(percent))
+
+
+# -- quantities -----------------------------------------------------------------------------------
+
+
+def _loss(report: Report) -> Iterator[tuple[str, Amount]]:
+    for name, packets in _packets(report):
+        lost = _number(packets, "lost")
+        yield name, (lost, lost + _number(packets, "accepted"))
+
+
+def _rejected(report: Report) -> Iterator[tuple[str, Amount]]:
+    for name, packets in _packets(report):
+        rejected = _section(packets, "rejected")
+        yield (
+            name,
+            (sum(_number(rejected, reason) for reason in rejected), _number(packets, "read")),
+        )
+
+
+def _scans(report: Report, key: str) -> Iterator[tuple[str, Amount]]:
+    scans = _section(report, "scans")
+    yield "", (_number(scans, key), _number(scans, "written"))
+
+
+def _without_points(report: Report) -> Iterator[tuple[str, Amount]]:
+    scans = _section(report, "scans")
+    counts = _section(scans, "no_points")
+    for name in counts:
+        yield name, (_number(counts, name), _number(scans, "written"))
+
+
+def _warnings(report: Report) -> Iterator[tuple[str, Amount]]:
+    codes = [one.get("code") for one in _list(report, "warnings")]
+    yield "", (sum(code != INFORMATION for code in codes), 0)
+
+
+def _packets(report: Report) -> Iterator[tuple[str, Report]]:
+    for one in _list(report, "sensors"):
+        yield str(one.get("name")), _section(one, "packets")
+
+
+def _section(report: Report, key: str) -> Report:
+    found = report.get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _list(report: Report, key: str) -> list[Report]:
+    found = report.get(key)
+    return [one for one in found if isinstance(one, Mapping)] if isinstance(found, list) else []
+
+
+def _number(section: Report, key: str) -> int:
+    value = section.get(key)
+    return value if isinstance(value, int) else 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    """A quantity of a report.
+
+    unit: for people; amounts: name of the sensor ("": the run) and amount; is_share: whether the
+    amount is a part of its whole.
+    """
+
+    unit: str
+    amounts: Callable[[Report], Iterator[tuple[str, Amount]]]
+    is_share: bool = True
+
+
+# A warning that is no error with `--strict`.
+INFORMATION = "clouds"
+_QUANTITIES: Mapping[str, _Quantity] = {
+    "loss": _Quantity("packets lost", _loss),
+    "rejected": _Quantity("packets rejected", _rejected),
+    "underfilled": _Quantity("scans underfilled", partial(_scans, key="underfilled")),
+    "incomplete": _Quantity("scans incomplete", partial(_scans, key="incomplete")),
+    "no_points": _Quantity("scans without its points", _without_points),
+    "empty_clouds": _Quantity("clouds without points", partial(_scans, key="empty_clouds"), False),
+    "empty": _Quantity("windows empty", partial(_scans, key="empty"), False),
+    "dropped_incomplete": _Quantity(
+        "windows left out", partial(_scans, key="dropped_incomplete"), False
+    ),
+    "warnings": _Quantity("warnings", _warnings, False),
+}

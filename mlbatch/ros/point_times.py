@@ -1,0 +1,376 @@
+"""Times of the points of decoded clouds: unit, zero, and whether both are plausible.
+
+Drivers agree neither on the unit nor on the zero of the times of points, and state neither in the
+message. The rig decides (`points:`), else type and values of the field by the conventions of the
+drivers; a sweep takes about as long as the messages are apart, which confirms or refutes the unit.
+Source: docs/sources/messages.md, section 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.arrays import I64Array, median
+from mlbatch.ros.point_packets import CloudError
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+# Numbers of the type of a cloud's time field.
+Times: TypeAlias = npt.NDArray[Any]
+
+TIME_NAMES = ("t", "time", "timestamp", "time_stamp", "timestamps", "offset_time", "ts")
+# Units by their names in a rig, largest first.
+UNITS_NS: Mapping[str, int] = {"s": NS_PER_S, "ms": NS_PER_MS, "us": NS_PER_US, "ns": 1}
+START = "start"
+END = "end"
+ABSOLUTE = "absolute"
+ORIGINS = (START, END, ABSOLUTE)
+
+_LIMIT_NS = 2**31 * NS_PER_S
+# Times of points after a header; times since 1970 are far above (1e8 s is 1973).
+_MOST_AFTER_NS = 1000 * NS_PER_S
+_LEAST_EPOCH_NS = 10**8 * NS_PER_S
+# No revolution takes longer; times in another unit than the assumed one would.
+_LONGEST_S = 10
+_FLOAT64_BYTES = 8
+
+# Span of the times of a cloud by the spacing of the messages: of a spinning lidar; below, points
+# would share the time of the message; above, sweeps of several lidars overlap.
+_SWEEP = (0.5, 1.2)
+_LEAST_SPAN = 0.05
+_MOST_SPAN = 1.5
+# Points after the log time of their message that rounding, or a header with it, cannot explain.
+_AHEAD_NS = 5 * NS_PER_MS
+
+
+@dataclass(frozen=True, slots=True)
+class PointRule:
+    """How the points of a topic are read; of the rig, or inferred.
+
+    time, ring: names of fields, "": the first known one; unit_ns: ns of the unit of the times, 0:
+    by convention; origin: one of ORIGINS, "": by convention; longest_ns: of a sweep; inferred: why
+    the unit is not the conventional one; places: file, line and key of what the rig gives, by key.
+    """
+
+    time: str = ""
+    unit_ns: int = 0
+    origin: str = ""
+    ring: str = ""
+    longest_ns: int = field(default=_LONGEST_S * NS_PER_S, compare=False)
+    inferred: str = field(default="", compare=False)
+    places: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    def keys(self) -> dict[str, str]:
+        """The keys of a rig that it is made of, with empty values for those left out."""
+        unit = _unit_name(self.unit_ns) if self.unit_ns else ""
+        return {"time": self.time, "unit": unit, "from": self.origin, "ring": self.ring}
+
+    def at(self, key: str) -> str:
+        """The begin of an error about a key of the rig, or ""."""
+        return f"{self.places[key]}: " if key in self.places else ""
+
+
+CONVENTION = PointRule()
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """What times may count from; field: name and type; base: description of base_ns."""
+
+    field: str
+    base_ns: int
+    base: str
+
+
+class Reading(NamedTuple):
+    """Unit of times in ns, and whether they are since 1970."""
+
+    unit_ns: int
+    is_absolute: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _FloatTime:
+    """Meaning of floating-point times whose largest is between two values."""
+
+    above: float
+    below: float
+    reading: Reading
+
+
+_FLOAT_TIMES = (
+    _FloatTime(-1e3, 1e3, Reading(NS_PER_S, is_absolute=False)),
+    _FloatTime(1e8, 1e11, Reading(NS_PER_S, is_absolute=True)),
+    _FloatTime(1e14, float(_LIMIT_NS), Reading(1, is_absolute=True)),
+)
+
+
+def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[I64Array, str]:
+    """Stamps (n,), ns, of points by their finite times (n > 0,); and the meaning of the times.
+
+    all_times: those of the whole message, which may include points that are left out.
+    """
+    low = time.min()
+    high = time.max()
+    reading = _reading(time.dtype, float(high), zero, rule)
+    unit_ns, is_absolute = reading
+    _check_values(float(low), float(high), zero, reading)
+    if time.dtype.kind == "f":
+        ns = _float_ns(time.astype(np.float64), unit_ns)
+    else:
+        ns = time.astype(np.int64) * unit_ns
+    unit = _unit_name(unit_ns)
+    why = f" ({rule.inferred})" if rule.inferred else ""
+    if is_absolute:
+        return ns, f"{zero.field}, {unit} since 1970{why}"
+    if not 0 < zero.base_ns < _LIMIT_NS:
+        raise CloudError(
+            f"field {zero.field}: expected times after {zero.base}, found {zero.base_ns} ns there; "
+            "set the clock of its driver and record again"
+        )
+    words = "up to" if high <= 0 > low else "after"
+    if rule.origin == END:
+        ns -= max(0, _last_ns(all_times, high, unit_ns, rule.longest_ns))
+        words = "up to"
+    elif rule.origin == START and low < 0:
+        ns -= int(ns.min())
+        words = "after"
+    return zero.base_ns + ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
+
+
+def _last_ns(all_times: Times, high: Any, unit_ns: int, longest_ns: int) -> int:
+    """The last time of a sweep: also of shots without a return, unless it is impossible."""
+    finite = all_times[np.isfinite(all_times)] if all_times.dtype.kind == "f" else all_times
+    last = finite.max()
+    # Points without a return may have any time.
+    if float(last) * unit_ns > longest_ns:
+        last = high
+    if all_times.dtype.kind == "f":
+        return int(_float_ns(np.array([last], np.float64), unit_ns)[0])
+    return int(last) * unit_ns
+
+
+def _float_ns(value: npt.NDArray[np.float64], unit_ns: int) -> I64Array:
+    """Times in ns, rounded; in two parts, as a float64 of ns since 1970 has a step of 256."""
+    whole = np.floor(value)
+    ns = whole.astype(np.int64) * unit_ns
+    ns += np.rint((value - whole) * unit_ns).astype(np.int64)
+    return ns
+
+
+def _reading(kind: np.dtype[Any], high: float, zero: Zero, rule: PointRule) -> Reading:
+    """Unit and zero of times: by the rule, else by convention."""
+    unit_ns = rule.unit_ns
+    found = _by_unit(high, unit_ns) if unit_ns else _conventional(kind, high, zero)
+    return Reading(found.unit_ns, rule.origin == ABSOLUTE) if rule.origin else found
+
+
+def _conventional(kind: np.dtype[Any], high: float, zero: Zero) -> Reading:
+    """Unit and zero of times by convention; CloudError if there is none."""
+    found = convention(kind, high)
+    if found is None:
+        raise CloudError(
+            f"field {zero.field}: expected s after {zero.base} (below 1000), or float64 s or ns "
+            f"since 1970, found {high:g}; give its unit in the rig (points: {{unit: us}}), or "
+            "record the raw packets"
+        )
+    return found
+
+
+def convention(kind: np.dtype[Any], high: float) -> Reading | None:
+    """What drivers mean by times of a type whose largest is `high`; None if it is not known."""
+    if kind.kind != "f":
+        return Reading(1, is_absolute=False)
+    found = next((one.reading for one in _FLOAT_TIMES if one.above < high < one.below), None)
+    if found is not None and found.is_absolute and kind.itemsize < _FLOAT64_BYTES:
+        return None
+    return found
+
+
+def _by_unit(high: float, unit_ns: int) -> Reading:
+    """Times of a known unit: since 1970 if they are that large."""
+    return Reading(unit_ns, is_absolute=high * unit_ns >= _LEAST_EPOCH_NS)
+
+
+def _unit_name(unit_ns: int) -> str:
+    return next(name for name, one_ns in UNITS_NS.items() if one_ns == unit_ns)
+
+
+def _check_values(low: float, high: float, zero: Zero, reading: Reading) -> None:
+    """Refuse times that cannot be those of one sweep."""
+    unit_ns, is_absolute = reading
+    remedy = "give its unit in the rig (points: {unit: us}), or record the raw packets"
+    span_s = (high - low) * (unit_ns / NS_PER_S)
+    if span_s > _LONGEST_S:
+        raise CloudError(
+            f"field {zero.field}: expected times of one cloud within {_LONGEST_S} s, found "
+            f"{span_s:g} s; {remedy}"
+        )
+    low_ns = low * unit_ns
+    high_ns = high * unit_ns
+    if is_absolute and not (low_ns > 0 and high_ns < _LIMIT_NS):
+        raise CloudError(
+            f"field {zero.field}: expected times since 1970, found {high_ns / NS_PER_S:g} s; "
+            "correct unit or from of `points` in the rig"
+        )
+    if not is_absolute and max(abs(low_ns), abs(high_ns)) > _MOST_AFTER_NS:
+        raise CloudError(
+            f"field {zero.field}: expected times within 1000 s of {zero.base}, found "
+            f"{high_ns / NS_PER_S:g} s; correct unit or from of `points` in the rig"
+        )
+
+
+# -- plausibility, by the first messages of a topic -----------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CloudSample:
+    """Times of one message as they are stored.
+
+    host_ns: log time; stamp_ns: of the header; kind: type of the field; low, high: of the points
+    with a place; points: their number; zero: as in `stamps`.
+    """
+
+    host_ns: int
+    stamp_ns: int
+    kind: np.dtype[Any]
+    low: float
+    high: float
+    points: int
+    zero: Zero
+
+    @property
+    def span(self) -> float:
+        """From the first to the last point, in the unit of the field."""
+        return self.high - self.low
+
+
+def checked_rule(
+    samples: Sequence[CloudSample], rule: PointRule, topic: str
+) -> tuple[PointRule, list[str]]:
+    """The rule by which a topic can be read, and warnings; CloudError if there is none.
+
+    samples: of messages of one lidar, as far as their ids say; rule: of the rig, or CONVENTION.
+    """
+    usable = [one for one in samples if one.points > 1]
+    if not usable:
+        return rule, []
+    name = usable[-1].zero.field
+    ways_out = (
+        f"name the field of the times or its unit in the rig (points: {{time: FIELD, unit: ns}}), "
+        f"or leave the topic out with --ignore {topic}"
+    )
+    span = median(np.array([one.span for one in usable]))
+    spacing_ns = _spacing_ns(samples)
+    apart = "" if spacing_ns is None else f" ({spacing_ns / NS_PER_MS:.3f} ms)"
+    if span == 0:
+        values = {value for one in usable for value in (one.low, one.high)}
+        found = "0 for every point" if values == {0} else "one time for all points of a cloud"
+        raise CloudError(
+            f"field {name}: expected times of points that span about the spacing of the "
+            f"messages{apart}, found {found}; {ways_out}"
+        )
+    if spacing_ns is None:
+        return rule, []
+    high = median(np.array([one.high for one in usable]))
+    rule = replace(rule, longest_ns=round(_SWEEP[1] * spacing_ns))
+    notes: list[str] = []
+    if rule.unit_ns:
+        found_unit: Reading | None = _by_unit(high, rule.unit_ns)
+    else:
+        usual = convention(usable[-1].kind, high)
+        rule, found_unit = _inferred(name, span, spacing_ns, high, usual, rule, topic, notes)
+    if found_unit is None:
+        # Refused with its values when a cloud is read.
+        return rule, notes
+    share = span * found_unit.unit_ns / spacing_ns
+    shown = f"{span * found_unit.unit_ns / NS_PER_MS:.3f} ms in messages {apart.strip(' ()')} apart"
+    if share < _LEAST_SPAN and "unit" not in rule.places:
+        raise CloudError(
+            f"field {name}: expected times of points that span at least 5 % of the spacing of the "
+            f"messages, found {shown}; {ways_out}"
+        )
+    if share > _MOST_SPAN and share * spacing_ns <= _LONGEST_S * NS_PER_S:
+        text = (
+            f"field {name}: expected sweeps of one lidar, found {shown}, which overlap: several "
+            "lidars share the topic, or the driver accumulates sweeps"
+        )
+        if "unit" not in rule.places:
+            raise CloudError(
+                f"{text}; give each lidar a topic or a frame_id of its own, name the unit in the "
+                f"rig (points: {{unit: ns}}), or leave the topic out with --ignore {topic}"
+            )
+        notes.append(text)
+    if not rule.origin:
+        notes += _ahead(usable, found_unit, name, spacing_ns)
+    return rule, notes
+
+
+def _inferred(
+    name: str,
+    span: float,
+    spacing_ns: float,
+    high: float,
+    usual: Reading | None,
+    rule: PointRule,
+    topic: str,
+    notes: list[str],
+) -> tuple[PointRule, Reading | None]:
+    """The rule with the unit by which sweeps take as long as messages are apart."""
+    fits = [
+        (unit, unit_ns)
+        for unit, unit_ns in UNITS_NS.items()
+        if _SWEEP[0] <= span * unit_ns / spacing_ns <= _SWEEP[1]
+    ]
+    if not fits or (usual is not None and usual.unit_ns == fits[0][1]):
+        return rule, usual
+    unit, unit_ns = fits[0]
+    if high * unit_ns >= _LIMIT_NS:
+        return rule, usual
+    instead = "" if usual is None else f", not {_unit_name(usual.unit_ns)} as usual"
+    span_text = f"{span * unit_ns / NS_PER_MS:.3f} ms in messages {spacing_ns / NS_PER_MS:.3f} ms"
+    text = f"inferred by sweeps of {span_text} apart{instead}"
+    notes.append(
+        f"field {name}: its unit is {unit}, {text}; confirm it in the rig (points: "
+        f"{{unit: {unit}}}), or leave the topic out with --ignore {topic}"
+    )
+    return replace(rule, unit_ns=unit_ns, inferred=text), _by_unit(high, unit_ns)
+
+
+def _ahead(
+    samples: Sequence[CloudSample], reading: Reading, name: str, spacing_ns: float
+) -> list[str]:
+    """A warning if points are later than the log time of their message."""
+    if reading.is_absolute:
+        return []
+    header_ns = median(np.array([one.stamp_ns - one.host_ns for one in samples]))
+    last_ns = header_ns + median(np.array([one.high for one in samples])) * reading.unit_ns
+    # A header that is itself that late is of a clock that is ahead.
+    if last_ns <= _AHEAD_NS or header_ns >= spacing_ns:
+        return []
+    return [
+        f"field {name}: points are up to {last_ns / NS_PER_MS:.1f} ms later than the log time of "
+        "their message, as where a driver stamps the header at the end of the sweep: then write "
+        "points: {from: end} in the rig; if the header is that of the first point, write "
+        "points: {from: start}"
+    ]
+
+
+def _spacing_ns(samples: Sequence[CloudSample]) -> float | None:
+    """Usual time between the messages of one lidar; None with a single one.
+
+    Over two steps: of two lidars that are stamped together every other step is short. The lower
+    quartile: gaps and jumps of the clock are long.
+    """
+    for times in ([one.stamp_ns for one in samples], [one.host_ns for one in samples]):
+        known = np.unique(np.array(times, np.int64))
+        if len(known) < 2:
+            continue
+        step = min(2, len(known) - 1)
+        steps = np.sort(known[step:] - known[:-step])
+        return float(steps[len(steps) // 4]) / step
+    return None

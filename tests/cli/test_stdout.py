@@ -1,0 +1,97 @@
+"""`-` as a path: standard output, or refused; never a file of that name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from mlbatch.cli.app import COMMANDS, PRINTABLE, command_line
+from mlbatch.rig.rig import read_rig
+from tests.builders.sessions import FIXTURE, NS_PER_S, Shell, Unit, report_of, write_session
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+
+
+def _paths() -> list[tuple[str, str, bool]]:
+    """Command, option and whether it is an argument, of all parameters that are paths."""
+    found: list[tuple[str, str, bool]] = []
+    for command in COMMANDS:
+        group = typer.main.get_command(command_line())
+        for param in group.commands[command].params:  # type: ignore[attr-defined]
+            is_argument = param.param_type_name == "argument"
+            if param.type.name == "path" and (command, param.name) not in PRINTABLE:
+                found += [(command, param.opts[-1], is_argument)]
+    return found
+
+
+@pytest.mark.parametrize(("command", "option", "is_argument"), _paths())
+def test_no_other_path_may_be_it(
+    shell: Shell, tmp_path: Path, command: str, option: str, is_argument: bool
+) -> None:
+    words = ["-"] if is_argument else [option, "-"]
+    if not is_argument and command != "bench":
+        words.append(str(CAPTURE))
+    outcome = shell(command, *words)
+    assert (outcome.code, outcome.out) == (2, "")
+    name = option.upper() if is_argument else {"--output": "-o"}.get(option, option)
+    assert outcome.err == (
+        f"mlbatch: error: {name}: expected a path, found -: neither standard input nor standard "
+        "output can be used here; give a file or folder\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_paths_of_all_commands_are_tested() -> None:
+    assert {command for command, _, _ in _paths()} >= {"convert", "inspect", "compare", "verify"}
+    assert ("convert", "--output", False) in _paths()
+    assert ("bench", "--keep", False) in _paths()
+
+
+@pytest.mark.parametrize("jobs", ["1", "3"])
+def test_a_printed_report_is_alone_and_complete(shell: Shell, tmp_path: Path, jobs: str) -> None:
+    outcome = shell(f"convert {CAPTURE} --rig {RIG} -o out --report - --jobs {jobs}")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert json.loads(outcome.out) == report_of("out/report.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert shell("verify out").code == 0
+
+
+@pytest.mark.parametrize("more", ["", " --quiet", " -v"])
+def test_of_a_dry_run_as_well(shell: Shell, tmp_path: Path, more: str) -> None:
+    outcome = shell(f"convert {CAPTURE} --rig {RIG} --dry-run --report -{more}")
+    assert json.loads(outcome.out)["schema"] == "mlbatch.report/1"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_line_for_each_segment(shell: Shell, tmp_path: Path) -> None:
+    write_session(tmp_path, Unit(turns=40))
+    words = "--fault jump:ouster_111:37s@2s --on-jump split --report -"
+    outcome = shell(f"convert drive.pcap -o out {words}")
+    assert outcome.code == 0, outcome.err
+    reports = [json.loads(line) for line in outcome.out.splitlines()]
+    starts = [one["grid"]["t_init_ns"] for one in reports]
+    assert len(starts) == 2
+    assert starts[1] - starts[0] > 37 * NS_PER_S
+    assert reports == [report_of(f"out.seg{n}/report.json") for n in (1, 2)]
+
+
+def test_a_printed_rig_is_one_that_can_be_read(shell: Shell, tmp_path: Path) -> None:
+    outcome = shell(f"inspect {CAPTURE} --write-rig -")
+    assert outcome.code == 0
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "rig.yaml").write_text(outcome.out)
+    rig = read_rig(tmp_path / "rig.yaml")
+    assert [sensor.name for sensor in rig.sensors] == [
+        "ouster_122647000123",
+        "ouster_122648000456",
+    ]
+
+
+def test_a_rig_and_json_cannot_both_be_printed(shell: Shell) -> None:
+    outcome = shell(f"inspect {CAPTURE} --write-rig - --json")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert "expected standard output for the rig alone, found --json" in outcome.err

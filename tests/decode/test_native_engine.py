@@ -1,0 +1,260 @@
+"""Compiled loops on pixels of any bytes: equal to numpy, and no writes beyond the arrays."""
+
+from __future__ import annotations
+
+import json
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mlbatch.arrays import I64Array
+from mlbatch.decode import decoder as decode
+from mlbatch.decode import native_engine
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
+from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
+from mlbatch.frames.transforms import from_rpy_deg
+from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.interface import Lidar
+from mlbatch.native.library import library
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.sensors.ouster.profiles import PROFILES
+from mlbatch.sensors.ouster.sensor import read_calibration
+from mlbatch.types import EXTRAS, RunInfo, SensorInfo
+from tests.builders.engines import BOXES_M, Pair, needs_native
+from tests.builders.ouster import OusterSpec, metadata_json
+from tests.golden import test_every_model as models
+
+pytestmark = needs_native
+
+START_NS = 1_800_000_000_000_000_000
+END_NS = 1_800_000_000_100_000_000
+# Tilted, level, and where the vehicle is: sensors that are decoded together differ in these.
+POSES = (
+    from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0)),
+    from_rpy_deg((-1.0, 0.0, 1.8), (0.0, 0.0, 180.0)),
+    np.eye(4),
+)
+NAMES = tuple(name for name in PROFILES if name != "OFF")
+GUARD_ROWS = 64
+GUARD = 0xA5
+# Of kinds that the loops decode, and of two that only numpy does.
+OTHERS = (
+    (models.velodyne_sent, ("VLP-16", "dual")),
+    (models.velodyne_sent, ("HDL-64E S3", "strongest")),
+    (models.hesai_sent, ("XT32M2X", "3d")),
+    (models.hesai_sent, ("AT128", "37")),
+    (models.hesai_sent, ("Pandar128E3X", "37")),
+    (models.robosense_sent, ("RS-16", "dual")),
+)
+
+
+def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
+    """A sensor with beams of its own."""
+    angles = np.random.default_rng(seed).uniform(-22, 22, (2, beams)).round(2).tolist()
+    spec = OusterSpec(profile, beams, 512, altitude_deg=angles[0], azimuth_deg=angles[1])
+    found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
+    assert found is not None
+    return cast(Lidar, found.lidar({}, None))
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
+    """Lidars of other vendors."""
+    found = []
+    for make, words in OTHERS:
+        job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
+        (sensor,) = Conversion(job).sensors
+        found.append(sensor.lidar)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Drawn values; everything else follows from the seed."""
+
+    seed: int
+    columns: int
+    layout: str
+    extras: frozenset[str]
+    is_cut: bool
+    keeps_repeated: bool
+
+
+cases = st.builds(
+    Case,
+    st.integers(0, 2**32),
+    st.sampled_from((1, 2, 17, 130, 700)),
+    st.sampled_from(("dense", "organized")),
+    st.frozensets(st.sampled_from(sorted(EXTRAS))),
+    st.booleans(),
+    st.booleans(),
+)
+
+
+class Guarded(ScanBuffer):
+    """A scan buffer between guard rows that nothing may write to."""
+
+    def __init__(self, rows: int, slots: int | None) -> None:
+        super().__init__(rows, slots)
+        self._guards: list[npt.NDArray[np.uint8]] = []
+        for name in ("point", "range_m", "reflectivity", "label", "column"):
+            array = getattr(self, name)
+            row = array.itemsize * int(np.prod(array.shape[1:]))
+            whole = np.full((len(array) + 2 * GUARD_ROWS) * row, GUARD, np.uint8)
+            begin = GUARD_ROWS * row
+            end = (GUARD_ROWS + len(array)) * row
+            self._guards += [whole[:begin], whole[end:]]
+            setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
+
+    @property
+    def is_intact(self) -> bool:
+        """Whether nothing was written beyond the arrays."""
+        return all(bool((guard == GUARD).all()) for guard in self._guards)
+
+
+def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArray[np.uint8]:
+    """Any bytes; many zeros, and few different ones, so that returns are absent or equal."""
+    data = rng.integers(0, 256, count * lidar.packet_size, np.uint8)
+    few = rng.random(len(data)) < rng.choice((0.0, 0.6, 0.95))
+    data[few] = rng.integers(0, 2, int(few.sum()), np.uint8)
+    return data
+
+
+def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array]:
+    """A ring that has wrapped, and the ring indexes of the columns that it contains."""
+    ring = PacketRing(lidar.packet_size, lidar.records)
+    places: I64Array = np.empty(0, np.int64)
+    for _ in range(4):
+        count = int(rng.integers(20, 45))
+        start = np.arange(count) * lidar.packet_size
+        oldest = int(places[0]) if len(places) else None
+        _, found = ring.store(packets_of(lidar, rng, count), start, oldest)
+        places = found
+    return ring, (places[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
+
+
+def words_of(lidar: Lidar, rng: np.random.Generator, count: int) -> I64Array:
+    """Any positions of the rotor."""
+    if lidar.beams.angle_rad is not None:
+        return rng.integers(0, len(lidar.beams.angle_rad), count)
+    speed = rng.choice((0.0, 5.0, -20.0, 40.0), count)
+    return rotor_words(rng.uniform(-1, 2, count), speed, int(rng.integers(len(lidar.firing_ns))))
+
+
+def check(lidars: list[Lidar], case: Case) -> None:
+    """Decode the same columns, twice, by both engines."""
+    rng = np.random.default_rng(case.seed)
+    rings = [filled(lidar, rng) for lidar in lidars]
+    boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
+    infos = []
+    sources = []
+    base = 0
+    for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
+        pose = POSES[(case.seed + number) % len(POSES)]
+        low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
+        sources.append(Source(lidar, ring, pose, base, low_m, high_m, case.keeps_repeated))
+        infos.append(SensorInfo("one", lidar.model, lidar.channels, lidar.returns, base, pose))
+        base += lidar.channels
+    info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
+    pair = Pair(
+        *(Decoder(info, sources, boxes_m, case.extras, engine=name) for name in ("numpy", "native"))
+    )
+    for _ in range(2):
+        sensor = rng.integers(0, len(lidars), case.columns)
+        place, word = np.empty((2, case.columns), np.int64)
+        for number, (lidar, (_, places)) in enumerate(zip(lidars, rings, strict=True)):
+            own = sensor == number
+            place[own] = rng.choice(places, int(own.sum()))
+            word[own] = words_of(lidar, rng, int(own.sum()))
+        stamp_ns = np.sort(rng.integers(START_NS, END_NS, case.columns))
+        pair.check(
+            WindowColumns(stamp_ns, sensor, place, word),
+            ScanHeader(0, 0, START_NS, END_NS, True, 0),
+        )
+
+
+@given(cases, st.sampled_from(NAMES), st.sampled_from((16, 32, 64, 128)))
+@settings(max_examples=40)
+def test_any_pixels_of_any_profile(case: Case, profile: str, beams: int) -> None:
+    check([ouster(profile, beams)], case)
+
+
+@given(case=cases, chosen=st.lists(st.integers(0, len(OTHERS) + 1), min_size=1, max_size=4))
+@settings(max_examples=30)
+def test_any_pixels_of_any_rig(case: Case, chosen: list[int], others: list[Lidar]) -> None:
+    # Two that are decoded together, as their pixels are alike.
+    alike = [ouster("RNG15_RFL8_NIR8", 32, 1), ouster("RNG15_RFL8_NIR8", 32, 2)]
+    check([[*others, *alike][number] for number in chosen], case)
+
+
+@pytest.mark.parametrize("chosen", [[0, 0, 0], [0, 2, 0], [5, 0, 5], [4, 1, 4]])
+def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: list[Lidar]) -> None:
+    for seed, layout in enumerate(("dense", "organized", "dense")):
+        case = Case(seed, 700, layout, EXTRAS, is_cut=seed == 0, keeps_repeated=False)
+        check([others[number] for number in chosen], case)
+
+
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+@pytest.mark.parametrize("chosen", [[0], [2], [3, 0], [5, 6, 2, 7]])
+def test_nothing_is_written_beyond_the_arrays(
+    layout: str, chosen: list[int], others: list[Lidar], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Guarded] = []
+
+    def guarded(rows: int, slots: int | None) -> Guarded:
+        made.append(Guarded(rows, slots))
+        return made[-1]
+
+    monkeypatch.setattr(decode, "ScanBuffer", guarded)
+    monkeypatch.setattr(native_engine, "ScanBuffer", guarded)
+    full = [ouster("RNG15_RFL8_NIR8", 16), ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)]
+    lidars = [[*others, *full][number] for number in chosen]
+    for seed in range(3):
+        check(lidars, Case(seed, 130, layout, EXTRAS, is_cut=False, keeps_repeated=True))
+    assert made
+    assert all(buffer.is_intact for buffer in made)
+
+
+def test_records_stay_while_the_loops_run() -> None:
+    lidar = ouster("RNG15_RFL8_NIR8", 16)
+    rng = np.random.default_rng(0)
+    ring, places = filled(lidar, rng)
+    before = weakref.ref(ring.pieces)
+    info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, POSES[0])
+    run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
+    sources = [Source(lidar, ring, POSES[0], 0)]
+    engine = "native"
+    decoder = Decoder(run, sources, np.empty((0, 6)), EXTRAS, engine=engine)
+    decode_columns = library().mlbatch_decode
+    grown = []
+
+    class Late:
+        """The library, whose ring grows before it runs."""
+
+        def mlbatch_decode(self, scan: object) -> int:
+            start = np.arange(1000) * lidar.packet_size
+            ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
+            grown.append(before() is not None and before() is not ring.pieces)
+            return int(decode_columns(scan))
+
+    cast(Any, decoder)._engine._library = Late()
+    stamp_ns = np.full(len(places), START_NS)
+    nothing = np.zeros(len(places), np.int64)
+    due = WindowColumns(stamp_ns, nothing, places, nothing)
+    assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
+    assert grown == [True]
+
+
+def test_labels_are_words_of_eight_bytes() -> None:
+    """As the compiled loops read them."""
+    assert LABEL.itemsize == 8
+    assert LABEL.fields is not None
+    assert LABEL.fields["lidar_id"][1] == 7

@@ -1,0 +1,138 @@
+"""The compiled library: its declarations, and what happens without it."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mlbatch
+from mlbatch import native
+from mlbatch.errors import UsageError
+from mlbatch.native import choose_engine, library
+from tests.builders.engines import needs_native
+from tests.builders.run import TWO_LIDARS, command
+from tests.contract.tree import PACKAGE
+
+SOURCES = PACKAGE / "native"
+HEADER = (SOURCES / "native.h").read_text(encoding="utf-8")
+COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+STRUCT = re.compile(r"typedef struct \{(.*?)\} (\w+);", re.DOTALL)
+MEMBER = re.compile(r"(const )?(\w+) (\*?)(\w+);")
+PROTOTYPE = re.compile(r"EXPORT \w+ (mlbatch_\w+)\((.*?)\);", re.DOTALL)
+
+
+@pytest.fixture
+def _fresh() -> Iterator[None]:
+    """The library is looked up anew, before and after."""
+    library.library.cache_clear()
+    library.trouble.cache_clear()
+    yield
+    library.library.cache_clear()
+    library.trouble.cache_clear()
+
+
+def declared() -> dict[str, list[tuple[str, bool]]]:
+    """The structs of the header: names of the members, and whether they are pointers."""
+    found = STRUCT.findall(COMMENT.sub("", HEADER))
+    return {
+        name: [(member[3], member[2] == "*") for member in MEMBER.findall(body)]
+        for body, name in found
+    }
+
+
+@pytest.mark.parametrize("name", ["Ring", "Field", "Group", "Scan"])
+def test_structs_are_those_of_the_header(name: str) -> None:
+    kind = getattr(library, name)
+    mirrored = [(member, of is ctypes.c_void_p) for member, of in kind._fields_]
+    assert mirrored == declared()[name]
+    # No padding.
+    assert ctypes.sizeof(kind) == 8 * len(mirrored)
+
+
+def test_functions_have_the_arguments_of_the_header() -> None:
+    found = {}
+    for name, arguments in PROTOTYPE.findall(COMMENT.sub("", HEADER)):
+        parts = [part for part in arguments.split(",") if part.strip() != "void"]
+        found[name] = tuple(ctypes.c_void_p if "*" in one else ctypes.c_int64 for one in parts)
+    # The only one that returns nothing.
+    assert len(found.pop("mlbatch_copy")) == 6
+    assert found == library._FUNCTIONS
+
+
+def test_the_version_of_the_declarations_is_that_of_the_header() -> None:
+    (number,) = re.findall(r"#define MLBATCH_ABI (\d+)", HEADER)
+    assert int(number) == library._ABI
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_without_the_library_numpy_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "library_path", lambda: None)
+    assert choose_engine("auto") == "numpy"
+    with pytest.raises(UsageError, match="--engine native: expected its compiled library"):
+        choose_engine("native")
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_a_damaged_library_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "broken.so"
+    path.write_bytes(b"\x7fELF" + bytes(100))
+    monkeypatch.setenv("MLBATCH_NATIVE", str(path))
+    assert native.library_path() == path
+    assert choose_engine("auto") == "numpy"
+    with pytest.raises(UsageError, match=r"broken\.so"):
+        choose_engine("native")
+
+
+@needs_native
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.usefixtures("_fresh")
+def test_a_library_of_another_version_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "other.so"
+    flags = ["-std=c11", "-shared", "-fPIC"]
+    text = HEADER.replace(f"MLBATCH_ABI {library._ABI}", f"MLBATCH_ABI {library._ABI + 1}")
+    for source in SOURCES.glob("*.c"):
+        (tmp_path / source.name).write_text(source.read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "native.h").write_text(text, encoding="utf-8")
+    files = [str(one) for one in tmp_path.glob("*.c")]
+    subprocess.run(["cc", *flags, "-o", str(path), *files], check=True)
+    monkeypatch.setenv("MLBATCH_NATIVE", str(path))
+    assert choose_engine("auto") == "numpy"
+    assert library.trouble() == "other.so of another version"
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_sources_have_no_warnings(tmp_path: Path) -> None:
+    flags = ["-std=c11", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
+    sources = [str(one) for one in sorted(SOURCES.glob("*.c"))]
+    done = subprocess.run(["cc", *flags, *sources], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@needs_native
+def test_the_name_of_an_earlier_engine_still_works(tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    capture = TWO_LIDARS / "two_lidars.pcap"
+    rig = TWO_LIDARS / "rig.yaml"
+    words: list[str | Path] = ["--rig", rig, "--dry-run", "--engine", "numba", "--report", report]
+    done = command("convert", capture, *words)
+    assert done.code == 0
+    assert "mlbatch: --engine numba is now native" in done.err
+    assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "native"
+
+
+def test_the_version_says_which_engine_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert command("--version").out == f"mlbatch {mlbatch.__version__}\n"
+    monkeypatch.setattr(library, "trouble", lambda: "")
+    assert command("--version", "-v").out.splitlines()[1] == "engine native"
+    monkeypatch.setattr(library, "trouble", lambda: "none")
+    line = command("--version", "--verbose").out.splitlines()[1]
+    assert line.startswith("engine numpy; native: none; reinstall mlbatch where a C compiler is")

@@ -1,0 +1,266 @@
+"""Every reader gives the same packets wherever its buffers end.
+
+Expected values are the packets written. A row is a number of frames of equal length, since readers
+step over such frames many at a time.
+"""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import IndexType
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.native.capture import CaptureLoops
+from mlbatch.readers.byte_records import SLACK
+from mlbatch.readers.capture.recording import CaptureRecording
+from mlbatch.readers.formats import mcap, pcap, pcapng, rosbag1, rosbag2
+from mlbatch.types import Recording, StreamTable
+from tests.builders import mcaps
+from tests.builders.bags import OUSTER_ROS1, Recorded
+from tests.builders.bags import packet_message as message_of
+from tests.builders.captures import (
+    Interface,
+    Packet,
+    Section,
+    pcap_bytes,
+    udp_frame,
+    write_pcap,
+    write_pcapng,
+)
+from tests.builders.engines import needs_native
+from tests.builders.reading import Seen, assert_balanced, seen_of
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import write_rosbag2
+
+T0_NS = 1_700_000_000_000_000_000
+_ETHERNET_HEADERS = 42
+_RECORD_BYTES = 16
+_FILE_HEADER_BYTES = 24
+# Not much larger than a frame.
+_SMALLEST = 64
+# Frames are longer than what follows the data in a buffer (`SLACK`).
+_LONG = 140
+# Rows up to this length end at every byte, longer ones at some.
+_ALL_BYTES = 30
+# Bags are read through buffers of every size up to this one.
+_MOST_OF_BAGS = 600
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A kind of file; write: payloads at times in ns; opened: with buffers of that many bytes."""
+
+    write: Callable[[Path, Sequence[tuple[int, bytes]]], object]
+    opened: Callable[[Path, int], Recording]
+
+
+def _frames(packets: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    return [(at_ns, udp_frame(payload)[0]) for at_ns, payload in packets]
+
+
+def _write_pcapng(path: Path, packets: Sequence[tuple[int, bytes]], big_endian: bool) -> None:
+    blocks = [Packet(frame, at_ns) for at_ns, frame in _frames(packets)]
+    write_pcapng(path, [Section(blocks, [Interface()], big_endian=big_endian)])
+
+
+def _write_mcap(path: Path, packets: Sequence[tuple[int, bytes]], form: mcaps.Form) -> None:
+    sent = [
+        mcaps.Sent("/lidar_packets", mcaps.OUSTER, at_ns, mcaps.packet_message(payload))
+        for at_ns, payload in packets
+    ]
+    mcaps.write_mcap(path, sent, form)
+
+
+def _recorded(packets: Sequence[tuple[int, bytes]], kind: str, encoding: str) -> list[Recorded]:
+    return [
+        Recorded("/lidar_packets", kind, at_ns, message_of(encoding, payload))
+        for at_ns, payload in packets
+    ]
+
+
+def _write_rosbag1(path: Path, packets: Sequence[tuple[int, bytes]], compression: str) -> None:
+    write_rosbag1(path, _recorded(packets, OUSTER_ROS1, "ros1"), compression, chunk_bytes=700)
+
+
+def _capture(
+    opener: Callable[[Path, StreamTable], Recording], engine: str = "numpy"
+) -> Callable[[Path, int], Recording]:
+    def opened(path: Path, buffer_bytes: int) -> Recording:
+        recording = opener(path, StreamTable())
+        assert isinstance(recording, CaptureRecording)
+        recording.buffer_bytes = buffer_bytes
+        recording.engine = engine
+        return recording
+
+    return opened
+
+
+def _open_mcap(path: Path, buffer_bytes: int) -> Recording:
+    return mcap.open_folder(path, [path], StreamTable(), buffer_bytes=buffer_bytes)
+
+
+def _open_rosbag1(path: Path, buffer_bytes: int) -> Recording:
+    return rosbag1.open_packets(path, StreamTable(), buffer_bytes=buffer_bytes)
+
+
+def _open_rosbag2(path: Path, buffer_bytes: int) -> Recording:
+    return rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=buffer_bytes)
+
+
+def _mcap(form: mcaps.Form) -> Format:
+    return Format(lambda path, packets: _write_mcap(path, packets, form), _open_mcap)
+
+
+def _pcap(engine: str, *, big_endian: bool = False) -> Format:
+    return Format(
+        lambda path, packets: write_pcap(path, _frames(packets), big_endian=big_endian),
+        _capture(pcap.open_packets, engine),
+    )
+
+
+def _pcapng(*, big_endian: bool = False) -> Format:
+    return Format(
+        lambda path, packets: _write_pcapng(path, packets, big_endian),
+        _capture(pcapng.open_packets),
+    )
+
+
+def _rosbag1(compression: str) -> Format:
+    return Format(lambda path, packets: _write_rosbag1(path, packets, compression), _open_rosbag1)
+
+
+FORMATS = {
+    "pcap": _pcap("numpy"),
+    "pcap, big endian": _pcap("numpy", big_endian=True),
+    "pcap, compiled": _pcap("native"),
+    "pcapng": _pcapng(),
+    "pcapng, big endian": _pcapng(big_endian=True),
+    "MCAP": _mcap(mcaps.Form(chunk_bytes=700)),
+    "MCAP without chunks": _mcap(mcaps.Form(chunked=False)),
+    "MCAP, lz4": _mcap(mcaps.Form(mcaps.LZ4, chunk_bytes=700)),
+    "MCAP without index": _mcap(mcaps.Form(chunk_bytes=700, index=IndexType.NONE, repeat=False)),
+    "ROS 1 bag": _rosbag1("none"),
+    "ROS 1 bag, lz4": _rosbag1("lz4"),
+    "ROS 2 bag": Format(
+        lambda path, packets: write_rosbag2(path, _recorded(packets, mcaps.OUSTER, "cdr")),
+        _open_rosbag2,
+    ),
+}
+_COMPILED = {"pcap, compiled"}
+_EACH = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[needs_native] * (name in _COMPILED)) for name in FORMATS]
+)
+
+
+def packets_of(rows: Sequence[tuple[int, int]]) -> list[tuple[int, bytes]]:
+    """Rows of (number of packets, bytes of a packet); every packet differs from all others."""
+    pick = random.Random(1)
+    sizes = [size for count, size in rows for _ in range(count)]
+    return [(T0_NS + 1_001 * number, pick.randbytes(size)) for number, size in enumerate(sizes)]
+
+
+def packets_read(recording: Recording) -> list[tuple[int, bytes]]:
+    """Receive times and payloads of all packets; the ledger must balance, without notes."""
+    streams: StreamTable = recording.streams  # type: ignore[attr-defined]
+    seen: list[Seen] = []
+    for batch in recording.packets():
+        seen += seen_of(batch, streams)
+    assert_balanced(recording)
+    assert recording.notes == []
+    assert not recording.counts.skipped
+    assert recording.counts.datagrams == len(seen)
+    return [(one.host_ns, one.payload) for one in seen]
+
+
+def _sizes(name: str, size_bytes: int) -> Iterator[int]:
+    """Sizes of buffers whose first end is at every byte of the frames around a row's 17th."""
+    if "pcap" in name:
+        yield from range(_SMALLEST, 400)
+        yield from range(max(400, size_bytes - 6 * _LONG), size_bytes + 2)
+    else:
+        yield from range(_SMALLEST, min(size_bytes, _MOST_OF_BAGS) + 2)
+
+
+@_EACH
+def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> None:
+    rows = [(1, 9), (19, _LONG), (2, 7)] if "pcap" in name else [(2, 9), (6, 4), (1, 7), (5, 4)]
+    packets = packets_of(rows)
+    path = tmp_path / "recording"
+    FORMATS[name].write(path, packets)
+    for buffer_bytes in _sizes(name, path.stat().st_size):
+        assert packets_read(FORMATS[name].opened(path, buffer_bytes)) == packets, buffer_bytes
+    assert packets_read(FORMATS[name].opened(path, 1 << 22)) == packets
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("native", marks=needs_native)])
+def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
+    tmp_path: Path, engine: str, big_endian: bool
+) -> None:
+    loops = CaptureLoops() if engine == "native" else None
+    pick = random.Random(1)
+    path = tmp_path / "a.pcap"
+    for length in range(1, 201):
+        packets = packets_of([(2, 3), (length, _LONG), (1, 9), (2, 11)])
+        content = pcap_bytes(_frames(packets), big_endian=big_endian)
+        path.write_bytes(content)
+        recording = pcap.open_packets(path, StreamTable())
+        assert isinstance(recording, CaptureRecording)
+        sizes = [len(payload) + _ETHERNET_HEADERS + _RECORD_BYTES for _, payload in packets]
+        after = np.cumsum([_FILE_HEADER_BYTES, *sizes])
+        file = _File(recording, loops, np.frombuffer(content + bytes(SLACK), np.uint8), after)
+        # Around the 17th equal frame of the row, and around its last.
+        cuts = [
+            cut
+            for begin, end in ((17, 20), (length, length + 4))
+            for cut in range(int(after[min(begin, len(sizes))]), int(after[min(end, len(sizes))]))
+        ]
+        for cut in cuts if length <= _ALL_BYTES else pick.sample(cuts, 40):
+            file.check(cut, [at_ns for at_ns, _ in packets])
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    """A capture with one buffer end; after: ends of its header and of each record."""
+
+    recording: CaptureRecording
+    loops: CaptureLoops | None
+    data: U8Array
+    after: I64Array
+
+    def check(self, cut: int, host_ns: list[int]) -> None:
+        """A walk over the bytes before `cut`, and one over the rest, find all frames."""
+        walker = self.recording.walker(self.loops)
+        whole = int(np.searchsorted(self.after[1:], cut, side="right"))
+        front = walker.walk(self.data[: cut + SLACK], 0, cut)
+        assert len(front.frames) == whole
+        assert front.next == self.after[whole]
+        rest = walker.walk(self.data, front.next, len(self.data) - SLACK)
+        start = np.concatenate([front.frames.start, rest.frames.start])
+        assert start.tolist() == (self.after[:-1] + _RECORD_BYTES).tolist()
+        found_ns = np.concatenate([front.frames.host_ns, rest.frames.host_ns])
+        assert found_ns.tolist() == host_ns
+
+
+_ROWS = st.lists(st.tuples(st.integers(1, 200), st.integers(1, 200)), min_size=1, max_size=4)
+
+
+@_EACH
+@settings(max_examples=15)
+@given(rows=_ROWS, buffer_bytes=st.integers(_SMALLEST, 20_000))
+def test_any_rows_and_any_buffer(name: str, rows: list[tuple[int, int]], buffer_bytes: int) -> None:
+    packets = packets_of(rows)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording"
+        FORMATS[name].write(path, packets)
+        assert packets_read(FORMATS[name].opened(path, buffer_bytes)) == packets
+        assert packets_read(FORMATS[name].opened(path, 1 << 22)) == packets

@@ -1,0 +1,77 @@
+"""`--fail-on`: what is parsed, what is refused, what exceeds a limit."""
+
+from __future__ import annotations
+
+import pytest
+
+from mlbatch.errors import UsageError
+from mlbatch.report.limits import exceeded, parse_limits
+
+REPORT = {
+    "sensors": [
+        {"name": "a", "packets": {"read": 999, "accepted": 999, "lost": 1, "rejected": {}}},
+        {
+            "name": "b",
+            "packets": {
+                "read": 1000,
+                "accepted": 990,
+                "lost": 10,
+                "rejected": {"bad_crc": 7, "duplicate": 3},
+            },
+        },
+    ],
+    "scans": {
+        **{"written": 40, "underfilled": 2, "incomplete": 0, "empty": 3, "empty_clouds": 0},
+        **{"dropped_incomplete": 4, "no_points": {"b": 5}},
+    },
+    "warnings": [{"code": "clouds"}, {"code": "loss"}],
+}
+EXCEEDED = [
+    # 10 of 1000 of b, 1 of 1000 of a.
+    ("loss>0.99%", "loss>0.99%: found b: 10 of 1000 (1 %) packets lost"),
+    ("loss>1%", ""),
+    ("loss>0.09%", "loss>0.09%: found a: 1 of 1000 (0.1 %) packets lost"),
+    ("loss>9", "loss>9: found b: 10 of 1000 (1 %) packets lost"),
+    ("rejected>0", "rejected>0: found b: 10 of 1000 (1 %) packets rejected"),
+    ("rejected>1%", ""),
+    ("underfilled>1", "underfilled>1: found 2 of 40 (5 %) scans underfilled"),
+    ("underfilled>5%", ""),
+    ("underfilled > 4.9 %", "underfilled > 4.9 %: found 2 of 40 (5 %) scans underfilled"),
+    ("incomplete>0", ""),
+    ("empty>2", "empty>2: found 3 windows empty"),
+    ("dropped_incomplete>3", "dropped_incomplete>3: found 4 windows left out"),
+    ("empty_clouds>0", ""),
+    ("no_points>12%", "no_points>12%: found b: 5 of 40 (12.5 %) scans without its points"),
+    # `clouds` is for information.
+    ("warnings>0", "warnings>0: found 1 warnings"),
+    ("warnings>1", ""),
+]
+
+
+@pytest.mark.parametrize(("text", "line"), EXCEEDED)
+def test_limits_by_hand(text: str, line: str) -> None:
+    assert exceeded(parse_limits([text]), REPORT) == ([line] if line else [])
+
+
+def test_limits_may_be_in_one_list_or_in_several() -> None:
+    limits = parse_limits(["loss>0.1%,underfilled>0", "warnings>0"])
+    assert [limit.text for limit in limits] == ["loss>0.1%", "underfilled>0", "warnings>0"]
+    assert len(exceeded(limits, REPORT)) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("lost>1", "expected one of loss, rejected, underfilled, .*, found 'lost'; write loss>"),
+        ("loss", "expected NAME>NUMBER or NAME>NUMBER%, found 'loss'"),
+        ("loss<1", "expected NAME>NUMBER or NAME>NUMBER%, found 'loss<1'"),
+        ("loss>-1", "expected NAME>NUMBER or NAME>NUMBER%, found 'loss>-1'"),
+        ("loss>1e3", "expected NAME>NUMBER"),
+        ("", "expected NAME>NUMBER or NAME>NUMBER%, found ''"),
+        ("loss>1,", "expected NAME>NUMBER or NAME>NUMBER%, found ''"),
+        ("warnings>1%", "expected a number of warnings, found 'warnings>1%'; write warnings>1"),
+    ],
+)
+def test_other_texts_are_refused(text: str, found: str) -> None:
+    with pytest.raises(UsageError, match=f"--fail-on: {found}"):
+        parse_limits([text])
