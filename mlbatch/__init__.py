@@ -5,20 +5,47 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mlbatch.api import convert as convert
+    from mlbatch.api import inspect as inspect
+    from mlbatch.api import open as open
+    from mlbatch.api import read as read
     from mlbatch.api import scans as scans
     from mlbatch.errors import MlbatchError as MlbatchError
-    from mlbatch.types import Scan as Scan
+    from mlbatch.outputs.scan import Scan as Scan
+    from mlbatch.python.recording import Recording as Recording
+    from mlbatch.python.run import Run as Run
+    from mlbatch.verify import verify as verify
 
 __version__ = "0.1.0"
-__all__ = ["MlbatchError", "Scan", "scans"]
+__all__ = [
+    "MlbatchError",
+    "Recording",
+    "Run",
+    "Scan",
+    "convert",
+    "inspect",
+    "open",
+    "read",
+    "scans",
+    "verify",
+]
 
-_PLACES = {"scans": "mlbatch.api", "MlbatchError": "mlbatch.errors", "Scan": "mlbatch.types"}
+_PLACES = {
+    "MlbatchError": "mlbatch.errors",
+    "Recording": "mlbatch.python.recording",
+    "Run": "mlbatch.python.run",
+    "Scan": "mlbatch.outputs.scan",
+    **dict.fromkeys(("convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
+}
 
 
 def __getattr__(name: str) -> object:
     """Load what is asked for: `mlbatch --help` must not wait for numpy."""
     import importlib
 
+    if name == "verify":
+        # A package that can be called: importing it replaces any function of this name here.
+        return importlib.import_module("mlbatch.verify")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -1,31 +1,72 @@
-"""Python interface: the scans that `mlbatch convert` writes, one after another in memory."""
+"""Python interface: recordings, scans, conversions and outputs (docs/python.md)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from fractions import Fraction
-from pathlib import Path
-from typing import TypeAlias
+from collections.abc import Iterable, Iterator, Mapping
 
-import numpy as np
-
-from mlbatch.discovery.discover import SensorSelection
+from mlbatch.discovery.inspect import Inspection
+from mlbatch.discovery.inspect import inspect as inspect_recordings
 from mlbatch.errors import UsageError
-from mlbatch.native import ALIASES, ENGINES
-from mlbatch.pipeline.conversion import Conversion
-from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, check_sort, wait_ns
-from mlbatch.types import Scan
-from mlbatch.units import parse_rate
+from mlbatch.outputs.read import read as read_output
+from mlbatch.outputs.scan import Scan
+from mlbatch.python.options import (
+    AnyPath,
+    Box,
+    Moment,
+    Names,
+    Paths,
+    Rate,
+    ScanOptions,
+    path_of,
+    paths_of,
+    session_job,
+)
+from mlbatch.python.recording import Recording, scans_of
+from mlbatch.python.run import OutputOptions, Run, run_job
 
-PathLike: TypeAlias = str | Path
+
+def open(
+    *recordings: Paths,
+    rig: AnyPath | None = None,
+    metadata: Paths = (),
+    only: Names = (),
+    ignore: Names = (),
+    identity_extrinsics: bool = False,
+    clock: str = "sensor",
+    align_clocks: bool = False,
+    decode: Mapping[str, str] | None = None,
+    strict: bool = False,
+    engine: str = "auto",
+) -> Recording:
+    """Open the recordings of one session; arguments are the options of `mlbatch convert`.
+
+    The first 10 s are read. Raises MlbatchError where the recording cannot be converted at all;
+    unknown extrinsics are an error of `Recording.scans` only.
+    """
+    return Recording(
+        session_job(
+            recordings,
+            rig=rig,
+            metadata=metadata,
+            only=only,
+            ignore=ignore,
+            identity_extrinsics=identity_extrinsics,
+            clock=clock,
+            align_clocks=align_clocks,
+            decode=decode,
+            strict=strict,
+            engine=engine,
+        )
+    )
 
 
 def scans(
-    *recordings: PathLike,
-    rig: PathLike | None = None,
-    rate: int | float | str | Fraction | None = None,
+    *recordings: Paths,
+    rig: AnyPath | None = None,
+    rate: Rate | None = None,
+    start: Moment | None = None,
+    end: Moment | None = None,
     slices: int = 1,
     layout: str = "dense",
     sort: str = "columns",
@@ -34,9 +75,9 @@ def scans(
     clock: str = "sensor",
     min_range: float = 0.0,
     max_range: float = math.inf,
-    metadata: Sequence[PathLike] = (),
-    only: Sequence[str] = (),
-    ignore: Sequence[str] = (),
+    metadata: Paths = (),
+    only: Names = (),
+    ignore: Names = (),
     identity_extrinsics: bool = False,
     keep_repeated: bool = False,
     decode: Mapping[str, str] | None = None,
@@ -48,53 +89,117 @@ def scans(
     Arguments are the options of `mlbatch convert` (max_wait in s, ranges in m, rate in Hz); fields
     of a Scan are named as the npz keys. Raises MlbatchError where the command ends with an error.
     """
-    for name, value, known in (
-        ("layout", layout, ("dense", "organized")),
-        ("clock", clock, ("sensor", "host")),
-        ("engine", engine, (*ENGINES, *ALIASES)),
-    ):
-        if value not in known:
-            raise UsageError(f"{name}: expected {' or '.join(known)}, found {value!r}; choose one")
-    check_ranges_m("min_range", min_range, "max_range", max_range)
-    job = Job(
-        recordings=tuple(Path(path) for path in recordings),
-        selection=SensorSelection(
-            rig=None if rig is None else Path(rig),
-            metadata=tuple(Path(path) for path in metadata),
-            only=tuple(only),
-            ignore=tuple(ignore),
-            identity_extrinsics=identity_extrinsics,
-            host_clock=clock == "host",
-            decode=dict(decode or {}),
-        ),
-        # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
-        rate=None if rate is None else parse_rate(str(rate)),
-        slices=check_slices("slices", slices),
-        layout=layout,
-        sort=check_sort("sort", sort, layout),
-        keep_partial=keep_partial,
-        keep_repeated=keep_repeated,
-        max_wait_ns=wait_ns("max_wait", max_wait, max_wait),
-        min_range_m=min_range,
-        max_range_m=max_range,
+    job = session_job(
+        recordings,
+        rig=rig,
+        metadata=metadata,
+        only=only,
+        ignore=ignore,
+        identity_extrinsics=identity_extrinsics,
+        clock=clock,
+        decode=decode,
         strict=strict,
         engine=engine,
     )
-    for scan, _ in Conversion(job).scans():
-        yield _owned(scan)
-
-
-def _owned(scan: Scan) -> Scan:
-    """A scan with arrays of its own."""
-    return replace(
-        scan,
-        xyz=np.array(scan.xyz, order="C"),
-        intensity=scan.intensity.copy(),
-        reflectivity=None if scan.reflectivity is None else scan.reflectivity.copy(),
-        range_m=None if scan.range_m is None else scan.range_m.copy(),
-        time_ns=scan.time_ns.copy(),
-        ring=scan.ring.copy(),
-        return_type=scan.return_type.copy(),
-        lidar_id=scan.lidar_id.copy(),
-        column=None if scan.column is None else scan.column.copy(),
+    options = ScanOptions(
+        rate=rate,
+        start=start,
+        end=end,
+        slices=slices,
+        layout=layout,
+        sort=sort,
+        keep_partial=keep_partial,
+        keep_repeated=keep_repeated,
+        max_wait=max_wait,
+        min_range=min_range,
+        max_range=max_range,
     )
+    yield from scans_of(options.apply(job))
+
+
+def convert(
+    recording: Recording | Paths,
+    output: AnyPath | None,
+    *,
+    rig: AnyPath | None = None,
+    metadata: Paths = (),
+    rate: Rate | None = None,
+    start: Moment | None = None,
+    end: Moment | None = None,
+    slices: int = 1,
+    layout: str = "dense",
+    split: bool = False,
+    keep_partial: bool = False,
+    drop_incomplete: float = 0.0,
+    max_wait: float = 1.0,
+    min_range: float = 0.0,
+    max_range: float = math.inf,
+    exclude_boxes: Iterable[Box] = (),
+    keep_repeated: bool = False,
+    sort: str = "columns",
+    copy_topics: Names = (),
+    format: str | None = None,
+    point_layout: str = "standard",
+    compression: str = "none",
+    overwrite: bool = False,
+    fsync: bool = True,
+    report: AnyPath | None = None,
+    jobs: int = 1,
+) -> Run:
+    """Write the scans of a recording as `mlbatch convert` does; its options are the arguments.
+
+    recording: opened, or paths (then rig and metadata may be given); output: None: a dry run;
+    copy_topics: as `--pass`. Raises MlbatchError where the command ends with an error.
+    """
+    if isinstance(recording, Recording):
+        if rig is not None or paths_of("metadata", metadata):
+            raise UsageError(
+                "convert: expected rig and metadata with paths only, found an opened recording; "
+                "give them to mlbatch.open"
+            )
+        job = recording.job
+    else:
+        job = session_job(recording, rig=rig, metadata=metadata)
+    options = ScanOptions(
+        rate=rate,
+        start=start,
+        end=end,
+        slices=slices,
+        layout=layout,
+        sort=sort,
+        split=split,
+        keep_partial=keep_partial,
+        drop_incomplete=drop_incomplete,
+        max_wait=max_wait,
+        min_range=min_range,
+        max_range=max_range,
+        exclude_boxes=exclude_boxes,
+        keep_repeated=keep_repeated,
+        copy_topics=copy_topics,
+    )
+    target = OutputOptions(
+        format=format,
+        point_layout=point_layout,
+        compression=compression,
+        overwrite=overwrite,
+        fsync=fsync,
+        report=path_of("report", report),
+        jobs=jobs,
+    )
+    return run_job(options.apply(job), path_of("output", output), target)
+
+
+def read(output: AnyPath) -> Iterator[Scan]:
+    """Yield the scans of an output of `convert`: npz, PLY, MCAP, ROS 1 or ROS 2 bag.
+
+    Arrays that the format does not store are empty, and named in `Scan.absent`. Raises
+    RecordingError where the output is damaged.
+    """
+    (path,) = paths_of("output", output)
+    return read_output(path)
+
+
+def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> Inspection:
+    """What the first 10 s of recordings contain (whole: all of them), as `mlbatch inspect`."""
+    paths = paths_of("recording", recordings)
+    return inspect_recordings(paths, paths_of("metadata", metadata), whole=whole)

@@ -235,7 +235,11 @@ def contents(folder: Path) -> dict[str, object]:
         if path.is_dir():
             found[name] = None
         elif path.name.endswith("report.json"):
-            found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
+            found[name] = {
+                k: v
+                for k, v in json.loads(path.read_text()).items()
+                if k not in ("timing", "command")
+            }
         else:
             found[name] = path.read_bytes()
     return found

@@ -128,6 +128,9 @@ def convert(
         Path | None,
         typer.Option(help="Path of the report (JSON); -: print it instead of the summary."),
     ] = None,
+    html: Annotated[
+        Path | None, typer.Option(help="Also write a page of the run (HTML), see mlbatch report.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
     engine: Annotated[
         str,
@@ -220,6 +223,7 @@ def convert(
             dry_run=dry_run,
             report=None if options.is_stdout(report) else report,
             prints_report=options.is_stdout(report),
+            html=html,
             split_jumps=on_jump == "split",
             limits=parse_limits(fail_on or ()),
             overwrite=overwrite,

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import datetime
 import math
-import re
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,9 +13,10 @@ import typer
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
 from mlbatch.native import ALIASES, ENGINES
-from mlbatch.pipeline.job import MOST_S, check_ranges_m, check_slices, wait_ns
+from mlbatch.pipeline.job import check_ranges_m, check_slices, wait_ns
+from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.sensors import DECODE_OPTIONS
-from mlbatch.units import NS_PER_S, parse_rate
+from mlbatch.units import parse_rate
 
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
@@ -43,49 +41,6 @@ def slices(count: int) -> None:
 def ranges_m(low: float, high: float) -> None:
     """`--min-range` and `--max-range`."""
     check_ranges_m("--min-range", low, "--max-range", high)
-
-
-def in_order(first: Limit | None, last: Limit | None) -> None:
-    """Raise UsageError unless `--start` is before `--end`, if both count from the same time."""
-    if first is None or last is None or first.from_t_init != last.from_t_init:
-        return
-    if last.ns <= first.ns:
-        raise UsageError(
-            f"--end: expected a time after --start ({first.ns / NS_PER_S:g} s), found "
-            f"{last.ns / NS_PER_S:g} s; swap them"
-        )
-
-
-def time_limit(option: str, text: str | None) -> tuple[Limit | None, bool]:
-    """A `--start` or `--end` (epoch seconds, ISO time, +S), and True if it is a date."""
-    if text is None:
-        return None, False
-    relative = text.startswith("+")
-    try:
-        seconds = Decimal(text)
-        # No arithmetic before the range is checked: abs(1e999999999) overflows.
-        if seconds.is_finite() and -MOST_S <= seconds <= MOST_S:
-            return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
-    except InvalidOperation:
-        pass
-    try:
-        return Limit(_iso_ns(text)), True
-    except ValueError:
-        raise UsageError(
-            f"{option}: expected epoch seconds, an ISO time or +SECONDS, found {text!r}; "
-            "write 1700000000.5, 2026-05-01T12:00:00 or +12.5"
-        ) from None
-
-
-def _iso_ns(text: str) -> int:
-    text = text.replace("Z", "+00:00")
-    # Python 3.10 accepts three or six decimals only.
-    text = re.sub(r"\.(\d{1,6})(?!\d)", lambda found: f".{found[1]:0<6}", text)
-    moment = datetime.datetime.fromisoformat(text)
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.timezone.utc)
-    since = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
-    return (since.days * 86400 + since.seconds) * NS_PER_S + since.microseconds * 1000
 
 
 def max_wait_ns(text: str) -> int | None:
@@ -202,10 +157,7 @@ def choices(**options: tuple[str, Sequence[str]]) -> None:
 
 def time_limits(start: str | None, end: str | None) -> tuple[Limit | None, Limit | None, bool]:
     """`--start` and `--end`, and True if one of them is a date."""
-    first, first_is_date = time_limit("--start", start)
-    last, last_is_date = time_limit("--end", end)
-    in_order(first, last)
-    return first, last, first_is_date or last_is_date
+    return limits_of("--start", start, "--end", end)
 
 
 def resume(resume: bool, *, dry_run: bool) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -58,6 +59,7 @@ class Target:
     dry_run: bool
     report: Path | None
     prints_report: bool  # to standard output, without a summary
+    html: Path | None  # page of the run
     split_jumps: bool
     limits: tuple[Limit, ...]  # of `--fail-on`
     overwrite: bool
@@ -123,12 +125,15 @@ def _run_one(job: Job, target: Target) -> list[str]:
         open_output = _opener(name, output, options)
         report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
+    _check_page(target, report_path, name)
     with _progress(target.quiet) as progress:
         conversion, inputs = _converted(
             job, open_output, progress, resume_log, _report_writer(target, report_path)
         )
+    inputs = replace(inputs, command=_command())
     for note in conversion.notes:
         _say(f"warning: {note.code}: {note.message}")
+    _write_page(conversion, inputs, target)
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
     if target.prints_report or (target.dry_run and report_path is None):
@@ -198,11 +203,51 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
         path = partial / report_path.name if is_inside else report_path
-        write_text(path, report_text(inputs), target.fsync)
+        write_text(path, report_text(replace(inputs, command=_command())), target.fsync)
         if target.fsync and path.parent.absolute() != target.output.parent.absolute():
             sync_entries(path.parent)
 
     return write
+
+
+def _command() -> str:
+    """The command line, as typed into a shell."""
+    return shlex.join(["mlbatch", *sys.argv[1:]])
+
+
+def _check_page(target: Target, report_path: Path | None, name: str) -> None:
+    """Refuse a page that cannot be written, before the run; name: of the output's format."""
+    if target.html is None:
+        return
+    from mlbatch.page import check_page
+
+    page = target.html.absolute()
+    if target.written is not None and target.written.absolute() in (page, *page.parents):
+        raise ExportError(
+            f"{target.html}: expected a page outside the output, found one in {target.written}; "
+            "choose another name"
+        )
+    own = [] if report_path is None else [report_path]
+    if target.written is not None:
+        own.append(report_paths(target.written, name).scans_csv)
+    if page in [path.absolute() for path in own]:
+        raise ExportError(
+            f"{target.html}: expected a page apart from the output, its table and report, found "
+            "the name of one of them; choose another"
+        )
+    check_page(target.html, overwrite=target.overwrite or target.resume)
+
+
+def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> None:
+    if target.html is None:
+        return
+    # Not loaded for runs without a page.
+    from mlbatch.page import write_page
+    from mlbatch.page.source import Source, read_report
+
+    report = read_report(target.html, report_text(inputs))
+    table = None if conversion.table is None else conversion.table.text()
+    write_page(target.html, Source(report, table, target.written, target.html))
 
 
 def _opener(name: str, output: Path, options: WriterOptions) -> OpenWriter:
@@ -299,6 +344,7 @@ def _numbered(target: Target, number: int) -> Target:
         target,
         output=_with_number(target.output, number, ".mcap", ".bag"),
         report=_with_number(target.report, number, ".json"),
+        html=_with_number(target.html, number, ".html"),
     )
 
 

@@ -5,9 +5,16 @@
 
 from __future__ import annotations
 
+import datetime
+import re
+from decimal import Decimal, InvalidOperation
+from operator import index
+from typing import SupportsIndex
+
 from mlbatch.batching.windows import Limit
 from mlbatch.clocks.timescale import DAY_NS, EPOCH_NS, UNKNOWN, describe_time
 from mlbatch.errors import UsageError
+from mlbatch.pipeline.job import MOST_S
 from mlbatch.units import NS_PER_S
 
 # The longest window (0.25 Hz): one that contains the first stamp may begin so long before it.
@@ -16,6 +23,71 @@ WINDOW_NS = 4 * NS_PER_S
 # small number is more often meant as `+S`, at the start of a window.
 EARLY_NS = DAY_NS
 EARLY_UPTIME_NS = WINDOW_NS
+
+
+def limits_of(
+    start_option: str, start: str | int | None, end_option: str, end: str | int | None
+) -> tuple[Limit | None, Limit | None, bool]:
+    """Start and end of a run, and True if one of them is a date; options: names for errors."""
+    first, first_is_date = time_limit(start_option, start)
+    last, last_is_date = time_limit(end_option, end)
+    _refuse_disorder((start_option, end_option), first, last)
+    return first, last, first_is_date or last_is_date
+
+
+def time_limit(option: str, text: str | int | None) -> tuple[Limit | None, bool]:
+    """A limit (epoch seconds, ISO time, +S or +Ss; int: ns), and True if it is a date."""
+    if text is None:
+        return None, False
+    if not isinstance(text, str):
+        return Limit(_whole_ns(option, text)), False
+    relative = text.startswith("+")
+    try:
+        seconds = Decimal(text.removesuffix("s") if relative else text)
+        # No arithmetic before the range is checked: abs(1e999999999) overflows.
+        if seconds.is_finite() and -MOST_S <= seconds <= MOST_S:
+            return Limit(int(seconds * NS_PER_S), from_t_init=relative), False
+    except InvalidOperation:
+        pass
+    try:
+        return Limit(_iso_ns(text)), True
+    except ValueError:
+        raise UsageError(
+            f"{option}: expected epoch seconds, an ISO time or +SECONDS, found {text!r}; "
+            "write 1700000000.5, 2026-05-01T12:00:00 or +12.5"
+        ) from None
+
+
+def _iso_ns(text: str) -> int:
+    text = text.replace("Z", "+00:00")
+    # Python 3.10 accepts three or six decimals only.
+    text = re.sub(r"\.(\d{1,6})(?!\d)", lambda found: f".{found[1]:0<6}", text)
+    moment = datetime.datetime.fromisoformat(text)
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.timezone.utc)
+    since = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+    return (since.days * 86400 + since.seconds) * NS_PER_S + since.microseconds * 1000
+
+
+def _whole_ns(option: str, value: object) -> int:
+    """A time in ns; numbers with a fraction could be meant as seconds, and are refused."""
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex):
+        raise UsageError(
+            f"{option}: expected whole nanoseconds or a text, found {value!r}; write an int of ns, "
+            "or seconds as a text"
+        )
+    return index(value)
+
+
+def _refuse_disorder(options: tuple[str, str], first: Limit | None, last: Limit | None) -> None:
+    """Raise UsageError unless start is before end, if both count from the same time."""
+    if first is None or last is None or first.from_t_init != last.from_t_init:
+        return
+    if last.ns <= first.ns:
+        raise UsageError(
+            f"{options[1]}: expected a time after {options[0]} ({first.ns / NS_PER_S:g} s), found "
+            f"{last.ns / NS_PER_S:g} s; swap them"
+        )
 
 
 def refuse_outside(start: Limit | None, end: Limit | None, first_ns: int) -> None:

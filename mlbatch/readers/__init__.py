@@ -1,5 +1,6 @@
 """Readers of recordings. Every module in `formats` is a plug-in for one container.
 
+Other distributions add containers by entry points of the group `mlbatch.readers`.
 A plug-in has `CONTAINER`, `recognises(head)` and `open_packets(path, streams)`, as in `Reader`;
 one for bags that are folders also `open_folder(folder, files, streams, notes)`.
 """
@@ -8,10 +9,11 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
+from mlbatch import entry_points
 from mlbatch.errors import RecordingError
 from mlbatch.readers import formats
 from mlbatch.readers.merge import merge
@@ -62,8 +64,8 @@ class FolderReader(Reader, Protocol):
 
 
 def readers() -> list[Reader]:
-    """All plug-ins, by name."""
-    return [_reader(name) for name in _names()]
+    """All plug-ins, by name; those of other distributions last."""
+    return [*map(_reader, _names()), *_other_readers()]
 
 
 def open_recording(path: Path, streams: StreamTable) -> Recording:
@@ -101,6 +103,12 @@ def _reader(name: str) -> Reader:
     return cast(Reader, importlib.import_module(f"{formats.__name__}.{name}"))
 
 
+def _other_readers() -> Iterator[Reader]:
+    """Plug-ins of other distributions."""
+    for name in entry_points.names(entry_points.READERS, _names()):
+        yield cast(Reader, entry_points.load(entry_points.READERS, name))
+
+
 def _reader_of(path: Path) -> Reader:
     """The plug-in that reads a file."""
     head = read_head(path)
@@ -108,6 +116,9 @@ def _reader_of(path: Path) -> Reader:
     likely = [suffix.lstrip(".") for suffix in path.suffixes]
     for name in sorted(_names(), key=lambda name: name not in likely):
         reader = _reader(name)
+        if reader.recognises(head):
+            return reader
+    for reader in _other_readers():
         if reader.recognises(head):
             return reader
     containers = ", ".join(reader.CONTAINER for reader in readers())

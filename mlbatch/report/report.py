@@ -145,6 +145,7 @@ class RunReport:
     faults: tuple[FaultReport, ...] = ()
     repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
     first_scan: str = ""  # start of the first scan, as text
+    command: str = ""  # command line; "" for runs by the Python interface
 
 
 def build_report(run: RunReport) -> Section:
@@ -152,6 +153,7 @@ def build_report(run: RunReport) -> Section:
     return {
         "schema": SCHEMA,
         "version": mlbatch.__version__,
+        **({"command": run.command} if run.command else {}),
         "inputs": [asdict(item) for item in run.inputs],
         "timescale": run.timescale,
         "grid": {
@@ -178,8 +180,8 @@ def build_report(run: RunReport) -> Section:
 
 
 def without_machine(report: Section, inputs: Sequence[InputReport]) -> Section:
-    """The report without timings and paths: the part that depends on the recordings alone."""
-    kept = {key: value for key, value in report.items() if key != "timing"}
+    """The report without timings, paths and command: what depends on the recordings alone."""
+    kept = {key: value for key, value in report.items() if key not in ("timing", "command")}
     kept["inputs"] = [{"bytes": item.bytes, "container": item.container} for item in inputs]
     return kept
 

@@ -2,6 +2,7 @@
 
 Each folder of this package is a vendor; its module `sensor` is the plug-in (`Plugin`), found by its
 place. Vendors are asked in alphabetical order, and a vendor is imported only when it is asked.
+Other distributions add vendors by entry points of the group `mlbatch.sensors`; they are asked last.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, cast
 
+from mlbatch import entry_points
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.interface import Calibration, SensorModel
@@ -54,14 +56,16 @@ class Plugin(Protocol):
 
 
 def plugins() -> tuple[Plugin, ...]:
-    """All plug-ins, sorted by name."""
+    """All plug-ins, sorted by name; those of other distributions last."""
     return tuple(_load_lazily())
 
 
 def _load_lazily() -> Iterator[Plugin]:
-    """All plug-ins, sorted by name, each imported when the iterator reaches it."""
+    """All plug-ins in their order, each imported when the iterator reaches it."""
     for name in _names():
         yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
+    for name in entry_points.names(entry_points.SENSORS, _names()):
+        yield cast(Plugin, entry_points.load(entry_points.SENSORS, name))
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,10 @@ so that a fault of the writers is not hidden by the same fault here.
 
 from __future__ import annotations
 
+import sys
+from os import PathLike
 from pathlib import Path
+from types import ModuleType
 
 from mlbatch.verify.outputs import Output, check_output
 from mlbatch.verify.report_checks import ReportPlaces
@@ -24,11 +27,13 @@ __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 _PARTIAL = ".partial"
 
 
-def verify(path: Path, report: Path | None = None) -> Verdict:
+def verify(path: str | PathLike[str], report: str | PathLike[str] | None = None) -> Verdict:
     """Check an output; report: path of `--report`, None for the usual one.
 
     Raises VerifyError if there is nothing to check.
     """
+    path = Path(path)
+    report = None if report is None else Path(report)
     if path.name.endswith(_PARTIAL):
         raise VerifyError(
             f"{path}: expected a finished output, found that of an unfinished run; convert again"
@@ -43,3 +48,15 @@ def verify(path: Path, report: Path | None = None) -> Verdict:
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
     return check_output(Output(path, ReportPlaces.of(path, report), log))
+
+
+class _CallableModule(ModuleType):
+    """`mlbatch.verify(path)`, although `mlbatch.verify` is this package."""
+
+    def __call__(
+        self, path: str | PathLike[str], report: str | PathLike[str] | None = None
+    ) -> Verdict:
+        return verify(path, report)
+
+
+sys.modules[__name__].__class__ = _CallableModule

@@ -30,7 +30,13 @@ from mlbatch.writers.base import (
     WriterOptions,
 )
 from mlbatch.writers.durable import sync_entries, sync_to_disk
-from mlbatch.writers.formats import format_module, format_names
+from mlbatch.writers.formats import (
+    built_in_names,
+    format_module,
+    format_names,
+    is_format,
+    other_names,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -78,7 +84,7 @@ LATER_SUFFIXES = {
 
 def plugin(name: str) -> WriterModule:
     """Return the module of a format, UsageError for an unknown one."""
-    if name not in format_names():
+    if not is_format(name):
         later = " (not in this version)" if name in LATER_FORMATS else ""
         raise UsageError(
             f"--format: expected one of {', '.join(format_names())}, found {name!r}{later}; "
@@ -112,15 +118,21 @@ def _format_of_suffix(suffix: str) -> str | None:
     if not suffix:
         return None
     # Importing all formats is slow: the likely one comes first.
-    likely = sorted(format_names(), key=lambda name: name != suffix.removeprefix("."))
-    suffixes = ((plugin(name).SUFFIX, name) for name in likely)
-    return next((name for own, name in suffixes if own == suffix), None)
+    likely = sorted(built_in_names(), key=lambda name: name != suffix.removeprefix("."))
+    for name in likely:
+        if _has_suffix(name, suffix):
+            return name
+    return next((name for name in other_names() if _has_suffix(name, suffix)), None)
+
+
+def _has_suffix(name: str, suffix: str) -> bool:
+    return suffix == plugin(name).SUFFIX
 
 
 def _refuse_file_name(target: Path, suffix: str) -> None:
     """Refuse names of files for outputs that are folders or not in this version."""
     name = suffix.removeprefix(".")
-    if name in format_names() and plugin(name).SUFFIX is None:
+    if is_format(name) and plugin(name).SUFFIX is None:
         raise UsageError(
             f"-o {target}: expected a folder, since {name} output is one file per scan, found a "
             f"file name; give -o {target.with_suffix('')} --format {name}"

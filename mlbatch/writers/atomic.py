@@ -19,7 +19,7 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.writers.durable import sync_entries, sync_to_disk
-from mlbatch.writers.formats import format_module, format_names
+from mlbatch.writers.formats import format_module, is_format
 
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
@@ -121,7 +121,7 @@ def _is_own_file(name: str) -> bool:
     scan = _SCAN_FILE.fullmatch(name)
     if scan is None:
         return name in (SCANS_CSV, REPORT_JSON)
-    return scan[3] in format_names() and format_module(scan[3]).SUFFIX is None
+    return is_format(scan[3]) and format_module(scan[3]).SUFFIX is None
 
 
 def is_report(path: Path) -> bool:

@@ -45,6 +45,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--ignore": "repeatable",
         "--fault": "repeatable",
         "--fault-seed": "random",
+        "--html": "page.*HTML",
         "--dry-run": "report.*split.*line.*segment",
         "--report": "JSON",
         "--jobs": "same time",
@@ -75,6 +76,11 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "sensors": {"--json": "JSON"},
     "verify": {"--report": "JSON.*next to", "--json": "JSON"},
+    "report": {
+        "--output": r"page.*OUTPUT\.html",
+        "--report": "JSON.*next to",
+        "--overwrite": "existing",
+    },
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",
@@ -165,4 +171,5 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
         "assert 'numpy' not in sys.modules\n"
         "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
     )
-    assert printed.strip() == "['MlbatchError', 'Scan', 'scans']"
+    names = [*("MlbatchError", "Recording", "Run", "Scan", "convert", "inspect", "open", "read")]
+    assert printed.strip() == str([*names, "scans", "verify"])

@@ -12,15 +12,16 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
-    ("api", "compare", "bench"),
+    ("api", "compare", "bench", "page"),
+    ("python",),
     ("pipeline",),
-    ("discovery",),
+    ("discovery", "outputs"),
     ("readers", "sensors", "writers", "verify", "faults"),
     ("decode", "batching"),
     ("report", "rig", "clocks"),
     ("lidar", "frames", "ros"),
     ("types", "native"),
-    ("arrays", "units"),
+    ("arrays", "units", "entry_points"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", ""),
 )

@@ -33,6 +33,13 @@ def test_the_types_travel_with_the_package() -> None:
     assert (PACKAGE / "py.typed").is_file()
 
 
+def test_every_asset_travels_with_the_package() -> None:
+    data = _settings("tool", "setuptools", "package-data")["mlbatch"]
+    assets = [path for suffix in ("css", "js") for path in PACKAGE.rglob(f"*.{suffix}")]
+    assert assets
+    assert {path.relative_to(PACKAGE).as_posix() for path in assets} <= set(data)
+
+
 def test_every_package_is_found() -> None:
     include = cast(list[str], _settings("tool", "setuptools", "packages", "find")["include"])
     packages = {"mlbatch", *(f"mlbatch.{path.parent.name}" for path in PACKAGE.glob("*/*.py"))}

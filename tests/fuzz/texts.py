@@ -15,6 +15,7 @@ from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import joints
+from mlbatch.pipeline import time_limits
 from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.sensors.options import check_options
@@ -124,8 +125,8 @@ _TYPED: Sequence[tuple[Callable[[str], object], tuple[str, ...]]] = (
     (options.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
     (options.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
     (options.max_wait_ns, ("1.0", "inf", "0.05", "1e9")),
-    (lambda text: options.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
-    (lambda text: options.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
+    (lambda text: time_limits.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
+    (lambda text: time_limits.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
     (lambda text: options.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
     (
         lambda text: check_options(dict(pair.partition("=")[::2] for pair in text.split(";"))),

@@ -227,7 +227,7 @@ def test_the_shortest_wait_is_a_nanosecond() -> None:
 
 def test_scans_in_python_wait_for_ever_from_some_time_on() -> None:
     one, other = (list(mlbatch.scans(CAPTURE, rig=RIG, max_wait=s)) for s in (1e300, math.inf))
-    assert [scan.points for scan in one] == [scan.points for scan in other]
+    assert [scan.point_count for scan in one] == [scan.point_count for scan in other]
 
 
 def test_a_conversion_may_be_left_half_way() -> None:

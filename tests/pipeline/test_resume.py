@@ -386,7 +386,7 @@ def test_another_byte_of_a_calibration_is_refused(shell: Shell, tmp_path: Path) 
     ("before", "after"),
     [
         ("translation_m: [", "translation_m: [1"),
-        ("exclude_boxes_m: [", "exclude_boxes_m: [[9, 9, 9, 10, 10, 10], "),
+        ("exclude_boxes_m: [[-1.7", "exclude_boxes_m: [[-1.8"),
     ],
 )
 def test_another_rig_of_the_same_time_is_refused(

@@ -156,7 +156,7 @@ def test_metadata_next_to_the_recording_is_found(case: Case, tmp_path: Path) -> 
 
 def _without_timing(text: str) -> dict[str, object]:
     report: dict[str, object] = json.loads(text)
-    del report["timing"]
+    del report["timing"], report["command"]
     return report
 
 

@@ -1,4 +1,4 @@
-"""Output formats, one module each; they are found by their place here.
+"""Output formats, one module each; they are found by their place here, or by entry points.
 
 A format that writes one file per scan uses its own name as the suffix of these files.
 """
@@ -10,16 +10,42 @@ import pkgutil
 from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
+from mlbatch import entry_points
+from mlbatch.errors import UsageError
+
 if TYPE_CHECKING:
     from mlbatch.writers.base import WriterModule
 
 
+def built_in_names() -> tuple[str, ...]:
+    """Return the names of the formats here, sorted, without importing them."""
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
+
+
 @lru_cache(maxsize=1)
 def format_names() -> tuple[str, ...]:
-    """Return the names of all formats, sorted, without importing them."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
+    """Return the names of all formats; those of other distributions last."""
+    return (*built_in_names(), *other_names())
+
+
+def other_names() -> tuple[str, ...]:
+    """Return the names of formats of other distributions (`mlbatch.writers`)."""
+    return entry_points.names(entry_points.WRITERS, built_in_names())
+
+
+def is_format(name: str) -> bool:
+    """Return whether there is a format of this name."""
+    return name in built_in_names() or (name != "" and name in format_names())
 
 
 def format_module(name: str) -> WriterModule:
     """Return the module of one of the formats."""
-    return cast("WriterModule", importlib.import_module(f"{__name__}.{name}"))
+    if name in built_in_names():
+        return cast("WriterModule", importlib.import_module(f"{__name__}.{name}"))
+    module = cast("WriterModule", entry_points.load(entry_points.WRITERS, name))
+    if name != module.FORMAT:
+        raise UsageError(
+            f"{entry_points.describe(entry_points.WRITERS, name)}: expected FORMAT {name!r}, found "
+            f"{module.FORMAT!r}; correct the distribution"
+        )
+    return module

@@ -1,0 +1,1 @@
+"""Example plug-ins of mlbatch: a reader, a sensor and a writer."""

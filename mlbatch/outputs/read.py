@@ -1,0 +1,363 @@
+"""`mlbatch.read`: the scans of an output, one after another, whatever its format.
+
+Records and messages are parsed by the readers of `verify`; anything that they report as damaged
+is an error here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from mlbatch.errors import RecordingError
+from mlbatch.outputs.clouds import CloudPlace, Rows, scan_of_cloud
+from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of
+from mlbatch.outputs.scan import Scan
+from mlbatch.types import RunInfo
+from mlbatch.verify.folders import ScanFile, entries, scan_files
+from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+from mlbatch.writers.atomic import PARTIAL_SUFFIX
+from mlbatch.writers.point_layouts import PLY_LAYOUT
+
+_METADATA = "metadata.yaml"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_BAG_MAGIC = b"#ROSBAG V2.0\n"
+_CLOUD = "sensor_msgs/PointCloud2"
+_SCHEMA = "mlbatch.scan/1"
+_PLY_INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)
+_PLY_END = b"end_header\n"
+
+
+def read(path: Path) -> Iterator[Scan]:
+    """Yield the scans of an output in its order, with `--split` those of each sensor.
+
+    path: a .mcap or .bag file, a folder (npz, PLY, ROS 2 bag), or one npz or PLY file. Raises
+    RecordingError where the output is damaged, unfinished or of another program.
+    """
+    if path.name.endswith(PARTIAL_SUFFIX):
+        raise RecordingError(
+            f"{path}: expected a finished output, found that of an unfinished run; convert again, "
+            "or continue it with --resume"
+        )
+    try:
+        yield from _scans(path)
+    except VerifyError as err:
+        raise RecordingError(str(err)) from err
+
+
+def _scans(path: Path) -> Iterator[Scan]:
+    if path.is_dir():
+        return _scans_of_folder(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as err:
+        raise RecordingError(
+            f"{path}: expected an output of `mlbatch convert`, found {err.strerror!r}; check the "
+            "name"
+        ) from err
+    if head.startswith(_MCAP_MAGIC):
+        return _scans_of_mcap(path, path.name)
+    if head.startswith(_BAG_MAGIC):
+        return _scans_of_bag(path)
+    if path.suffix in _FILE_READERS:
+        folder = path.parent
+        log = CheckLog()
+        named = [file for file in scan_files(log, folder, path.suffix) if file.path == path]
+        # The files of a sensor are in a folder of their own.
+        if not RunFiles.of(folder).report and RunFiles.of(folder.parent).report:
+            folder = folder.parent
+            named = [file for file in scan_files(log, folder, path.suffix) if file.path == path]
+        if named:
+            return _scans_of_files(folder, path.suffix, named)
+    raise RecordingError(
+        f"{path}: expected an output of `mlbatch convert`, found another file; name the .mcap or "
+        ".bag file, or the folder"
+    )
+
+
+def _scans_of_folder(path: Path) -> Iterator[Scan]:
+    inside = entries(path)
+    if any(entry.name == _METADATA for entry in inside):
+        from mlbatch.verify.rosbag2 import open_bag
+
+        log = CheckLog()
+        file, _ = open_bag(log, path)
+        _refuse_damage(log, path)
+        return _scans_of_mcap(file, f"{path.name}/{file.name}")
+    for suffix in _FILE_READERS:
+        log = CheckLog()
+        files = scan_files(log, path, suffix)
+        if files:
+            _refuse_damage(log, path)
+            return _scans_of_files(path, suffix, files)
+    raise RecordingError(
+        f"{path}: expected an output of `mlbatch convert`, found a folder without scans; name the "
+        "output"
+    )
+
+
+def _refuse_damage(log: CheckLog, path: Path) -> None:
+    """Raise RecordingError for what a reader of `verify` has found."""
+    for violation in log.violations:
+        raise RecordingError(
+            f"{path}: {violation.where}: expected {violation.expected}, found {violation.found}; "
+            "see `mlbatch verify`, and convert again"
+        )
+
+
+# -- messages -------------------------------------------------------------------------------------
+
+
+def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
+    import json
+
+    from mlbatch.verify.mcap_file import McapFile
+
+    log = CheckLog()
+    file = McapFile(log, path, where)
+    grid = file.metadata.get("mlbatch.grid")
+    report = file.metadata.get("mlbatch.report", {}).get("json", "")
+    table = file.attachments.get("scans.csv", b"")
+    if grid is None:
+        raise RecordingError(
+            f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
+            "another; name the output of `mlbatch convert`"
+        )
+    try:
+        about = RunOfOutput(
+            str(path),
+            tuple(map(str, json.loads(grid["sensors"]))),
+            grid["rate_hz"],
+            int(grid["slices"]),
+            grid["timescale"],
+            int(grid["t_init_ns"]),
+            grid.get("sort", "columns"),
+            RunFiles(str(path), report, table.decode("utf-8", "replace")),
+        )
+    except (KeyError, TypeError, ValueError, RecursionError) as err:
+        raise RecordingError(
+            f"{path}: expected rate, slices and sensors in mlbatch.grid, found "
+            f"{type(err).__name__}: {err}; convert again"
+        ) from err
+    clouds = _Clouds(about)
+    for message in file.messages():
+        _refuse_damage(log, path)
+        if message.type == _CLOUD:
+            yield from clouds.scan(message.topic, message.data, message.encoding)
+    _refuse_damage(log, path)
+
+
+def _scans_of_bag(path: Path) -> Iterator[Scan]:
+    from mlbatch.verify.rosbag1 import BagFile
+
+    log = CheckLog()
+    clouds = _Clouds(RunFiles.of(path).about())
+    for message in BagFile(log, path, path.name).messages():
+        _refuse_damage(log, path)
+        if message.type == _CLOUD:
+            yield from clouds.scan(message.topic, message.data, message.encoding)
+    _refuse_damage(log, path)
+
+
+class _Clouds:
+    """Converts the messages of a run to scans."""
+
+    def __init__(self, about: RunOfOutput) -> None:
+        self._about = about
+        self._places = about.places()
+        self._table = about.table()
+        self._infos: dict[tuple[str, str], RunInfo] = {}
+
+    def scan(self, topic: str, data: bytes | memoryview, encoding: str) -> Iterator[Scan]:
+        """The scan of a message; none for a forwarded topic."""
+        from mlbatch.verify.encoding import MessageCursor
+        from mlbatch.verify.messages import read_cloud
+
+        own = {"/points": None} | {
+            f"/{name}/points": number for number, name in enumerate(self._about.sensors)
+        }
+        if topic not in own:
+            return
+        try:
+            cloud = read_cloud(MessageCursor.of_message(data, encoding))
+        except DamageError as err:
+            raise RecordingError(f"{self._about.where}: {topic}: {err}; convert again") from err
+        layout = "dense" if cloud.is_dense else "organized"
+        key = (cloud.frame_id, layout)
+        if key not in self._infos:
+            self._infos[key] = self._about.info(*key)
+        index, part, end_ns = self._places.place(cloud.stamp_ns)
+        row = row_of(self._table, index, part, own[topic])
+        if row is None:
+            raise RecordingError(
+                f"{self._about.where}: expected a row of scan {index} slice {part} in scans.csv, "
+                "found none; put scans.csv back, or convert again"
+            )
+        place = CloudPlace(self._infos[key], index, part, cloud.stamp_ns, end_ns, row, own[topic])
+        rows = cloud.records.T if layout == "organized" else cloud.records.reshape(-1)
+        yield scan_of_cloud(place, rows, row.complete)
+
+
+# -- a file a scan --------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _FileRun:
+    """The run of a folder; info: of the first scan."""
+
+    files: RunFiles
+    info: RunInfo | None = None
+    about: RunOfOutput | None = None
+
+    def shared(self, about: RunOfOutput, frame_id: str, layout: str) -> RunInfo:
+        """What all scans share, made once."""
+        if self.info is None:
+            self.about = about
+            self.info = about.info(frame_id, layout)
+        return self.info
+
+
+def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterator[Scan]:
+    reader = _FILE_READERS[suffix]
+    run = _FileRun(RunFiles.of(folder))
+    table = None
+    for file in files:
+        try:
+            scan, index = reader(file, run)
+        except DamageError as err:
+            raise RecordingError(
+                f"{file.path}: {err}; see `mlbatch verify`, and convert again"
+            ) from err
+        if table is None and run.about is not None:
+            table = run.about.table()
+        only = None if file.sensor is None else index
+        row = row_of(table, scan.index, scan.slice, only)
+        if row is not None:
+            scan.columns_per_sensor = row.columns
+            scan.max_gap_ns = row.max_gap_ns
+            scan.coverage = row.coverage
+            scan.overlap = row.overlap
+            scan.fill = np.array(row.fill, np.float32)
+            scan.ready_host_ns = row.ready_host_ns
+        yield scan
+
+
+def _sensor_index(file: ScanFile, names: tuple[str, ...]) -> int | None:
+    """Index of the sensor in whose folder a file is; None without `--split`."""
+    if file.sensor is None:
+        return None
+    if file.sensor not in names:
+        raise DamageError(f"the folder of one of {', '.join(names)}", file.sensor)
+    return names.index(file.sensor)
+
+
+def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
+    try:
+        with np.load(BytesIO(file.read()), allow_pickle=False) as archive:
+            values = {key: archive[key] for key in archive.files}
+    except (BadZipFile, OSError, ValueError, EOFError) as err:
+        raise DamageError("a complete npz file", str(err)) from err
+    try:
+        if str(values["schema"]) != _SCHEMA:
+            raise DamageError(f"the schema {_SCHEMA}", str(values["schema"]))
+        names = tuple(map(str, values["sensors"].tolist()))
+        slices = int(values["slices"])
+        rate_hz = str(values["rate_hz"])
+        about = RunOfOutput(
+            str(file.path),
+            names,
+            rate_hz,
+            slices,
+            str(values["timescale"]),
+            None,
+            str(values.get("sort", "columns")),
+            run.files,
+        )
+        layout = "dense" if values["xyz"].ndim == 2 else "organized"
+        info = run.shared(about, str(values["frame_id"]), layout)
+        columns = values["column_lidar_id"]
+        scan = Scan(
+            info=info,
+            index=int(values["index"]),
+            slice=int(values["slice"]),
+            start_ns=int(values["start_ns"]),
+            end_ns=int(values["end_ns"]),
+            complete=bool(values["complete"]),
+            ready_host_ns=0,
+            xyz=values["xyz"],
+            intensity=values["intensity"],
+            reflectivity=values.get("reflectivity"),
+            range_m=values["range_m"],
+            time_ns=values["time_ns"],
+            ring=values["ring"],
+            return_type=values["return_type"],
+            lidar_id=values["lidar_id"],
+            column=values.get("column"),
+            column_stamp_ns=values["column_stamp_ns"],
+            column_lidar_id=columns,
+            columns_per_sensor=tuple(np.bincount(columns, minlength=len(names)).tolist()),
+            max_gap_ns=(),
+            fill=values.get("fill", np.zeros(0, np.float32)),
+            absent=frozenset({"ring_base"}),
+        )
+    except (KeyError, TypeError, ValueError) as err:
+        raise DamageError("the keys of docs/formats.md", f"{type(err).__name__}: {err}") from err
+    return scan, _sensor_index(file, names)
+
+
+def _ply_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
+    data = file.read()
+    end = data.find(_PLY_END) + len(_PLY_END)
+    text = data[:end].decode("utf-8", "replace")
+    comments: dict[str, str] = {}
+    for line in text.splitlines():
+        words = line.split(" ", 2)
+        if words[0] == "comment" and len(words) == 3:
+            comments[words[1]] = words[2]
+    properties = re.findall(r"^property \w+ (\w+)$", text, re.MULTILINE)
+    vertices = re.search(r"^element vertex (\d{1,19})$", text, re.MULTILINE)
+    expected = [field.name for field in PLY_LAYOUT.fields]
+    if vertices is None or properties != expected or "mlbatch" not in comments:
+        raise DamageError("the header of a PLY file of mlbatch", repr(text[:60]))
+    layout = PLY_LAYOUT.dtype
+    if len(data) - end != int(vertices[1]) * layout.itemsize:
+        stored = f"{vertices[1]} vertices of {layout.itemsize} bytes"
+        raise DamageError(stored, f"{len(data) - end} bytes after the header")
+    rows: Rows = np.frombuffer(data, layout, offset=end)
+    try:
+        found = _PLY_INDEX.fullmatch(comments["index"])
+        if found is None:
+            raise ValueError(comments["index"])
+        index, part, slices = map(int, found.groups())
+        names = tuple(comments["lidar_id"].partition("from 0: ")[2].split(" "))
+        about = RunOfOutput(
+            str(file.path),
+            names,
+            comments["rate_hz"],
+            slices,
+            comments["timescale"],
+            None,
+            comments.get("sort", "columns"),
+            run.files,
+        )
+        info = run.shared(about, comments["frame_id"], "dense")
+        start_ns = int(comments["start_ns"])
+        end_ns = int(comments["end_ns"])
+        complete = {"true": True, "false": False}[comments["complete"]]
+    except (KeyError, ValueError) as err:
+        raise DamageError("the comments of docs/formats.md", str(err)) from err
+    place = CloudPlace(info, index, part, start_ns, end_ns, None)
+    return scan_of_cloud(place, rows, complete), _sensor_index(file, names)
+
+
+_FILE_READERS: dict[str, Callable[[ScanFile, _FileRun], tuple[Scan, int | None]]] = {
+    ".npz": _npz_scan,
+    ".ply": _ply_scan,
+}

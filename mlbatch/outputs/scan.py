@@ -1,0 +1,319 @@
+"""A scan for users: arrays named as the npz keys, and what is commonly computed from them."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, field, fields, replace
+from types import ModuleType
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch import types
+from mlbatch.arrays import (
+    BoolArray,
+    F32Array,
+    F64Array,
+    I64Array,
+    U8Array,
+    U16Array,
+    U32Array,
+)
+from mlbatch.errors import UsageError
+from mlbatch.types import RunInfo
+from mlbatch.units import NS_PER_S
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
+
+Records: TypeAlias = npt.NDArray[np.void]
+
+_LAYOUTS = CLOUD_LAYOUTS | {PLY_LAYOUT.name: PLY_LAYOUT}
+# Arrays with an entry for each point, as a table has them.
+_POINT_ARRAYS = (
+    "intensity",
+    "reflectivity",
+    "range_m",
+    "time_ns",
+    "ring",
+    "return_type",
+    "lidar_id",
+)
+# Arrays from which the fields of a point layout are made; the others are made of `xyz`.
+_NEEDED = {
+    "intensity": "intensity",
+    "time": "time_ns",
+    "t": "time_ns",
+    "timestamp": "time_ns",
+    "time_stamp": "time_ns",
+    "ring": "ring",
+    "channel": "ring_base",
+    "return_type": "return_type",
+    "lidar_id": "lidar_id",
+    "range": "range_m",
+    "reflectivity": "reflectivity",
+    "azimuth": "lidar_id",
+    "elevation": "lidar_id",
+    "distance": "lidar_id",
+}
+
+
+@dataclass(slots=True, eq=False)
+class Scan:
+    """All columns of one window of the common clock, sorted by timestamp; named as the npz keys.
+
+    n columns. Dense: p points, only valid returns, never NaN. Organized: arrays of points are
+    (n, slots[, 3]), NaN where empty. Of a scan that was read from an output, arrays that the
+    output does not store are in `absent`: they are empty, or None.
+    """
+
+    info: RunInfo  # shared by all scans of a run
+    index: int  # of the window, from t_init; -1: the partial one before it
+    slice: int  # within the window
+    start_ns: int
+    end_ns: int
+    complete: bool  # every sensor covers the window in time
+    ready_host_ns: int  # receive time of the packet that closed the window; 0: not stored
+    xyz: F32Array  # (p, 3) m, body frame
+    intensity: F32Array  # (p,)
+    reflectivity: U16Array | None  # (p,); None: no sensor has it
+    range_m: F32Array | None  # (p,)
+    time_ns: U32Array  # (p,) after `start_ns`
+    ring: U16Array  # (p,)
+    return_type: U8Array  # (p,)
+    lidar_id: U8Array  # (p,) index into `sensors`
+    column: U32Array | None  # (p,) index of the point's column; None when organized
+    column_stamp_ns: I64Array  # (n,)
+    column_lidar_id: U8Array  # (n,)
+    columns_per_sensor: tuple[int, ...]
+    # By sensor: widest time without a column, from the last one before the window up to its end.
+    max_gap_ns: tuple[int, ...]
+    coverage: tuple[float, ...] = ()  # by sensor, share of a revolution passed at least once
+    overlap: tuple[float, ...] = ()  # by sensor, share of a revolution passed more than once
+    # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    absent: frozenset[str] = frozenset()
+
+    @classmethod
+    def copied(cls, scan: types.Scan) -> Scan:
+        """A scan of a conversion with arrays of its own, contiguous."""
+        values = {one.name: getattr(scan, one.name) for one in fields(cls) if one.name != "absent"}
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                values[name] = np.array(value, order="C")
+        return cls(**values)
+
+    # -- description --------------------------------------------------------------------------
+
+    @property
+    def point_count(self) -> int:
+        """Number of points; empty slots of an organized scan are none."""
+        return int(np.count_nonzero(self.is_valid))
+
+    @property
+    def frame_id(self) -> str:
+        """Name of the body frame, in which `xyz` is."""
+        return self.info.frame_id
+
+    @property
+    def rate_hz(self) -> str:
+        """Rate of the windows as text, exact: "10", "10/3"."""
+        return self.info.rate_hz
+
+    @property
+    def timescale(self) -> str:
+        """Timescale of all times: utc, tai, uptime or unknown."""
+        return self.info.timescale
+
+    @property
+    def slices(self) -> int:
+        """Slices of a window."""
+        return self.info.slices
+
+    @property
+    def sort(self) -> str:
+        """Order of the points of a dense scan: `columns` or `points`."""
+        return self.info.sort
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors, by `lidar_id`."""
+        return tuple(sensor.name for sensor in self.info.sensors)
+
+    @property
+    def time_s(self) -> F64Array:
+        """Time of each point after `start_ns`, s; UsageError where it is not stored."""
+        self._require("time_s", "time_ns")
+        return np.divide(self.time_ns, NS_PER_S, dtype=np.float64)
+
+    @property
+    def stamp_ns(self) -> I64Array:
+        """Time of each point on the common clock, ns; UsageError where it is not stored."""
+        self._require("stamp_ns", "time_ns")
+        return np.add(self.time_ns, self.start_ns, dtype=np.int64)
+
+    @property
+    def is_valid(self) -> BoolArray:
+        """Which places contain a point: all of a dense scan, some slots of an organized one."""
+        valid: BoolArray = np.isfinite(self.xyz[..., 0])
+        return valid
+
+    def __repr__(self) -> str:
+        """One line; the arrays are not printed."""
+        state = "complete" if self.complete else "incomplete"
+        return (
+            f"<Scan {self.index}: {self.point_count} points of {', '.join(self.sensors)}, "
+            f"{self.start_ns} to {self.end_ns} ns {self.info.timescale}, {state}>"
+        )
+
+    # -- parts --------------------------------------------------------------------------------
+
+    def __getitem__(self, sensor: str) -> Scan:
+        """The points and columns of one sensor; `lidar_id` remains, columns are counted anew.
+
+        UsageError for an unknown name, or where the output does not store `lidar_id`.
+        """
+        if sensor not in self.sensors:
+            raise UsageError(
+                f"sensor: expected one of {', '.join(self.sensors)}, found {sensor!r}; choose one"
+            )
+        self._require(f"scan[{sensor!r}]", "lidar_id")
+        number = self.sensors.index(sensor)
+        columns = self.column_lidar_id == number
+        # Organized arrays have a row for each column.
+        is_organized = self.lidar_id.ndim == 2
+        mine = self.lidar_id[:, 0] == number if is_organized else self.lidar_id == number
+        found = replace(
+            self,
+            column_stamp_ns=self.column_stamp_ns[columns],
+            column_lidar_id=self.column_lidar_id[columns],
+            columns_per_sensor=_only(self.columns_per_sensor, number, 0),
+            max_gap_ns=_only(self.max_gap_ns, number, 0),
+            coverage=_only(self.coverage, number, 0.0),
+            overlap=_only(self.overlap, number, 0.0),
+            fill=np.where(np.arange(len(self.fill)) == number, self.fill, np.float32("nan")),
+        )
+        found.xyz = self.xyz[mine]
+        for name in _POINT_ARRAYS:
+            values = getattr(self, name)
+            if values is not None and name not in self.absent:
+                setattr(found, name, values[mine])
+        if self.column is not None:
+            before = np.cumsum(columns, dtype=np.uint32) - np.uint32(1)
+            found.column = before[self.column[mine]]
+        return found
+
+    @property
+    def xyz_sensor(self) -> F32Array:
+        """Each point in the frame of its own sensor, m; shape of `xyz`.
+
+        UsageError where the output stores no `lidar_id`, or no report with the extrinsics.
+        """
+        self._require("xyz_sensor", "lidar_id")
+        self._require_poses("xyz_sensor")
+        poses = np.stack([sensor.body_from_sensor for sensor in self.info.sensors])
+        own = self.lidar_id
+        rotation = poses[:, :3, :3][own]
+        offset = self.xyz - poses[:, :3, 3][own]
+        # The inverse of a rotation is its transpose.
+        moved: F64Array = np.einsum("...ji,...j->...i", rotation, offset)
+        return moved.astype(np.float32)
+
+    # -- other forms --------------------------------------------------------------------------
+
+    def points(self, layout: str = "standard") -> Records:
+        """The points as records of a point layout; shape of the point arrays.
+
+        UsageError for an unknown layout, or for fields that the output does not store.
+        """
+        if layout not in _LAYOUTS:
+            raise UsageError(
+                f"layout: expected one of {', '.join(_LAYOUTS)}, found {layout!r}; choose one"
+            )
+        chosen = _LAYOUTS[layout]
+        needed = {_NEEDED[field.name] for field in chosen.fields if field.name in _NEEDED}
+        if self.range_m is None and "range_m" in needed:
+            needed.add("range_m")
+        self._require(f"layout {layout}", *needed)
+        if layout == "autoware":
+            self._require_poses(f"layout {layout}")
+        points = points_of(self._record())
+        records: Records = np.zeros(points.time_ns.shape or (0,), chosen.dtype)
+        chosen.pack(points, records)
+        in_shape: Records = records.T
+        return in_shape
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame with a row for each point; UsageError without pandas.
+
+        Columns: x, y, z (m, body frame), the stored point arrays, and `stamp_ns`.
+        """
+        pandas = _optional("pandas", "to_pandas")
+        # Organized scans have empty slots.
+        valid = self.is_valid
+        x, y, z = (self.xyz[..., axis][valid] for axis in range(3))
+        table: dict[str, npt.NDArray[np.generic]] = {"x": x, "y": y, "z": z}
+        for name in _POINT_ARRAYS:
+            values = getattr(self, name)
+            if values is not None and name not in self.absent:
+                table[name] = values[valid]
+        if "time_ns" not in self.absent:
+            table["stamp_ns"] = self.stamp_ns[valid]
+        return pandas.DataFrame(table)
+
+    def to_open3d(self) -> Any:
+        """An open3d.t.geometry.PointCloud (m, body frame); UsageError without open3d.
+
+        Attributes: positions, and intensity and time (s after `start_ns`) where they are stored.
+        """
+        open3d = _optional("open3d", "to_open3d")
+        valid = self.is_valid
+        tensor = open3d.core.Tensor
+        cloud = open3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(self.xyz[valid])))
+        if "intensity" not in self.absent:
+            intensity = self.intensity[valid].astype(np.float32)
+            cloud.point["intensity"] = tensor(intensity.reshape(-1, 1))
+        if "time_ns" not in self.absent:
+            cloud.point["time"] = tensor(self.time_s[valid].reshape(-1, 1))
+        return cloud
+
+    def _record(self) -> types.Scan:
+        """The same arrays as conversions pass them to writers."""
+        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "absent"}
+        for name in self.absent & set(_POINT_ARRAYS):
+            if values[name] is not None:
+                # Not used by the layout, but of the shape of all others.
+                values[name] = np.zeros(self.xyz.shape[:-1], values[name].dtype)
+        return types.Scan(points=self.point_count, points_per_sensor=(), **values)
+
+    # -- checks -------------------------------------------------------------------------------
+
+    def _require(self, what: str, *names: str) -> None:
+        missing = sorted(self.absent & set(names))
+        if missing:
+            raise UsageError(
+                f"{what}: expected {', '.join(missing)} in the output, which does not store it; "
+                "convert to npz, or to a point layout that has it"
+            )
+
+    def _require_poses(self, what: str) -> None:
+        for sensor in self.info.sensors:
+            if not np.isfinite(sensor.body_from_sensor).all():
+                raise UsageError(
+                    f"{what}: expected the extrinsics of {sensor.name}, found no report of the "
+                    "run; put report.json back where `convert` wrote it"
+                )
+
+
+def _only(values: tuple[Any, ...], number: int, other: float) -> tuple[Any, ...]:
+    """The value of one sensor; `other` for all others."""
+    return tuple(value if i == number else other for i, value in enumerate(values))
+
+
+def _optional(package: str, method: str) -> ModuleType:
+    """A package that mlbatch does not depend on."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as err:
+        raise UsageError(
+            f"{method}: expected the package {package}, found none ({err}); pip install {package}"
+        ) from err

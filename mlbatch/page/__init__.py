@@ -1,0 +1,56 @@
+"""A page for a run: one HTML file without references to other files, see docs/page.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mlbatch.errors import ExportError
+from mlbatch.page.document import page_text
+from mlbatch.page.source import Source, find_source
+
+__all__ = ["Source", "check_page", "find_source", "write_page"]
+
+# First bytes of a page; only files that begin with them are replaced.
+MARK = b"<!DOCTYPE html>\n<!-- mlbatch page -->"
+
+
+def check_page(path: Path, *, overwrite: bool) -> None:
+    """Raise ExportError if a page cannot be written to a path."""
+    if not path.parent.is_dir():
+        raise ExportError(
+            f"{path}: expected a page in an existing folder, found none at {path.parent}; "
+            "create it (mkdir -p) or choose another"
+        )
+    if path.is_dir():
+        raise ExportError(f"{path}: expected a file for the page, found a folder; add a name")
+    if not path.exists():
+        return
+    try:
+        with path.open("rb") as file:
+            is_page = file.read(len(MARK)) == MARK
+    except OSError as err:
+        raise ExportError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+    if not is_page:
+        raise ExportError(
+            f"{path}: expected a new file or an earlier page, found another file; choose another "
+            "name for the page"
+        )
+    if not overwrite:
+        raise ExportError(
+            f"{path}: expected a new file, found an earlier page; replace it with --overwrite"
+        )
+
+
+def write_page(path: Path, source: Source) -> None:
+    """Write the page of a run; the file appears complete or not at all."""
+    # Names in a report may contain bytes that are not UTF-8.
+    data = page_text(source).encode("utf-8", "backslashreplace")
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as err:
+        partial.unlink(missing_ok=True)
+        raise ExportError(
+            f"{path}: expected to write the page, found {err.strerror!r}; choose another place"
+        ) from err

@@ -1,0 +1,312 @@
+"""Chosen scans of an output, read by their place in it, and thinned for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
+from mlbatch.page.windows import Windows
+from mlbatch.units import NS_PER_S
+from mlbatch.verify import npz, ply
+from mlbatch.verify.containers import BoundedFile, Message, library_errors
+from mlbatch.verify.encoding import MessageCursor
+from mlbatch.verify.folders import entries, scan_files
+from mlbatch.verify.messages import CLOUD, read_cloud, stored_scan
+from mlbatch.verify.scan import StoredScan
+from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+
+# Points of all scans on a page: 9 bytes each, 12 in base64.
+MOST_POINTS = 54_000
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_BAG_MAGIC = b"#ROSBAG V2.0\n"
+# Opcode and length.
+_RECORD_HEAD_BYTES = 9
+_BYTE = 255
+_WORD = 65535
+# Shares of the points that the range of a colour covers: single bright points are no scale.
+_LOW, _HIGH = 0.02, 0.98
+# Share of the points inside the first view.
+_IN_VIEW = 0.97
+_SEED = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A window to show."""
+
+    title: str
+    row: int  # of the table
+    index: int
+    slice: int
+    start_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class PageCloud:
+    """A scan as the page stores it."""
+
+    place: Place
+    total: int  # points of the scan
+    low_m: tuple[float, float, float]
+    size_m: float  # of the cube that the coordinates divide
+    xyz: U16Array  # (p, 3)
+    lidar: U8Array
+    time: U8Array  # of the window
+    intensity: U8Array
+    height_m: tuple[float, float]  # range of the colours
+    view_m: float  # radius around the body that contains most points
+    has_lidar: bool
+    has_time: bool
+    has_intensity: bool
+
+
+def choose_places(windows: Windows) -> list[Place]:
+    """The first, middle and worst window; each once."""
+    titles: dict[int, list[str]] = {}
+    row = windows.worst()
+    is_whole = windows.fill[row].min() >= 1.0
+    worst = "fewest points" if is_whole else "worst"
+    first = int(windows.has_head and len(windows) > 1)
+    chosen = (("first", first), ("middle", len(windows) // 2), (worst, row))
+    for title, row in chosen:
+        titles.setdefault(row, []).append(title)
+    return [
+        Place(
+            " and ".join(names),
+            row,
+            int(windows.index[row]),
+            int(windows.slice[row]),
+            int(windows.start_ns[row]),
+        )
+        for row, names in titles.items()
+    ]
+
+
+def read_clouds(output: Path, places: list[Place], sensors: tuple[str, ...]) -> list[PageCloud]:
+    """The scans of an output at some places. Raises VerifyError if it cannot be read."""
+    parts: dict[int, list[StoredScan]] = {}
+    try:
+        for scan in _scans(output, places, sensors):
+            parts.setdefault(scan.start_ns, []).append(scan)
+    except DamageError as err:
+        raise VerifyError(f"{output}: {err}") from err
+    most = MOST_POINTS // max(1, len(places))
+    return [
+        _thinned(place, parts[place.start_ns], most) for place in places if place.start_ns in parts
+    ]
+
+
+# -- containers -------------------------------------------------------------------------------
+
+
+def mcap_of(path: Path) -> Path | None:
+    """The MCAP file of an output: itself, or that in a bag folder; None in other outputs."""
+    if path.is_dir():
+        files = [entry for entry in entries(path) if entry.suffix == ".mcap"]
+        return files[0] if len(files) == 1 else None
+    return path if _begins_with(path, _MCAP_MAGIC) else None
+
+
+def _begins_with(path: Path, magic: bytes) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError as err:
+        raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+
+
+def _scans(output: Path, places: list[Place], sensors: tuple[str, ...]) -> Iterator[StoredScan]:
+    file = mcap_of(output)
+    topics = {"/points": None} | {f"/{name}/points": i for i, name in enumerate(sensors)}
+    if file is not None:
+        yield from _of_messages(_mcap_messages(file, places, list(topics)), topics)
+    elif output.is_dir():
+        yield from _of_files(output, places)
+    elif _begins_with(output, _BAG_MAGIC):
+        yield from _of_messages(_bag_messages(output, places, list(topics)), topics)
+    else:
+        raise VerifyError(f"{output}: expected an output of mlbatch, found another file")
+
+
+def _of_files(folder: Path, places: list[Place]) -> Iterator[StoredScan]:
+    log = CheckLog()
+    keys = {(place.index, place.slice) for place in places}
+    for suffix in (npz.SUFFIX, ply.SUFFIX):
+        files = scan_files(log, folder, suffix)
+        if not files:
+            continue
+        reader = npz.NpzReader(log) if suffix == npz.SUFFIX else ply.PlyReader(log)
+        reader.begin(files[0])
+        yield from reader.scans([one for one in files if (one.index, one.slice or 0) in keys])
+        return
+
+
+def _of_messages(
+    messages: Iterator[Message], topics: dict[str, int | None]
+) -> Iterator[StoredScan]:
+    for message in messages:
+        if message.type == CLOUD:
+            cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
+            yield stored_scan(cloud, message.where, topics[message.topic])
+
+
+def _mcap_messages(file: Path, places: list[Place], topics: list[str]) -> Iterator[Message]:
+    """Messages at the start of each place, from the chunks that contain it.
+
+    The names of the time limits of `iter_messages` differ between versions of the library.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.reader import make_reader
+    from mcap.records import Chunk
+    from mcap.records import Message as Record
+    from mcap.stream_reader import breakup_chunk
+
+    from mlbatch.verify.mcap_file import unpacked
+
+    starts = {place.start_ns for place in places}
+    with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:
+        summary = make_reader(stream).get_summary()
+        if summary is None:
+            raise DamageError("a summary", "none")
+        for index in summary.chunk_indexes:
+            first_ns = index.message_start_time
+            if not any(first_ns <= start <= index.message_end_time for start in starts):
+                continue
+            stream.seek(index.chunk_start_offset + _RECORD_HEAD_BYTES)
+            chunk = Chunk.read(ReadDataStream(stream))
+            # The library unpacks to any size.
+            data = unpacked(chunk.compression, chunk.data, chunk.uncompressed_size)
+            for record in breakup_chunk(replace(chunk, compression="", data=data)):
+                if not isinstance(record, Record) or record.log_time not in starts:
+                    continue
+                channel = summary.channels[record.channel_id]
+                if channel.topic in topics:
+                    yield Message(
+                        where=f"{file.name} {channel.topic}",
+                        topic=channel.topic,
+                        type=summary.schemas[channel.schema_id].name.replace("/msg/", "/"),
+                        encoding=channel.message_encoding,
+                        log_ns=record.log_time,
+                        publish_ns=record.publish_time,
+                        data=record.data,
+                    )
+
+
+def _bag_messages(file: Path, places: list[Place], topics: list[str]) -> Iterator[Message]:
+    from rosbags.rosbag1 import Reader
+
+    with library_errors("a bag with an index"), Reader(file) as reader:
+        connections = [one for one in reader.connections if one.topic in topics]
+        for place in places:
+            if not connections:
+                return
+            found = reader.messages(connections, place.start_ns, place.start_ns + 1)
+            for connection, stamp_ns, data in found:
+                yield Message(
+                    where=f"{file.name} {connection.topic}",
+                    topic=connection.topic,
+                    type=connection.msgtype.replace("/msg/", "/"),
+                    encoding="ros1",
+                    log_ns=stamp_ns,
+                    publish_ns=stamp_ns,
+                    data=data,
+                )
+
+
+# -- points -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Valid points of one stored scan."""
+
+    xyz: F32Array
+    lidar: U8Array | None
+    time_ns: F64Array | None
+    intensity: F64Array | None
+
+
+def _valid(scan: StoredScan) -> _Points:
+    finite: BoolArray = np.isfinite(scan.xyz)
+    valid = np.asarray(finite.all(axis=-1))
+    count = int(np.count_nonzero(valid))
+    lidar: U8Array | None = None
+    if scan.sensor is not None:
+        lidar = np.full(count, scan.sensor, dtype=np.uint8)
+    elif scan.lidar_id is not None:
+        # In an organized scan, of the columns.
+        ids = scan.lidar_id if scan.lidar_id.ndim == valid.ndim else scan.lidar_id[:, None]
+        lidar = np.broadcast_to(ids, valid.shape)[valid]
+    bright = scan.intensity if scan.intensity is not None else scan.byte_intensity
+    return _Points(
+        scan.xyz[valid],
+        lidar,
+        None if scan.time_ns is None else scan.time_ns[valid].astype(np.float64),
+        None if bright is None else bright[valid].astype(np.float64),
+    )
+
+
+def _thinned(place: Place, scans: list[StoredScan], most: int) -> PageCloud:
+    """Join the scans of a window and keep at most `most` points, drawn at random."""
+    parts = [_valid(scan) for scan in scans]
+    xyz: F64Array = np.concatenate([part.xyz for part in parts]).astype(np.float64)
+    total = len(xyz)
+    kept = np.arange(total)
+    if total > most:
+        # Every nth point would miss whole channels.
+        kept = np.sort(np.random.default_rng(_SEED).choice(total, most, replace=False))
+    lidars = [part.lidar for part in parts if part.lidar is not None]
+    times = [part.time_ns for part in parts if part.time_ns is not None]
+    bright = [part.intensity for part in parts if part.intensity is not None]
+    none = np.zeros(total)
+    has_lidar = len(lidars) == len(parts)
+    has_time = len(times) == len(parts)
+    has_intensity = len(bright) == len(parts)
+    lidar: U8Array = np.concatenate(lidars) if has_lidar else none.astype(np.uint8)
+    time_ns: F64Array = np.concatenate(times) if has_time else none
+    intensity: F64Array = np.concatenate(bright) if has_intensity else none
+    xyz = xyz[kept]
+    low_m: F64Array = xyz.min(axis=0) if len(xyz) else np.zeros(3)
+    high_m: F64Array = xyz.max(axis=0) if len(xyz) else np.zeros(3)
+    size_m = max(float((high_m - low_m).max()), 1e-3)
+    radius_m = np.linalg.norm(xyz[:, :2], axis=1)
+    return PageCloud(
+        place=place,
+        total=total,
+        low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
+        size_m=size_m,
+        xyz=np.rint((xyz - low_m) / size_m * _WORD).astype(np.uint16),
+        lidar=lidar[kept],
+        time=_byte(time_ns[kept], 0.0, float(time_ns.max(initial=0.0))),
+        intensity=_byte(intensity[kept], *_span(intensity[kept])),
+        height_m=_span(xyz[:, 2]),
+        view_m=max(1.0, _quantile(radius_m, _IN_VIEW)),
+        has_lidar=has_lidar,
+        has_time=has_time,
+        has_intensity=has_intensity,
+    )
+
+
+def _quantile(values: F64Array, share: float) -> float:
+    """A value of the array by nearest rank; 0 without one."""
+    if not len(values):
+        return 0.0
+    return float(np.sort(values)[int(share * (len(values) - 1))])
+
+
+def _span(values: F64Array) -> tuple[float, float]:
+    return _quantile(values, _LOW), _quantile(values, _HIGH)
+
+
+def _byte(values: F64Array, low: float, high: float) -> U8Array:
+    width = high - low if high > low else 1.0
+    return np.rint(np.clip((values - low) / width, 0.0, 1.0) * _BYTE).astype(np.uint8)
+
+
+def window_ms(windows: Windows, place: Place) -> float:
+    """Length of a window, ms."""
+    return int(windows.end_ns[place.row] - windows.start_ns[place.row]) / NS_PER_S * 1000.0

@@ -1,0 +1,285 @@
+"""What is wrong with a run, in plain words: from its report and its windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray
+from mlbatch.page.values import Values
+from mlbatch.page.windows import Windows
+
+_NETWORK = (
+    "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "
+    "the disk"
+)
+_POWER = "check the sensor's power, cable and log; the windows are written with complete = false"
+# What to do about a warning, by its code (docs/report.md).
+REMEDIES = {
+    "recording": "copy the file again; the readable part was used",
+    "message": "give metadata with --metadata, transforms in a rig file (--rig)",
+    "late_stream": "name the sensor in a rig file (--rig)",
+    "no_metadata": "give the sensor's metadata or calibration with --metadata FILE",
+    "no_decoder": "see mlbatch sensors for the supported models",
+    "no_overlap": "give recordings of one drive, or remove the optional sensors from the rig",
+    "unassigned": "name both lidars in a rig file (--rig), each with its serial number",
+    "not_in_rig": "add the lidar to the rig, or leave it out with --ignore",
+    "not_seen_yet": "check address, port or topic of the sensor in the rig",
+    "calibration": "check that the calibration belongs to this sensor",
+    "rejected": "check model, return mode and calibration: mlbatch inspect RECORDING",
+    "clipped": "choose a point layout with a float32 intensity (--point-layout standard)",
+    "late": "raise --max-wait; look for damaged timestamps (--decode crc=check)",
+    "loss": _NETWORK,
+    "no_points": "look for a covered lens; check --min-range, --max-range and --exclude-box",
+    "empty_cloud": "check that the sensor measures; leave scans out with --drop-incomplete",
+    "timescale": "set all sensors to one time source (PTP or GPS), or use --clock host",
+    "extrinsics_contradict": "correct one of the sources, or give the pose in a rig file (--rig)",
+    "extrinsics_frame": "give the pose in a rig file (--rig): extrinsics: {frame: NAME}",
+    "extrinsics_mixed": "give all poses in a rig file (--rig)",
+    "same_pose": "correct the pose of one of them in the rig file",
+    "constant_tf": "nothing to do if the sensor does not move; else publish on /tf_static",
+    "urdf": "give the pose in a rig file (--rig)",
+    "other_ros": "write an output of the same ROS version (--format rosbag1, mcap or rosbag2)",
+    "imu_clock": "set IMU and lidars to one time source, or give the topic with --pass",
+    "clock_epoch": "correct the offset in the rig (clock.offset_s), or use --clock host",
+    "clocks": "synchronise the sensors (PTP or GPS), or use --align-clocks or --clock host",
+    "clock_jump": "use --on-jump split, or --clock host",
+    "host_step": "do not set the clock of the capture host during a recording",
+    "max_wait": "give --max-wait in seconds",
+    "cloud_time": "state the unit of the time field in the rig (points: unit)",
+    "clouds": "nothing to do; check that the interpretation is correct",
+}
+_INFORMATION = frozenset({"clouds", "constant_tf", "calibration"})
+_SERIOUS = frozenset({"clocks", "clock_jump", "recording", "clock_epoch"})
+
+# Shares of packets or columns.
+_LITTLE, _MUCH = 0.001, 0.01
+# Distance that clocks drift apart during the recording.
+_DRIFT_MS, _MUCH_DRIFT_MS = 0.5, 5.0
+_MOST_STALLS = 6
+
+
+class Level(IntEnum):
+    """How serious a finding is."""
+
+    GOOD = 0
+    NOTE = 1
+    WARNING = 2
+    PROBLEM = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One finding; code: of the warning it repeats, else ""."""
+
+    level: Level
+    text: str
+    remedy: str = ""
+    code: str = ""
+
+
+def findings(report: Values, windows: Windows | None) -> list[Finding]:
+    """All findings, the most serious first."""
+    found = [
+        *_scans(report, windows),
+        *(() if windows is None else _stalls(windows)),
+        *_packets(report),
+        *_columns(report),
+        *_clocks(report),
+        *_faults(report),
+        *_warnings(report),
+    ]
+    return sorted(found, key=lambda one: -one.level)
+
+
+def verdict(found: list[Finding]) -> tuple[Level, str, str]:
+    """The overall level, a heading, and the number of other findings in words."""
+    level = max((one.level for one in found), default=Level.GOOD)
+    if level < Level.WARNING:
+        return Level.GOOD, "Everything is fine", ""
+    problems = sum(one.level == Level.PROBLEM for one in found)
+    warnings = sum(one.level == Level.WARNING for one in found)
+    parts = [number(problems, "problem")] * (problems > 0)
+    parts += [number(warnings, "warning")] * (warnings > 0)
+    return level, found[0].text, f"{' and '.join(parts)} below." if len(found) > 1 else ""
+
+
+def percent(part: float, whole: float) -> str:
+    """A share in %, with as many digits as it needs."""
+    share = 100.0 * part / whole if whole else 0.0
+    if share and share < 0.01:
+        return "less than 0.01 %"
+    return f"{share:.2f} %" if share < 1 else f"{share:.1f} %"
+
+
+def number(count: int, one: str, many: str = "") -> str:
+    """A count with its noun."""
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def _scans(report: Values, windows: Windows | None) -> Iterator[Finding]:
+    scans = report.at("scans")
+    written = scans.count("written")
+    if not written:
+        yield Finding(
+            Level.PROBLEM,
+            "No scan was written.",
+            "see the error of mlbatch convert; mlbatch inspect shows what the recording contains",
+        )
+    if empty := scans.count("empty"):
+        yield Finding(
+            Level.WARNING,
+            f"{number(empty, 'window')} without a column of any sensor: no scan was written.",
+            "look for a pause of the capture; the indices of scans keep the gap",
+        )
+    incomplete = scans.count("incomplete")
+    if windows is not None and windows.has_head:
+        yield Finding(Level.NOTE, "Head and tail are incomplete, as requested by --keep-partial.")
+        incomplete -= 1 + int(not windows.complete[-1])
+    if incomplete > 0:
+        yield Finding(
+            Level.WARNING,
+            f"{number(incomplete, 'scan')} of {written:,} "
+            f"{'is' if incomplete == 1 else 'are'} incomplete: a sensor does not cover the window.",
+            "skip scans with complete = false, or leave them out with --drop-incomplete",
+        )
+    if dropped := scans.count("dropped_incomplete"):
+        yield Finding(
+            Level.NOTE, f"{number(dropped, 'scan')} left out, as requested by --drop-incomplete."
+        )
+
+
+def _stalls(windows: Windows) -> Iterator[Finding]:
+    """Intervals of whole windows in which a sensor sent nothing."""
+    for i, name in enumerate(windows.sensors):
+        silent: BoolArray = windows.columns[:, i] == 0
+        if windows.has_head and len(silent) > 1:
+            # Head and tail are partial: alone, they are no stall.
+            silent[0] &= silent[1]
+            silent[-1] &= silent[-2] | windows.complete[-1]
+        intervals = _intervals(silent)
+        for first, end in intervals[:_MOST_STALLS]:
+            begin_s = windows.seconds(first)
+            end_s = windows.seconds(end - 1) + _length_s(windows, end - 1)
+            what = f"{name} sent nothing"
+            if first == 0 and end == len(windows):
+                text = f"{what}: no column in any scan."
+            elif first == 0:
+                text = f"{what} until +{end_s:.1f} s ({number(end - first, 'scan')})."
+            elif end == len(windows):
+                text = f"{what} from +{begin_s:.1f} s to the end ({number(end - first, 'scan')})."
+            else:
+                text = (
+                    f"{what} from +{begin_s:.1f} s to +{end_s:.1f} s: a stall of "
+                    f"{number(end - first, 'scan')}."
+                )
+            yield Finding(Level.PROBLEM, text, _POWER)
+        if len(intervals) > _MOST_STALLS:
+            more = len(intervals) - _MOST_STALLS
+            yield Finding(Level.PROBLEM, f"{number(more, 'more stall')} of {name}.", _POWER)
+
+
+def _length_s(windows: Windows, row: int) -> float:
+    return int(windows.end_ns[row] - windows.start_ns[row]) / 1e9
+
+
+def _intervals(mask: BoolArray) -> list[tuple[int, int]]:
+    """First and end rows of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
+def _packets(report: Values) -> Iterator[Finding]:
+    warned = {one.text("sensor") for one in report.items("warnings") if one.text("code") == "loss"}
+    for sensor in report.items("sensors"):
+        name = sensor.text("name")
+        packets = sensor.at("packets")
+        lost = packets.count("lost")
+        sent = packets.count("read") + lost
+        # Else the warning states it.
+        if lost and name not in warned:
+            level = _level(lost, sent)
+            text = f"{name} lost {number(lost, 'packet')} of {sent:,}, {percent(lost, sent)}."
+            yield Finding(level, text, _NETWORK)
+        rejected = {
+            reason: count
+            for reason, count in packets.counts("rejected").items()
+            if reason != "duplicate"
+        }
+        total = sum(rejected.values())
+        if total:
+            reasons = ", ".join(f"{reason} {count:,}" for reason, count in rejected.items())
+            text = f"{number(total, 'packet')} of {name} rejected ({reasons})."
+            yield Finding(_level(total, sent), text, REMEDIES["rejected"])
+
+
+def _level(part: int, whole: int) -> Level:
+    if part >= _MUCH * whole:
+        return Level.PROBLEM
+    return Level.WARNING if part >= _LITTLE * whole else Level.NOTE
+
+
+def _columns(report: Values) -> Iterator[Finding]:
+    for sensor in report.items("sensors"):
+        late = sensor.at("columns").counts("dropped").get("late", 0)
+        decoded = sensor.count("columns", "decoded")
+        if late and late < _MUCH * decoded:
+            text = f"{number(late, 'column')} of {sensor.text('name')} came late and were dropped."
+            yield Finding(Level.NOTE, text, REMEDIES["late"])
+
+
+def _clocks(report: Values) -> Iterator[Finding]:
+    recorded_s = report.number("timing", "recorded_s")
+    drifts = {
+        sensor.text("name"): drift
+        for sensor in report.items("sensors")
+        if (drift := sensor.number("clock", "drift_ppm")) is not None
+    }
+    if len(drifts) < 2 or recorded_s is None:
+        return
+    slow = min(drifts, key=drifts.__getitem__)
+    fast = max(drifts, key=drifts.__getitem__)
+    ppm = drifts[fast] - drifts[slow]
+    apart_ms = ppm * recorded_s / 1000.0
+    if apart_ms < _DRIFT_MS:
+        return
+    level = Level.PROBLEM if apart_ms >= _MUCH_DRIFT_MS else Level.WARNING
+    text = (
+        f"The clocks of {fast} and {slow} drift apart by {ppm:.1f} ppm: {apart_ms:.2f} ms in "
+        f"{recorded_s:.0f} s."
+    )
+    yield Finding(level, text, REMEDIES["clocks"])
+
+
+def _faults(report: Values) -> Iterator[Finding]:
+    faults = report.items("faults")
+    if faults:
+        texts = ", ".join(
+            f"{one.text('fault')} ({number(one.count('packets'), 'packet')})" for one in faults
+        )
+        yield Finding(Level.NOTE, f"Faults were injected by --fault: {texts}.")
+
+
+def _warnings(report: Values) -> Iterator[Finding]:
+    losses = {
+        sensor.text("name"): _level(
+            sensor.count("packets", "lost"),
+            sensor.count("packets", "lost") + sensor.count("packets", "read"),
+        )
+        for sensor in report.items("sensors")
+        if sensor.count("packets", "lost")
+    }
+    for one in report.items("warnings"):
+        code = one.text("code")
+        level = Level.WARNING
+        if code in _INFORMATION:
+            level = Level.NOTE
+        elif code in _SERIOUS:
+            level = Level.PROBLEM
+        elif code == "loss":
+            level = max(level, losses.get(one.text("sensor"), level))
+        remedy = REMEDIES.get(code, "see docs/report.md")
+        yield Finding(level, one.text("message"), remedy, code)

@@ -1,0 +1,133 @@
+"""What a page is made of: the report, the table of scans, and the output if it is there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from mlbatch.errors import ExportError
+from mlbatch.page.values import Values
+from mlbatch.verify.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
+
+_REPORT_SUFFIX = f".{REPORT}"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A run."""
+
+    report: Values
+    table: str | None  # text of scans.csv
+    output: Path | None  # None: no scans
+    page: Path  # usual place of the page
+
+
+def read_report(where: Path, text: str) -> Values:
+    """The report in a JSON text."""
+    try:
+        root = json.loads(text)
+    except (ValueError, RecursionError) as err:
+        raise ExportError(
+            f"{where}: expected a report in JSON, found {err}; restore it, or convert again"
+        ) from err
+    report = Values(root)
+    if report.text("schema") != SCHEMA:
+        found = report.text("schema") or "none"
+        raise ExportError(
+            f"{where}: expected a report of schema {SCHEMA}, found {found!r}; name the report of "
+            "`mlbatch convert`"
+        )
+    return report
+
+
+def find_source(path: Path, report: Path | None = None) -> Source:
+    """The run of a report or of an output; report: path of `--report`, if it is not the usual one.
+
+    Raises ExportError if there is no report.
+    """
+    if not path.exists():
+        raise ExportError(
+            f"{path}: expected a report or an output, found no such file or folder; check the name"
+        )
+    if _is_json(path):
+        return _of_report(path)
+    return _of_output(path, report)
+
+
+def _is_json(path: Path) -> bool:
+    if path.is_dir():
+        return False
+    try:
+        with path.open("rb") as file:
+            return file.read(64).lstrip().startswith(b"{")
+    except OSError as err:
+        raise ExportError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+
+
+def _of_report(path: Path) -> Source:
+    places = ReportPlaces(path, path, is_given=True)
+    report = read_report(path, places.report_text() or "")
+    output: Path | None = None
+    if path.name.endswith(_REPORT_SUFFIX):
+        output = path.with_name(path.name.removesuffix(_REPORT_SUFFIX))
+    elif path.name == REPORT:
+        output = path.parent
+    if output is None or not output.exists():
+        return Source(report, None, None, path.with_suffix(".html"))
+    table = ReportPlaces.of(output, None).table_text()
+    # The folder of a dry run's report has no scans.
+    is_output = output.is_file() or table is not None
+    if not is_output:
+        return Source(report, table, None, path.with_suffix(".html"))
+    return Source(report, table, output, page_of(output))
+
+
+def page_of(output: Path) -> Path:
+    """Usual place of the page; not in a folder of scans, which could not be overwritten then."""
+    named = output if output.name else output.resolve()
+    return named.with_name(f"{named.name}.html")
+
+
+def _of_output(path: Path, report: Path | None) -> Source:
+    places = ReportPlaces.of(path, report)
+    text = places.report_text()
+    table = places.table_text()
+    if text is None or table is None:
+        inner_report, inner_table = _inside(path)
+        text = inner_report if text is None else text
+        table = inner_table if table is None else table
+    if text is None:
+        raise ExportError(
+            f"{path}: expected a report in or next to the output, found none; give it with "
+            "--report, or convert again"
+        )
+    return Source(read_report(places.report, text), table, path, page_of(path))
+
+
+def _inside(path: Path) -> tuple[str | None, str | None]:
+    """Report and table in an MCAP file; None in other outputs."""
+    from mlbatch.page.clouds import mcap_of
+
+    file = mcap_of(path)
+    if file is None:
+        return None, None
+    from mcap.reader import make_reader
+
+    from mlbatch.verify.containers import BoundedFile, library_errors
+    from mlbatch.verify.verdict import DamageError
+
+    report = None
+    table = None
+    try:
+        with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:
+            reader = make_reader(stream)
+            for metadata in reader.iter_metadata():
+                if metadata.name == "mlbatch.report":
+                    report = metadata.metadata.get("json")
+            for attachment in reader.iter_attachments():
+                if attachment.name == TABLE:
+                    table = attachment.data.decode("utf-8", "replace")
+    except DamageError as err:
+        raise ExportError(f"{path}: {err}; convert again") from err
+    return report, table

@@ -1,0 +1,1 @@
+"""Classes of the Python interface: opened recordings, runs and their reports."""

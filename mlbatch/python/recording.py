@@ -1,0 +1,334 @@
+"""An opened recording: its sensors, and iterators over scans, packets and IMU samples.
+
+Everything is read when it is asked for. Each iterator is a pass of its own over the files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from operator import index as whole_number
+from pathlib import Path
+from typing import SupportsIndex
+
+import numpy as np
+
+from mlbatch.arrays import F64Array
+from mlbatch.batching.grid import Grid
+from mlbatch.batching.windows import Limit
+from mlbatch.discovery.discover import Discovery, discover
+from mlbatch.errors import NoScanError, RecordingError, UsageError
+from mlbatch.native import choose_engine
+from mlbatch.outputs.scan import Scan
+from mlbatch.outputs.table import Rows, read_table
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.ingest import Ingest
+from mlbatch.pipeline.job import DEFAULT_RATE, Job
+from mlbatch.pipeline.session import Session
+from mlbatch.pipeline.time_limits import time_limit
+from mlbatch.python.options import Box, Moment, Rate, ScanOptions
+from mlbatch.readers import merge, open_recording
+from mlbatch.types import ImuSamples, StreamTable
+from mlbatch.units import NS_PER_S
+
+# `print` reads recordings up to this size to their end, for their duration.
+_MEASURED_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedSensor:
+    """A lidar of a recording."""
+
+    name: str
+    model: str
+    mode: str
+    serial: str  # "" if unknown
+    channels: int
+    returns: int
+    streams: tuple[str, ...]  # in the first 10 s
+    calibration: str
+    extrinsics: F64Array | None  # (4, 4) body_from_sensor, m; None: unknown
+    extrinsics_source: str  # rig, tf_static, metadata, ...; "" if unknown
+
+
+@dataclass(frozen=True, slots=True)
+class RawPacket:
+    """A UDP payload of a lidar as it was recorded."""
+
+    host_ns: int  # receive time at the capture host
+    data: bytes
+    stream: str
+
+
+class Recording:
+    """One session: recordings that belong together, and the sensors found in them.
+
+    job: its options, shared with the command line.
+    """
+
+    def __init__(self, job: Job) -> None:
+        """Read the first 10 s; MlbatchError where `convert` would refuse the recording.
+
+        Missing extrinsics are an error of `scans` only.
+        """
+        self.job = job
+        self._duration_s: float | None = None
+        found = self._discover()
+        self.frame_id = found.frame_id
+        rig_rate = None if found.rig is None else found.rig.rate
+        self._rate = job.rate or rig_rate or DEFAULT_RATE
+        self.size_bytes = sum(one.size_bytes for one in found.recordings)
+        self.containers = tuple(one.container for one in found.recordings)
+        self.warnings = tuple(note.message for note in found.notes)
+        streams = found.sampler.table.streams
+        self.sensors: Mapping[str, RecordedSensor] = {
+            sensor.name: RecordedSensor(
+                name=sensor.name,
+                model=sensor.lidar.model,
+                mode=sensor.lidar.mode,
+                serial=sensor.lidar.serial,
+                channels=sensor.lidar.channels,
+                returns=sensor.lidar.returns,
+                streams=tuple(str(streams[number]) for number in sorted(sensor.streams)),
+                calibration=Path(sensor.lidar.calibration).name,
+                extrinsics=sensor.pose.body_from_sensor.copy() if sensor.pose.is_known else None,
+                extrinsics_source=sensor.pose.describe() if sensor.pose.is_known else "",
+            )
+            for sensor in found.sensors
+        }
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The recordings."""
+        return self.job.recordings
+
+    def _discover(self) -> Discovery:
+        table = StreamTable()
+        opened = [open_recording(path, table) for path in self.job.recordings]
+        engine = choose_engine(self.job.engine)
+        for recording in opened:
+            recording.use_engine(engine)
+        return discover(opened, table, replace(self.job.selection, identity_extrinsics=True))
+
+    # -- description --------------------------------------------------------------------------
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last packet by the capture host, s; reads all files."""
+        if self._duration_s is None:
+            first_ns: int | None = None
+            last_ns = 0
+            with contextlib.closing(merge(self._discover().recordings)) as batches:
+                for batch in batches:
+                    if len(batch):
+                        first_ns = int(batch.host_ns[0]) if first_ns is None else first_ns
+                        last_ns = int(batch.host_ns[-1])
+            self._duration_s = 0.0 if first_ns is None else (last_ns - first_ns) / NS_PER_S
+        return self._duration_s
+
+    def __repr__(self) -> str:
+        """Names of files and sensors, in a line."""
+        files = ", ".join(path.name for path in self.paths)
+        return f"<Recording {files}: {', '.join(self.sensors) or 'no sensor'}>"
+
+    def __str__(self) -> str:
+        """Files, duration, and a table of the sensors.
+
+        The duration of recordings over 256 MB is shown once `duration_s` has measured it.
+        """
+        if self._duration_s is None and self.size_bytes > _MEASURED_BYTES:
+            duration = "duration_s not measured yet"
+        else:
+            duration = f"{self.duration_s:.3f} s"
+        files = ", ".join(map(str, self.paths))
+        kinds = ", ".join(dict.fromkeys(self.containers))
+        rows = [("sensor", "model", "mode", "streams", "calibration", "extrinsics")]
+        for one in self.sensors.values():
+            source = one.extrinsics_source or "unknown"
+            streams = ", ".join(one.streams)
+            rows.append((one.name, one.model, one.mode, streams, one.calibration, source))
+        widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+        lines = [f"{files}: {kinds}, {self.size_bytes / 1e6:.1f} MB, {duration}"]
+        for row in rows:
+            cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+            lines.append("  ".join(cells).rstrip())
+        return "\n".join(lines)
+
+    # -- scans --------------------------------------------------------------------------------
+
+    def scans(
+        self,
+        rate: Rate | None = None,
+        *,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        slices: int = 1,
+        layout: str = "dense",
+        sort: str = "columns",
+        split: bool = False,
+        keep_partial: bool = False,
+        drop_incomplete: float = 0.0,
+        max_wait: float = 1.0,
+        min_range: float = 0.0,
+        max_range: float = math.inf,
+        exclude_boxes: Iterable[Box] = (),
+        keep_repeated: bool = False,
+    ) -> Iterator[Scan]:
+        """Yield the scans that `convert` would write, each with arrays of its own.
+
+        Arguments are the options of `mlbatch convert`; start, end: ns of the common clock, or a
+        text (ISO time, epoch seconds, "+5s" after the first scan). Raises MlbatchError where the
+        command ends with an error, at the latest after the last scan.
+        """
+        options = ScanOptions(
+            rate=rate,
+            start=start,
+            end=end,
+            slices=slices,
+            layout=layout,
+            sort=sort,
+            split=split,
+            keep_partial=keep_partial,
+            drop_incomplete=drop_incomplete,
+            max_wait=max_wait,
+            min_range=min_range,
+            max_range=max_range,
+            exclude_boxes=exclude_boxes,
+            keep_repeated=keep_repeated,
+        )
+        return scans_of(options.apply(self.job))
+
+    def __iter__(self) -> Iterator[Scan]:
+        """All scans, at the rate of the rig, else at 10 Hz."""
+        return self.scans()
+
+    def __getitem__(self, index: SupportsIndex) -> Scan:
+        """The scan with this index; the recording is read up to it.
+
+        IndexError for a negative index, and for a window without a scan.
+        """
+        number = whole_number(index)
+        if number < 0:
+            raise IndexError(f"scan {number}: expected 0 or more")
+        # Bounds are rounded up: the start after t_init is one of two whole nanoseconds.
+        exact = number * NS_PER_S * self._rate.denominator
+        first = Limit(exact // self._rate.numerator, from_t_init=True)
+        end = Limit(-(-exact // self._rate.numerator) + 1, from_t_init=True)
+        found = _last_of(replace(self.job, start=first, end=end))
+        if found is None or found.index != number:
+            raise IndexError(f"scan {number}: no such scan in {self!r}")
+        return found
+
+    def at(self, moment: Moment, rate: Rate | None = None) -> Scan:
+        """The scan whose window contains a time; the recording is read up to it.
+
+        moment: as `start` of `scans`. Raises RecordingError if there is no such scan.
+        """
+        limit, is_date = time_limit("at", moment)
+        if limit is None:
+            raise UsageError("at: expected a time, found None; give ns or an ISO time")
+        job = ScanOptions(rate=rate).apply(self.job)
+        grid = Grid(job.rate or self._rate)
+        if limit.from_t_init:
+            # The only window of two that contains the time is not known before t_init is.
+            first = Limit(max(0, limit.ns - grid.bound(1)), from_t_init=True)
+        else:
+            first = Limit(grid.floor_bound(limit.ns))
+        end = Limit(limit.ns + 1, limit.from_t_init)
+        limited = replace(job, start=first, end=end, limits_are_dates=is_date)
+        found = _last_of(limited)
+        time_ns = limit.ns
+        if found is not None and limit.from_t_init:
+            time_ns += grid.bound(grid.index_of(found.start_ns) - found.index)
+        if found is None or not found.start_ns <= time_ns < found.end_ns:
+            raise RecordingError(
+                f"{self!r}: expected a scan at {moment!r}, found none; see the times in rec.table()"
+            )
+        return found
+
+    def table(self, rate: Rate | None = None) -> Rows:
+        """scans.csv of a run as an array of rows; reads and decodes all, keeps no scan.
+
+        `pandas.DataFrame(rec.table())` is a table of pandas. Empty cells: -1, or NaN.
+        """
+        run = Conversion(ScanOptions(rate=rate).apply(self.job))
+        for _ in run.scans():
+            pass
+        if run.table is None:
+            raise RecordingError(f"{self!r}: expected a table of scans, found none; please report")
+        return read_table(run.table.text(), "scans.csv")
+
+    # -- packets ------------------------------------------------------------------------------
+
+    def packets(self, sensor: str) -> Iterator[RawPacket]:
+        """Yield the lidar packets of a sensor in receive order, as they are.
+
+        Not included: packets of another size, and IMU packets.
+        """
+        number = self._number(sensor)
+        session = Session(self._without_poses())
+        lidar = session.sensors[number].lidar
+        size = lidar.packet_size
+        streams = session.setup.sampler.table.streams
+        with contextlib.closing(session.packets()) as batches:
+            for batch in batches:
+                owner = session.ingest.owners(batch)
+                # Some sources append a byte, which the lidar does not send.
+                is_lidar = (batch.size == size) | (batch.size == size + 1)
+                rows = np.flatnonzero((owner == number) & is_lidar)
+                packets = batch.data[batch.start[rows, None] + np.arange(size)]
+                for row in rows[lidar.sent_by_me(packets)].tolist():
+                    begin = int(batch.start[row])
+                    data = batch.data[begin : begin + int(batch.size[row])].tobytes()
+                    stream = streams[int(batch.stream[row])]
+                    yield RawPacket(int(batch.host_ns[row]), data, str(stream))
+
+    def imu(self, sensor: str) -> Iterator[ImuSamples]:
+        """Yield the samples of a sensor's own IMU packets, some at a time, in its IMU frame.
+
+        Timestamps are on the clock of the scans; duplicates are left out.
+        """
+        number = self._number(sensor)
+        session = Session(self._without_poses())
+        ingest: Ingest = session.ingest
+        offset_ns = session.sensors[number].clock.imu_offset_ns
+        nothing: list[int | None] = [None] * len(session.sensors)
+        with contextlib.closing(session.packets()) as batches:
+            for batch in batches:
+                for samples in ingest.columns(batch, nothing).imu:
+                    if samples.sensor == number and len(samples.stamp_ns):
+                        samples.stamp_ns = samples.stamp_ns + offset_ns
+                        yield samples
+
+    def _number(self, sensor: str) -> int:
+        names = list(self.sensors)
+        if sensor not in names:
+            raise UsageError(
+                f"sensor: expected one of {', '.join(names) or 'none'}, found {sensor!r}; "
+                "choose one"
+            )
+        return names.index(sensor)
+
+    def _without_poses(self) -> Job:
+        """The job, for what needs no extrinsics."""
+        selection = replace(self.job.selection, identity_extrinsics=True)
+        return replace(self.job, selection=selection)
+
+
+def scans_of(job: Job) -> Iterator[Scan]:
+    """Yield the scans of a job, each with arrays of its own."""
+    for scan, _ in Conversion(job).scans():
+        yield Scan.copied(scan)
+
+
+def _last_of(job: Job) -> Scan | None:
+    """The last scan of a job; None without a scan."""
+    found = None
+    try:
+        for scan in scans_of(job):
+            found = scan
+    except NoScanError:
+        return None
+    return found

@@ -1,0 +1,169 @@
+"""`mlbatch.convert`: a run of the command line's `convert`, and its report."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mlbatch.errors import UsageError
+from mlbatch.pipeline import preflight, resume
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.resume import ResumeLog
+from mlbatch.pipeline.run import convert
+from mlbatch.report.ledger import SensorLedger
+from mlbatch.report.report import (
+    RunReport,
+    Section,
+    SensorReport,
+    build_report,
+    report_text,
+    summary_lines,
+)
+from mlbatch.report.scan_table import ScanStatistics
+from mlbatch.types import RunInfo
+from mlbatch.writers import (
+    ScanWriter,
+    WriterOptions,
+    check_compression,
+    check_target,
+    choose_format,
+    extras,
+    open_writer,
+    report_paths,
+    sync_entries,
+    write_text,
+)
+
+# Every job needs memory for a few scans.
+_MAX_JOBS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFigures:
+    """A sensor in the report of a run; ledger: all its counts."""
+
+    name: str
+    model: str
+    packets: int  # read
+    lost: int  # packets
+    rejected: Mapping[str, int]  # packets by reason
+    columns: int  # written
+    dropped: Mapping[str, int]  # columns by reason
+    points: int  # written
+    ledger: SensorLedger
+
+    @classmethod
+    def of(cls, sensor: SensorReport) -> SensorFigures:
+        """The figures of one sensor."""
+        ledger = sensor.ledger
+        return cls(
+            name=sensor.name,
+            model=sensor.model,
+            packets=ledger.packets.read,
+            lost=ledger.packets.lost,
+            rejected=dict(ledger.packets.rejected),
+            columns=ledger.columns.written,
+            dropped=dict(ledger.columns.dropped),
+            points=ledger.points.written,
+            ledger=ledger,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The report of a run; `content`: all of it."""
+
+    content: RunReport
+
+    @property
+    def sensors(self) -> dict[str, SensorFigures]:
+        """The sensors by name, in the order of `lidar_id`."""
+        return {sensor.name: SensorFigures.of(sensor) for sensor in self.content.sensors}
+
+    @property
+    def scans(self) -> ScanStatistics:
+        """Numbers of scans and points; spans and periods."""
+        return self.content.scans
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings as `code: message`."""
+        return tuple(f"{one.code}: {one.message}" for one in self.content.warnings)
+
+    def as_json(self) -> Section:
+        """The values of report.json."""
+        return build_report(self.content)
+
+    def __str__(self) -> str:
+        """The summary that `mlbatch convert` prints."""
+        return "\n".join(summary_lines(self.content))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A finished conversion; path: of its output, None after a dry run."""
+
+    path: Path | None
+    report: Report
+    report_path: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputOptions:
+    """Options of the output, as those of `mlbatch convert`."""
+
+    format: str | None = None
+    point_layout: str = "standard"
+    compression: str = "none"
+    overwrite: bool = False
+    fsync: bool = True  # wait until the output is on the disk
+    report: Path | None = None
+    jobs: int = 1
+
+
+def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
+    """Convert to `output` (None: a dry run); the report is written as by the command."""
+    if not 1 <= options.jobs <= _MAX_JOBS:
+        raise UsageError(
+            f"jobs: expected 1 to {_MAX_JOBS}, found {options.jobs}; give the number of free cores"
+        )
+    name = choose_format(output or Path("scans.mcap"), options.format)
+    writer_options = WriterOptions(
+        options.point_layout,
+        options.overwrite,
+        job.split,
+        compression=options.compression,
+        fsync=options.fsync,
+    )
+    check_compression(name, writer_options)
+    job = replace(job, extras=extras(name, writer_options), jobs=options.jobs)
+    if output is None:
+        preflight.check_report(job, options.report, None, name)
+        _, content = convert(job, None)
+        if options.report is not None:
+            write_text(options.report, report_text(content))
+        return Run(None, Report(content), options.report)
+    preflight.check_output(job, output, name)
+    # Also locks the output against other runs.
+    log = ResumeLog(output, job, name, writer_options, None)
+    resume.forget(output)
+    check_target(name, output, writer_options, job.layout)
+    if shortage := preflight.check_disk(job, output):
+        warnings.warn(shortage, stacklevel=3)
+    report_path = options.report or report_paths(output, name).report
+    preflight.check_report(job, report_path, output, name)
+    is_inside = report_path.parent.absolute() == output.absolute()
+
+    def opener(info: RunInfo) -> ScanWriter:
+        return open_writer(name, output, info, writer_options)
+
+    def write_report(content: RunReport, partial: Path) -> None:
+        path = partial / report_path.name if is_inside else report_path
+        write_text(path, report_text(content), options.fsync)
+        if options.fsync and path.parent.absolute() != output.parent.absolute():
+            sync_entries(path.parent)
+
+    _, content = convert(job, opener, None, log, write_report)
+    return Run(output, Report(content), report_path)

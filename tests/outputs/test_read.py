@@ -1,0 +1,252 @@
+"""Outputs read back are the scans that were written."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mlbatch
+from mlbatch.arrays import I64Array
+from mlbatch.errors import RecordingError, UsageError
+from mlbatch.outputs.clouds import CloudPlace, scan_of_cloud
+from mlbatch.outputs.scan import Scan
+from mlbatch.python.recording import Recording
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
+from tests.builders.scans import run_info
+from tests.contract.tree import ROOT
+
+FIXTURE = ROOT / "fixtures" / "two_lidars"
+FOUR = ROOT / "fixtures" / "four_makers"
+# Output, and its format.
+FORMATS = (
+    ("scans.mcap", None),
+    ("scans.bag", None),
+    ("bag", "rosbag2"),
+    ("npz", "npz"),
+    ("ply", "ply"),
+)
+ARRAYS = ("intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type", "lidar_id")
+FLOAT32_STEP_NS = 8  # of seconds below 0.125
+FLOAT64_STEP_NS = 300  # of seconds since 1970
+
+
+@pytest.fixture(scope="module")
+def rec() -> Recording:
+    return mlbatch.open(FIXTURE / "two_lidars.pcap", rig=FIXTURE / "rig.yaml")
+
+
+def _assert_same(read: Scan, wrote: Scan, step_ns: int) -> None:
+    """Equal in all that the output stores; times may be up to `step_ns` earlier."""
+    for name in ("index", "slice", "start_ns", "end_ns", "complete", "columns_per_sensor"):
+        assert getattr(read, name) == getattr(wrote, name), name
+    assert read.max_gap_ns == wrote.max_gap_ns
+    assert read.ready_host_ns == wrote.ready_host_ns
+    np.testing.assert_array_equal(read.fill, wrote.fill)
+    np.testing.assert_allclose(read.coverage, wrote.coverage, atol=5e-4)
+    assert (read.sensors, read.frame_id) == (wrote.sensors, wrote.frame_id)
+    assert (read.rate_hz, read.timescale) == (wrote.rate_hz, wrote.timescale)
+    assert (read.slices, read.info.layout) == (wrote.slices, wrote.info.layout)
+    assert read.sort == wrote.sort
+    for one, other in zip(read.info.sensors, wrote.info.sensors, strict=True):
+        assert (one.name, one.model) == (other.name, other.model)
+        np.testing.assert_array_equal(one.body_from_sensor, other.body_from_sensor)
+    np.testing.assert_array_equal(read.xyz, wrote.xyz)
+    for name in ARRAYS:
+        found, expected = getattr(read, name), getattr(wrote, name)
+        if name in read.absent:
+            assert found is None or len(found) == 0
+        elif name == "time_ns":
+            early = expected.astype(np.int64) - found
+            assert early.min(initial=0) >= 0
+            assert early.max(initial=0) <= step_ns
+        elif expected is None:
+            assert found is None or not found.any(), name
+        else:
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected, err_msg=name)
+
+
+@pytest.mark.parametrize(("name", "kind"), FORMATS)
+@pytest.mark.parametrize("rate", [10, "15", "10/3"])
+def test_scans_come_back(
+    name: str, kind: str | None, rate: str | int, rec: Recording, tmp_path: Path
+) -> None:
+    run = mlbatch.convert(rec, tmp_path / name, rate=rate, format=kind, keep_partial=True)
+    wrote = list(rec.scans(rate=rate, keep_partial=True))
+    assert wrote[0].index == -1
+    read = list(mlbatch.read(tmp_path / name))
+    assert len(read) == len(wrote) == run.report.scans.written > 0
+    step_ns = 0 if kind in ("npz", "ply") else 4 * FLOAT32_STEP_NS
+    for one, other in zip(read, wrote, strict=True):
+        _assert_same(one, other, step_ns)
+        if kind == "npz":
+            assert one.absent == {"ring_base"}
+            for key in ("column", "column_stamp_ns", "column_lidar_id"):
+                np.testing.assert_array_equal(getattr(one, key), getattr(other, key))
+
+
+@pytest.mark.parametrize(("name", "kind"), FORMATS)
+def test_scans_sorted_by_points_come_back(
+    name: str, kind: str | None, rec: Recording, tmp_path: Path
+) -> None:
+    mlbatch.convert(rec, tmp_path / name, format=kind, sort="points")
+    for one, other in zip(mlbatch.read(tmp_path / name), rec.scans(sort="points"), strict=True):
+        _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
+
+
+@pytest.mark.parametrize(("name", "kind"), FORMATS[:4])
+def test_organized_scans_come_back(
+    name: str, kind: str | None, rec: Recording, tmp_path: Path
+) -> None:
+    mlbatch.convert(rec, tmp_path / name, format=kind, layout="organized")
+    read = list(mlbatch.read(tmp_path / name))
+    for one, other in zip(read, rec.scans(layout="organized"), strict=True):
+        assert one.time_ns.ndim == 2
+        _assert_same(one, other, 0 if kind == "npz" else FLOAT32_STEP_NS)
+
+
+@pytest.mark.parametrize(("name", "kind"), FORMATS)
+def test_slices_of_single_sensors_come_back(
+    name: str, kind: str | None, rec: Recording, tmp_path: Path
+) -> None:
+    mlbatch.convert(rec, tmp_path / name, format=kind, split=True, slices=4)
+
+    # Folders have the scans sensor by sensor.
+    def key(scan: Scan) -> tuple[int, int, int]:
+        return int(scan.lidar_id[0]), scan.index, scan.slice
+
+    read = sorted(mlbatch.read(tmp_path / name), key=key)
+    wrote = sorted(rec.scans(split=True, slices=4), key=key)
+    assert len({key(scan) for scan in read}) == len(read) == len(wrote)
+    for one, other in zip(read, wrote, strict=True):
+        # The table has the last arrival and the gaps of both sensors.
+        other.ready_host_ns = one.ready_host_ns
+        own = int(one.lidar_id[0])
+        assert one.max_gap_ns[own] == other.max_gap_ns[own]
+        other.max_gap_ns = one.max_gap_ns
+        _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
+
+
+@pytest.mark.parametrize("layout", CLOUD_LAYOUTS)
+def test_every_point_layout_is_read(layout: str, tmp_path: Path) -> None:
+    """Four vendors, dual returns: what is read gives the stored records again, byte by byte."""
+    rec = mlbatch.open(FOUR / "four_makers.pcap", rig=FOUR / "rig.yaml")
+    mlbatch.convert(rec, tmp_path / "scans.mcap", point_layout=layout)
+    read = list(mlbatch.read(tmp_path / "scans.mcap"))
+    wrote = list(rec.scans())
+    steps_ns = {"hesai": FLOAT64_STEP_NS, "ouster": 0, "autoware": 0}
+    for one, other in zip(read, wrote, strict=True):
+        if layout == "autoware":
+            # Its intensity has 8 bits.
+            other.intensity = other.points("autoware")["intensity"].astype(np.float32)
+        if layout == "ouster":
+            assert one.range_m is not None
+            assert other.range_m is not None
+            np.testing.assert_allclose(one.range_m, other.range_m, atol=6e-4)
+            other.range_m = one.range_m
+        if layout == "hesai":
+            late = one.time_ns.astype(np.int64) - other.time_ns
+            assert abs(late).max() <= FLOAT64_STEP_NS
+            other.time_ns = one.time_ns
+        _assert_same(one, other, steps_ns.get(layout, FLOAT32_STEP_NS))
+        if layout != "autoware":
+            np.testing.assert_array_equal(one.points(layout), other.points(layout))
+
+
+def test_a_sensor_of_a_scan_that_was_read(rec: Recording, tmp_path: Path) -> None:
+    mlbatch.convert(rec, tmp_path / "scans.mcap")
+    for one, other in zip(mlbatch.read(tmp_path / "scans.mcap"), rec.scans(), strict=True):
+        np.testing.assert_array_equal(one["right"].xyz_sensor, other["right"].xyz_sensor)
+
+
+def test_one_file_of_a_folder(rec: Recording, tmp_path: Path) -> None:
+    for kind in ("npz", "ply"):
+        mlbatch.convert(rec, tmp_path / kind, format=kind, split=True)
+        (scan,) = mlbatch.read(str(tmp_path / kind / "right" / f"000002.{kind}"))
+        assert (scan.index, set(scan.lidar_id.tolist())) == (2, {1})
+        assert np.isfinite(scan.xyz_sensor).all()
+
+
+@given(st.lists(st.integers(0, 4_000_000_000), min_size=1))
+def test_float32_seconds_are_the_ns_that_give_them(times: list[int]) -> None:
+    """Reading is the inverse of writing: what is read rounds to the same float32, toward zero."""
+    rows = np.zeros(len(times), CLOUD_LAYOUTS["kiss-icp"].dtype)
+    exact = [Fraction(time, 10**9) for time in times]
+    for row, value in enumerate(exact):
+        rounded = np.float32(float(value))
+        if Fraction(float(rounded)) > value:
+            rounded = np.nextafter(rounded, np.float32(0))
+        rows["time"][row] = rounded
+    place = CloudPlace(run_info(), 0, 0, 10**18, 10**18 + 10**10, None)
+    read: I64Array = scan_of_cloud(place, rows, True).time_ns.astype(np.int64)
+    for stored, found, time in zip(rows["time"].tolist(), read.tolist(), times, strict=True):
+        # The smallest whole nanosecond that is not before the stored time.
+        assert Fraction(found - 1, 10**9) < Fraction(stored) <= Fraction(found, 10**9)
+        assert found <= time
+
+
+# -- mistakes -------------------------------------------------------------------------------------
+
+
+def _converted(rec: Recording, tmp_path: Path, name: str, kind: str | None = None) -> Path:
+    mlbatch.convert(rec, tmp_path / name, format=kind)
+    return tmp_path / name
+
+
+def test_a_bag_without_its_report(rec: Recording, tmp_path: Path) -> None:
+    bag = _converted(rec, tmp_path, "scans.bag")
+    (tmp_path / "scans.bag.report.json").unlink()
+    with pytest.raises(RecordingError, match=r"expected the report of the run, .* found none"):
+        list(mlbatch.read(bag))
+
+
+def test_npz_without_a_report_has_no_poses(rec: Recording, tmp_path: Path) -> None:
+    folder = _converted(rec, tmp_path, "npz")
+    (folder / "report.json").unlink()
+    scan = next(iter(mlbatch.read(folder)))
+    with pytest.raises(UsageError, match="expected the extrinsics of left, found no report"):
+        _ = scan.xyz_sensor
+
+
+@pytest.mark.parametrize(("name", "kind"), [FORMATS[0], FORMATS[3], FORMATS[4]])
+def test_damage_is_an_error(name: str, kind: str | None, rec: Recording, tmp_path: Path) -> None:
+    output = _converted(rec, tmp_path, name, kind)
+    file = output if output.is_file() else output / f"000003.{kind}"
+    data = bytearray(file.read_bytes())
+    half = len(data) // 2
+    damaged = data[:half] if kind == "ply" else data[:half] + b"\xa5" * 64 + data[half + 64 :]
+    file.write_bytes(damaged)
+    with pytest.raises(RecordingError, match=r"expected .*, found .*; .*convert again"):
+        list(mlbatch.read(output))
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("nothing.mcap", "found 'No such file or directory'"),
+        ("scans.mcap.partial", "expected a finished output, found that of an unfinished run"),
+        ("empty", "found a folder without scans"),
+        ("other.txt", "found another file"),
+    ],
+)
+def test_what_is_no_output(name: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other.txt").write_text("text")
+    with pytest.raises(RecordingError, match=expected):
+        list(mlbatch.read(tmp_path / name))
+
+
+def test_mcap_of_others(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(RecordingError, match=r"expected an MCAP file of mlbatch"):
+        list(mlbatch.read(tmp_path / "other.mcap"))

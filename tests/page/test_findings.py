@@ -1,0 +1,124 @@
+"""Findings of runs, made by hand."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from mlbatch.page.findings import REMEDIES, Level, findings, percent, verdict
+from mlbatch.page.values import Values
+from mlbatch.page.windows import read_windows
+from tests.contract.tree import PACKAGE, ROOT
+from tests.page.runs import report, sensor, table
+
+
+def found(document: dict[str, Any], columns: list[list[int]] | None = None) -> list[str]:
+    """Level and text of each finding."""
+    windows = None
+    if columns is not None:
+        missing = [[512 - count for count in own] for own in columns]
+        windows = read_windows(table(("left", "right"), columns, missing), 1)
+    return [f"{one.level.name}: {one.text}" for one in findings(Values(document), windows)]
+
+
+def test_a_clean_run_has_no_finding() -> None:
+    document = report(sensor("left"), sensor("right", 1))
+    assert found(document, [[512, 512]] * 10) == []
+    assert verdict(findings(Values(document), None)) == (Level.GOOD, "Everything is fine", "")
+
+
+@pytest.mark.parametrize(
+    ("lost", "expected"),
+    [
+        (0, []),
+        (1, ["WARNING: left lost 1 packet of 1,000, 0.10 %."]),
+        (9, ["WARNING: left lost 9 packets of 1,000, 0.90 %."]),
+        (10, ["PROBLEM: left lost 10 packets of 1,000, 1.0 %."]),
+    ],
+)
+def test_loss_is_graded(lost: int, expected: list[str]) -> None:
+    assert found(report(sensor("left", lost=lost))) == expected
+
+
+@pytest.mark.parametrize(
+    ("silent", "text"),
+    [
+        (range(3, 6), "right sent nothing from +0.3 s to +0.6 s: a stall of 3 scans."),
+        (range(0, 2), "right sent nothing until +0.2 s (2 scans)."),
+        (range(7, 10), "right sent nothing from +0.7 s to the end (3 scans)."),
+        (range(0, 10), "right sent nothing: no column in any scan."),
+        (range(4, 5), "right sent nothing from +0.4 s to +0.5 s: a stall of 1 scan."),
+    ],
+)
+def test_a_silent_sensor_is_named_with_its_time(silent: range, text: str) -> None:
+    columns = [[512, 0 if index in silent else 512] for index in range(10)]
+    document = report(sensor("left"), sensor("right", 1))
+    assert found(document, columns) == [f"PROBLEM: {text}"]
+
+
+def test_head_and_tail_are_partial_by_request() -> None:
+    document = report(sensor("left"), sensor("right", 1))
+    document["scans"]["incomplete"] = 3
+    columns = [[100, 100], [512, 512], [512, 512], [512, 0]]
+    missing = [[512 - count for count in own] for own in columns]
+    text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
+    texts = [one.text for one in findings(Values(document), read_windows(text, 1))]
+    assert "1 scan of 10 is incomplete: a sensor does not cover the window." in texts
+    assert "Head and tail are incomplete, as requested by --keep-partial." in texts
+
+
+def test_the_warning_of_a_loss_is_not_repeated() -> None:
+    message = "left: 20 of 1000 packets lost (2 %)"
+    warning = {"code": "loss", "sensor": "left", "message": message}
+    document = report(sensor("left", lost=20), sensor("right", 1, lost=1), warnings=[warning])
+    expected = [f"PROBLEM: {message}", "WARNING: right lost 1 packet of 1,000, 0.10 %."]
+    assert found(document) == expected
+
+
+def test_drifting_clocks_are_weighed_by_the_length_of_the_recording() -> None:
+    sensors = (sensor("left", drift_ppm=10), sensor("right", 1, drift_ppm=-40))
+    assert found(report(*sensors, timing={"recorded_s": 9.0})) == []
+    (text,) = found(report(*sensors, timing={"recorded_s": 60.0}))
+    assert text == "WARNING: The clocks of left and right drift apart by 50.0 ppm: 3.00 ms in 60 s."
+    (text,) = found(report(*sensors, timing={"recorded_s": 3600.0}))
+    assert text.startswith("PROBLEM: ")
+
+
+def test_the_verdict_is_the_worst_finding() -> None:
+    warning = {"code": "calibration", "sensor": "left", "message": "a note"}
+    document = report(sensor("left", bad_size=50), sensor("right", 1, lost=2), warnings=[warning])
+    level, heading, others = verdict(findings(Values(document), None))
+    assert level == Level.PROBLEM
+    assert heading == "50 packets of left rejected (bad_size 50)."
+    assert others == "1 problem and 1 warning below."
+    last = findings(Values(document), None)[-1]
+    assert (last.level, last.code, last.text) == (Level.NOTE, "calibration", "a note")
+
+
+def test_a_run_without_a_scan_is_a_problem() -> None:
+    assert found(report(sensor("left"), scans=0)) == ["PROBLEM: No scan was written."]
+
+
+def test_every_warning_has_a_remedy() -> None:
+    page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
+    described = re.findall(r"^\| `(\w+)` \|", page.partition("### warnings")[2], re.MULTILINE)
+    assert described
+    assert set(described) <= set(REMEDIES)
+    source = "".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    assert set(re.findall(r'\bNote\(\s*"(\w+)"', source)) <= set(REMEDIES)
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "text"),
+    [(0, 0, "0.00 %"), (1, 3, "33.3 %"), (1, 1000, "0.10 %"), (1, 100_000, "less than 0.01 %")],
+)
+def test_shares_have_the_digits_they_need(part: int, whole: int, text: str) -> None:
+    assert percent(part, whole) == text
+
+
+@pytest.mark.parametrize("value", [None, "x", 5, [], [1], {"sensors": "x", "scans": []}])
+def test_a_damaged_report_gives_no_exception(value: Any) -> None:
+    findings(Values(value), None)
+    findings(Values({"sensors": [value], "warnings": [value], "faults": [value]}), None)

@@ -1,0 +1,307 @@
+"""Opened recordings: sensors, scans, single scans, packets and IMU samples."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from itertools import islice
+from pathlib import Path
+
+import dpkt
+import numpy as np
+import pytest
+
+import mlbatch
+from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.python.recording import Recording
+from tests.builders.sessions import Unit, twin, write_session
+from tests.contract.tree import ROOT, run_python
+
+FIXTURE = ROOT / "fixtures" / "two_lidars"
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+FIRST_NS = 1_777_881_600_100_000_000  # 2026-05-04T08:00:00.1Z, by SOURCE.md of the fixture
+PERIOD_NS = 100_000_000
+
+
+@pytest.fixture(scope="module")
+def rec() -> Recording:
+    return mlbatch.open(CAPTURE, rig=RIG)
+
+
+def test_the_description_of_a_recording(rec: Recording) -> None:
+    head, names, left, right = str(rec).splitlines()
+    assert head == f"{CAPTURE}: pcap, 2.5 MB, 0.850 s"
+    assert names.split() == ["sensor", "model", "mode", "streams", "calibration", "extrinsics"]
+    assert left.split()[:2] == ["left", "OS-0-32-U1"]
+    assert right.endswith("10.5.5.88 > port 7502  right.json   rig")
+    assert repr(rec) == "<Recording two_lidars.pcap: left, right>"
+
+
+def test_the_duration_is_that_of_the_packets(rec: Recording) -> None:
+    with CAPTURE.open("rb") as file:
+        times = [seconds for seconds, _ in dpkt.pcap.Reader(file)]
+    assert rec.duration_s == pytest.approx(max(times) - min(times), abs=1e-6)
+
+
+def test_long_recordings_are_not_read_by_print(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mlbatch.python.recording._MEASURED_BYTES", 1000)
+    rec = mlbatch.open(CAPTURE, rig=RIG)
+    assert "duration_s not measured yet" in str(rec)
+    assert rec.duration_s > 0
+    assert "0.850 s" in str(rec)
+
+
+def test_sensors_have_the_extrinsics_of_the_rig(rec: Recording) -> None:
+    """left of the rig: translation 0.3, 0.95, 2.45; its z axis stays a unit vector."""
+    assert list(rec.sensors) == ["left", "right"]
+    pose = rec.sensors["left"].extrinsics
+    assert pose is not None
+    np.testing.assert_array_equal(pose[:3, 3], [0.3, 0.95, 2.45])
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    assert rec.sensors["left"].extrinsics_source == "rig"
+    assert (rec.sensors["right"].channels, rec.sensors["right"].returns) == (32, 1)
+
+
+def test_unknown_extrinsics_are_an_error_of_scans_only(tmp_path: Path) -> None:
+    unit = Unit()
+    rec = mlbatch.open(write_session(tmp_path, unit, twin(unit, 7)))
+    assert [one.extrinsics for one in rec.sensors.values()] == [None, None]
+    assert "unknown" in str(rec)
+    name = next(iter(rec.sensors))
+    assert next(rec.packets(name)).data
+    with pytest.raises(RigError, match="extrinsics"):
+        next(rec.scans())
+
+
+@pytest.mark.parametrize(
+    ("metadata", "sensors"),
+    [("left.json", 1), (Path("left.json"), 1), (["left.json", "right.json"], 2)],
+)
+def test_a_text_is_one_path(
+    metadata: str | Path | list[str], sensors: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(FIXTURE)
+    # The right sensor is left out where its metadata are not given.
+    ignore = "122648000456" if sensors == 1 else ()
+    rec = mlbatch.open(
+        "two_lidars.pcap", metadata=metadata, ignore=ignore, identity_extrinsics=True
+    )
+    assert len(rec.sensors) == sensors
+    scans = mlbatch.scans(
+        "two_lidars.pcap", metadata=metadata, ignore=ignore, identity_extrinsics=True
+    )
+    assert len(next(scans).sensors) == sensors
+
+
+@pytest.mark.parametrize(
+    "recordings", [(str(CAPTURE),), (CAPTURE,), ([CAPTURE],), (iter([str(CAPTURE)]),)]
+)
+def test_recordings_are_paths_or_several(recordings: tuple[Path, ...]) -> None:
+    assert list(mlbatch.open(*recordings, rig=str(RIG)).sensors) == ["left", "right"]
+
+
+def test_one_name_of_a_sensor() -> None:
+    assert list(mlbatch.open(CAPTURE, rig=RIG, only="right").sensors) == ["right"]
+    assert list(mlbatch.open(CAPTURE, rig=RIG, ignore=["right"]).sensors) == ["left"]
+
+
+# -- scans ----------------------------------------------------------------------------------------
+
+
+def test_scans_are_those_of_the_command_line(rec: Recording, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "mlbatch",
+        "convert",
+        str(CAPTURE),
+        "--rig",
+        str(RIG),
+        "--rate",
+        "20",
+    ]
+    subprocess.run([*command, "-o", str(tmp_path / "scans"), "--quiet"], check=True)
+    files = sorted((tmp_path / "scans").glob("*.npz"))
+    for file, scan in zip(files, rec.scans(20), strict=True):
+        with np.load(file) as stored:
+            for key in set(stored.files) - {"schema"}:
+                np.testing.assert_array_equal(getattr(scan, key), stored[key], err_msg=key)
+
+
+def test_each_pass_is_of_its_own(rec: Recording) -> None:
+    one, other = rec.scans(), iter(rec)
+    for _ in range(2):
+        np.testing.assert_array_equal(next(one).xyz, next(other).xyz)
+    assert [scan.index for scan in one] == [2, 3, 4, 5, 6]
+
+
+def test_a_part_of_the_recording(rec: Recording) -> None:
+    """Windows that start in [0.2 s, 0.4 s) after the first: 2 and 3."""
+    for start, end in (
+        ("+0.2s", "+0.4s"),
+        ("+0.2", "+0.4"),
+        (FIRST_NS + 2 * PERIOD_NS, FIRST_NS + 4 * PERIOD_NS),
+        ("2026-05-04T08:00:00.3Z", "2026-05-04T10:00:00.5+02:00"),
+    ):
+        found = list(rec.scans(start=start, end=end))
+        assert [scan.index for scan in found] == [2, 3], start
+        assert found[0].start_ns == FIRST_NS + 2 * PERIOD_NS
+
+
+@pytest.mark.parametrize("start", [1.5, True, "tomorrow"])
+def test_times_that_are_none(start: int, rec: Recording) -> None:
+    with pytest.raises(UsageError, match="start: expected "):
+        next(rec.scans(start=start))
+
+
+def test_a_scan_by_its_index(rec: Recording) -> None:
+    whole = list(rec.scans())
+    for index in (0, 3, np.int64(6)):
+        np.testing.assert_array_equal(rec[index].xyz, whole[index].xyz)
+        assert rec[index].index == index
+
+
+@pytest.mark.parametrize("rate", ["15", "10/3", "29.97"])
+def test_a_scan_by_its_index_where_bounds_are_rounded(rate: str, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    text = RIG.read_text(encoding="utf-8").replace("metadata: ", f"metadata: {FIXTURE}/")
+    assert "rate_hz: 10\n" in text
+    rig.write_text(text.replace("rate_hz: 10\n", f"rate_hz: {rate}\n"), encoding="utf-8")
+    rec = mlbatch.open(CAPTURE, rig=rig)
+    for scan in rec.scans():
+        assert rec[scan.index].start_ns == scan.start_ns
+        assert rec.at(scan.start_ns).index == scan.index
+        assert rec.at(scan.end_ns - 1).index == scan.index
+
+
+@pytest.mark.parametrize("index", [-1, 7, 1000])
+def test_an_index_without_a_scan(index: int, rec: Recording) -> None:
+    with pytest.raises(IndexError, match=f"scan {index}: "):
+        rec[index]
+
+
+def test_the_scan_at_a_time(rec: Recording) -> None:
+    start_ns = FIRST_NS + 3 * PERIOD_NS
+    assert rec.at("2026-05-04T08:00:00.45Z").index == 3
+    assert rec.at("+0.35").index == 3
+    assert [rec.at(start_ns + ns).index for ns in (-1, 0, PERIOD_NS - 1, PERIOD_NS)] == [2, 3, 3, 4]
+    # At 20 Hz the first scan is half a period earlier.
+    assert [rec.at(start_ns, rate=20).index, rec.at("+0.35", rate=20).index] == [6 + 1, 7]
+
+
+@pytest.mark.parametrize("moment", ["+5", "2026-05-04T08:00:01Z", FIRST_NS - PERIOD_NS])
+def test_a_time_without_a_scan(moment: str | int, rec: Recording) -> None:
+    with pytest.raises(RecordingError, match=r"expected a scan at .*, found none"):
+        rec.at(moment)
+
+
+def test_the_table_has_typed_columns(rec: Recording) -> None:
+    table = rec.table()
+    scans = list(rec.scans())
+    assert table["index"].tolist() == list(range(7))
+    assert table["points"].tolist() == [scan.point_count for scan in scans]
+    assert table["complete"].all()
+    assert {table.dtype[name].str for name in ("start_ns", "columns_left", "points")} == {"<i8"}
+    assert table.dtype["coverage_left"].str == "<f8"
+
+
+def test_scans_wait_for_nobody_to_ask(monkeypatch: pytest.MonkeyPatch, rec: Recording) -> None:
+    """The file is read as far as the scans that are taken need it."""
+    read: list[int] = []
+    from mlbatch.pipeline.session import Session
+
+    count = Session._count
+
+    def counted(self: Session, batch: object) -> None:
+        read.append(1)
+        count(self, batch)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Session, "_count", counted)
+    scans = rec.scans()
+    assert read == []
+    assert len(list(islice(scans, 1))) == 1
+
+
+# -- packets --------------------------------------------------------------------------------------
+
+
+def _payloads(source: str, port: int) -> list[tuple[int, bytes]]:
+    """Payloads as another library reads the frames, with receive times in ns.
+
+    Fragments are joined by their IP identification; the last one gives the time.
+    """
+    found = []
+    parts: dict[int, bytes] = {}
+    with CAPTURE.open("rb") as file:
+        for seconds, frame in dpkt.pcap.Reader(file):
+            ip = dpkt.ethernet.Ethernet(frame).data
+            if not isinstance(ip, dpkt.ip.IP) or ".".join(map(str, ip.src)) != source:
+                continue
+            parts[ip.id] = parts.get(ip.id, b"") + bytes(ip.data)
+            if not ip.mf:
+                datagram = parts.pop(ip.id)
+                if int.from_bytes(datagram[2:4], "big") == port:
+                    found.append((round(float(seconds) * 1e9), datagram[8:]))
+    return found
+
+
+@pytest.mark.parametrize(("sensor", "source"), [("left", "10.5.5.87"), ("right", "10.5.5.88")])
+def test_packets_are_the_payloads(sensor: str, source: str, rec: Recording) -> None:
+    expected = _payloads(source, 7502)
+    found = list(rec.packets(sensor))
+    assert [packet.data for packet in found] == [data for _, data in expected]
+    for packet, (host_ns, _) in zip(found, expected, strict=True):
+        assert abs(packet.host_ns - host_ns) < 2000
+    assert {packet.stream for packet in found} == {f"{source} > port 7502"}
+
+
+def test_imu_samples(rec: Recording) -> None:
+    """One sample a packet, at 100 Hz, as they lie in the output."""
+    samples = list(rec.imu("left"))
+    stamps = np.concatenate([one.stamp_ns for one in samples])
+    assert len(stamps) == len(_payloads("10.5.5.87", 7503))
+    np.testing.assert_allclose(np.diff(stamps), 10_000_000, atol=1_000_000)
+    gravity = np.concatenate([one.acceleration for one in samples])
+    assert np.linalg.norm(gravity, axis=1).mean() == pytest.approx(9.81, abs=0.5)
+
+
+def test_packets_of_no_sensor(rec: Recording) -> None:
+    for read in (rec.packets, rec.imu):
+        with pytest.raises(UsageError, match="expected one of left, right, found 'top'"):
+            next(iter(read("top")))
+
+
+# -- values of options ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"layout": "flat"}, "layout: expected dense or organized, found 'flat'"),
+        ({"drop_incomplete": 101}, "drop_incomplete: expected a share from 0 to 100 %"),
+        ({"exclude_boxes": [(0, 0, 0, 1, 1)]}, "exclude_boxes: expected"),
+        ({"min_range": math.nan}, "min_range: expected 0 or more metres"),
+        ({"start": "+2", "end": "+1"}, "end: expected a time after start"),
+    ],
+)
+def test_impossible_values(options: dict[str, float | str], expected: str, rec: Recording) -> None:
+    with pytest.raises(UsageError, match=expected):
+        rec.scans(**options)  # type: ignore[arg-type]
+
+
+def test_a_path_of_another_type() -> None:
+    with pytest.raises(UsageError, match=r"recording: expected a path .*, found int"):
+        mlbatch.open(3)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="recording: expected at least one path, found none"):
+        mlbatch.open()
+
+
+def test_importing_the_package_loads_nothing() -> None:
+    printed = run_python(
+        "import sys\nimport mlbatch\n"
+        "print([name for name in sys.modules if name.startswith('mlbatch.') or name == 'numpy'])\n"
+        "print(mlbatch.verify is __import__('mlbatch.verify').verify, callable(mlbatch.verify))\n"
+    )
+    assert printed.splitlines() == ["[]", "True True"]

@@ -1,0 +1,114 @@
+"""`mlbatch.convert`, `verify` and `inspect` do what the commands do."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mlbatch
+from mlbatch.errors import ExportError, NoScanError, UsageError
+from tests.contract.tree import ROOT
+
+FIXTURE = ROOT / "fixtures" / "two_lidars"
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+
+
+def test_the_output_is_that_of_the_command(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "mlbatch",
+        "convert",
+        str(CAPTURE),
+        "--rig",
+        str(RIG),
+        "--rate",
+        "20",
+    ]
+    subprocess.run([*command, "-o", str(tmp_path / "a.mcap"), "--quiet"], check=True)
+    rec = mlbatch.open(CAPTURE, rig=RIG)
+    run = mlbatch.convert(rec, str(tmp_path / "b.mcap"), rate=20)
+    assert run.path == tmp_path / "b.mcap"
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    names = [path.name for path in sorted(tmp_path.glob("b*"))]
+    assert names == ["b.mcap", "b.mcap.report.json", "b.mcap.scans.csv"]
+
+
+def test_the_report_of_a_run(tmp_path: Path) -> None:
+    run = mlbatch.convert(CAPTURE, tmp_path / "scans", rig=RIG)
+    left = run.report.sensors["left"]
+    # README: 271 packets, 3584 columns written and 752 dropped, 90790 points.
+    assert (left.packets, left.lost, left.rejected) == (271, 0, {})
+    assert (left.columns, sum(left.dropped.values()), left.points) == (3584, 752, 90790)
+    assert run.report.scans.written == 7
+    assert run.report.warnings == ()
+    assert run.report_path == tmp_path / "scans" / "report.json"
+    stored = json.loads(run.report_path.read_text(encoding="utf-8"))
+    assert stored["sensors"] == json.loads(json.dumps(run.report.as_json()["sensors"]))
+    assert str(run.report).splitlines()[1].split()[0] == "left"
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = mlbatch.convert(CAPTURE, None, rig=RIG)
+    assert (run.path, run.report_path) == (None, None)
+    assert run.report.scans.points == 195986
+    assert list(tmp_path.iterdir()) == []
+    run = mlbatch.convert(CAPTURE, None, rig=RIG, report="report.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_jobs_do_not_change_the_output(tmp_path: Path) -> None:
+    for jobs in (1, 3):
+        mlbatch.convert(CAPTURE, tmp_path / f"{jobs}.mcap", rig=RIG, jobs=jobs)
+    assert (tmp_path / "1.mcap").read_bytes() == (tmp_path / "3.mcap").read_bytes()
+
+
+def test_an_existing_output_is_kept(tmp_path: Path) -> None:
+    output = tmp_path / "scans.mcap"
+    mlbatch.convert(CAPTURE, output, rig=RIG)
+    before = output.read_bytes()
+    with pytest.raises(ExportError, match="expected a new output, found an existing one"):
+        mlbatch.convert(CAPTURE, output, rig=RIG, rate=20)
+    assert output.read_bytes() == before
+    mlbatch.convert(CAPTURE, output, rig=RIG, rate=20, overwrite=True)
+    assert output.read_bytes() != before
+
+
+def test_a_run_without_a_scan_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(NoScanError):
+        mlbatch.convert(CAPTURE, tmp_path / "scans.mcap", rig=RIG, start="+100")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_of_an_opened_recording_are_given_there(tmp_path: Path) -> None:
+    rec = mlbatch.open(CAPTURE, rig=RIG)
+    with pytest.raises(UsageError, match=r"give them to mlbatch\.open"):
+        mlbatch.convert(rec, tmp_path / "scans.mcap", rig=RIG)
+    with pytest.raises(UsageError, match="jobs: expected 1 to 64, found 0"):
+        mlbatch.convert(rec, tmp_path / "scans.mcap", jobs=0)
+
+
+def test_verify_is_a_function_before_and_after_its_import(tmp_path: Path) -> None:
+    output = tmp_path / "scans.mcap"
+    mlbatch.convert(CAPTURE, output, rig=RIG)
+    assert mlbatch.verify(output).ok
+    import mlbatch.verify as package
+
+    assert package.verify(str(output)).ok
+    assert mlbatch.verify(str(output)).format == "mcap, standard"
+    data = bytearray(output.read_bytes())
+    data[len(data) // 2] ^= 1
+    output.write_bytes(data)
+    assert not mlbatch.verify(output).ok
+
+
+def test_inspect() -> None:
+    found = mlbatch.inspect(str(CAPTURE))
+    assert [stream.sensor for stream in found.streams if stream.model] != []
+    assert mlbatch.inspect([CAPTURE], whole=True).whole
