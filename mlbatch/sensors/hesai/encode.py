@@ -96,6 +96,25 @@ class HesaiSpec:
         return bool(self.row.flags & flag)
 
 
+def advanced(spec: HesaiSpec, packets: int) -> HesaiSpec:
+    """Return the lidar as it is so many packets later; ValueError if that is no whole ns.
+
+    packets: a multiple of those after which the firing tables repeat.
+    """
+    row = spec.row
+    columns = packets * spec.groups
+    after_ns = row.step_ns * columns
+    if after_ns.denominator != 1:
+        raise ValueError(f"{packets} packets last {after_ns} ns, no whole number")
+    turned_deg = float(after_ns * spec.rpm * 6 % (360 * 10**9)) * 1e-9
+    return replace(
+        spec,
+        start_deg=(spec.start_deg + turned_deg) % 360.0,
+        start_ns=spec.start_ns + int(after_ns),
+        sequence=(spec.sequence + packets) % 2**32,
+    )
+
+
 def packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
     """(P,) what the packets say: whole microseconds."""
     step_ns = spec.row.step_ns * spec.groups

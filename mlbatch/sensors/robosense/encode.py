@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
@@ -152,6 +152,20 @@ def origins(spec: RobosenseSpec, columns: I64Array) -> F64Array:
     radius, height = spec.row.lens_m
     parts = (radius * np.cos(azimuth), -radius * np.sin(azimuth), np.full_like(azimuth, height))
     return np.stack(parts, axis=-1)
+
+
+def advanced(spec: RobosenseSpec, packets: int) -> RobosenseSpec:
+    """Return the unit as it is so many packets later, measuring all around.
+
+    packets: a number that whole columns fill.
+    """
+    columns = round(packets * spec.columns_per_packet)
+    return replace(
+        spec,
+        start_deg=(spec.start_deg + columns * _step_deg(spec)) % 360.0,
+        start_ns=spec.start_ns + columns * spec.round_ns,
+        first_counter=(spec.first_counter + packets) % 2**32,
+    )
 
 
 def msop(spec: RobosenseSpec, ranges: I64Array, levels: I64Array) -> list[tuple[int, bytes]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
@@ -130,6 +130,13 @@ def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
     packets["factory"] = _factory(spec, count)
     payloads = packets.view(np.uint8).reshape(count, _PACKET.itemsize)
     return Sent(payloads, _receive_ns(spec, row_us.reshape(count, -1)[:, -1] + spec.row_us))
+
+
+def advanced(spec: VelodyneSpec, packets: int) -> VelodyneSpec:
+    """Return the sensor as it is so many packets later, without a blind sector."""
+    after_us = packets * spec.rows_per_packet * spec.row_us
+    azimuth_deg = float(_azimuth_deg(spec, np.array([after_us]))[0]) % 360.0
+    return replace(spec, start_us=spec.start_us + after_us, start_azimuth_deg=azimuth_deg)
 
 
 def observe(

@@ -1,0 +1,125 @@
+"""A simulated HESAI: rays of its firing groups, packets and the angle file of the unit.
+
+Source: docs/sources/hesai.md sections 2 to 8, by way of the encoder.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.lidar.simulated import (
+    ImuUnit,
+    LidarFiles,
+    LidarModel,
+    LidarSettings,
+    PacketTopic,
+    Sent,
+    Shots,
+    whole_counts,
+)
+from mlbatch.sensors.hesai.encode import (
+    HesaiSpec,
+    advanced,
+    directions,
+    encode_packets,
+    fires,
+    firing_times_ns,
+    packet_times_ns,
+)
+from mlbatch.sensors.hesai.encode_angles import Angles, Beams, MirrorAngles, angles_csv
+from mlbatch.sensors.hesai.encode_models import MODELS as ROWS
+from mlbatch.units import NS_PER_S, RAD_PER_DEG
+
+DATA_PORT = 2368
+_MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
+_LARGEST = 65535
+# A multiple of the packets after which times are whole ns (3) and firing tables repeat (4).
+_CHUNK_PACKETS = 60
+# Highest and lowest beam, deg; of models with other fields of view.
+_SPAN_DEG = (14.9, -15.1)
+_SPANS_DEG = {"Pandar20A": (7.9, -24.9), "Pandar20B": (2.9, -18.9)}
+_MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
+# Azimuths in which an AT128 measures, from the middle of a mirror's field.
+_HALF_VIEW_DEG = 60.0
+_TYPE = "hesai_ros_driver/UdpFrame"
+
+MODELS = tuple(
+    LidarModel(
+        name,
+        ("strongest",) if name == "JT16" else tuple(_MODES),
+        (10,) if name == "AT128" else (10, 5, 20),
+    )
+    for name in ROWS
+)
+
+
+def simulated(settings: LidarSettings) -> SimulatedHesai:
+    """Return the lidar."""
+    return SimulatedHesai(settings)
+
+
+class SimulatedHesai:
+    """Firing groups follow each other without a gap."""
+
+    def __init__(self, settings: LidarSettings) -> None:
+        """Choose the encoder's specification of the unit, and its angles."""
+        rpm = settings.rate_hz * 60
+        self._spec = HesaiSpec(
+            settings.model,
+            _MODES[settings.mode],
+            rpm=rpm,
+            start_deg=settings.phase_deg,
+            start_ns=settings.start_ns,
+        )
+        row = self._spec.row
+        span = _SPANS_DEG.get(settings.model, _SPAN_DEG)
+        elevation = np.round(np.linspace(*span, row.channels), 3).tolist()
+        azimuth = np.round(np.linspace(-4.0, 4.0, row.channels), 3).tolist()
+        self._beams: Beams = Angles(elevation, azimuth)
+        self.files = LidarFiles("csv", angles_csv(elevation, azimuth))
+        self._has_mirrors = settings.model == "AT128"
+        if self._has_mirrors:
+            mirrors = MirrorAngles(_MIRROR_STARTS_DEG, elevation, azimuth)
+            self._beams = mirrors
+            self.files = LidarFiles("dat", mirrors.dat())
+        self.rig_model = ""
+        self.topics = {DATA_PORT: PacketTopic("hesai_packets", _TYPE)}
+        self.imu: ImuUnit | None = None
+        self._columns = _CHUNK_PACKETS * self._spec.groups
+        self.chunk_s = float(row.step_ns * self._columns) / NS_PER_S
+
+    def shots(self, chunk: int) -> Shots:
+        """Rays of the columns of a chunk."""
+        spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
+        time_ns = firing_times_ns(spec, self._columns)
+        fired = fires(spec, self._columns)
+        first_ns = np.where(fired, time_ns, time_ns.max()).min(axis=1)
+        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
+        direction = directions(spec, self._beams, self._columns)
+        if self._has_mirrors:
+            # The middle of the field is at twice 60 degrees of the mirror.
+            azimuth = np.arctan2(direction[..., 0], direction[..., 1]) / RAD_PER_DEG % 360.0
+            fired = fired & (np.abs(azimuth - 120.0) <= _HALF_VIEW_DEG)
+        return Shots(first_ns, delay_s, np.zeros((1, 1, 3)), direction, fired)
+
+    def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
+        """Packets of a chunk."""
+        spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
+        counts = whole_counts(distance_m, spec.row.unit_mm / 1000.0, _LARGEST, None)
+        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
+        shape = (*counts.shape, spec.returns)
+        payloads = encode_packets(
+            spec,
+            np.broadcast_to(counts[..., None], shape),
+            np.broadcast_to(level[..., None], shape),
+        )
+        last_ns = firing_times_ns(spec, self._columns).reshape(_CHUNK_PACKETS, -1).max(axis=1)
+        ready_ns = np.maximum(last_ns, packet_times_ns(spec, _CHUNK_PACKETS)).tolist()
+        return [Sent(at, DATA_PORT, one) for at, one in zip(ready_ns, payloads, strict=True)]
+
+    def imu_packets(
+        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
+    ) -> list[Sent]:
+        """None: its IMU is not supported."""
+        return []

@@ -1,0 +1,125 @@
+"""A simulated ROBOSENSE: rays of its firing rounds, point and device packets.
+
+Source: docs/sources/robosense.md sections 1 to 7, by way of the encoder.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.lidar.simulated import (
+    ImuUnit,
+    LidarFiles,
+    LidarModel,
+    LidarSettings,
+    PacketTopic,
+    Sent,
+    Shots,
+    whole_counts,
+)
+from mlbatch.sensors.robosense.encode import (
+    RobosenseSpec,
+    advanced,
+    difop,
+    directions,
+    fan,
+    firing_times_ns,
+    msop,
+    origins,
+)
+from mlbatch.sensors.robosense.encode_models import MODELS as ROWS
+from mlbatch.units import NS_PER_S
+
+MSOP_PORT = 6699
+DIFOP_PORT = 7788
+_DIFOP_NS = NS_PER_S // 10
+_LARGEST = 65535
+# Airy: two bits of a range are flags (section 4).
+_AIRY_FLAG = 0x4000
+_AIRY_LARGEST = 0x3FFF
+_CHUNK_PACKETS = 60
+_TYPE = "rslidar_msg/RslidarPacket"
+# Rows for packets that name their model a byte earlier, and other kinds of one model.
+_EARLY = ", early type"
+
+MODELS = tuple(
+    LidarModel(name, tuple(mode for mode in row.modes), (10, 5, 20))
+    for name, row in ROWS.items()
+    if not name.endswith(_EARLY)
+)
+
+
+def simulated(settings: LidarSettings) -> SimulatedRobosense:
+    """Return the lidar."""
+    return SimulatedRobosense(settings)
+
+
+class SimulatedRobosense:
+    """Firing rounds follow each other without a gap."""
+
+    def __init__(self, settings: LidarSettings) -> None:
+        """Choose the encoder's specification of the unit, and its angles."""
+        self._spec = RobosenseSpec(
+            settings.model,
+            settings.mode,
+            rpm=settings.rate_hz * 60,
+            start_deg=settings.phase_deg,
+            start_ns=settings.start_ns,
+            serial=f"{settings.serial:012d}"[-12:],
+        )
+        self._angles = fan(self._spec)
+        self.rig_model = ""
+        self.files = LidarFiles()
+        self.topics = {
+            MSOP_PORT: PacketTopic("rslidar_packets", _TYPE),
+            DIFOP_PORT: PacketTopic("rslidar_packets", _TYPE, flag=1),
+        }
+        self.imu: ImuUnit | None = None
+        self._columns = np.arange(round(_CHUNK_PACKETS * self._spec.columns_per_packet))
+        self.chunk_s = len(self._columns) * self._spec.round_ns / NS_PER_S
+        is_airy = settings.model.startswith("Airy")
+        self._flag = _AIRY_FLAG if is_airy else 0
+        self._largest = _AIRY_LARGEST if is_airy else _LARGEST
+
+    def shots(self, chunk: int) -> Shots:
+        """Rays of the columns of a chunk."""
+        spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
+        time_ns = firing_times_ns(spec, self._columns)
+        first_ns = time_ns.min(axis=1)
+        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
+        direction = directions(spec, self._angles, self._columns)
+        return Shots(first_ns, delay_s, origins(spec, self._columns), direction)
+
+    def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
+        """Packets of a chunk, and device packets of the same time."""
+        spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
+        # Receive times are those of the simulation.
+        spec = replace(spec, latency_ns=0)
+        counts = whole_counts(distance_m, spec.range_unit_m, self._largest, None)
+        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
+        shape = (*counts.shape, spec.returns)
+        payloads = msop(
+            spec,
+            np.broadcast_to(counts[..., None] + self._flag, shape),
+            np.broadcast_to(level[..., None], shape),
+        )
+        data = [Sent(at, MSOP_PORT, payload) for at, payload in payloads]
+        return data + self._device_packets(chunk)
+
+    def imu_packets(
+        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
+    ) -> list[Sent]:
+        """None: its IMU is not supported."""
+        return []
+
+    def _device_packets(self, chunk: int) -> list[Sent]:
+        chunk_ns = len(self._columns) * self._spec.round_ns
+        begin_ns = chunk * chunk_ns
+        first = -(-begin_ns // _DIFOP_NS) * _DIFOP_NS
+        times = range(
+            self._spec.start_ns + first, self._spec.start_ns + begin_ns + chunk_ns, _DIFOP_NS
+        )
+        return [Sent(at, DIFOP_PORT, difop(self._spec, self._angles, time_ns=at)) for at in times]

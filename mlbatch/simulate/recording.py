@@ -1,0 +1,334 @@
+"""Writes a simulated recording: packets of all lidars in the order of arrival, and ground truth.
+
+Time advances in steps; a step writes what is received before every later packet, so that memory
+does not depend on the duration.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from mlbatch.errors import UsageError
+from mlbatch.frames.transforms import quaternion, rpy_deg
+from mlbatch.simulate.containers import (
+    MCAP,
+    PCAP,
+    SUFFIXES,
+    Bag,
+    McapFile,
+    PcapFile,
+    SqliteFile,
+)
+from mlbatch.simulate.lidar_stream import LidarStream, Received, SensorClock, with_errors
+from mlbatch.simulate.messages import (
+    TF,
+    PacketMessages,
+    Stamped,
+    imu_message,
+    odometry_message,
+    text_message,
+    transform_message,
+)
+from mlbatch.simulate.scenario import Scenario
+from mlbatch.simulate.trajectory import Poses
+from mlbatch.units import NS_PER_S
+from mlbatch.writers.atomic import Output, discard, export_errors, prepare
+
+_STEP_S = 0.1
+# From an IMU sample to its message.
+_IMU_LATENCY_NS = 500_000
+# The streams of random numbers of lidars are numbered from 1.
+_RANDOM_OF_IMU = 1_000_000
+_RANK_OF_TRUTH = -2
+_RANK_OF_IMU = -1
+
+
+@dataclass(frozen=True, slots=True)
+class LidarFigures:
+    """What a lidar of the recording did; packets: lost ones included."""
+
+    name: str
+    shots: int
+    returns: int
+    packets: int
+    lost: int
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures of a recording; files: all that were written, the recording first."""
+
+    lidars: tuple[LidarFigures, ...]
+    imu_samples: int
+    poses: int
+    files: tuple[Path, ...]
+
+
+def write_recording(scenario: Scenario, target: Path, *, overwrite: bool = False) -> Figures:
+    """Write the recording and its files; nothing has its final name before all are complete."""
+    if target.suffix not in SUFFIXES:
+        raise UsageError(
+            f"-o: expected a name that ends with {', '.join(SUFFIXES)}, found {target.name}; "
+            "choose one of these"
+        )
+    streams = [LidarStream(scenario, index) for index in range(len(scenario.lidars))]
+    texts = _side_files(scenario, streams, target)
+    truth = _with_suffix(target, "truth.tum")
+    samples = _with_suffix(target, "imu.csv")
+    paths = [target, truth, *texts, *([samples] if scenario.imu else [])]
+    outputs: list[Output] = []
+    try:
+        outputs.extend(prepare(path, overwrite, folder=False) for path in paths)
+        places = {one.target: one.partial for one in outputs}
+        with contextlib.ExitStack() as files, export_errors(target):
+            for path, content in texts.items():
+                places[path].write_bytes(content)
+            lines = files.enter_context(_text_file(places[truth]))
+            rows = files.enter_context(_text_file(places[samples])) if scenario.imu else None
+            run = _Run(scenario, streams, places[target], lines, rows, target.suffix)
+            run.write()
+        # The recording last: with it the others are complete.
+        for output in (*outputs[1:], outputs[0]):
+            output.publish()
+    except BaseException:
+        for output in outputs:
+            discard(output.target)
+        raise
+    return Figures(
+        tuple(
+            LidarFigures(one.plan.name, one.shots, one.returns, one.packets, one.lost)
+            for one in streams
+        ),
+        run.imu_samples,
+        run.poses,
+        tuple(paths),
+    )
+
+
+def _text_file(path: Path) -> IO[str]:
+    return path.open("w", encoding="utf-8", newline="\n")
+
+
+def _with_suffix(target: Path, suffix: str) -> Path:
+    return target.with_name(f"{target.stem}.{suffix}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Event:
+    """Something that is written when the host receives it; rank: order of equal times."""
+
+    host_ns: int
+    rank: int
+    write: Callable[[], None]
+
+
+class _Run:
+    """Simulates and writes in the order of arrival."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        streams: list[LidarStream],
+        path: Path,
+        truth: IO[str],
+        samples: IO[str] | None,
+        suffix: str,
+    ) -> None:
+        self._scenario = scenario
+        self._streams = streams
+        self._truth = truth
+        self._samples = samples
+        self._pcap = PcapFile(path) if suffix == PCAP else None
+        self._bag: Bag | None = None
+        if suffix != PCAP:
+            self._bag = McapFile(path) if suffix == MCAP else SqliteFile(path)
+        self._messages: dict[tuple[int, int], PacketMessages] = {}
+        for index, stream in enumerate(streams):
+            for port, topic in stream.lidar.topics.items():
+                self._messages[index, port] = PacketMessages(topic, stream.plan.name)
+        self.imu_samples = 0
+        self.poses = 0
+
+    def write(self) -> None:
+        """Write the whole recording."""
+        self._write_metadata()
+        if self._samples is not None:
+            self._samples.write("stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n")
+        waiting: list[_Event] = []
+        duration_s = self._scenario.duration_s
+        steps = max(1, math.ceil(round(duration_s / _STEP_S, 6)))
+        for step in range(steps):
+            is_last = step + 1 == steps
+            end_s = duration_s if is_last else (step + 1) * _STEP_S
+            for index, stream in enumerate(self._streams):
+                while stream.next_s < end_s:
+                    waiting += self._packets(index, stream)
+            waiting += self._inertial(end_s)
+            waiting += self._poses(end_s)
+            waiting.sort(key=lambda one: (one.host_ns, one.rank))
+            # Later steps receive nothing before their begin.
+            end_ns = self._scenario.start_ns + math.floor(end_s * NS_PER_S)
+            ready = sum(is_last or one.host_ns < end_ns for one in waiting)
+            for event in waiting[:ready]:
+                event.write()
+            del waiting[:ready]
+        self._close()
+
+    def _packets(self, index: int, stream: LidarStream) -> list[_Event]:
+        """Return the packets of the next chunk of a lidar."""
+        return [
+            _Event(one.host_ns, index, partial(self._write_packet, index, one))
+            for one in stream.receive()
+        ]
+
+    def _write_packet(self, index: int, one: Received) -> None:
+        if self._pcap is not None:
+            address = self._streams[index].plan.address
+            self._pcap.packet(one.host_ns, address, one.port, one.payload)
+        messages = self._messages.get((index, one.port))
+        if self._bag is not None and messages is not None:
+            data = messages.add(Stamped(one.host_ns, one.payload))
+            self._send(index, messages, one.host_ns, data)
+
+    def _send(self, index: int, messages: PacketMessages, host_ns: int, data: bytes | None) -> None:
+        if self._bag is not None and data is not None:
+            topic = f"/{self._streams[index].plan.name}/{messages.topic.name}"
+            self._bag.message(topic, messages.topic.message, host_ns, data)
+
+    def _inertial(self, end_s: float) -> list[_Event]:
+        """Return the samples of the body's IMU up to a time."""
+        plan = self._scenario.imu
+        if plan is None:
+            return []
+        until = math.ceil(round(end_s * plan.rate_hz, 6))
+        number = np.arange(self.imu_samples, until)
+        if not len(number):
+            return []
+        random = np.random.default_rng((self._scenario.seed, _RANDOM_OF_IMU, int(number[0])))
+        self.imu_samples = until
+        true_s = number / plan.rate_hz
+        force, rate = self._scenario.trajectory.inertial(true_s, plan.body_from_imu)
+        force, rate = with_errors(force, rate, plan.errors, random)
+        stamps = SensorClock(self._scenario.start_ns, plan.clock).sensor_ns(true_s).tolist()
+        host = self._scenario.start_ns + np.rint(true_s * NS_PER_S).astype(np.int64)
+        return [
+            _Event(
+                int(host[row]) + _IMU_LATENCY_NS,
+                _RANK_OF_IMU,
+                partial(
+                    self._write_sample,
+                    int(host[row]) + _IMU_LATENCY_NS,
+                    stamp,
+                    force[row].tolist(),
+                    rate[row].tolist(),
+                ),
+            )
+            for row, stamp in enumerate(stamps)
+        ]
+
+    def _write_sample(
+        self, host_ns: int, stamp_ns: int, force: list[float], rate: list[float]
+    ) -> None:
+        plan = self._scenario.imu
+        if plan is None or self._samples is None:
+            return
+        values = ",".join(f"{value:.9g}" for value in (*rate, *force))
+        self._samples.write(f"{stamp_ns},{values}\n")
+        if self._bag is not None:
+            data = imu_message(stamp_ns, plan.name, force, rate)
+            self._bag.message(plan.topic, "sensor_msgs/Imu", host_ns, data)
+
+    def _poses(self, end_s: float) -> list[_Event]:
+        """Return the poses of the ground truth up to a time; the last step includes its end."""
+        plan = self._scenario.truth
+        is_last = end_s >= self._scenario.duration_s
+        until = (
+            math.floor(round(end_s * plan.rate_hz, 6)) + 1
+            if is_last
+            else math.ceil(round(end_s * plan.rate_hz, 6))
+        )
+        number = np.arange(self.poses, until)
+        if not len(number):
+            return []
+        self.poses = until
+        true_s = number / plan.rate_hz
+        poses = self._scenario.trajectory.poses(true_s)
+        host = self._scenario.start_ns + np.rint(true_s * NS_PER_S).astype(np.int64)
+        return [
+            _Event(at, _RANK_OF_TRUTH, partial(self._write_pose, at, poses, row))
+            for row, at in enumerate(host.tolist())
+        ]
+
+    def _write_pose(self, host_ns: int, poses: Poses, row: int) -> None:
+        values = (*poses.position_m[row].tolist(), *quaternion(poses.rotation[row]).tolist())
+        text = " ".join(f"{value:.9f}" for value in values)
+        second, rest_ns = divmod(host_ns, NS_PER_S)
+        self._truth.write(f"{second}.{rest_ns:09d} {text}\n")
+        if self._bag is None:
+            return
+        plan = self._scenario.truth
+        is_transform = plan.topic == TF
+        encode = transform_message if is_transform else odometry_message
+        kind = "tf2_msgs/TFMessage" if is_transform else "nav_msgs/Odometry"
+        data = encode(host_ns, plan.frame, self._scenario.body_frame, poses, row)
+        self._bag.message(plan.topic, kind, host_ns, data)
+
+    def _write_metadata(self) -> None:
+        """Write the latched messages with the calibrations."""
+        if self._bag is None:
+            return
+        for stream in self._streams:
+            files = stream.lidar.files
+            if files.topic:
+                topic = f"/{stream.plan.name}/{files.topic}"
+                data = text_message(files.content.decode())
+                self._bag.message(topic, "std_msgs/String", self._scenario.start_ns, data, True)
+
+    def _close(self) -> None:
+        """Write the packets that wait for others, complete the file."""
+        if self._pcap is not None:
+            self._pcap.close()
+        if self._bag is not None:
+            for (index, _), messages in self._messages.items():
+                last_ns = messages.last_ns
+                self._send(index, messages, last_ns, messages.rest())
+            self._bag.close()
+
+
+def _side_files(scenario: Scenario, streams: list[LidarStream], target: Path) -> dict[Path, bytes]:
+    """Return the rig file and the calibrations of the lidars."""
+    found = {}
+    sensors = []
+    for plan, stream in zip(scenario.lidars, streams, strict=True):
+        files = stream.lidar.files
+        port = min(stream.lidar.topics)
+        where = f"{{source_ip: {plan.address}, port: {port}}}"
+        if target.suffix != PCAP:
+            where = f"{{topic: /{plan.name}/{stream.lidar.topics[port].name}}}"
+        lines = [f"  - name: {plan.name}", f"    stream: {where}"]
+        if stream.lidar.rig_model:
+            lines.append(f"    model: {stream.lidar.rig_model}")
+        if files.name:
+            path = _with_suffix(target, f"{plan.name}.{files.name}")
+            found[path] = files.content
+            lines.append(f"    metadata: {path.name}")
+        translation = ", ".join(f"{value:.9g}" for value in plan.body_from_sensor[:3, 3])
+        rotation = ", ".join(f"{value:.9g}" for value in rpy_deg(plan.body_from_sensor))
+        lines.append(
+            f"    extrinsics: {{translation_m: [{translation}], rotation_rpy_deg: [{rotation}]}}"
+        )
+        sensors += lines
+    head = [
+        f"# Rig of the simulated recording {target.name}.",
+        f"body_frame: {scenario.body_frame}",
+    ]
+    text = "\n".join([*head, "sensors:", *sensors]) + "\n"
+    return {_with_suffix(target, "rig.yaml"): text.encode(), **found}

@@ -1,0 +1,182 @@
+"""The motion of the body: smooth poses, their rates, and what an IMU feels; world frame, metres.
+
+Positions and yaw are natural cubic splines through waypoints; sway adds sinusoids to single
+coordinates. A standstill precedes them, and the speed then grows smoothly. Rotations are
+Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import F64Array
+from mlbatch.units import STANDARD_GRAVITY
+
+COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+# From standstill to full speed.
+RAMP_S = 1.0
+# Step of differences that give the angular acceleration.
+_STEP_S = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Sway:
+    """A sinusoid of one coordinate; amplitude: m or rad."""
+
+    coordinate: int
+    amplitude: float
+    frequency_hz: float
+    phase_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Poses at n times: rotation (n, 3, 3) world_from_body, position (n, 3), and rates.
+
+    velocity, acceleration: (n, 3) of the position, world frame; angular_velocity: (n, 3), body
+    frame, rad/s.
+    """
+
+    rotation: F64Array
+    position_m: F64Array
+    velocity: F64Array
+    acceleration: F64Array
+    angular_velocity: F64Array
+
+
+class Spline:
+    """A natural cubic spline through values (k, m) at increasing knots (k,)."""
+
+    def __init__(self, knots: F64Array, values: F64Array) -> None:
+        """Compute the second derivatives; one knot: a constant."""
+        self.knots = knots
+        self.values = values
+        count = len(knots)
+        self.second = np.zeros_like(values)
+        if count > 2:
+            step = np.diff(knots)
+            slope = np.diff(values, axis=0) / step[:, None]
+            matrix = np.diag(2.0 * (step[:-1] + step[1:]))
+            matrix += np.diag(step[1:-1], 1) + np.diag(step[1:-1], -1)
+            self.second[1:-1] = np.linalg.solve(matrix, 6.0 * np.diff(slope, axis=0))
+
+    def __call__(self, at: F64Array) -> tuple[F64Array, F64Array, F64Array]:
+        """Return values and two derivatives, (n, m) each; constant outside the knots."""
+        if len(self.knots) == 1:
+            value = np.repeat(self.values, len(at), axis=0)
+            return value, np.zeros_like(value), np.zeros_like(value)
+        inside = np.clip(at, self.knots[0], self.knots[-1])
+        i = np.clip(np.searchsorted(self.knots, inside, "right") - 1, 0, len(self.knots) - 2)
+        step = (self.knots[i + 1] - self.knots[i])[:, None]
+        b = (inside - self.knots[i])[:, None] / step
+        a = 1.0 - b
+        low, high = self.values[i], self.values[i + 1]
+        low2, high2 = self.second[i], self.second[i + 1]
+        bend = ((a**3 - a) * low2 + (b**3 - b) * high2) * step**2 / 6.0
+        value = a * low + b * high + bend
+        first = (high - low) / step
+        first += ((3 * b**2 - 1) * high2 - (3 * a**2 - 1) * low2) * step / 6.0
+        moving = (at == inside)[:, None]
+        return value, np.where(moving, first, 0.0), np.where(moving, a * low2 + b * high2, 0.0)
+
+
+class Trajectory:
+    """Poses of the body at any time since the start, s."""
+
+    def __init__(self, path: Spline, sway: Sequence[Sway] = (), standstill_s: float = 0.0) -> None:
+        """path: (x, y, z, yaw) against the time since the standstill."""
+        self._path = path
+        self._sway = tuple(sway)
+        self._standstill_s = standstill_s
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last waypoint; after it the body stands."""
+        ramp_s = 0.5 * RAMP_S if self._standstill_s > 0.0 else 0.0
+        return self._standstill_s + ramp_s + float(self._path.knots[-1])
+
+    def poses(self, time_s: F64Array) -> Poses:
+        """Return the poses at times (n,)."""
+        value, first, second = self._coordinates(time_s)
+        return Poses(
+            _rotations(value[:, 3:]),
+            value[:, :3],
+            first[:, :3],
+            second[:, :3],
+            _body_rates(value[:, 3:], first[:, 3:]),
+        )
+
+    def inertial(self, time_s: F64Array, body_from_imu: F64Array) -> tuple[F64Array, F64Array]:
+        """Return specific force and angular velocity (n, 3), frame of an IMU, m/s2 and rad/s."""
+        poses = self.poses(time_s)
+        later = self.poses(time_s + _STEP_S).angular_velocity
+        earlier = self.poses(time_s - _STEP_S).angular_velocity
+        rate = poses.angular_velocity
+        change = (later - earlier) / (2.0 * _STEP_S)
+        arm = body_from_imu[:3, 3]
+        felt = poses.acceleration + np.array([0.0, 0.0, STANDARD_GRAVITY])
+        force = np.einsum("nji,nj->ni", poses.rotation, felt)
+        force += np.cross(change, arm) + np.cross(rate, np.cross(rate, arm))
+        return force @ body_from_imu[:3, :3], rate @ body_from_imu[:3, :3]
+
+    def _coordinates(self, time_s: F64Array) -> tuple[F64Array, F64Array, F64Array]:
+        """Return x, y, z, roll, pitch, yaw (n, 6) and two derivatives by time."""
+        own, speed, gain = _ramp(time_s, self._standstill_s)
+        parts = [np.zeros((len(time_s), 6)) for _ in range(3)]
+        for part, path in zip(parts, self._path(own), strict=True):
+            part[:, :3] = path[:, :3]
+            part[:, 5] = path[:, 3]
+        for sway in self._sway:
+            pulse = 2.0 * math.pi * sway.frequency_hz
+            phase = pulse * own + sway.phase_rad
+            start = math.sin(sway.phase_rad)
+            parts[0][:, sway.coordinate] += sway.amplitude * (np.sin(phase) - start)
+            parts[1][:, sway.coordinate] += sway.amplitude * pulse * np.cos(phase)
+            parts[2][:, sway.coordinate] -= sway.amplitude * pulse**2 * np.sin(phase)
+        value, first, second = parts
+        return (
+            value,
+            first * speed[:, None],
+            second * speed[:, None] ** 2 + first * gain[:, None],
+        )
+
+
+def _ramp(time_s: F64Array, standstill_s: float) -> tuple[F64Array, F64Array, F64Array]:
+    """Return the time along the path, its rate and the change of that; rate 3 u^2 - 2 u^3."""
+    if standstill_s <= 0.0:
+        return time_s, np.ones_like(time_s), np.zeros_like(time_s)
+    u = np.clip((time_s - standstill_s) / RAMP_S, 0.0, 1.0)
+    own = RAMP_S * (u**3 - 0.5 * u**4) + np.maximum(time_s - standstill_s - RAMP_S, 0.0)
+    return own, 3.0 * u**2 - 2.0 * u**3, 6.0 * (u - u**2) / RAMP_S
+
+
+def _rotations(rpy_rad: F64Array) -> F64Array:
+    """Return rotations (n, 3, 3) of roll, pitch, yaw (n, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad).T, np.sin(rpy_rad).T
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def _body_rates(rpy_rad: F64Array, change: F64Array) -> F64Array:
+    """Return angular velocities (n, 3), body frame, of the changes of roll, pitch, yaw (n, 3)."""
+    (cr, cp, _), (sr, sp, _) = np.cos(rpy_rad).T, np.sin(rpy_rad).T
+    roll, pitch, yaw = change.T
+    rates = (roll - yaw * sp, pitch * cr + yaw * cp * sr, -pitch * sr + yaw * cp * cr)
+    return np.stack(rates, axis=-1)
+
+
+def path_from_waypoints(time_s: F64Array, xyz_m: F64Array, yaw_rad: F64Array | None) -> Spline:
+    """Return the spline (x, y, z, yaw) through waypoints; without yaw, the body looks ahead."""
+    if yaw_rad is None:
+        _, ahead, _ = Spline(time_s, xyz_m)(time_s)
+        moves = np.hypot(ahead[:, 0], ahead[:, 1]) > 1e-9
+        yaw_rad = np.where(moves, np.arctan2(ahead[:, 1], ahead[:, 0]), 0.0)
+    return Spline(time_s, np.column_stack([xyz_m, np.unwrap(yaw_rad)]))
