@@ -98,7 +98,7 @@ class LidarStream:
         chosen = np.arange(shape[0] * shape[1])
         if shots.fires is not None:
             chosen = np.flatnonzero(shots.fires.ravel())
-        rays = Rays(
+        rays = Rays.of(
             origin.reshape(-1, 3)[chosen], direction.reshape(-1, 3)[chosen], time_s.ravel()[chosen]
         )
         distance_m = np.full(shape[0] * shape[1], np.inf)

@@ -2,129 +2,145 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 
-# A ray is marched until it is this close above the ground, then the cell's plane is met.
-_CLOSE_M = 2e-3
 _MOST_STEPS = 400
-# Steps of the final refinement, each on the cell below the ray.
-_REFINEMENTS = 3
+_BLOCK_CELLS = 4
+# A step ends a little behind a border.
+_INTO_M = 1e-9
+_TINY = 1e-300
+# Finished rays are removed when fewer than this share are left.
+_COMPACT = 0.8
 _OCTAVES = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Terrain:
     """Heights (n, n), m, at x = y = -half_m, -half_m + cell_m, ..., half_m; none outside."""
 
-    height_m: F64Array
-    cell_m: float
-    half_m: float
-    # (cells, 4): height a + b u + c v + d u v at (u, v) in [0, 1) of a cell.
-    _cells: F64Array = field(init=False)
-    _slope: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Compute the cells and the largest slope."""
-        h = self.height_m
+    def __init__(self, height_m: F64Array, cell_m: float, half_m: float) -> None:
+        """Compute the cells, and the highest point of blocks of cells."""
+        self.half_m = half_m
+        self.cell_m = cell_m
+        self.low_m = float(height_m.min())
+        self.high_m = float(height_m.max())
+        self._count = len(height_m) - 1
+        h = height_m
         a, b, c, d = h[:-1, :-1], h[1:, :-1], h[:-1, 1:], h[1:, 1:]
-        cells = np.stack([a, b - a, c - a, a + d - b - c], axis=-1).reshape(-1, 4)
-        along = np.abs(np.diff(h, axis=0)).max()
-        across = np.abs(np.diff(h, axis=1)).max()
-        object.__setattr__(self, "_cells", np.ascontiguousarray(cells))
-        object.__setattr__(self, "_slope", float(np.hypot(along, across)) / self.cell_m)
+        # Height a + b u + c v + d u v at (u, v) in [0, 1) of a cell.
+        cells = np.stack([a, b - a, c - a, a + d - b - c], axis=0)
+        self._cells = np.ascontiguousarray(cells.reshape(4, -1))
+        highest = np.maximum(np.maximum(a, b), np.maximum(c, d))
+        self._blocks = -(-self._count // _BLOCK_CELLS)
+        self._block_m = _BLOCK_CELLS * cell_m
+        self._block_high = _block_maximum(highest)
 
     def height(self, xy_m: F64Array) -> F64Array:
         """Return heights (n,) at points (n, 2); of the nearest cell outside."""
-        return self._below(xy_m[:, 0], xy_m[:, 1])
+        cell, u, v, _ = self._cell(xy_m[:, 0], xy_m[:, 1])
+        a, b, c, d = self._cells.take(cell, axis=1)
+        height: F64Array = a + b * u + (c + d * u) * v
+        return height
 
     def cast(self, origin_m: F64Array, direction: F64Array, limit_m: F64Array) -> F64Array:
-        """Return distances (n,) along rays (n, 3) to the ground, inf for none before limit_m (n,).
+        """Return distances (n,) along rays (3, n) to the ground, inf for none before limit_m (n,).
 
-        A step is so short that no slope of the field can rise above the ray within it, so that the
-        first crossing is found. Source: sphere tracing, Hart 1996, for height fields.
+        A ray above all of a block of cells is moved to the border of the block, or to the height
+        of its highest point; other rays are moved from cell to cell, and meet the surface of one
+        in closed form (a quadratic equation). Rays with more than _MOST_STEPS steps have none.
         """
         found = np.full(len(limit_m), np.inf)
-        low = float(self.height_m.min())
-        high = float(self.height_m.max())
-        begin, end = self._within(origin_m, direction, limit_m)
-        dz = direction[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            into = (high - origin_m[:, 2]) / dz
-            out_of = (low - origin_m[:, 2]) / dz
-        begin = np.where(dz < 0.0, np.maximum(begin, into), begin)
-        end = np.where(dz < 0.0, np.minimum(end, out_of + _CLOSE_M), np.minimum(end, into))
-        level = np.abs(dz) < 1e-12
-        end = np.where(level, np.where(origin_m[:, 2] <= high, limit_m, -1.0), end)
-        row = np.flatnonzero(begin < end)
-        flat = np.hypot(direction[:, 0], direction[:, 1])
-        ox, oy, oz = (np.ascontiguousarray(part) for part in origin_m[row].T)
-        dx, dy, dz = (np.ascontiguousarray(part) for part in direction[row].T)
-        # Fastest approach of the ground per metre of the ray.
-        inverse = 1.0 / np.maximum(self._slope * flat[row] - dz, 1e-9)
-        at, last = begin[row], end[row]
+        begin, end = self._part_above_grid(origin_m, direction, limit_m)
+        rows = np.flatnonzero(begin < end)
+        rays = np.concatenate([origin_m, direction, begin[None], end[None]]).take(rows, axis=1)
         for _ in range(_MOST_STEPS):
-            gap = oz + at * dz - self._below(ox + at * dx, oy + at * dy)
-            near = gap <= _CLOSE_M
-            found[row[near]] = at[near]
-            at = at + gap * inverse
-            keep = np.flatnonzero(~near & (at < last))
-            if not len(keep):
+            if not len(rows):
                 break
-            row = row[keep]
-            ox, oy, oz, dx, dy, dz = (part[keep] for part in (ox, oy, oz, dx, dy, dz))
-            inverse, at, last = inverse[keep], at[keep], last[keep]
-        return self._refined(found, origin_m, direction)
-
-    def _refined(self, found: F64Array, origin_m: F64Array, direction: F64Array) -> F64Array:
-        """Return distances at the surface of rays that are a little above it."""
-        row = np.flatnonzero(np.isfinite(found))
-        o, d, at = origin_m[row], direction[row], found[row]
-        for _ in range(_REFINEMENTS):
-            x, y = o[:, 0] + at * d[:, 0], o[:, 1] + at * d[:, 1]
-            cell, u, v = self._cell(x, y)
-            a, b, c, e = self._cells[cell].T
-            gap = o[:, 2] + at * d[:, 2] - (a + b * u + c * v + e * u * v)
-            rise = ((b + e * v) * d[:, 0] + (c + e * u) * d[:, 1]) / self.cell_m
-            # Almost parallel rays stay where they are: they are close enough.
-            closing = rise - d[:, 2]
-            at = np.where(closing > 1e-3, at + gap / np.maximum(closing, 1e-3), at)
-        found[row] = at
+            ox, oy, oz, dx, dy, dz, at, last = rays
+            x = ox + at * dx
+            y = oy + at * dy
+            z = oz + at * dz
+            cell, u, v, highest = self._cell(x, y)
+            is_above = z > highest
+            border = self._border(is_above, ((x, dx), (y, dy)))
+            meets = self._meets(cell, u, v, z, rays[3:6])
+            done = np.flatnonzero(~is_above & (meets <= border))
+            found[rows[done]] = at[done] + meets[done]
+            with np.errstate(divide="ignore"):
+                down_to = np.where(is_above & (dz < 0.0), (highest - z) / dz, np.inf)
+            at += np.minimum(border, down_to) + _INTO_M
+            last[done] = -1.0
+            keep = np.flatnonzero(at < last)
+            if len(keep) < _COMPACT * len(rows):
+                rows = rows[keep]
+                rays = rays.take(keep, axis=1)
         return found
 
-    def _within(
+    def _meets(
+        self, cell: I64Array, u: F64Array, v: F64Array, z: F64Array, direction: F64Array
+    ) -> F64Array:
+        """Return distances of rays at height z to the surface of a cell, inf for none.
+
+        Height above the surface: g + f t + e t t at distance t; the first root, for g > 0.
+        """
+        dx, dy, dz = direction
+        a, b, c, d = self._cells.take(cell, axis=1)
+        du = dx * (1.0 / self.cell_m)
+        dv = dy * (1.0 / self.cell_m)
+        gap = z - (a + b * u + (c + d * u) * v)
+        f = dz - (b + d * v) * du - (c + d * u) * dv
+        e = -d * du * dv
+        with np.errstate(invalid="ignore", divide="ignore"):
+            divisor = np.sqrt(f * f - 4.0 * e * gap) - f
+            first = np.where(divisor > 0.0, 2.0 * gap / divisor, np.inf)
+        return np.where(gap <= 0.0, 0.0, first)
+
+    def _part_above_grid(
         self, origin_m: F64Array, direction: F64Array, limit_m: F64Array
     ) -> tuple[F64Array, F64Array]:
-        """Return the part of each ray above the grid."""
+        """Return begins and ends of the parts of rays that may meet the ground."""
         begin = np.zeros(len(limit_m))
         end = limit_m.copy()
-        for axis in range(2):
-            step = direction[:, axis]
-            inverse = 1.0 / np.where(np.abs(step) < 1e-300, 1e-300, step)
-            low = (-self.half_m - origin_m[:, axis]) * inverse
-            high = (self.half_m - origin_m[:, axis]) * inverse
-            begin = np.maximum(begin, np.minimum(low, high))
-            end = np.minimum(end, np.maximum(low, high))
+        sides = ((-self.half_m, self.half_m), (-self.half_m, self.half_m), (-np.inf, self.high_m))
+        for (low, high), place, step in zip(sides, origin_m, direction, strict=True):
+            inverse = 1.0 / np.where(step == 0.0, _TINY, step)
+            first = (low - place) * inverse
+            second = (high - place) * inverse
+            np.maximum(begin, np.minimum(first, second), out=begin)
+            np.minimum(end, np.maximum(first, second), out=end)
         return begin, end
 
-    def _below(self, x: F64Array, y: F64Array) -> F64Array:
-        """Return the heights of the ground (n,) at places (n,)."""
-        cell, u, v = self._cell(x, y)
-        parts = self._cells[cell]
-        below: F64Array = parts[:, 0] + parts[:, 1] * u + (parts[:, 2] + parts[:, 3] * u) * v
-        return below
+    def _border(self, is_above: BoolArray, axes: tuple[tuple[F64Array, F64Array], ...]) -> F64Array:
+        """Return distances to the borders of blocks, for rays above them, or of cells.
 
-    def _cell(self, x: F64Array, y: F64Array) -> tuple[I64Array, F64Array, F64Array]:
-        """Return the cells of places, and where in them these are."""
-        count = len(self.height_m) - 1
+        axes: places and steps of the rays in x and y.
+        """
+        scale = np.where(is_above, 1.0 / self._block_m, 1.0 / self.cell_m)
+        border = np.full(len(scale), np.inf)
+        for place, step in axes:
+            across = (place + self.half_m) * scale
+            ahead = np.floor(across) + (step > 0.0) - across
+            speed = step * scale
+            inverse = 1.0 / np.where(speed == 0.0, _TINY, speed)
+            np.minimum(border, np.abs(ahead * inverse), out=border)
+        return border
+
+    def _cell(self, x: F64Array, y: F64Array) -> tuple[I64Array, F64Array, F64Array, F64Array]:
+        """Return the cells of places, where in them these are, and the highest of the block."""
         across = (x + self.half_m) * (1.0 / self.cell_m)
         up = (y + self.half_m) * (1.0 / self.cell_m)
-        i = np.clip(across.astype(np.int32), 0, count - 1)
-        j = np.clip(up.astype(np.int32), 0, count - 1)
-        return i * count + j, across - i, up - j
+        i = np.minimum(np.maximum(across.astype(np.int64), 0), self._count - 1)
+        j = np.minimum(np.maximum(up.astype(np.int64), 0), self._count - 1)
+        block = (i // _BLOCK_CELLS) * self._blocks + j // _BLOCK_CELLS
+        return i * self._count + j, across - i, up - j, self._block_high[block]
+
+
+def _block_maximum(values: F64Array) -> F64Array:
+    """Return the largest value of each block of cells, one after the other."""
+    starts = np.arange(0, len(values), _BLOCK_CELLS)
+    rows = np.maximum.reduceat(values, starts, axis=0)
+    return np.maximum.reduceat(rows, starts, axis=1).ravel()
 
 
 def rough_terrain(

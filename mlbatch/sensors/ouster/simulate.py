@@ -101,8 +101,8 @@ class SimulatedOuster:
         imu_mm = np.array(self._spec.imu_to_sensor_mm).reshape(4, 4)
         imu_mm[:3, 3] *= M_PER_MM
         self.imu = ImuUnit(_IMU_HZ, imu_mm) if settings.imu else None
-        # An eighth of a revolution, whole packets for all numbers of columns.
-        self._chunk_columns = settings.columns // 8
+        # A quarter of a revolution, whole packets for all numbers of columns.
+        self._chunk_columns = settings.columns // 4
         self._per_second = settings.columns * settings.rate_hz
         self.chunk_s = self._chunk_columns / self._per_second
         self._start_ns = settings.start_ns
