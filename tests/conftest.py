@@ -25,6 +25,7 @@ LONG = (
     "cli/test_bench.py",
     "clocks/test_simulated.py",
     "contract/test_models.py",
+    "simulate/test_every_model.py",
 )
 
 

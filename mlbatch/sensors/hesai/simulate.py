@@ -44,13 +44,17 @@ _MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
 _HALF_VIEW_DEG = 60.0
 _TYPE = "hesai_ros_driver/UdpFrame"
 
+
+def _modes(name: str) -> tuple[str, ...]:
+    """Return the return modes; JT16 has one, and seven blocks cannot have pairs of returns."""
+    modes = tuple(_MODES)
+    if name == "JT16":
+        return modes[:1]
+    return modes[:2] if ROWS[name].blocks % 2 else modes
+
+
 MODELS = tuple(
-    LidarModel(
-        name,
-        ("strongest",) if name == "JT16" else tuple(_MODES),
-        (10,) if name == "AT128" else (10, 5, 20),
-    )
-    for name in ROWS
+    LidarModel(name, _modes(name), (10,) if name == "AT128" else (10, 5, 20)) for name in ROWS
 )
 
 

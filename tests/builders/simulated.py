@@ -1,0 +1,157 @@
+"""Simulated recordings in tests: scenarios, ground truth, distances of points from the scene.
+
+Distances are computed here in closed form from the surfaces, poses from the TUM file: nothing of
+the ray casting or of the trajectory is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import mlbatch
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.outputs.scan import Scan
+from mlbatch.simulate.recording import write_recording
+from mlbatch.simulate.scenario import Scenario, read_scenario
+from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems
+
+# A room with things in it, one of which moves; the rig turns and moves at 1 m/s.
+MOTION = """\
+motion:
+  waypoints:
+    - [0, -1.0, -0.5, 1.2, 10]
+    - [1, 0.0, -0.3, 1.25, 60]
+    - [2, 0.8, 0.4, 1.2, 140]
+    - [3, 0.2, 1.2, 1.15, 200]
+  sway:
+    - {coordinate: roll, amplitude: 4, frequency_hz: 1.3}
+    - {coordinate: pitch, amplitude: 3, frequency_hz: 0.9, phase_deg: 50}
+"""
+ROOM = """\
+scene:
+  boxes:
+    - {centre_m: [0, 0, 2], size_m: [14, 11, 4], reflectivity: 90}
+    - {centre_m: [4, 2, 0.6], size_m: [1.5, 1.0, 1.2], yaw_deg: 20, reflectivity: 40}
+    - {centre_m: [-4, -4, 1], size_m: [2, 0.8, 2], velocity_mps: [2.5, 0.4, 0], reflectivity: 130}
+  stems:
+    - {base_m: [3, -3, 0], height_m: 3, radius_m: 0.3, reflectivity: 150}
+    - {base_m: [-3, 3, 0], height_m: 2.5, radius_m: 0.4, top_radius_m: 0.1, reflectivity: 70}
+  rectangles:
+    - {corner_m: [5, -4, 0], along_m: [1, 0, 1], across_m: [0, 3, 0], reflectivity: 60}
+"""
+HEAD = """\
+schema: mlbatch.scenario/1
+seed: 7
+duration_s: {duration}
+truth: {{rate_hz: 1000}}
+"""
+
+
+def scenario_text(
+    sensors: str, *, scene: str = ROOM, motion: str = MOTION, duration: float = 0.25, more: str = ""
+) -> str:
+    """A scenario; sensors: lines of the list."""
+    return HEAD.format(duration=duration) + motion + scene + more + "sensors:\n" + sensors
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A scenario and its recording."""
+
+    scenario: Scenario
+    path: Path
+
+    @property
+    def rig(self) -> Path:
+        """The rig file next to it."""
+        return self.path.with_name(f"{self.path.stem}.rig.yaml")
+
+    @property
+    def truth(self) -> Path:
+        """The ground truth next to it."""
+        return self.path.with_name(f"{self.path.stem}.truth.tum")
+
+    def scans(self, **options: str | bool) -> list[Scan]:
+        """What convert makes of it."""
+        found = mlbatch.scans(self.path, rig=self.rig, keep_partial=True, **options)  # type: ignore[arg-type]
+        return list(found)
+
+
+def record(folder: Path, text: str, suffix: str = "pcap") -> Recorded:
+    """Simulate a scenario."""
+    source = folder / "scenario.yaml"
+    source.write_text(text, encoding="utf-8")
+    scenario = read_scenario(str(source))
+    path = folder / f"drive.{suffix}"
+    write_recording(scenario, path)
+    return Recorded(scenario, path)
+
+
+def read_tum(path: Path) -> tuple[I64Array, F64Array]:
+    """Times (n,), ns, and rows (n, 7): x, y, z, qx, qy, qz, qw."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    seconds = [line[0].split(".") for line in lines]
+    time_ns = np.array([int(one) * 10**9 + int(rest) for one, rest in seconds])
+    return time_ns, np.array([[float(word) for word in line[1:]] for line in lines])
+
+
+def at_true_poses(points_m: F64Array, time_ns: F64Array, truth: Path) -> F64Array:
+    """Points (n, 3) of the body frame in the world; time_ns: (n,) true time of each."""
+    stamps, rows = read_tum(truth)
+    after = np.clip(np.searchsorted(stamps, time_ns), 1, len(stamps) - 1)
+    share = ((time_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1]))[:, None]
+    first, second = rows[after - 1], rows[after].copy()
+    second[:, 3:] *= np.sign((first[:, 3:] * second[:, 3:]).sum(axis=1))[:, None]
+    pose = first * (1 - share) + second * share
+    vector = pose[:, 3:6] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
+    scalar = (pose[:, 6] / np.linalg.norm(pose[:, 3:], axis=1))[:, None]
+    twice = 2 * np.cross(vector, points_m)
+    turned: F64Array = points_m + scalar * twice + np.cross(vector, twice)
+    return turned + pose[:, :3]
+
+
+def distance_to_scene(scene: Scene, points_m: F64Array, time_s: F64Array) -> F64Array:
+    """Distances (n,) of points (n, 3) from the nearest surface at times (n,)."""
+    found = [np.full(len(points_m), np.inf)]
+    for kind in scene.kinds:
+        for row in range(len(kind.reflectivity)):
+            if isinstance(kind, Boxes):
+                found.append(_to_box(kind, row, points_m, time_s))
+            elif isinstance(kind, Stems):
+                found.append(_to_stem(kind, row, points_m))
+            else:
+                found.append(_to_rectangle(kind, row, points_m))
+    if scene.terrain is not None:
+        # The vertical distance is never less than the distance.
+        found.append(np.abs(points_m[:, 2] - scene.terrain.height(points_m[:, :2])))
+    return np.asarray(np.min(found, axis=0))
+
+
+def _to_box(kind: Boxes, row: int, points_m: F64Array, time_s: F64Array) -> F64Array:
+    since = time_s % kind.repeat_s[row] if np.isfinite(kind.repeat_s[row]) else time_s
+    local = points_m - kind.centre_m[row] - since[:, None] * kind.velocity_mps[row]
+    cosine, sine = np.cos(kind.yaw_rad[row]), np.sin(kind.yaw_rad[row])
+    turned = local @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    past = np.abs(turned) - kind.size_m[row] / 2
+    outside = np.linalg.norm(np.maximum(past, 0), axis=1)
+    return np.asarray(np.where(outside > 0, outside, -past.max(axis=1)))
+
+
+def _to_stem(kind: Stems, row: int, points_m: F64Array) -> F64Array:
+    local = points_m - kind.base_m[row]
+    height = kind.height_m[row]
+    share = np.clip(local[:, 2] / height, 0, 1)
+    radius = kind.radius_m[row] + share * (kind.top_radius_m[row] - kind.radius_m[row])
+    aside = np.hypot(local[:, 0], local[:, 1]) - radius
+    return np.hypot(aside, local[:, 2] - share * height)
+
+
+def _to_rectangle(kind: Rectangles, row: int, points_m: F64Array) -> F64Array:
+    local = points_m - kind.corner_m[row]
+    nearest = np.zeros_like(local)
+    for edge in (kind.along_m[row], kind.across_m[row]):
+        nearest += np.clip(local @ edge / (edge @ edge), 0, 1)[:, None] * edge
+    return np.asarray(np.linalg.norm(local - nearest, axis=1))
