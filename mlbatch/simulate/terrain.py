@@ -65,9 +65,10 @@ class Terrain:
             is_above = z > highest
             border = self._border(is_above, ((x, dx), (y, dy)))
             meets = self._meets(cell, u, v, z, rays[3:6])
-            done = np.flatnonzero(~is_above & (meets <= border))
+            # Finished rays may still be in the table.
+            done = np.flatnonzero(~is_above & (meets <= border) & (at < last))
             found[rows[done]] = at[done] + meets[done]
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 down_to = np.where(is_above & (dz < 0.0), (highest - z) / dz, np.inf)
             at += np.minimum(border, down_to) + _INTO_M
             last[done] = -1.0
@@ -122,8 +123,9 @@ class Terrain:
             across = (place + self.half_m) * scale
             ahead = np.floor(across) + (step > 0.0) - across
             speed = step * scale
-            inverse = 1.0 / np.where(speed == 0.0, _TINY, speed)
-            np.minimum(border, np.abs(ahead * inverse), out=border)
+            is_still = speed == 0.0
+            to_border = np.abs(ahead / np.where(is_still, 1.0, speed))
+            np.minimum(border, np.where(is_still, np.inf, to_border), out=border)
         return border
 
     def _cell(self, x: F64Array, y: F64Array) -> tuple[I64Array, F64Array, F64Array, F64Array]:

@@ -1,0 +1,154 @@
+"""Rays against surfaces: hand-worked hits, and all surfaces tried one after the other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.arrays import F64Array
+from mlbatch.simulate.scene import Boxes, Rays, Rectangles, Scene, Stems
+from tests.builders.scene import Pillar, Rectangle
+from tests.builders.scene import Scene as PlainScene
+from tests.builders.scene import box as plain_box
+
+Vector = tuple[float, float, float]
+ONE = np.ones(1)
+
+
+def stems(*rows: tuple[Vector, float, float, float]) -> Stems:
+    base, height, radius, top = zip(*rows, strict=True)
+    return Stems(*(np.array(part, np.float64) for part in (base, height, radius, top)), ONE)
+
+
+def boxes(
+    centre: Vector, size: Vector, yaw_deg: float = 0, velocity: Vector = (0, 0, 0),
+    repeat_s: float = math.inf,
+) -> Boxes:  # fmt: skip
+    return Boxes(
+        np.array([centre], np.float64),
+        np.array([size], np.float64),
+        np.radians([yaw_deg]),
+        np.array([velocity], np.float64),
+        np.array([repeat_s]),
+        ONE,
+    )
+
+
+def square(corner: Vector, along: Vector, across: Vector) -> Rectangles:
+    return Rectangles(*(np.array([part], np.float64) for part in (corner, along, across)), ONE)
+
+
+def cast_one(
+    kind: Stems | Boxes | Rectangles, origin: Vector, direction: Vector, time_s: float = 0
+) -> float:
+    ray = np.array([direction]) / math.hypot(*direction)
+    rays = Rays.of(np.array([origin], np.float64), ray, np.array([time_s], np.float64))
+    return float(Scene((kind,)).cast(rays, 1000.0)[0][0])
+
+
+PILLAR = stems(((5, 0, 0), 2, 1, 1))
+# Its radius falls from 1 to 0 over 2 m.
+CONE = stems(((5, 0, 0), 2, 1, 0))
+CRATE = boxes((4, 0, 1), (2, 2, 2))
+SHIELD = square((4, -1, -1), (0, 2, 0), (0, 0, 2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "origin", "direction", "expected"),
+    [
+        pytest.param(SHIELD, (0, 0, 0), (1, 0, 0), 4.0, id="square on"),
+        pytest.param(SHIELD, (0, 0, 0), (4, 0.75, 0), math.hypot(4, 0.75), id="aslant"),
+        pytest.param(SHIELD, (0, 0, 0), (4, 1.25, 0), math.inf, id="past its edge"),
+        pytest.param(SHIELD, (0, 0, 0), (-1, 0, 0), math.inf, id="behind"),
+        pytest.param(PILLAR, (0, 0, 1), (1, 0, 0), 4.0, id="pillar in the middle"),
+        pytest.param(PILLAR, (0, 0.6, 1), (1, 0, 0), 4.2, id="pillar off the middle"),
+        pytest.param(PILLAR, (0, 0, 2.1), (1, 0, 0), math.inf, id="above the pillar"),
+        pytest.param(
+            PILLAR, (4, 0, 2.5), (2, 0, -1), math.sqrt(5), id="from above to the far side"
+        ),
+        # Half way up the cone's radius is 0.5.
+        pytest.param(CONE, (0, 0, 1), (1, 0, 0), 4.5, id="cone"),
+        # Along x = t, z = t / 8: radius 1 - t / 16 = 5 - t at t = 64 / 15.
+        pytest.param(CONE, (0, 0, 0), (8, 0, 1), 64 / 15 * math.hypot(1, 1 / 8), id="cone aslant"),
+        pytest.param(CRATE, (0, 0, 1), (1, 0, 0), 3.0, id="box"),
+        pytest.param(CRATE, (4, 0, 1), (1, 0, 0), 1.0, id="box from inside"),
+        pytest.param(CRATE, (0, 1.1, 1), (1, 0, 0), math.inf, id="past the box"),
+        pytest.param(
+            boxes((4, 0, 1), (2, 2, 2), 45), (0, 0, 1), (1, 0, 0), 4 - math.sqrt(2), id="corner"
+        ),
+    ],
+)
+def test_ray_meets_what_geometry_says(
+    kind: Stems | Boxes | Rectangles, origin: Vector, direction: Vector, expected: float
+) -> None:
+    assert cast_one(kind, origin, direction) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("time_s", "expected"), [(0, 3.0), (2, 4.0), (9.5, 7.75), (10, 3.0)])
+def test_a_box_moves_and_returns(time_s: float, expected: float) -> None:
+    moving = boxes((4, 0, 1), (2, 2, 2), 0, (0.5, 0, 0), 10)
+    assert cast_one(moving, (0, 0, 1), (1, 0, 0), time_s) == pytest.approx(expected, abs=1e-9)
+
+
+def fan(seed: int, count: int = 4000) -> tuple[F64Array, F64Array]:
+    """Rays of all directions from almost one place, as of a chunk of a lidar."""
+    random = np.random.default_rng(seed)
+    direction = random.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    return random.uniform(-0.1, 0.1, (count, 3)) + np.array([0, 0, 1.0]), direction
+
+
+@given(st.integers(0, 200))
+def test_culling_loses_no_hit(seed: int) -> None:
+    """The scene as the plain one of the fixtures computes it, every surface against every ray."""
+    random = np.random.default_rng(seed)
+    places = random.uniform(-6, 6, (8, 2))
+    radius = random.uniform(0.05, 0.5, 8)
+    # One around the origin of the rays.
+    places[0] = 0.3, 0.0
+    radius[0] = 0.6
+    plain = [
+        Pillar(float(x), float(y), float(r), 2.0, 1)
+        for (x, y), r in zip(places, radius, strict=True)
+    ]
+    low = random.uniform(-5, 3, 3)
+    high = low + random.uniform(0.2, 2, 3)
+    sides = [
+        *plain_box(tuple(low), tuple(high), 1),
+        # The bottom, which the plain box lacks.
+        Rectangle(tuple(low), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), 1),
+    ]
+    wall = ((-7.0, -7.0, -1.0), (14.0, 0.0, 0.0), (0.0, 0.0, 5.0))
+    expected = PlainScene((*plain, *sides, Rectangle(*wall, 1)))
+    ends = np.zeros(8)
+    own = Scene(
+        (
+            Stems(np.column_stack([places, ends]), ends + 2, radius, radius, ends + 1),
+            boxes(tuple((low + high) / 2), tuple(high - low)),
+            square(*wall),
+        )
+    )
+    origin, direction = fan(seed)
+    found, _ = own.cast(Rays.of(origin, direction, np.zeros(len(origin))), 40.0)
+    wanted = expected.cast(origin, direction)
+    np.testing.assert_allclose(found, np.where(wanted < 40, wanted, np.inf), atol=1e-9)
+
+
+def test_reflectivity_is_that_of_the_nearest_surface() -> None:
+    near = boxes((3, 0, 0), (1, 1, 1))
+    far = boxes((6, 0, 0), (1, 4, 4))
+    scene = Scene((near, replace(far, reflectivity=np.array([9.0]))))
+    direction = np.array([[1, 0, 0], [6, 1.5, 0]]) / np.array([[1.0], [math.hypot(6, 1.5)]])
+    _, level = scene.cast(Rays.of(np.zeros((2, 3)), direction, np.zeros(2)), 100.0)
+    assert level.tolist() == [1.0, 9.0]
+
+
+def test_nothing_is_seen_beyond_the_range() -> None:
+    rays = Rays.of(np.zeros((1, 3)), np.array([[1.0, 0, 0]]), np.zeros(1))
+    assert Scene((SHIELD,)).cast(rays, 3.9)[0].tolist() == [math.inf]
+    assert Scene((SHIELD,)).cast(rays, 4.1)[0].tolist() == [4.0]
