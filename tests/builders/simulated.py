@@ -6,6 +6,7 @@ the ray casting or of the trajectory is used.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,6 +129,20 @@ def distance_to_scene(scene: Scene, points_m: F64Array, time_s: F64Array) -> F64
         # The vertical distance is never less than the distance.
         found.append(np.abs(points_m[:, 2] - scene.terrain.height(points_m[:, :2])))
     return np.asarray(np.min(found, axis=0))
+
+
+def residuals(recorded: Recorded, scans: Sequence[Scan]) -> F64Array:
+    """Distances (p,) of all points from the scene at the true poses, m; clocks of all are equal."""
+    found = []
+    plan = recorded.scenario.lidars[0]
+    start_ns = recorded.scenario.start_ns
+    for scan in scans:
+        own_ns = scan.time_ns.astype(np.int64) + scan.start_ns - start_ns
+        # The clock of the sensor against the true one.
+        true_ns = (own_ns - plan.clock.offset_s * 1e9) / (1 + plan.clock.drift_ppm * 1e-6)
+        world = at_true_poses(scan.xyz.astype(np.float64), true_ns + start_ns, recorded.truth)
+        found.append(distance_to_scene(recorded.scenario.scene, world, true_ns * 1e-9))
+    return np.concatenate(found)
 
 
 def _to_box(kind: Boxes, row: int, points_m: F64Array, time_s: F64Array) -> F64Array:

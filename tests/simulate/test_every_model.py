@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mlbatch.arrays import F64Array
-from mlbatch.outputs.scan import Scan
 from mlbatch.simulate.models import lidar_models
 from tests.builders.simulated import (
-    Recorded,
-    at_true_poses,
-    distance_to_scene,
     record,
+    residuals,
     scenario_text,
 )
 
@@ -31,20 +26,6 @@ LIDAR = """\
 MODELS = lidar_models()
 OUSTER = [name for name in MODELS if name.startswith("OS")]
 PROFILES = MODELS["OS1-64"].profiles
-
-
-def residuals(recorded: Recorded, scans: Sequence[Scan]) -> F64Array:
-    """Distances (p,) of all points from the scene, m."""
-    found = []
-    (plan,) = recorded.scenario.lidars
-    start_ns = recorded.scenario.start_ns
-    for scan in scans:
-        own_ns = scan.time_ns.astype(np.int64) + scan.start_ns - start_ns
-        # The clock of the sensor against the true one.
-        true_ns = (own_ns - plan.clock.offset_s * 1e9) / (1 + plan.clock.drift_ppm * 1e-6)
-        world = at_true_poses(scan.xyz.astype(np.float64), true_ns + start_ns, recorded.truth)
-        found.append(distance_to_scene(recorded.scenario.scene, world, true_ns * 1e-9))
-    return np.concatenate(found)
 
 
 def check(folder: Path, text: str, least_points: int = 3000, suffix: str = "pcap") -> None:
