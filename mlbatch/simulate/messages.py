@@ -91,13 +91,10 @@ class PacketMessages:
         self._frame = frame
         self._encode, self._has_many = _ENCODE[topic.message]
         self._waiting: list[Stamped] = []
-        # Receive time of the last packet.
-        self.last_ns = 0
 
     def add(self, packet: Stamped) -> bytes | None:
         """Return the message that a packet completes, of its receive time; None if it waits."""
         self._waiting.append(packet)
-        self.last_ns = packet.host_ns
         if self._has_many and packet.host_ns - self._waiting[0].host_ns < _GROUP_NS:
             return None
         return self.rest()

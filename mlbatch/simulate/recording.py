@@ -154,6 +154,7 @@ class _Run:
         for index, stream in enumerate(streams):
             for port, topic in stream.lidar.topics.items():
                 self._messages[index, port] = PacketMessages(topic, stream.plan.name)
+        self._last_ns = scenario.start_ns
         self.imu_samples = 0
         self.poses = 0
 
@@ -179,6 +180,7 @@ class _Run:
             ready = sum(is_last or one.host_ns < end_ns for one in waiting)
             for event in waiting[:ready]:
                 event.write()
+                self._last_ns = event.host_ns
             del waiting[:ready]
         self._close()
 
@@ -298,8 +300,7 @@ class _Run:
             self._pcap.close()
         if self._bag is not None:
             for (index, _), messages in self._messages.items():
-                last_ns = messages.last_ns
-                self._send(index, messages, last_ns, messages.rest())
+                self._send(index, messages, self._last_ns, messages.rest())
             self._bag.close()
 
 
