@@ -36,7 +36,7 @@ def simulate(
     if quiet:
         return
     typer.echo(f"{plan.name}: {plan.duration_s:g} s, seed {plan.seed}")
-    rows = [("lidar", "model", "shots", "returns", "packets", "lost")]
+    rows: list[tuple[str, ...]] = [("lidar", "model", "shots", "returns", "packets", "lost")]
     for lidar, own in zip(plan.lidars, figures.lidars, strict=True):
         counts = (own.shots, own.returns, own.packets, own.lost)
         rows.append((own.name, lidar.settings.model, *map(str, counts)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -110,7 +111,8 @@ class McapFile:
 
     def close(self) -> None:
         """Complete the file."""
-        self._writer.finish()
+        finish: Callable[[], None] = self._writer.finish
+        finish()
         self._file.close()
 
 

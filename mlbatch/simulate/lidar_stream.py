@@ -126,24 +126,23 @@ class LidarStream:
         first_s = self._clock.true_s(shots.time_ns)
         poses = self._scenario.trajectory.poses(first_s)
         body = self.plan.body_from_sensor
-        shape = shots.direction.shape
+        turn, arm = body[:3, :3], body[:3, 3]
         delay_s = shots.delay_s / self._clock.rate
+        shape = shots.direction.shape
+        # Rows are vectors: they are multiplied by transposed matrices.
+        turned = np.matmul(poses.rotation, turn).transpose(0, 2, 1)
+        place = np.matmul(poses.rotation, arm) + poses.position_m
+        direction = np.matmul(shots.direction, turned)
+        origin = np.matmul(shots.origin_m, turned) + place[:, None]
+        if delay_s.any():
+            later = delay_s[..., None]
+            spin = np.matmul(poses.rotation, _cross_matrix(poses.angular_velocity))
+            turning = np.matmul(spin, turn).transpose(0, 2, 1)
+            speed = np.matmul(spin, arm) + poses.velocity
+            direction += later * np.matmul(shots.direction, turning)
+            origin = origin + later * (np.matmul(shots.origin_m, turning) + speed[:, None])
         time_s = np.broadcast_to(first_s[:, None] + delay_s, shape[:2])
-        if not delay_s.any():
-            turned = np.matmul(poses.rotation, body[:3, :3])
-            place = np.matmul(poses.rotation, body[:3, 3]) + poses.position_m
-            direction = np.matmul(shots.direction, turned.transpose(0, 2, 1))
-            origin = np.matmul(shots.origin_m, turned.transpose(0, 2, 1)) + place[:, None]
-            return np.broadcast_to(origin, shape), direction, time_s
-        rate = poses.angular_velocity[:, None]
-        later = delay_s[..., None]
-        aim = shots.direction @ body[:3, :3].T
-        aim = aim + later * np.cross(rate, aim)
-        start = shots.origin_m @ body[:3, :3].T + body[:3, 3]
-        start = start + later * np.cross(rate, start)
-        back = poses.rotation.transpose(0, 2, 1)
-        place = poses.position_m[:, None] + later * poses.velocity[:, None]
-        return np.matmul(start, back) + place, np.matmul(aim, back), time_s
+        return np.broadcast_to(origin, shape), direction, time_s
 
     def _inertial(self, random: np.random.Generator) -> list[Sent]:
         """Return the IMU packets until the end of the chunk."""
@@ -183,6 +182,14 @@ class LidarStream:
             self._sent += 1
             found.append(Received(self._last_ns, self._index, self._sent, one.port, one.payload))
         return found
+
+
+def _cross_matrix(vectors: F64Array) -> F64Array:
+    """Return matrices (n, 3, 3) that multiply by vectors (n, 3) from the left, crosswise."""
+    x, y, z = vectors.T
+    nothing = np.zeros(len(vectors))
+    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
 
 
 def with_errors(

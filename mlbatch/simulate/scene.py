@@ -58,7 +58,8 @@ class Rays:
     @property
     def time_s(self) -> F64Array:
         """Times (n,) since the start."""
-        return self.table[6]
+        time_s: F64Array = self.table[6]
+        return time_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +167,7 @@ class Boxes:
 
     def centres(self, index: I64Array, time_s: F64Array) -> F64Array:
         """Return centres (3, n) of the boxes `index` (n,) at times (n,)."""
-        centre = self.centre_m.T.take(index, axis=1)
+        centre: F64Array = self.centre_m.T.take(index, axis=1)
         if not self.velocity_mps.any():
             return centre
         repeat = self.repeat_s[index]

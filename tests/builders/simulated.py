@@ -111,7 +111,8 @@ def at_true_poses(points_m: F64Array, time_ns: F64Array, truth: Path) -> F64Arra
     scalar = (pose[:, 6] / np.linalg.norm(pose[:, 3:], axis=1))[:, None]
     twice = 2 * np.cross(vector, points_m)
     turned: F64Array = points_m + scalar * twice + np.cross(vector, twice)
-    return turned + pose[:, :3]
+    moved: F64Array = turned + pose[:, :3]
+    return moved
 
 
 def distance_to_scene(scene: Scene, points_m: F64Array, time_s: F64Array) -> F64Array:
@@ -139,9 +140,11 @@ def residuals(recorded: Recorded, scans: Sequence[Scan]) -> F64Array:
     for scan in scans:
         own_ns = scan.time_ns.astype(np.int64) + scan.start_ns - start_ns
         # The clock of the sensor against the true one.
-        true_ns = (own_ns - plan.clock.offset_s * 1e9) / (1 + plan.clock.drift_ppm * 1e-6)
-        world = at_true_poses(scan.xyz.astype(np.float64), true_ns + start_ns, recorded.truth)
-        found.append(distance_to_scene(recorded.scenario.scene, world, true_ns * 1e-9))
+        rate = 1 + plan.clock.drift_ppm * 1e-6
+        true_ns: F64Array = np.divide(own_ns - plan.clock.offset_s * 1e9, rate)
+        epoch_ns = np.add(true_ns, start_ns)
+        world = at_true_poses(scan.xyz.astype(np.float64), epoch_ns, recorded.truth)
+        found.append(distance_to_scene(recorded.scenario.scene, world, np.multiply(true_ns, 1e-9)))
     return np.concatenate(found)
 
 
@@ -161,7 +164,8 @@ def _to_stem(kind: Stems, row: int, points_m: F64Array) -> F64Array:
     share = np.clip(local[:, 2] / height, 0, 1)
     radius = kind.radius_m[row] + share * (kind.top_radius_m[row] - kind.radius_m[row])
     aside = np.hypot(local[:, 0], local[:, 1]) - radius
-    return np.hypot(aside, local[:, 2] - share * height)
+    found: F64Array = np.hypot(aside, local[:, 2] - share * height)
+    return found
 
 
 def _to_rectangle(kind: Rectangles, row: int, points_m: F64Array) -> F64Array:

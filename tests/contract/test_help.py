@@ -81,6 +81,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--report": "JSON.*next to",
         "--overwrite": "existing",
     },
+    "simulate": {
+        "--output": r"\.pcap, \.mcap or \.db3",
+        "--duration": "Seconds",
+        "--seed": "noise",
+        "--overwrite": "existing",
+        "--quiet": "nothing",
+    },
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",

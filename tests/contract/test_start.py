@@ -49,6 +49,8 @@ NEEDLESS = (
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
+    *("mlbatch.cli.simulate", "mlbatch.simulate.recording", "mlbatch.sensors.ouster.encode"),
+    *("mlbatch.sensors.ouster.simulate", "mlbatch.lidar.simulated"),
     *("numpy.ma", "rosbags", "rich"),
 )
 

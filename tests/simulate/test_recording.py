@@ -6,6 +6,7 @@ import csv
 import json
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import mcap_ros2.reader
 import numpy as np
@@ -163,7 +164,8 @@ def test_a_database_as_another_reader_sees_it(bags: dict[str, Recorded]) -> None
     poses = []
     for number, _, data in rows:
         if topics[number][0] == "/tf":
-            (one,) = store.deserialize_cdr(data, topics[number][1]).transforms
+            message: Any = store.deserialize_cdr(data, topics[number][1])
+            (one,) = message.transforms
             poses.append([one.transform.translation.x, one.transform.rotation.z])
     _, expected = read_tum(recorded.truth)
     np.testing.assert_allclose(poses, expected[:, [0, 5]], atol=1e-8)

@@ -22,7 +22,8 @@ ONE = np.ones(1)
 
 def stems(*rows: tuple[Vector, float, float, float]) -> Stems:
     base, height, radius, top = zip(*rows, strict=True)
-    return Stems(*(np.array(part, np.float64) for part in (base, height, radius, top)), ONE)
+    table = [np.array(part, np.float64) for part in (base, height, radius, top)]
+    return Stems(table[0], table[1], table[2], table[3], ONE)
 
 
 def boxes(
@@ -40,7 +41,8 @@ def boxes(
 
 
 def square(corner: Vector, along: Vector, across: Vector) -> Rectangles:
-    return Rectangles(*(np.array([part], np.float64) for part in (corner, along, across)), ONE)
+    edges = [np.array([part], np.float64) for part in (corner, along, across)]
+    return Rectangles(edges[0], edges[1], edges[2], ONE)
 
 
 def cast_one(

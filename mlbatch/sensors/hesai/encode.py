@@ -7,6 +7,7 @@ of blocks that share an azimuth; the rotor has constant speed.
 
 from __future__ import annotations
 
+import functools
 import struct
 import zlib
 from dataclasses import dataclass, replace
@@ -69,17 +70,7 @@ class HesaiSpec:
     @property
     def row(self) -> HesaiModel:
         """The model's layout, with what the spec chooses."""
-        row = MODELS[self.model]
-        slower = self.model in STATES and self.operation != HIGH
-        flags = row.flags if self.flags is None else self.flags
-        return replace(
-            row,
-            step_ns=row.step_ns * (2 if slower else 1),
-            flags=flags,
-            unit=row.unit + (row.grows and (flags & UNIT_FLAGS).bit_count()),
-            date=self.date or row.date,
-            unit_mm=self.unit_mm or row.unit_mm,
-        )
+        return _row(self.model, self.operation, self.flags, self.date, self.unit_mm)
 
     @property
     def returns(self) -> int:
@@ -94,6 +85,22 @@ class HesaiSpec:
     def has(self, flag: int) -> bool:
         """Whether the packets have this optional part."""
         return bool(self.row.flags & flag)
+
+
+@functools.lru_cache(maxsize=64)
+def _row(model: str, operation: str, flags: int | None, date: str, unit_mm: int) -> HesaiModel:
+    """Return the layout of a model with what a spec chooses."""
+    row = MODELS[model]
+    slower = model in STATES and operation != HIGH
+    own_flags = row.flags if flags is None else flags
+    return replace(
+        row,
+        step_ns=row.step_ns * (2 if slower else 1),
+        flags=own_flags,
+        unit=row.unit + (row.grows and (own_flags & UNIT_FLAGS).bit_count()),
+        date=date or row.date,
+        unit_mm=unit_mm or row.unit_mm,
+    )
 
 
 def advanced(spec: HesaiSpec, packets: int) -> HesaiSpec:

@@ -23,7 +23,13 @@ from mlbatch.lidar.simulated import (
     Shots,
     whole_counts,
 )
-from mlbatch.sensors.ouster.encode import OusterSpec, encode_packets, imu_packet, metadata_json
+from mlbatch.sensors.ouster.encode import (
+    IntLike,
+    OusterSpec,
+    encode_packets,
+    imu_packet,
+    metadata_json,
+)
 from mlbatch.sensors.ouster.profiles import OFF, PROFILES
 from mlbatch.units import M_PER_MM, MM_PER_M, NS_PER_S, RAD_PER_DEG
 
@@ -77,7 +83,8 @@ class SimulatedOuster:
         line = _LINES[line_name]
         # Not quite even, as calibration gives them.
         even = np.linspace(*line.altitude_deg, beams)
-        altitude = np.round(even + 0.03 * (np.arange(beams) * 7 % 5 - 2), 2)
+        uneven = 0.03 * (np.arange(beams) * 7 % 5 - 2)
+        altitude = np.asarray(np.round(even + uneven, 2), np.float64)
         self._spec = OusterSpec(
             profile=settings.profile,
             beams=beams,
@@ -158,7 +165,7 @@ class SimulatedOuster:
     def _stamps(self, number: I64Array) -> I64Array:
         return self._start_ns + number * NS_PER_S // self._per_second
 
-    def _fields(self, distance_m: F64Array, reflectivity: F64Array) -> dict[str, I64Array]:
+    def _fields(self, distance_m: F64Array, reflectivity: F64Array) -> dict[str, IntLike]:
         """Return what the profile has: range, reflectivity, signal, ambient light."""
         fields = PROFILES[self._spec.profile].fields
         place = fields["RANGE"]
@@ -168,7 +175,10 @@ class SimulatedOuster:
         largest = (1 << min(place.width, _RANGE_BITS)) - 1
         counts = whole_counts(range_m, step_mm * M_PER_MM, largest, None)
         level = np.where(counts > 0, np.rint(reflectivity), 0.0)
-        found = {"RANGE": counts * step_mm, "REFLECTIVITY": level.astype(np.int64)}
+        found: dict[str, IntLike] = {
+            "RANGE": counts * step_mm,
+            "REFLECTIVITY": level.astype(np.int64),
+        }
         if "SIGNAL" in fields:
             square = np.maximum(counts * (step_mm / MM_PER_M), 1.0) ** 2
             found["SIGNAL"] = np.rint(level / 255.0 * _SIGNAL_AT_1_M / square).astype(np.int64)
