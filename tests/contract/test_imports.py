@@ -18,7 +18,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("discovery", "outputs"),
     ("readers", "sensors", "writers", "verify", "faults"),
     ("decode", "batching"),
-    ("report", "rig", "clocks"),
+    ("report", "rig", "clocks", "motion"),
     ("lidar", "frames", "ros"),
     ("types", "native"),
     ("arrays", "units", "entry_points"),

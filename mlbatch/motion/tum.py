@@ -1,0 +1,93 @@
+"""Reads trajectories of the TUM format: `time x y z qx qy qz qw` a line, s and m.
+
+Source: the TUM RGB-D benchmark, "File formats". Times are read as decimal text, to the ns.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RigError
+from mlbatch.motion.se3 import rotations_of
+from mlbatch.motion.track import PoseTrack
+from mlbatch.units import NS_PER_S
+
+# Further from 1, the numbers are no quaternion.
+_NORM_TOLERANCE = 1e-2
+_TIME = re.compile(r"(\d{1,12})(?:\.(\d*))?", re.ASCII)
+_EXPONENT = re.compile(r"\d(?:\.\d+)?[eE][+]?\d{1,2}", re.ASCII)
+_VALUES = 8
+_DIGITS = 9
+
+
+def read_tum(path: Path) -> PoseTrack:
+    """Read a trajectory; RigError with file and line for the first mistake."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        reason = getattr(err, "strerror", None) or "bytes that are not UTF-8"
+        raise RigError(
+            f"{path}: expected a trajectory (TUM), found {reason}; check the path"
+        ) from err
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        stamp_ns, row = _values(f"{path}:{number}", words)
+        if stamps and stamp_ns <= stamps[-1]:
+            raise RigError(
+                f"{path}:{number}: expected a time after that of the line before, found "
+                f"{words[0]}; sort the lines by time"
+            )
+        stamps.append(stamp_ns)
+        rows.append(row)
+    if len(stamps) < 2:
+        raise RigError(
+            f"{path}: expected at least 2 poses, found {len(stamps)}; give a trajectory of the "
+            "recording"
+        )
+    table = np.array(rows)
+    norm = np.sqrt((table[:, 3:] ** 2).sum(axis=1))
+    rotations = rotations_of(table[:, 3:] / norm[:, None])
+    return PoseTrack(np.array(stamps, np.int64), rotations, table[:, :3], path.name)
+
+
+def _values(place: str, words: list[str]) -> tuple[int, list[float]]:
+    if len(words) != _VALUES:
+        raise RigError(
+            f"{place}: expected 8 numbers (time x y z qx qy qz qw), found {len(words)}; export the "
+            "trajectory in TUM format"
+        )
+    try:
+        row = [float(word) for word in words[1:]]
+    except ValueError:
+        row = [float("nan")]
+    stamp_ns = _stamp_ns(words[0])
+    if stamp_ns is None or not np.isfinite(row).all():
+        raise RigError(
+            f"{place}: expected 8 finite numbers, the first a time in s since 1970, found "
+            f"{' '.join(words)[:60]!r}; correct the line"
+        )
+    norm = float(np.sqrt(np.square(row[3:]).sum()))
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        raise RigError(
+            f"{place}: expected a unit quaternion x, y, z, w, found norm {norm:.4g}; check the "
+            "order of the columns"
+        )
+    return stamp_ns, row
+
+
+def _stamp_ns(text: str) -> int | None:
+    """Return a time in ns, None for no time; numpy writes exponents, which have fewer digits."""
+    if _EXPONENT.fullmatch(text):
+        return round(float(text) * NS_PER_S)
+    match = _TIME.fullmatch(text)
+    if match is None:
+        return None
+    fraction = (match[2] or "")[:_DIGITS].ljust(_DIGITS, "0")
+    return int(match[1]) * NS_PER_S + int(fraction)
