@@ -7,12 +7,14 @@ errors of the accelerometer; within a window only its product with 0.1 s matters
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
+from mlbatch.frames.transforms import inverse
 from mlbatch.motion.se3 import exp_rotation
 from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
 from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
@@ -62,6 +64,89 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
     return Standstill(rate[rows].mean(axis=0), gravity)
 
 
+@dataclass(slots=True)
+class _State:
+    """The last integrated sample: pose and velocity of the IMU, and its rates."""
+
+    rotation: F64Array
+    velocity: F64Array
+    position_m: F64Array
+    acceleration: F64Array
+    turning: F64Array
+    stamp_ns: int
+
+
+class Integrator:
+    """Integrates the samples of one IMU as they come; results do not depend on their grouping."""
+
+    def __init__(self, body_from_imu: F64Array, name: str = "imu") -> None:
+        """body_from_imu: (4, 4), m; name: for errors and as the source of the track."""
+        self._imu_from_body = inverse(body_from_imu)
+        self._name = name
+        self._waiting: list[tuple[I64Array, F64Array, F64Array]] = []
+        self._rest: Standstill | None = None
+        self._begin_ns = 0
+        self._state: _State | None = None
+        # A longer gap than MAX_GAP_NS: the velocity is not known any more.
+        self.is_lost = False
+
+    def push(self, stamp_ns: I64Array, force: F64Array, rate: F64Array) -> PoseTrack:
+        """Return the poses at samples (n,), none before the first second is complete.
+
+        stamp_ns: increasing; force, rate: (n, 3), m/s2 and rad/s, frame of the IMU.
+        """
+        if self._rest is None:
+            self._waiting.append((stamp_ns, force, rate))
+            stamp_ns, force, rate = (
+                np.concatenate(part) for part in zip(*self._waiting, strict=True)
+            )
+            if len(stamp_ns) == 0 or stamp_ns[-1] - stamp_ns[0] <= STANDSTILL_NS:
+                return self._track(stamp_ns[:0], np.zeros((0, 3, 3)), np.zeros((0, 3)))
+            self._rest = standstill(stamp_ns, force, rate, self._name)
+            self._begin_ns = int(stamp_ns[0])
+            self._waiting = []
+        if self.is_lost or len(stamp_ns) == 0:
+            return self._track(stamp_ns[:0], np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        return self._integrated(self._rest, stamp_ns, force, rate)
+
+    def _integrated(
+        self, rest: Standstill, stamp_ns: I64Array, force: F64Array, rate: F64Array
+    ) -> PoseTrack:
+        turning = rate - rest.gyro_bias
+        state = self._state
+        if state is None:
+            still = np.zeros(3)
+            first = int(stamp_ns[0])
+            state = _State(_upright(rest.gravity), still, still, still, turning[0], first)
+        stamps = np.concatenate([[state.stamp_ns], stamp_ns])
+        gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        count = int(gaps[0]) if len(gaps) else len(stamp_ns)
+        self.is_lost = count < len(stamp_ns)
+        step_s: F64Array = np.diff(stamps[: count + 1]) / NS_PER_S
+        rates = np.concatenate([state.turning[None], turning[:count]])
+        # Mean angular velocity of each step.
+        turns = exp_rotation(0.5 * (rates[1:] + rates[:-1]) * step_s[:, None])
+        rotation = np.empty((count + 1, 3, 3))
+        rotation[0] = state.rotation
+        for row in range(count):
+            rotation[row + 1] = rotation[row] @ turns[row]
+        gravity = np.array([0.0, 0.0, math.sqrt(float((rest.gravity**2).sum()))])
+        acceleration = np.matmul(rotation[1:], force[:count, :, None])[..., 0] - gravity
+        acceleration[stamp_ns[:count] - self._begin_ns <= STANDSTILL_NS] = 0.0
+        felt = np.concatenate([state.acceleration[None], acceleration])
+        velocity = _summed(state.velocity, felt, step_s)
+        position = _summed(state.position_m, velocity, step_s)
+        last = int(stamps[count])
+        self._state = _State(rotation[-1], velocity[-1], position[-1], felt[-1], rates[-1], last)
+        return self._track(stamp_ns[:count], rotation[1:], position[1:])
+
+    def _track(self, stamp_ns: I64Array, rotation: F64Array, position_m: F64Array) -> PoseTrack:
+        """Return poses of the body for poses of the IMU."""
+        arm = np.matmul(rotation, self._imu_from_body[:3, 3])
+        turned = np.matmul(rotation, self._imu_from_body[:3, :3])
+        return PoseTrack(stamp_ns, turned, position_m + arm, self._name)
+
+
 def integrated(
     stamp_ns: I64Array,
     force: F64Array,
@@ -69,39 +154,22 @@ def integrated(
     body_from_imu: F64Array,
     name: str = "imu",
 ) -> PoseTrack:
-    """Return the track of the body from samples in the order of their times.
+    """Return the track of the body from all samples of an IMU, as `Integrator.push`.
 
-    stamp_ns: (n,), increasing; force, rate: (n, 3), IMU frame; body_from_imu: (4, 4), m. A gap
-    longer than MAX_GAP_NS ends what is known of the velocity: the track ends there.
+    RecordingError if they are shorter than the standstill.
     """
-    rest = standstill(stamp_ns, force, rate, name)
-    gaps = np.flatnonzero(np.diff(stamp_ns) > MAX_GAP_NS)
-    count = int(gaps[0]) + 1 if len(gaps) else len(stamp_ns)
-    stamp_ns = stamp_ns[:count]
-    step_s: F64Array = np.diff(stamp_ns) / NS_PER_S
-    turning = rate[:count] - rest.gyro_bias
-    # Mean angular velocity of each step.
-    turns = exp_rotation(0.5 * (turning[1:] + turning[:-1]) * step_s[:, None])
-    rotation = np.empty((count, 3, 3))
-    rotation[0] = _upright(rest.gravity)
-    for row in range(count - 1):
-        rotation[row + 1] = rotation[row] @ turns[row]
-    gravity = np.array([0.0, 0.0, np.sqrt((rest.gravity**2).sum())])
-    acceleration = np.einsum("nij,nj->ni", rotation, force[:count]) - gravity
-    still = stamp_ns - stamp_ns[0] <= STANDSTILL_NS
-    acceleration[still] = 0.0
-    velocity = _summed(acceleration, step_s)
-    position = _summed(velocity, step_s)
-    # The body hangs at the IMU.
-    imu_from_body = np.linalg.inv(body_from_imu)
-    moved = position + np.einsum("nij,j->ni", rotation, imu_from_body[:3, 3])
-    return PoseTrack(stamp_ns, rotation @ imu_from_body[:3, :3], moved, name)
+    integrator = Integrator(body_from_imu, name)
+    track = integrator.push(stamp_ns, force, rate)
+    if not len(track.stamp_ns):
+        standstill(stamp_ns, force, rate, name)
+    return track
 
 
-def _summed(rates: F64Array, step_s: F64Array) -> F64Array:
-    """Return integrals (n, 3) of rates (n, 3) by the trapezoidal rule, from 0."""
+def _summed(begin: F64Array, rates: F64Array, step_s: F64Array) -> F64Array:
+    """Return integrals (n + 1, 3) of rates (n + 1, 3) by the trapezoidal rule, from (3,)."""
     steps = 0.5 * (rates[1:] + rates[:-1]) * step_s[:, None]
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    sums: F64Array = np.cumsum(np.concatenate([begin[None], steps]), axis=0)
+    return sums
 
 
 def _upright(gravity: F64Array) -> F64Array:

@@ -44,7 +44,8 @@ def log_rotation(rotations: F64Array) -> F64Array:
 
 def exp_transform(part_m: F64Array, vectors: F64Array) -> tuple[F64Array, F64Array]:
     """Return rotations and translations of twists (translation part, rotation vector)."""
-    return exp_rotation(vectors), np.einsum("nij,nj->ni", _left_jacobian(vectors), part_m)
+    moved: F64Array = np.matmul(_left_jacobian(vectors), part_m[..., None])[..., 0]
+    return exp_rotation(vectors), moved
 
 
 def log_transform(rotations: F64Array, translation_m: F64Array) -> tuple[F64Array, F64Array]:
@@ -70,7 +71,8 @@ def quaternions_of(rotations: F64Array) -> F64Array:
     longest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
     row = outer[np.arange(len(outer)), longest]
     row = row / np.sqrt((row**2).sum(axis=1))[:, None]
-    return np.where(row[:, 3:] < 0.0, -row, row)
+    positive: F64Array = np.where(row[:, 3:] < 0.0, -row, row)
+    return positive
 
 
 def rotations_of(quaternions: F64Array) -> F64Array:

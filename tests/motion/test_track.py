@@ -22,7 +22,8 @@ S = 1_000_000_000
 def turns(yaw_rad: F64Array) -> F64Array:
     cosine, sine, nothing = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))
     rows = [[cosine, -sine, nothing], [sine, cosine, nothing], [nothing, nothing, nothing + 1]]
-    return np.array(rows).transpose(2, 0, 1)
+    found: F64Array = np.array(rows).transpose(2, 0, 1)
+    return found
 
 
 def on_a_circle(time_s: F64Array) -> tuple[F64Array, F64Array]:

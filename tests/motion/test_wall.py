@@ -83,7 +83,8 @@ def corrected(track: PoseTrack, word: str) -> Callable[[Scan], F64Array]:
         assert not motion.no_pose.any()
         turn = motion.rotation[scan.column]
         points = np.einsum("nij,nj->ni", turn, scan.xyz.astype(np.float64))
-        return np.add(points, motion.translation_m[scan.column])
+        moved: F64Array = np.add(points, motion.translation_m[scan.column])
+        return moved
 
     return move
 

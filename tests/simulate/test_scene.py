@@ -154,3 +154,16 @@ def test_nothing_is_seen_beyond_the_range() -> None:
     rays = Rays.of(np.zeros((1, 3)), np.array([[1.0, 0, 0]]), np.zeros(1))
     assert Scene((SHIELD,)).cast(rays, 3.9)[0].tolist() == [math.inf]
     assert Scene((SHIELD,)).cast(rays, 4.1)[0].tolist() == [4.0]
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 3.9, 3.97])
+def test_culling_loses_no_hit_of_a_moving_box(begin_s: float) -> None:
+    """Every ray at its own time; the box returns to its first place after 4 s."""
+    moving = boxes((4, 3, 0.5), (2, 1, 3), 30, (-2.5, -1.5, 0.2), 4.0)
+    origin, direction = fan(11)
+    time_s = begin_s + np.linspace(0.0, 0.1, len(origin))
+    rays = Rays.of(origin, direction, time_s)
+    expected = moving.meet(np.zeros(len(origin), np.int64), rays)
+    found, _ = Scene((moving,)).cast(rays, 60.0)
+    np.testing.assert_array_equal(found, np.where(expected < 60.0, expected, np.inf))
+    assert 10 < np.isfinite(found).sum() < len(found) / 2

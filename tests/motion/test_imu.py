@@ -1,0 +1,142 @@
+"""Integrated IMU samples: rest, straight lines and circles by hand, grouping, refusals."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.errors import RecordingError
+from mlbatch.motion.imu import Integrator, integrated
+from mlbatch.motion.ledger import MotionLedger
+from mlbatch.motion.track import MAX_GAP_NS, column_motion
+from mlbatch.units import STANDARD_GRAVITY
+
+HZ = 100
+S = 1_000_000_000
+START = 1_777_881_600 * S
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+Samples = tuple[I64Array, F64Array, F64Array]
+
+
+def samples(seconds: float) -> Samples:
+    """An IMU at rest, level."""
+    count = round(seconds * HZ) + 1
+    stamps: I64Array = START + np.arange(count) * (S // HZ)
+    return stamps, np.tile(UP, (count, 1)), np.zeros((count, 3))
+
+
+def test_at_rest_the_body_stays_whatever_bias_and_tilt() -> None:
+    stamps, force, rate = samples(5)
+    # Tilted by 30 degrees about x.
+    force = np.tile(STANDARD_GRAVITY * np.array([0, 0.5, np.sqrt(0.75)]), (len(force), 1))
+    track = integrated(stamps, force, rate + np.array([0.02, -0.01, 0.005]), np.eye(4))
+    np.testing.assert_allclose(track.position_m, np.zeros((len(stamps), 3)), atol=1e-9)
+    # Up of the world in the body: what was felt.
+    expected = [[0, 0.5, np.sqrt(0.75)]] * len(stamps)
+    np.testing.assert_allclose(track.rotation[:, 2], expected, atol=1e-9)
+
+
+def test_a_constant_acceleration_gives_a_parabola() -> None:
+    """1 m/s2 along x from 2 s on: at 4 s 2 m/s and 2 m, less half a step of the ramp."""
+    stamps, force, rate = samples(4)
+    force[stamps >= START + 2 * S, 0] += 1.0
+    track = integrated(stamps, force, rate, np.eye(4))
+    assert track.position_m[-1, 0] == pytest.approx(2.0, abs=2.0 / HZ + 1e-3)
+    np.testing.assert_allclose(track.position_m[:, 1:], np.zeros((len(stamps), 2)), atol=1e-9)
+
+
+def test_a_turn_in_place_about_the_body_not_about_the_imu() -> None:
+    """The IMU is 1 m ahead of the body, which turns at 0.5 rad/s without moving."""
+    stamps, force, rate = samples(6)
+    turning = stamps >= START + 2 * S
+    rate[turning, 2] = 0.5
+    # Centripetal, toward the body.
+    force[turning, 0] -= 0.25
+    # The jump of the velocity of the IMU, 0.5 m/s to the left, within one step.
+    force[np.flatnonzero(turning)[0], 1] += 0.5 * HZ
+    body_from_imu = np.eye(4)
+    body_from_imu[0, 3] = 1.0
+    track = integrated(stamps, force, rate, body_from_imu)
+    start = track.position_m[0]
+    assert np.abs(track.position_m - start).max() < 0.03
+    heading = np.arctan2(track.rotation[-1, 1, 0], track.rotation[-1, 0, 0])
+    assert heading == pytest.approx(2.0, abs=0.5 / HZ)
+
+
+def moving() -> Samples:
+    stamps, force, rate = samples(4)
+    random = np.random.default_rng(1)
+    late = stamps > START + S
+    force[late] += random.normal(0, 0.5, (int(late.sum()), 3))
+    rate[late] += random.normal(0, 0.5, (int(late.sum()), 3))
+    return stamps, force, rate
+
+
+@given(st.lists(st.integers(0, 401), max_size=8))
+def test_grouping_does_not_matter(cuts: list[int]) -> None:
+    """To the bit."""
+    stamps, force, rate = moving()
+    whole = integrated(stamps, force, rate, np.eye(4))
+    integrator = Integrator(np.eye(4))
+    edges = [0, *sorted(cuts), len(stamps)]
+    parts = [integrator.push(stamps[a:b], force[a:b], rate[a:b]) for a, b in pairwise(edges)]
+    for name in ("stamp_ns", "rotation", "position_m"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
+
+
+def test_a_gap_ends_the_track() -> None:
+    stamps, force, rate = samples(4)
+    stamps[300:] += MAX_GAP_NS
+    track = integrated(stamps, force, rate, np.eye(4))
+    assert len(track.stamp_ns) == 300
+    integrator = Integrator(np.eye(4))
+    integrator.push(stamps[:200], force[:200], rate[:200])
+    assert not integrator.is_lost
+    integrator.push(stamps[200:350], force[200:350], rate[200:350])
+    assert integrator.is_lost
+    assert not len(integrator.push(stamps[350:], force[350:], rate[350:]).stamp_ns)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("moves", "front: expected the rig to stand in the first second, found deviations"),
+        ("g", r"front: expected 9\.81 m/s2 at rest, found 1\.000; check the units"),
+        ("short", "front: expected 20 samples in the first second"),
+        ("none", "front: expected 20 samples in the first second, found 0"),
+    ],
+)
+def test_an_unusable_imu_is_refused(change: str, expected: str) -> None:
+    stamps, force, rate = samples(3)
+    if change == "moves":
+        rate[:100:2, 1] = 0.3
+    elif change == "g":
+        force /= STANDARD_GRAVITY
+    else:
+        count = 50 if change == "short" else 0
+        stamps, force, rate = stamps[:count], force[:count], rate[:count]
+    with pytest.raises(RecordingError, match=expected):
+        integrated(stamps, force, rate, np.eye(4), "front")
+
+
+def test_every_column_is_moved_or_counted() -> None:
+    track = integrated(*samples(3), np.eye(4))
+    ledger = MotionLedger("imu", "start")
+    # 10 columns before the track, 290 in it, 100 after it.
+    stamps: I64Array = START + (np.arange(400) - 10) * (S // HZ) - 5 * S // 1000
+    ledger.add(column_motion(track, stamps[:150], START + S))
+    ledger.add(column_motion(track, stamps[150:], START + S))
+    # The first pose is at the start, the last 3 s later: columns 11 to 310.
+    assert (ledger.moved, ledger.no_pose) == (300, 100)
+    assert ledger.columns == ledger.moved + ledger.no_pose == 400
+    # No pose at the instant: none of the window.
+    ledger.add(column_motion(track, stamps[20:30], START - S))
+    assert ledger.as_json() == {
+        "source": "imu", "to": "start", "columns": 410, "moved": 300, "no_pose": 110
+    }  # fmt: skip
