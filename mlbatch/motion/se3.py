@@ -52,7 +52,7 @@ def log_transform(rotations: F64Array, translation_m: F64Array) -> tuple[F64Arra
     """Return the twists (translation part, rotation vector) of transforms."""
     vectors = log_rotation(rotations)
     part = np.linalg.solve(_left_jacobian(vectors), translation_m[..., None])[..., 0]
-    return part, vectors
+    return np.asarray(part, np.float64), vectors
 
 
 def quaternions_of(rotations: F64Array) -> F64Array:
