@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -206,6 +207,45 @@ class Columns:
     def take(self, index: I64Array | BoolArray | slice) -> Columns:
         """The columns at `index`."""
         return Columns(self.stamp_ns[index], self.ring_index[index], self.encoder[index])
+
+
+class ColumnFigures(NamedTuple):
+    """Columns of one sensor in one window; coverage and overlap as in `Scan`."""
+
+    columns: int
+    max_gap_ns: int  # between two of them
+    coverage: float
+    overlap: float
+    # Timestamps; 0 without a column.
+    first_ns: int
+    last_ns: int
+
+
+NO_COLUMNS = ColumnFigures(0, 0, 0.0, 0.0, 0, 0)
+# Of all sensors in one window.
+WindowFigures: TypeAlias = Sequence[ColumnFigures]
+
+
+@dataclass(slots=True)
+class WindowColumns:
+    """Columns of all sensors by stamp, then sensor, then order of delivery; arrays (n,) int64."""
+
+    stamp_ns: I64Array  # common clock
+    sensor: I64Array  # index of the column's sensor
+    ring_index: I64Array  # as in `Columns`
+    encoder: I64Array  # as in `Columns`
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, index: slice | I64Array) -> WindowColumns:
+        """Return the columns at `index`."""
+        return WindowColumns(
+            self.stamp_ns[index],
+            self.sensor[index],
+            self.ring_index[index],
+            self.encoder[index],
+        )
 
 
 @dataclass(slots=True)

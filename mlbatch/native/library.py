@@ -10,16 +10,17 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 1
+_ABI = 2
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
-_COLUMNS = (_WORD, *[_ADDRESS] * 3)
+_BYTE = ctypes.c_char
 # Arguments of the functions that return a number.
 _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_abi": (),
     "mlbatch_decode": (_ADDRESS,),
     "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
-    "mlbatch_statistics": (*_COLUMNS, _WORD, _WORD, _ADDRESS, _ADDRESS, _ADDRESS),
+    "mlbatch_merge": (_WORD, _ADDRESS, _WORD, *[_ADDRESS] * 5),
+    "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
 }
@@ -124,10 +125,25 @@ class Scan(ctypes.Structure):
     ]
 
 
+class Part(ctypes.Structure):
+    """Columns of a sensor that wait for their window."""
+
+    _fields_: ClassVar = [
+        ("sensor", _WORD),
+        ("columns", _WORD),
+        ("stamp_ns", _ADDRESS),
+        ("ring_index", _ADDRESS),
+        ("encoder", _ADDRESS),
+    ]
+
+
 def address(array: npt.NDArray[Any]) -> int:
     """Return the address of a C-contiguous array; the caller keeps the array."""
     if not array.flags.c_contiguous:
         raise ValueError("expected a C-contiguous array")
+    if array.size and array.flags.writeable:
+        # A fifth of the time of the other way, and a window needs many addresses.
+        return ctypes.addressof(_BYTE.from_buffer(array.data))
     return int(array.ctypes.data)
 
 

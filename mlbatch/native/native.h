@@ -15,7 +15,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 1
+#define MLBATCH_ABI 2
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -135,12 +135,25 @@ typedef struct {
     uint32_t *column;
 } Scan;
 
+/* Columns of a sensor that wait for their window: `types.Columns`. */
+typedef struct {
+    int64_t sensor;
+    int64_t columns;
+    const int64_t *stamp_ns; /* (columns,) */
+    const int64_t *ring_index;
+    const int64_t *encoder;
+} Part;
+
 EXPORT int64_t mlbatch_abi(void);
 EXPORT int64_t mlbatch_decode(const Scan *scan);
 EXPORT int64_t mlbatch_angles(int64_t count, const int64_t *words, float *cosine, float *sine);
-EXPORT int64_t mlbatch_statistics(int64_t columns, const int64_t *stamp_ns, const int64_t *sensor,
-                                  const int64_t *encoder, int64_t sensors, int64_t sectors,
-                                  const int64_t *positions, int64_t *entered, int64_t *figures);
+EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
+                             int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
+                             int64_t *ring_index, int64_t *encoder);
+EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
+                               const int64_t *sensor, const int64_t *encoder, int64_t sensors,
+                               const int64_t *positions, int64_t sectors, int64_t *entered,
+                               int64_t *figures);
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);

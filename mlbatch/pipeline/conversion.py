@@ -9,10 +9,9 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import numpy as np
-
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
+from mlbatch.batching.merge import column_merge
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
@@ -97,12 +96,14 @@ class Conversion:
         rig = self.session.setup.rig
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
+        paces = [sensor.pace() for sensor in self.sensors]
         self.batcher = Batcher(
             self.grid,
             [sensor.intake() for sensor in self.sensors],
             Policy(job.max_wait_ns, job.keep_partial, job.start, job.end),
             self.session.clocks.guards,
-            [sensor.pace() for sensor in self.sensors],
+            paces,
+            column_merge(self.session.engine, [pace.positions for pace in paces]),
         )
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.refuse_unknown(self.session.recordings)
@@ -189,9 +190,8 @@ class Conversion:
         # No comparison with an unknown fill is true.
         if not share or not bool((window.fill < share).any()):
             return False
-        counts = np.bincount(window.sensor, minlength=len(self.sensors)).tolist()
-        for sensor, count in zip(self.sensors, counts, strict=True):
-            sensor.ledger.columns.drop("incomplete", count)
+        for sensor, own in zip(self.sensors, window.figures, strict=True):
+            sensor.ledger.columns.drop("incomplete", own.columns)
         self.dropped_incomplete += 1
         return True
 

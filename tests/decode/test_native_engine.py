@@ -113,6 +113,7 @@ class Guarded(ScanBuffer):
             end = (GUARD_ROWS + len(array)) * row
             self._guards += [whole[:begin], whole[end:]]
             setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
+        self.view_labels()
 
     @property
     def is_intact(self) -> bool:
