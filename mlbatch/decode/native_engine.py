@@ -34,6 +34,7 @@ _MOST_WORDS = 3
 _WORD_BYTES = 4
 # Beams of a plane are a multiple of this.
 _BEAMS_TOGETHER = 16
+_BEAMS_OF_FOUR = 4
 _COUNTS = 5
 _UNSURE = np.float32(2)
 _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
@@ -199,6 +200,7 @@ class _DecodedGroup:
             rotors = [one.projection for one in projectors]
             self._set_rotors([one for one in rotors if isinstance(one, Turning)], lidar.channels)
         self._set_slots(projectors[0])
+        struct.fits_fours = _fits_fours(projectors[0], table)
         self._set_labels(projectors)
         if any(one.is_limited for one in projectors):
             limits_m = np.concatenate([one.limits_m for one in projectors])
@@ -395,6 +397,19 @@ def _is_inside_return(lidar: Lidar, table: PixelTable, layout: ReturnLayout) -> 
         and run.channel + run.channels <= lidar.channels
         for run in layout.runs
     )
+
+
+def _fits_fours(projector: Projector, table: PixelTable) -> bool:
+    """Return whether the beams of a column can be decoded four at a time, in wire order."""
+    lidar = projector.lidar
+    if lidar.returns > 1 or projector.order is not None or table.dark:
+        return False
+    channel = 0
+    for run in table.returns[0].runs:
+        if run.channel != channel or run.channels % _BEAMS_OF_FOUR:
+            return False
+        channel += run.channels
+    return channel == lidar.channels == projector.slots
 
 
 def _fields(layout: ReturnLayout) -> tuple[list[int], list[tuple[int, int, int, bool]]]:

@@ -35,6 +35,7 @@ class Ring(ctypes.Structure):
         ("per_row", _WORD),
         ("row_bytes", _WORD),
         ("column_bytes", _WORD),
+        ("base", _WORD),
     ]
 
 
@@ -86,6 +87,7 @@ class Group(ctypes.Structure):
         ("slot", _ADDRESS),
         ("typed", _WORD),
         ("sends_twice", _WORD),
+        ("fits_fours", _WORD),
         ("drops_repeated", _WORD),
         ("limits_m", _ADDRESS),
         ("counts", _ADDRESS),

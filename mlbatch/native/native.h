@@ -35,6 +35,7 @@ typedef struct {
     int64_t per_row;
     int64_t row_bytes;
     int64_t column_bytes;
+    int64_t base; /* scratch: number of the row that was last at `first` */
 } Ring;
 
 /* An integer in a word of a pixel: `(word >> shift) & mask`, its two bytes swapped if is_big. */
@@ -72,7 +73,7 @@ typedef struct {
     int64_t dark_count;
     const int64_t *dark; /* (dark_count,): channels without returns */
     int64_t has_reflectivity;
-    const Ring *rings; /* (members,) */
+    Ring *rings; /* (members,) */
     /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
        TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
@@ -96,6 +97,8 @@ typedef struct {
     const int64_t *slot;   /* (E,): slot in an organized row */
     int64_t typed;
     int64_t sends_twice;
+    /* One return in wire order, runs of fours in the order of the channels, none of them dark. */
+    int64_t fits_fours;
     int64_t drops_repeated;
     const float *limits_m; /* (members, 2) or NULL */
     int64_t *counts;       /* (members, COUNTS), added to */
