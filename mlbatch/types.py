@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
+
+if TYPE_CHECKING:
+    from mlbatch.native.arena import PacketArena
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +114,7 @@ class PacketBatch:
     stream: I64Array  # (n,) numbers in a `StreamTable`
     host_ns: I64Array  # (n,) receive time at the capture host, of the completing fragment
     messages: tuple[Message, ...] = ()  # of the topics in `Recording.keep`, in file order
+    place: int | None = None  # of `data[0]` in the `PacketArena` of the pass; None: elsewhere
 
     def __len__(self) -> int:
         return len(self.start)
@@ -118,7 +122,12 @@ class PacketBatch:
     def take(self, index: I64Array | slice) -> PacketBatch:
         """The packets at `index`, over the same bytes, without messages."""
         return PacketBatch(
-            self.data, self.start[index], self.size[index], self.stream[index], self.host_ns[index]
+            self.data,
+            self.start[index],
+            self.size[index],
+            self.stream[index],
+            self.host_ns[index],
+            place=self.place,
         )
 
 
@@ -171,6 +180,10 @@ class Recording:
     def use_engine(self, engine: str) -> None:
         """Read by `numpy` or `native`; ignored by containers that have one implementation."""
 
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Read the next pass into an arena; False for containers that cannot."""
+        return False
+
 
 class WrappedRecording(Recording):
     """A recording that changes the packets of another one.
@@ -191,6 +204,10 @@ class WrappedRecording(Recording):
     def use_engine(self, engine: str) -> None:
         """Pass the engine on."""
         self.inner.use_engine(engine)
+
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Not passed on, since packets change; see `Recording`."""
+        return False
 
 
 @dataclass(slots=True)

@@ -326,7 +326,10 @@ class Batcher:
         if not count:
             return
         per_packet = headers.valid.shape[1]
-        ring_index = arrival.ring_index[:, None] + np.arange(per_packet)
+        offsets = arrival.column_offsets
+        if offsets is None:
+            offsets = np.arange(per_packet)
+        ring_index = arrival.ring_index[:, None] + offsets
         columns = Columns(
             headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
         )

@@ -190,7 +190,7 @@ def _run(run: Conversion, joiner: Joiner, statistics: SetStatistics) -> tuple[in
         end_ns = window.end_ns
         if previous is not None:
             statistics.add(_sweeps_of(previous, len(run.sensors)))
-            columns += len(previous.stamp_ns)
+            columns += len(previous.columns)
         # As in a conversion, the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None
     run.session.refuse_absent()

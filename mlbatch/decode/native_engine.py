@@ -211,11 +211,11 @@ class _DecodedGroup:
         self._counts.fill(0)
         for number, ring in enumerate(self._rings):
             # Columns (rows, columns of a row).
-            pieces = ring.pieces
+            pieces, origin = ring.view
             if pieces is not self._pieces[number]:
                 self._pieces[number] = pieces
                 self._ring_structs[number] = Ring(
-                    pieces.ctypes.data, *pieces.shape, *pieces.strides
+                    pieces.ctypes.data, *pieces.shape, *pieces.strides, origin
                 )
 
     def add_counts(self) -> None:

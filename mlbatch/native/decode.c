@@ -717,8 +717,10 @@ static const uint8_t *record_of(const Scan *scan, const Group *group, int64_t co
     Ring *ring = group->rings + scan->member_of[scan->sensor[column]];
     const int64_t index = scan->ring_index[column];
     const int64_t row = ring->per_row == 1 ? index : index / ring->per_row;
-    if (row < ring->base || row >= ring->base + ring->rows)
-        ring->base = row - row % ring->rows;
+    if (row < ring->base || row >= ring->base + ring->rows) {
+        const int64_t rest = (row - ring->base) % ring->rows;
+        ring->base = row - (rest < 0 ? rest + ring->rows : rest);
+    }
     return ring->first + (row - ring->base) * ring->row_bytes
         + (index - row * ring->per_row) * ring->column_bytes;
 }

@@ -14,7 +14,7 @@ _ABI = 2
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _BYTE = ctypes.c_char
-# Arguments of the functions that return a number.
+# Arguments of the functions; they return a number, except some.
 _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_abi": (),
     "mlbatch_decode": (_ADDRESS,),
@@ -23,7 +23,10 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
+    "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
+    "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
 }
+_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather")
 
 
 class Ring(ctypes.Structure):
@@ -159,9 +162,7 @@ def library() -> Any:
     for name, arguments in _FUNCTIONS.items():
         function = getattr(loaded, name)
         function.argtypes = arguments
-        function.restype = _WORD
-    loaded.mlbatch_copy.argtypes = (_WORD, *[_ADDRESS] * 5)
-    loaded.mlbatch_copy.restype = None
+        function.restype = None if name in _WITHOUT_RESULT else _WORD
     if loaded.mlbatch_abi() != _ABI:
         raise OSError(f"{path.name} of another version")
     return loaded

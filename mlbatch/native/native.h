@@ -35,7 +35,7 @@ typedef struct {
     int64_t per_row;
     int64_t row_bytes;
     int64_t column_bytes;
-    int64_t base; /* scratch: number of the row that was last at `first` */
+    int64_t base; /* number of a row that was at `first` */
 } Ring;
 
 /* An integer in a word of a pixel: `(word >> shift) & mask`, its two bytes swapped if is_big. */
@@ -166,5 +166,8 @@ EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t 
                                int64_t *others, int64_t *found);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
                          const int64_t *bytes, uint8_t *target, const int64_t *target_at);
+EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
+                           int64_t range_count, const int64_t *ranges, int64_t row_bytes,
+                           uint8_t *out);
 
 #endif

@@ -127,10 +127,11 @@ class Conversion:
         smallest first, and cut at the bounds of an absolute grid.
         """
         self.passthrough.subscribe(self.session.recordings)
+        oldest_ring_indexes = self._oldest_ring_indexes()
         with contextlib.closing(self.session.packets()) as packets:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
-                ingested = self.session.ingest.columns(batch, self._oldest_ring_indexes())
+                ingested = self.session.ingest.columns(batch, oldest_ring_indexes)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -139,6 +140,8 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes)
                 if self.batcher.past_end:
                     break
+                oldest_ring_indexes = self._oldest_ring_indexes()
+                self.session.keep_from(oldest_ring_indexes)
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
