@@ -135,7 +135,7 @@ class Session:
             from mlbatch.pipeline.overlap import RunOverlap
 
             self._overlap = RunOverlap(self.recordings, self.setup)
-        elif self._arena is not None:
+        elif self._arena is not None and self.replay is None:
             self.recordings[0].use_arena(self._arena)
         seen = None if self._overlap is None else self._overlap.add
         with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:
