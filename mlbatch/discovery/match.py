@@ -154,7 +154,10 @@ def match(
 
     Raises RecordingError where several calibrations match packets equally well.
     """
-    every = [*calibrations, *sensors.built_in()]
+    senders: set[str] = set()
+    for kind, samples in sampler.kinds.items():
+        senders.update(sensors.senders(kind.size, samples.arrays()[0]))
+    every = [*calibrations, *sensors.built_in(senders)]
     # By index of the calibration, and by stream where it is shared.
     found: dict[tuple[int, int], DetectedSensor] = {}
     matched = Matched([], [])

@@ -35,9 +35,11 @@ def test_the_library_leaves_the_collector_alone() -> None:
     assert printed.strip() == "True"
 
 
-# Vendors that are asked after Ouster, containers and messages that are not there, outputs and
+# Other vendors, containers and messages that are not there, outputs and
 # commands that were not requested.
 NEEDLESS = (
+    *("mlbatch.sensors.hesai.sensor", "mlbatch.sensors.hesai.identify"),
+    *("mlbatch.sensors.livox.sensor", "mlbatch.sensors.livox.identify"),
     *("mlbatch.sensors.pointcloud.sensor", "mlbatch.sensors.robosense.sensor"),
     *("mlbatch.sensors.velodyne.sensor", "mlbatch.sensors.robosense.identify"),
     *("mlbatch.sensors.velodyne.identify", "mlbatch.readers.formats.mcap"),
