@@ -6,9 +6,9 @@ import difflib
 import ipaddress
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -66,8 +66,7 @@ class SensorSelection:
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
 
 
-@dataclass(frozen=True, slots=True)
-class Ignored:
+class Ignored(NamedTuple):
     """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
 
     sensors: tuple[DetectedSensor, ...] = ()
@@ -619,7 +618,7 @@ def _choose(
             if word not in known
             and not _is_address(word)
             and not any(
-                _is_ignored(sampler, replace(others, words=(word,)), kind) for kind in lidar_kinds
+                _is_ignored(sampler, others._replace(words=(word,)), kind) for kind in lidar_kinds
             )
         ]
     for word in unknown:

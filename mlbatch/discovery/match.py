@@ -39,8 +39,7 @@ class Matched:
 # -- the scorer -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(NamedTuple):
     """A calibration that matches packets."""
 
     score: int

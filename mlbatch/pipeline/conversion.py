@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -74,8 +74,7 @@ class Stages:
             yield item
 
 
-@dataclass(frozen=True, slots=True)
-class SkippedWindow:
+class SkippedWindow(NamedTuple):
     """A window with columns that gives no scan (`--drop-incomplete`)."""
 
     end_ns: int
