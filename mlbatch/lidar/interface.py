@@ -16,8 +16,7 @@ from mlbatch.types import ColumnHeaders, ImuSamples, Pixels, Stream
 FAULTS = ("", "bad_size", "bad_header", "bad_crc")
 
 
-@dataclass(frozen=True, slots=True)
-class SensorModel:
+class SensorModel(NamedTuple):
     """A row of `mlbatch sensors`: a supported model.
 
     returns: supported numbers of returns; clock, calibration: their sources; verified: how the
