@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -35,6 +36,7 @@ __all__ = [
     "plugins",
     "read_calibration",
     "senders",
+    "vendor_of",
 ]
 
 # Calibration files are far smaller; a larger file is a recording or something else.
@@ -77,10 +79,14 @@ def plugins() -> tuple[Plugin, ...]:
 
 def _load_lazily(built_in: Iterable[str]) -> Iterator[Plugin]:
     """These built-in plug-ins and all others, each imported when the iterator reaches it."""
-    for name in built_in:
-        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
+    yield from _load(built_in)
     for name in entry_points.names(entry_points.SENSORS, _names()):
         yield cast(Plugin, entry_points.load(entry_points.SENSORS, name))
+
+
+def _load(built_in: Iterable[str]) -> Iterator[Plugin]:
+    for name in built_in:
+        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
 
 
 @lru_cache(maxsize=1)
@@ -97,15 +103,32 @@ def senders(size: int, packets: U8Array) -> list[str]:
     return [name for name in _names() if _vendor(name).may_send(size, packets)]
 
 
-def models() -> tuple[SensorModel, ...]:
-    """All supported models."""
-    return tuple(model for plugin in plugins() for model in plugin.MODELS)
+def vendor_of(model: str) -> tuple[str, ...]:
+    """Name of the built-in vendor that has a model of this name; () if none has.
+
+    Vendors that are loaded are searched first; the result is the same, since names differ.
+    """
+    by_loading = sorted(_names(), key=lambda name: f"{__name__}.{name}.sensor" not in sys.modules)
+    for name in by_loading:
+        (plugin,) = _load([name])
+        if any(row.name == model for row in plugin.MODELS):
+            return (name,)
+    return ()
 
 
-def built_in(senders: Collection[str] | None = None) -> tuple[Calibration, ...]:
-    """Calibrations that need no file, of all vendors; senders: only of these built-in ones."""
-    chosen = [name for name in _names() if senders is None or name in senders]
-    return tuple(calibration for plugin in _load_lazily(chosen) for calibration in plugin.BUILT_IN)
+def models(vendors: Collection[str] | None = None) -> tuple[SensorModel, ...]:
+    """Supported models, of these built-in vendors (None: all) and of other distributions."""
+    return tuple(model for plugin in _load_lazily(_chosen(vendors)) for model in plugin.MODELS)
+
+
+def built_in(vendors: Collection[str] | None = None) -> tuple[Calibration, ...]:
+    """Calibrations without a file, of these built-in vendors and of other distributions."""
+    plugins = _load_lazily(_chosen(vendors))
+    return tuple(calibration for plugin in plugins for calibration in plugin.BUILT_IN)
+
+
+def _chosen(vendors: Collection[str] | None) -> list[str]:
+    return [name for name in _names() if vendors is None or name in vendors]
 
 
 def read_calibration(path: Path) -> Calibration | None:

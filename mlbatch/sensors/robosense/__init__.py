@@ -7,6 +7,7 @@ from mlbatch.sensors.packet_bytes import any_has_bytes
 
 # Points, device packets, IMU packets.
 _MARKS = (b"\x55\xaa", b"\xa5\xff", b"\xaa\x55")
+_MOST_BYTES = 100_000
 
 
 def may_send(size: int, packets: U8Array) -> bool:
@@ -15,5 +16,8 @@ def may_send(size: int, packets: U8Array) -> bool:
 
 
 def may_calibrate(content: bytes) -> bool:
-    """Angle files are tables of two columns."""
-    return b"," in content
+    """Angle files are short tables of two columns."""
+    if b"," not in content or len(content) > _MOST_BYTES:
+        return False
+    lines = content.decode("utf-8-sig", errors="replace").splitlines()
+    return all(line.count(",") == 1 for line in lines if line.strip())
