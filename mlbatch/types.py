@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from mlbatch.native.arena import PacketArena
 
 
-@dataclass(frozen=True, slots=True)
-class Stream:
+class Stream(NamedTuple):
     """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.
 
     Source ports are ephemeral and no part of it. frame_id, lidar_id: only where a topic has decoded

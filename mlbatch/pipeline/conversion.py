@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
@@ -73,8 +73,7 @@ class Stages:
             yield item
 
 
-@dataclass(frozen=True, slots=True)
-class SkippedWindow:
+class SkippedWindow(NamedTuple):
     """A window with columns that gives no scan (`--drop-incomplete`)."""
 
     end_ns: int

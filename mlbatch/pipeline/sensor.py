@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.arrays import F64Array
 from mlbatch.batching.fill import Pace
@@ -48,8 +48,7 @@ class SensorClock:
         return timescale(host_ns if self.by_host else stamp_ns, host_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """Which points of a sensor are written; ranges in m."""
 
     min_range_m: float

@@ -9,6 +9,7 @@ import tempfile
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,7 @@ UNDERFILLED = 0.5
 _SPOOL_BYTES = 2**20
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
+class Spread(NamedTuple):
     """Distribution of a time over scans, ms; None without a value."""
 
     p50: float | None = None
@@ -32,8 +32,7 @@ class Spread:
     max: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ScanStatistics:
+class ScanStatistics(NamedTuple):
     """The scans of a run; span: last minus first column timestamp; period: between scan starts."""
 
     written: int
