@@ -175,6 +175,10 @@ class Batcher:
             for track in self._tracks
         ]
 
+    def host_offset_ns(self, sensor: int) -> int | None:
+        """First stamp of a sensor minus the receive time of its packet; None without a stamp."""
+        return self._tracks[sensor].offset_ns
+
     def loss(self, sensor: int) -> tuple[int, int]:
         """Lost and reordered packets of a sensor."""
         loss = self._tracks[sensor].intake.loss

@@ -300,9 +300,10 @@ class Conversion:
 
     def _scan_offset_ns(self) -> int:
         """Scan clock minus receive time, by the first packet of the first sensor that has one."""
-        for sensor, first in zip(self.sensors, self.batcher.firsts, strict=True):
-            if first is not None:
-                return 0 if sensor.clock.by_host else first[0] - first[1]
+        for sensor in self.sensors:
+            offset_ns = self.batcher.host_offset_ns(sensor.index)
+            if offset_ns is not None:
+                return 0 if sensor.clock.by_host else offset_ns
         return 0
 
     def close(self) -> None:
