@@ -168,12 +168,12 @@ class Boxes:
     def centres(self, index: I64Array, time_s: F64Array) -> F64Array:
         """Return centres (3, n) of the boxes `index` (n,) at times (n,)."""
         centre: F64Array = self.centre_m.T.take(index, axis=1)
-        if not self.velocity_mps.any():
-            return centre
-        repeat = self.repeat_s[index]
-        with np.errstate(invalid="ignore"):
-            own = np.where(np.isfinite(repeat), time_s % repeat, time_s)
-        centre += own * self.velocity_mps.T.take(index, axis=1)
+        moving = np.flatnonzero(self.velocity_mps.any(axis=1)[index])
+        if len(moving):
+            own_s = time_s[moving]
+            repeat_s = self.repeat_s[index[moving]]
+            own_s = np.where(np.isfinite(repeat_s), own_s % repeat_s, own_s)
+            centre[:, moving] += own_s * self.velocity_mps.T.take(index[moving], axis=1)
         return centre
 
     def bounds(self, time_s: tuple[float, float]) -> Bounds:

@@ -125,8 +125,9 @@ def advanced(spec: HesaiSpec, packets: int) -> HesaiSpec:
 def packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
     """(P,) what the packets say: whole microseconds."""
     step_ns = spec.row.step_ns * spec.groups
-    times = [int(spec.start_ns + packet * step_ns) // 1000 * 1000 for packet in range(packets)]
-    return np.array(times, np.int64)
+    after_ns = np.arange(packets) * step_ns.numerator // step_ns.denominator
+    times: I64Array = (spec.start_ns + after_ns) // 1000 * 1000
+    return times
 
 
 def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
