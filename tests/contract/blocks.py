@@ -1,7 +1,7 @@
 """Fenced blocks of the pages: where they are, whether they run, and what a console block types.
 
-A block runs unless the line before it is `<!-- not run: REASON -->`. `<!-- needs MODULE -->` runs it
-where the module is installed. All blocks of a page share one folder and one Python namespace.
+A block runs unless the line before it is `<!-- not run: REASON -->`. `<!-- needs MODULE -->` runs
+it where the module is installed. All blocks of a page share one folder and one Python namespace.
 """
 
 from __future__ import annotations

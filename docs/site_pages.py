@@ -1,0 +1,168 @@
+"""Pages of the site that are made of others, and links of the repository as links of the site.
+
+A hook of mkdocs (mkdocs.yml); tests import it for the anchors of the made pages.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from typer.main import get_command
+
+from mlbatch.cli.app import COMMANDS, command_line
+from mlbatch.page.findings import REMEDIES
+
+if TYPE_CHECKING:
+    from click import Parameter
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+# Files of the repository that are pages of the site.
+ADOPTED = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+}
+_LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+_ROW = re.compile(r"^\| `(\w+)` \| (.+) \|$", re.MULTILINE)
+
+
+def made_pages() -> dict[str, str]:
+    """Return the text of every page that has no file in docs/, by its path there."""
+    adopted = {
+        target: _relinked((ROOT / source).read_text(encoding="utf-8"), ROOT, DOCS)
+        for source, target in ADOPTED.items()
+    }
+    return {
+        **adopted,
+        "reference/options.md": options_page(),
+        "reference/warnings.md": warnings_page(),
+    }
+
+
+def options_page() -> str:
+    """Return the options of all commands, as the command line describes them."""
+    commands = getattr(get_command(command_line()), "commands")  # noqa: B009 - typer hides its type
+    parts = [
+        "# Options of all commands\n\n",
+        "Made of the commands themselves. Rules, limits and exit codes: [commands](../commands.md).\n",
+    ]
+    for name in COMMANDS:
+        command = commands[name]
+        arguments = [one for one in command.params if one.param_type_name == "argument"]
+        words = " ".join(str(one.human_readable_name).upper() for one in arguments)
+        parts.append(f"\n## mlbatch {name}\n\n{command.help or ''}\n\n")
+        parts.append(f"`mlbatch {name} [OPTIONS] {words}`".replace(" `", "`") + "\n")
+        parts += [f"\n- `{one.human_readable_name.upper()}`: {_help(one)}" for one in arguments]
+        parts.append("\n")
+        groups: dict[str, list[Parameter]] = {}
+        for one in command.params:
+            if one.param_type_name == "option" and not getattr(one, "hidden", False):
+                groups.setdefault(getattr(one, "rich_help_panel", None) or "", []).append(one)
+        for group, options in groups.items():
+            title = f"\n**{group}**\n" if group else ""
+            parts.append(f"{title}\n| option | meaning |\n|---|---|\n")
+            parts += [f"| {_names(one)} | {_help(one)} |\n" for one in options]
+    return "".join(parts)
+
+
+def _names(option: Parameter) -> str:
+    names = [*option.opts, *option.secondary_opts]
+    metavar = "" if getattr(option, "is_flag", False) else f" {_metavar(option)}"
+    return ", ".join(f"`{name}{metavar}`" for name in sorted(names, key=len))
+
+
+def _metavar(option: Parameter) -> str:
+    choices = getattr(option.type, "choices", None)
+    if choices:
+        return "\\|".join(str(getattr(one, "value", one)) for one in choices)
+    return option.metavar or option.type.name.upper()
+
+
+def _help(parameter: Parameter) -> str:
+    text = " ".join((getattr(parameter, "help", None) or "").split())
+    if getattr(parameter, "show_default", False) and "[default" not in text:
+        default = parameter.default
+        if isinstance(default, (str, int, float)) and not isinstance(default, bool) and default:
+            text += f" [default: {getattr(default, 'value', default)}]"
+    return text.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+
+
+def warnings_page() -> str:
+    """Return a section for each warning: the meaning of the report's page, and the remedy."""
+    report = (DOCS / "report.md").read_text(encoding="utf-8")
+    _, _, table = report.partition("### warnings\n")
+    parts = [
+        "# Warnings\n\n",
+        "Codes of the [report](../report.md#warnings), on stderr and on the [page](../page.md) of a ",
+        "run. With `--strict` each is an error, except `clouds`. ",
+        "Errors: [errors](errors.md).\n",
+    ]
+    for code, meaning in _ROW.findall(table):
+        parts.append(f"\n## {code}\n\n{_relinked(_sentence(meaning), DOCS, DOCS / 'reference')}\n")
+        if code in REMEDIES:
+            parts.append(f"\n**What to do:** {REMEDIES[code].replace('<', '&lt;')}.\n")
+    return "".join(parts)
+
+
+def _sentence(text: str) -> str:
+    first = text[0] if text.startswith("`") else text[0].upper()
+    return first + text[1:] + ("" if text.endswith(".") else ".")
+
+
+def _relinked(text: str, old: Path, new: Path) -> str:
+    """Return a text of folder `old` with links for folder `new` of the site.
+
+    Files outside docs/ have no page: only their name is left.
+    """
+
+    def link(found: re.Match[str]) -> str:
+        image, label, target, anchor = found[1], found[2], found[3], found[4] or ""
+        path = (old / target).resolve()
+        if path.parent == ROOT and path.name in ADOPTED:
+            path = DOCS / ADOPTED[path.name]
+        if not path.is_relative_to(DOCS):
+            return label
+        depth = len(new.relative_to(DOCS).parts)
+        return f"{image}[{label}]({'../' * depth}{path.relative_to(DOCS).as_posix()}{anchor})"
+
+    return _LINK.sub(link, text)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the made pages."""
+    from mkdocs.structure.files import File
+
+    for path, text in made_pages().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Remove links to files outside the site; give every row of a code its anchor."""
+    path = page.file.src_uri
+    if path in made_pages():
+        return markdown
+    folder = (DOCS / path).parent
+    markdown = _relinked(markdown, folder, folder)
+    return anchored(markdown) if path == "report.md" else markdown
+
+
+def anchored(markdown: str) -> str:
+    """Return the report's page with an anchor for each reason: section-reason."""
+    section = ""
+    lines = []
+    for line in markdown.splitlines():
+        heading = re.match(r"#+ (.+)", line)
+        section = heading[1].lower() if heading else section
+        row = re.match(r"\| `(\w+)` \|", line)
+        if row and section != "warnings":
+            line = line.replace("| `", f'| <a id="{section}-{row[1]}"></a>`', 1)
+        lines.append(line)
+    return "\n".join(lines) + "\n"
