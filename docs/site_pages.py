@@ -51,7 +51,7 @@ def options_page() -> str:
     commands = getattr(get_command(command_line()), "commands")  # noqa: B009 - typer hides its type
     parts = [
         "# Options of all commands\n\n",
-        "Made of the commands themselves. Rules, limits and exit codes: [commands](../commands.md).\n",
+        "Made of the commands themselves. Rules, limits, exit codes: [commands](../commands.md).\n",
     ]
     for name in COMMANDS:
         command = commands[name]
@@ -100,8 +100,8 @@ def warnings_page() -> str:
     _, _, table = report.partition("### warnings\n")
     parts = [
         "# Warnings\n\n",
-        "Codes of the [report](../report.md#warnings), on stderr and on the [page](../page.md) of a ",
-        "run. With `--strict` each is an error, except `clouds`. ",
+        "Codes of the [report](../report.md#warnings), on stderr and on the [page](../page.md) of ",
+        "a run. With `--strict` each is an error, except `clouds`. ",
         "Errors: [errors](errors.md).\n",
     ]
     for code, meaning in _ROW.findall(table):
