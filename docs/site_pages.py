@@ -51,7 +51,7 @@ def options_page() -> str:
     commands = getattr(get_command(command_line()), "commands")  # noqa: B009 - typer hides its type
     parts = [
         "# Options of all commands\n\n",
-        "Made of the commands themselves. Rules, limits, exit codes: [commands](../commands.md).\n",
+        "Generated from the commands. Rules, limits, exit codes: [commands](../commands.md).\n",
     ]
     for name in COMMANDS:
         command = commands[name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from mlbatch import writers
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.page.findings import REMEDIES
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers
@@ -19,15 +21,17 @@ from mlbatch.report.report import build_report
 from mlbatch.sensors import models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
+from tests.contract.blocks import PAGES
+from tests.contract.test_help import OPTIONS
 from tests.contract.tree import PACKAGE, ROOT, run_mlbatch, run_python
 
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "fixtures" / "README.md")
+LINKED = (*PAGES, *sorted((ROOT / "docs" / "sources").glob("*.md")))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 MODELS = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
 FIXTURE = "fixtures/two_lidars/two_lidars.pcap"
 RIG = "fixtures/two_lidars/rig.yaml"
 MAKE_TABLE = "runpy.run_path('docs/sensors_table.py', run_name='__main__')"
-LINK = re.compile(r"\]\(([^)#:]+)\)")
+LINK = re.compile(r"\]\(([^)#:\s]*)(?:#([^)]*))?\)")
 
 
 def _page(name: str) -> str:
@@ -127,17 +131,62 @@ def _keys(value: object) -> Iterator[str]:
             yield from _keys(inner)
 
 
-def test_every_warning_is_described() -> None:
+def _warning_codes() -> set[str]:
+    """Codes of warnings that the source has as a text."""
     source = "".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
     codes = set(re.findall(r'\bNote\(\s*"(\w+)"', source))
     assert codes
-    assert codes <= _first_cells(_page("report.md"))
+    return codes
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_warning_is_described() -> None:
+    assert _warning_codes() <= _first_cells(_page("report.md"))
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in LINK.findall(page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.name}: {target}"
+    """To a file of the repository, and to a heading or anchor of it."""
+    for target, anchor in LINK.findall(_prose(page)):
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in _anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+def _prose(page: Path) -> str:
+    """The text of a page without blocks of code."""
+    return re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def _anchors(page: Path) -> set[str]:
+    """Anchors of a page: of its headings as Git hosts name them, and its own."""
+    text = _prose(page)
+    slugs = [
+        re.sub(r"[^\w\- ]", "", re.sub(r"`|\[([^]]*)\]\([^)]*\)", r"\1", title).lower())
+        for title in re.findall(r"^#+ (.+?) *$", text, re.MULTILINE)
+    ]
+    return {slug.replace(" ", "-") for slug in slugs} | set(re.findall(r'<a id="([^"]+)"', text))
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    made = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["made_pages"]()
+    nav = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(nav) == sorted([*pages, *made])
+
+
+def test_every_warning_has_a_section_with_its_remedy() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["warnings_page"]()
+    sections = re.findall(r"^## (\w+)$", page, re.MULTILINE)
+    assert _warning_codes() <= set(sections) == set(REMEDIES)
+    assert page.count("**What to do:**") == len(sections)
+
+
+def test_the_page_of_options_has_every_option() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["options_page"]()
+    for name, options in OPTIONS.items():
+        section = page.partition(f"## mlbatch {name}\n")[2].partition("\n## ")[0]
+        assert set(re.findall(r"`(--[\w-]+)", section)) >= set(options), name
 
 
 def test_every_module_is_on_the_map() -> None:
