@@ -21,6 +21,7 @@ from typer.main import get_command
 
 from mlbatch.cli.app import COMMANDS, command_line
 from tests.contract.blocks import LANGUAGES, PAGES, Block, blocks, calls
+from tests.contract.test_help import OPTIONS
 from tests.contract.tree import ROOT
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
@@ -151,6 +152,23 @@ def _parse(arguments: list[str]) -> None:
         return
     with command.make_context(name, rest):
         pass
+
+
+# Options of other programs that the pages name.
+FOREIGN_OPTIONS = set(
+    "--count --decimate --help --number --output-dir --seed --target --version".split()
+)
+OPTION = re.compile(r"(?<![\w-])(--[a-z][\w-]*)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_options_in_the_text_exist(page: Path) -> None:
+    known = {option for options in OPTIONS.values() for option in options} | FOREIGN_OPTIONS
+    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    text = re.sub(r"<!--.*?-->", "", text)
+    for code in re.findall(r"`([^`]+)`", text):
+        if not code.startswith(("ouster-cli", "make", "pip", "python", "tcpdump", "rosbag")):
+            assert set(OPTION.findall(code)) <= known, code
 
 
 def test_calls_are_found() -> None:
