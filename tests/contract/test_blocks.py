@@ -155,9 +155,10 @@ def _parse(arguments: list[str]) -> None:
 
 
 # Options of other programs that the pages name.
-FOREIGN_OPTIONS = set(
-    "--count --decimate --help --number --output-dir --seed --target --version".split()
-)
+FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir", "--seed"} | {
+    "--target",
+    "--version",
+}
 OPTION = re.compile(r"(?<![\w-])(--[a-z][\w-]*)")
 
 
