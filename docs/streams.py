@@ -28,7 +28,7 @@ WRITTEN = (
 )
 PERIOD_MS, END_MS = 100, 860
 WIDTH, HEIGHT = 840, 330
-ORIGIN_X, PX_PER_MS, TOP, LANE_STEP = 60, 0.88, 62, 34
+ORIGIN_X, PX_PER_MS, TOP, LANE_STEP = 60, 0.82, 62, 34
 
 STYLE = """
   .card { fill: #ffffff; stroke: #d0d7de; }
