@@ -53,8 +53,9 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
+# The variable removes a notice about the next version of mkdocs.
 docs: $(VENV)/docs.stamp
-	$(BIN)/python -m mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow
