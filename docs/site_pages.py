@@ -6,6 +6,8 @@ A hook of mkdocs (mkdocs.yml); tests import it for the anchors of the made pages
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +17,6 @@ from mlbatch.cli.app import COMMANDS, command_line
 from mlbatch.page.findings import REMEDIES
 
 if TYPE_CHECKING:
-    from click import Parameter
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
@@ -46,8 +47,26 @@ def made_pages() -> dict[str, str]:
     }
 
 
+class HelpRows:
+    """Takes the place of a formatter of help: keeps the rows of each section."""
+
+    def __init__(self) -> None:
+        self.groups: dict[str, list[tuple[str, str]]] = {}
+        self._title = ""
+
+    @contextmanager
+    def section(self, title: str) -> Iterator[None]:
+        """A section of the help."""
+        self._title = title
+        yield
+
+    def write_dl(self, rows: list[tuple[str, str]]) -> None:
+        """Names and help of parameters."""
+        self.groups.setdefault(self._title, []).extend(rows)
+
+
 def options_page() -> str:
-    """Return the options of all commands, as the command line describes them."""
+    """Return the options of all commands, as `--help` has them."""
     commands = getattr(get_command(command_line()), "commands")  # noqa: B009 - typer hides its type
     parts = [
         "# Options of all commands\n\n",
@@ -55,43 +74,23 @@ def options_page() -> str:
     ]
     for name in COMMANDS:
         command = commands[name]
-        arguments = [one for one in command.params if one.param_type_name == "argument"]
-        words = " ".join(str(one.human_readable_name).upper() for one in arguments)
-        parts.append(f"\n## mlbatch {name}\n\n{command.help or ''}\n\n")
-        parts.append(f"`mlbatch {name} [OPTIONS] {words}`".replace(" `", "`") + "\n")
-        parts += [f"\n- `{one.human_readable_name.upper()}`: {_help(one)}" for one in arguments]
-        parts.append("\n")
-        groups: dict[str, list[Parameter]] = {}
-        for one in command.params:
-            if one.param_type_name == "option" and not getattr(one, "hidden", False):
-                groups.setdefault(getattr(one, "rich_help_panel", None) or "", []).append(one)
-        for group, options in groups.items():
-            title = f"\n**{group}**\n" if group else ""
-            parts.append(f"{title}\n| option | meaning |\n|---|---|\n")
-            parts += [f"| {_names(one)} | {_help(one)} |\n" for one in options]
+        context = command.make_context(name, [], resilient_parsing=True)
+        usage = " ".join(["mlbatch", name, *command.collect_usage_pieces(context)])
+        help_rows = HelpRows()
+        command.format_options(context, help_rows)
+        about = " ".join((command.help or "").split())
+        parts.append(f"\n## mlbatch {name}\n\n{about}\n\n`{usage}`\n")
+        for title, rows in help_rows.groups.items():
+            parts.append(f"\n| {title.lower()} | meaning |\n|---|---|\n")
+            parts += [
+                f"| `{_cell(names)}` | {_cell(text).replace('<', '&lt;')} |\n"
+                for names, text in rows
+            ]
     return "".join(parts)
 
 
-def _names(option: Parameter) -> str:
-    names = [*option.opts, *option.secondary_opts]
-    metavar = "" if getattr(option, "is_flag", False) else f" {_metavar(option)}"
-    return ", ".join(f"`{name}{metavar}`" for name in sorted(names, key=len))
-
-
-def _metavar(option: Parameter) -> str:
-    choices = getattr(option.type, "choices", None)
-    if choices:
-        return "\\|".join(str(getattr(one, "value", one)) for one in choices)
-    return option.metavar or option.type.name.upper()
-
-
-def _help(parameter: Parameter) -> str:
-    text = " ".join((getattr(parameter, "help", None) or "").split())
-    if getattr(parameter, "show_default", False) and "[default" not in text:
-        default = parameter.default
-        if isinstance(default, (str, int, float)) and not isinstance(default, bool) and default:
-            text += f" [default: {getattr(default, 'value', default)}]"
-    return text.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def warnings_page() -> str:
