@@ -104,7 +104,7 @@ def test_licence_and_readme_are_there() -> None:
 
 def test_metadata_names_no_person_and_no_address() -> None:
     project = _settings("project")
-    assert project["authors"] == [{"name": "The mlbatch authors"}]
+    assert str(project["authors"]) == "[{'name': 'The mlbatch authors'}]"
     assert "urls" not in project
     assert f"Programming Language :: Python :: {sys.version_info[0]}" in project["classifiers"]
 
