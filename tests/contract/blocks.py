@@ -22,8 +22,8 @@ PAGES = (
     ROOT / "fixtures" / "README.md",
     ROOT / "examples" / "mlbatch-example" / "README.md",
 )
-# `text`: what no program reads. Anything else has to be one of those that the tests know.
-LANGUAGES = ("console", "python", "yaml", "toml", "text")
+# What is typed: console; scripts of a cluster, which never run here: bash; `text`: anything else.
+LANGUAGES = ("console", "bash", "python", "yaml", "toml", "json", "text")
 _FENCE = re.compile(r"^( *)```(.*)$")
 _INFO = re.compile(r'^(\w*)(?: title="([\w./-]+)")?$')
 _MARK = re.compile(r"^ *<!-- (not run|needs):? (.+) -->$")
@@ -56,7 +56,9 @@ class Block:
         return f"{self.page.relative_to(ROOT).as_posix()}:{self.number}"
 
     def commands(self) -> list[Command]:
-        """The lines after `$ ` of a console block, with what is printed below each."""
+        """Lines after `$ ` of a console block, with what is printed below each; of a script all."""
+        if self.language == "bash":
+            return [Command(line, "") for line in self.text.splitlines()]
         found = []
         for part in re.split(r"^\$ ", self.text, flags=re.MULTILINE)[1:]:
             line, _, printed = re.sub(r" *\\\n *", " ", part).partition("\n")
@@ -89,8 +91,10 @@ def _block(page: Path, lines: list[str], begin: int, end: int, info: str) -> Blo
 
 
 def calls(line: str, program: str) -> list[list[str]]:
-    """Arguments of each call of a program in a line of a shell."""
-    lexer = shlex.shlex(line, posix=True, punctuation_chars=_PUNCTUATION)
+    """Arguments of each call of a program in a line of a shell; a variable counts as 1."""
+    lexer = shlex.shlex(
+        re.sub(r"\$\{?\w+\}?", "1", line), posix=True, punctuation_chars=_PUNCTUATION
+    )
     lexer.whitespace_split = True
     found: list[list[str]] = []
     inside = False

@@ -119,7 +119,11 @@ def test_languages_are_known(page: Path) -> None:
     for block in blocks(page):
         assert block.language in LANGUAGES, f"{block.place}: expected one of {LANGUAGES}"
         typed = [line for line in block.text.splitlines() if re.match(r"(\$ )?mlbatch ", line)]
-        assert block.language == "console" or not typed, f"{block.place}: expected ```console"
+        is_script = block.language == "bash"
+        assert block.language == "console" or is_script or not typed, (
+            f"{block.place}: expected ```console"
+        )
+        assert block.reason or not is_script, f"{block.place}: expected <!-- not run: REASON -->"
     inside = False
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         inside ^= line.lstrip().startswith("```")
@@ -173,6 +177,8 @@ def test_options_in_the_text_exist(page: Path) -> None:
 
 
 def test_calls_are_found() -> None:
+    script = 'mlbatch convert "$1" -o OUT --jobs "${CPUS}"  # one each'
+    assert calls(script, "mlbatch") == [["convert", "1", "-o", "OUT", "--jobs", "1"]]
     line = "mlbatch convert a -o b && mlbatch verify b | tee log > mlbatch; mlbatch sensors"
     assert calls(line, "mlbatch") == [["convert", "a", "-o", "b"], ["verify", "b"], ["sensors"]]
 
