@@ -54,7 +54,7 @@ NEEDLESS = (
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
     *("mlbatch.cli.simulate", "mlbatch.simulate.recording", "mlbatch.sensors.ouster.encode"),
     *("mlbatch.sensors.ouster.simulate", "mlbatch.lidar.simulated"),
-    *("numpy.ma", "rosbags", "rich"),
+    *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
 )
 
 
