@@ -168,7 +168,7 @@ class Boxes:
     def centres(self, index: I64Array, time_s: F64Array) -> F64Array:
         """Return centres (3, n) of the boxes `index` (n,) at times (n,)."""
         centre: F64Array = self.centre_m.T.take(index, axis=1)
-        moving = np.flatnonzero(self.velocity_mps.any(axis=1)[index])
+        moving = np.flatnonzero((self.velocity_mps != 0.0).any(axis=1).take(index))
         if len(moving):
             own_s = time_s[moving]
             repeat_s = self.repeat_s[index[moving]]
