@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.decode.engine import EngineSetup
@@ -206,7 +208,7 @@ class NumpyEngine:
             # Whole rows, since to choose points costs more than to move the empty slots.
             element = part.projector.slot_elements()
             own = (rows, slice(slots)) if slots < out.point.shape[1] else rows
-            pairs = [
+            pairs: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = [
                 (view.point.view(np.complex128)[..., 0], out.point.view(np.complex128)[..., 0]),
                 (view.label.view(np.uint64), out.label.view(np.uint64)),
                 (view.reflectivity, out.reflectivity),
