@@ -9,30 +9,49 @@ from typing import Annotated
 
 import typer
 
+from mlbatch.cli.words import one_of
 from mlbatch.errors import UsageError, one_line
 from mlbatch.units import NS_PER_S
+
+CLOCKS = ("sensor", "host")
 
 
 def compare(
     recordings: Annotated[
         list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
     ],
-    rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", "-r", help="Rig file (YAML).", metavar="FILE")
+    ] = None,
     rate: Annotated[
-        str | None, typer.Option(help="Windows per second, Hz: 10, 29.97. [default: rig's, 10]")
+        str | None,
+        typer.Option(
+            help="Windows per second, Hz: 10, 29.97.  [default: rig's, or 10]", metavar="HZ"
+        ),
     ] = None,
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
+        typer.Option(
+            *("--metadata", "-m"),
+            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+            metavar="FILE",
+        ),
     ] = None,
     clock: Annotated[
-        str, typer.Option(help="sensor: timestamps of the packets; host: their receive times.")
+        str,
+        one_of(
+            CLOCKS, "--clock", help="sensor: timestamps of the packets; host: their receive times."
+        ),
     ] = "sensor",
     tolerance: Annotated[
-        str, typer.Option(help="Approximate time: sweeps begin within this many s of each other.")
+        str,
+        typer.Option(
+            help="Approximate time: sweeps begin within this many s of each other.", metavar="S"
+        ),
     ] = "0.05",
     timeout: Annotated[
-        str, typer.Option(help="Timeout collate: a set is closed after this many s.")
+        str,
+        typer.Option(help="Timeout collate: a set is closed after this many s.", metavar="S"),
     ] = "0.1",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
@@ -43,7 +62,7 @@ def compare(
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
 
-    options.choice("--clock", clock, ("sensor", "host"))
+    options.choice("--clock", clock, CLOCKS)
     settings = Settings(
         _duration_ns("--tolerance", tolerance),
         _duration_ns("--timeout", timeout),

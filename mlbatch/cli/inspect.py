@@ -17,7 +17,11 @@ def inspect(
     ],
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
+        typer.Option(
+            *("--metadata", "-m"),
+            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+            metavar="FILE",
+        ),
     ] = None,
     whole: Annotated[
         bool,
@@ -25,7 +29,10 @@ def inspect(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     write_rig: Annotated[
-        Path | None, typer.Option(help="Write a rig file that `convert` accepts; -: print only it.")
+        Path | None,
+        typer.Option(
+            help="Write a rig file that `convert` accepts; -: print only it.", metavar="FILE"
+        ),
     ] = None,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""

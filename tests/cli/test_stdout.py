@@ -24,7 +24,7 @@ def _paths() -> list[tuple[str, str, bool]]:
         for param in group.commands[command].params:  # type: ignore[attr-defined]
             is_argument = param.param_type_name == "argument"
             if param.type.name == "path" and (command, param.name) not in PRINTABLE:
-                found += [(command, param.opts[-1], is_argument)]
+                found += [(command, max(param.opts, key=len), is_argument)]
     return found
 
 
