@@ -54,10 +54,17 @@ def compare(
         typer.Option(help="Timeout collate: a set is closed after this many s.", metavar="S"),
     ] = "0.1",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
+        ),
+    ] = False,
 ) -> None:
     """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
     from mlbatch.cli import options
-    from mlbatch.cli.tables import table_lines
+    from mlbatch.cli.progress import progress_bar
+    from mlbatch.cli.tables import paragraph, table_lines
     from mlbatch.compare.compare import Settings, compare
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
@@ -69,14 +76,15 @@ def compare(
     )
     selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
     job = Job(tuple(recordings), selection, rate=None if rate is None else options.rate(rate))
-    found = compare(job, settings)
+    with progress_bar("compare", is_verbose=verbose) as progress:
+        found = compare(job, settings, progress)
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
     if as_json:
         typer.echo(json.dumps(found.as_json(), indent=1))
         return
-    typer.echo(found.title())
-    for line in table_lines(found.rows()):
+    typer.echo(paragraph(found.title()))
+    for line in table_lines(found.rows(), transposable=True):
         typer.echo(line)
 
 

@@ -26,7 +26,7 @@ from mlbatch.compare.sweeps import (
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
@@ -145,8 +145,13 @@ class Joiner:
         ]
 
 
-def compare(job: Job, settings: Settings | None = None) -> Comparison:
-    """Join the sweeps of a recording by each policy, and batch the same columns by windows."""
+def compare(
+    job: Job, settings: Settings | None = None, progress: Progress | None = None
+) -> Comparison:
+    """Join the sweeps of a recording by each policy, and batch the same columns by windows.
+
+    progress: as of a conversion; its scans are windows.
+    """
     settings = settings or Settings()
     # Extrinsics are not used. Partial windows are read: sweeps may begin or end in them.
     selection = replace(job.selection, identity_extrinsics=True)
@@ -165,7 +170,7 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     )
     joiner = Joiner([_cutter(sensor) for sensor in run.sensors], policies, period_ns)
     windows = SetStatistics(WINDOWS, count, period_ns)
-    columns, length_ns = _run(run, joiner, windows)
+    columns, length_ns = _run(run, joiner, windows, progress)
     return Comparison(
         rate_hz=rate_text(run.grid.rate),
         period_ms=float(NS_PER_S / run.grid.rate / NS_PER_MS),
@@ -178,13 +183,22 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     )
 
 
-def _run(run: Conversion, joiner: Joiner, statistics: SetStatistics) -> tuple[int, int]:
+def _run(
+    run: Conversion, joiner: Joiner, statistics: SetStatistics, progress: Progress | None
+) -> tuple[int, int]:
     """Read all windows; returns the number of columns due in them, and their length in ns."""
     columns = 0
     first_ns: int | None = None
     end_ns = 0
     previous: Window | None = None
-    for window in run.windows():
+    count = 0
+
+    def show(done_bytes: int, size_bytes: int, _: int) -> None:
+        if progress is not None:
+            progress(done_bytes, size_bytes, count)
+
+    for window in run.windows(show):
+        count += 1
         joiner.add(window)
         first_ns = window.start_ns if first_ns is None else first_ns
         end_ns = window.end_ns

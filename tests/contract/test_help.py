@@ -63,7 +63,9 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--verbose": "chosen",
     },
     "inspect": {
+        "--rig": "YAML",
         "--whole": "whole",
+        "--verbose": "minute",
         "--metadata": "repeatable",
         "--json": "JSON",
         "--write-rig": "convert",
@@ -75,10 +77,11 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--clock": "sensor.*host",
         "--tolerance": r"\bs\b.*other",
         "--timeout": r"\bs\b",
+        "--verbose": "minute",
         "--json": "JSON",
     },
     "sensors": {"--json": "JSON"},
-    "verify": {"--report": "JSON.*next to", "--json": "JSON"},
+    "verify": {"--report": "JSON.*next to", "--json": "JSON", "--verbose": "minute"},
     "report": {
         "--output": r"page.*OUTPUT\.html",
         "--report": "JSON.*next to",
@@ -189,8 +192,9 @@ SHORT = {
         *("-o --output", "-r --rig", "-f --format", "-j --jobs", "-m --metadata"),
         *("-q --quiet", "-v --verbose"),
     },
-    "inspect": {"-r --rig", "-m --metadata"},
-    "compare": {"-r --rig", "-m --metadata"},
+    "inspect": {"-r --rig", "-m --metadata", "-v --verbose"},
+    "compare": {"-r --rig", "-m --metadata", "-v --verbose"},
+    "verify": {"-v --verbose"},
 }
 
 
