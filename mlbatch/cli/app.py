@@ -20,8 +20,13 @@ COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "report", "ben
 
 HELP = ("-h", "--help")
 
-# Options that may be `-`, standard output: command and parameter.
-PRINTABLE = frozenset({("convert", "report"), ("inspect", "write_rig")})
+# What may be `-`, standard output or, as a source, standard input: command and parameter.
+PRINTABLE = frozenset(
+    {
+        *(("convert", "report"), ("inspect", "write_rig")),
+        *(("report", "source"), ("report", "output")),
+    }
+)
 
 
 class Group(TyperGroup):
@@ -41,7 +46,7 @@ class Group(TyperGroup):
 
 
 class Command(TyperCommand):
-    """A command that takes `-` for standard output where it can be that, and refuses it elsewhere.
+    """A command that takes `-` for a standard stream where it can be that; refuses it elsewhere.
 
     Otherwise `-` would name a file.
     """

@@ -18,7 +18,11 @@ CLOCKS = ("sensor", "host")
 
 def compare(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
     ],
     rig: Annotated[
         Path | None, typer.Option("--rig", "-r", help="Rig file (YAML).", metavar="FILE")
@@ -68,6 +72,7 @@ def compare(
     from mlbatch.compare.compare import Settings, compare
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
+    from mlbatch.readers.inputs import expand
 
     options.choice("--clock", clock, CLOCKS)
     settings = Settings(
@@ -75,7 +80,7 @@ def compare(
         _duration_ns("--timeout", timeout),
     )
     selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(tuple(recordings), selection, rate=None if rate is None else options.rate(rate))
+    job = Job(expand(recordings), selection, rate=None if rate is None else options.rate(rate))
     with progress_bar("compare", is_verbose=verbose) as progress:
         found = compare(job, settings, progress)
     for note in found.notes:

@@ -20,7 +20,11 @@ ENGINES = ("auto", "numpy", "native")
 
 def convert(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -245,6 +249,7 @@ def convert(
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job, check_sort
+    from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
 
     options.choices(
@@ -259,7 +264,7 @@ def convert(
     options.ranges_m(min_range, max_range)
     first, last, are_dates = options.time_limits(start, end)
     job = Job(
-        recordings=tuple(recordings),
+        recordings=expand(recordings),
         selection=SensorSelection(
             rig=rig,
             metadata=tuple(metadata or ()),

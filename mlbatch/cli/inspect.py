@@ -13,7 +13,11 @@ from mlbatch.errors import one_line
 
 def inspect(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
     ],
     metadata: Annotated[
         list[Path] | None,
@@ -51,6 +55,7 @@ def inspect(
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import fits, paragraph, table_lines
     from mlbatch.discovery.inspect import inspect as inspect_recordings
+    from mlbatch.readers.inputs import expand
 
     prints_rig = write_rig == Path("-")
     if prints_rig and as_json:
@@ -61,7 +66,7 @@ def inspect(
         )
     with progress_bar("inspect", is_shown=whole, is_verbose=verbose) as progress:
         found = inspect_recordings(
-            tuple(recordings), tuple(metadata or ()), rig=rig, whole=whole, progress=progress
+            expand(recordings), tuple(metadata or ()), rig=rig, whole=whole, progress=progress
         )
     if prints_rig:
         typer.echo(found.rig_text(Path()), nl=False)

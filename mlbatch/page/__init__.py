@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.page.document import page_text
-from mlbatch.page.source import Source, find_source
+from mlbatch.page.source import Source, find_source, source_of_text
 
-__all__ = ["Source", "check_page", "find_source", "write_page"]
+__all__ = ["Source", "check_page", "find_source", "source_of_text", "write_page"]
 
 # First bytes of a page; only files that begin with them are replaced.
 MARK = b"<!DOCTYPE html>\n<!-- mlbatch page -->"
