@@ -11,11 +11,12 @@ from typer.core import TyperCommand, TyperGroup
 
 import mlbatch
 from mlbatch.cli import help as help_page
+from mlbatch.cli import rig_options
 from mlbatch.errors import UsageError
 
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
-COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "report", "bench")
+COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "report", "schema", "bench")
 
 
 HELP = ("-h", "--help")
@@ -63,7 +64,13 @@ class Command(TyperCommand):
                     f"{name or param.opts[0]}: expected a path, found -: neither standard input "
                     "nor standard output can be used here; give a file or folder"
                 )
-        return super().invoke(ctx)
+        if self.name != "convert":
+            return super().invoke(ctx)
+        places = rig_options.take(ctx, self.params)
+        try:
+            return super().invoke(ctx)
+        except UsageError as err:
+            raise rig_options.located(err, places) from err
 
     def get_help(self, ctx: Any) -> str:
         """Options in groups; on a terminal drawn by rich."""

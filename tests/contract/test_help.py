@@ -87,6 +87,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--report": "JSON.*next to",
         "--overwrite": "existing",
     },
+    "schema": {},
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",
