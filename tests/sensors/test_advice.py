@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from mlbatch.lidar.interface import SensorModel
@@ -16,8 +18,9 @@ def test_models_that_need_a_file_have_advice(model: SensorModel) -> None:
     advice = calibration_advice(f"{model.vendor} {model.name}")
     assert advice.startswith(f"{model.vendor} calls it ")
     # The kind of file that `mlbatch sensors` names.
-    (kind,) = [word for word in ("JSON", "csv", "dat", "db.xml") if word in model.calibration]
-    assert kind in advice
+    kinds = re.findall(r"\b(?:JSON|csv|dat|db\.xml)\b", model.calibration)
+    assert kinds
+    assert all(kind in advice for kind in kinds)
 
 
 @pytest.mark.parametrize(
