@@ -25,7 +25,7 @@ HELP = ("-h", "--help")
 PRINTABLE = frozenset(
     {
         *(("convert", "report"), ("inspect", "write_rig")),
-        *(("report", "source"), ("report", "output")),
+        *(("report", "source"), ("report", "output"), ("compare", "html")),
     }
 )
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+from mlbatch.batching.batcher import SLACK_NS
 from mlbatch.batching.windows import Window
 from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
 from mlbatch.compare.sweeps import (
@@ -25,6 +26,7 @@ from mlbatch.compare.sweeps import (
 )
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
+from mlbatch.page.policies import PolicyFigures
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
@@ -95,6 +97,28 @@ class Comparison:
         )
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
 
+    def figures(self) -> list[PolicyFigures]:
+        """What pages and figures show of each policy."""
+        starts_ns = [one.series.first_ns for one in self.reports if one.series is not None]
+        begin_ns = min((int(start.min()) for start in starts_ns if len(start)), default=0)
+        return [
+            PolicyFigures(
+                name=one.policy,
+                sets=one.sets,
+                without_a_sensor=one.without_a_sensor,
+                stale=one.stale,
+                columns=one.columns,
+                used_twice=one.used_twice,
+                never_used=one.never_used,
+                start_s=(one.series.first_ns - begin_ns) / NS_PER_S,
+                span_ms=one.series.span_ns / NS_PER_MS,
+                apart_ms=one.series.apart_ns / NS_PER_MS,
+                latency_ms=one.series.latency_ns / NS_PER_MS,
+            )
+            for one in self.reports
+            if one.series is not None
+        ]
+
     def as_json(self) -> dict[str, Value]:
         """The JSON document."""
         return {
@@ -135,7 +159,7 @@ class Joiner:
             self.lengths_ns[sweep.sensor].append(sweep.ready_ns - sweep.first_ns)
             for policy, statistics in self._policies:
                 for joined in policy.publish(sweep):
-                    statistics.add(joined)
+                    statistics.add(joined, policy.ready_ns)
 
     def reports(self) -> list[SetReport]:
         """Figures of each policy."""
@@ -203,7 +227,8 @@ def _run(
         first_ns = window.start_ns if first_ns is None else first_ns
         end_ns = window.end_ns
         if previous is not None:
-            statistics.add(_sweeps_of(previous, len(run.sensors)))
+            ready_ns = previous.end_ns + SLACK_NS
+            statistics.add(_sweeps_of(previous, len(run.sensors)), ready_ns)
             columns += len(previous.stamp_ns)
         # As in a conversion, the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None
