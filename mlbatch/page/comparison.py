@@ -25,6 +25,7 @@ _BOTTOM = 34
 _BINS = 400
 _ROW = 34
 _NAME_WIDTH = 150
+_WORDS_WIDTH = 170
 _STYLE = """
 svg { display: block; width: 100%; min-width: 620px; height: auto; }
 svg text { fill: var(--soft); font-size: 12px; font-family: inherit; }
@@ -33,8 +34,12 @@ svg .value { fill: var(--text); font-size: 11px; }
 .k0 { fill: #2f7ed8; stroke: #2f7ed8; } .k1 { fill: #e8743b; stroke: #e8743b; }
 .k2 { fill: #945ecf; stroke: #945ecf; } .k3 { fill: #19a979; stroke: #19a979; }
 .light { opacity: .38; }
+.legend span { white-space: nowrap; margin-right: 14px; }
+th { white-space: normal; }
+td:last-child { min-width: 0; }
+td:first-child { white-space: nowrap; }
 .legend i { display: inline-block; width: 12px; height: 12px; border-radius: 3px;
-  margin: 0 5px 0 12px; vertical-align: -2px; }
+  margin-right: 5px; vertical-align: -2px; }
 i.k0 { background: #2f7ed8; } i.k1 { background: #e8743b; } i.k2 { background: #945ecf; }
 i.k3 { background: #19a979; }
 .once { fill: #8d99a8; } .twice { fill: #d97706; } .never { fill: #e23b4b; }
@@ -87,7 +92,7 @@ def comparison_page(
     )
     return f"""<!DOCTYPE html>
 <!-- mlbatch page -->
-<html lang="en">
+<html lang="en" data-drawn="0">
 <head>
 <meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
@@ -150,15 +155,16 @@ def _notes(notes: Sequence[str]) -> str:
 
 def _legend(policies: Sequence[PolicyFigures]) -> str:
     marks = "".join(
-        f"<i class='k{number % 4}'></i>{escape(one.name)}" for number, one in enumerate(policies)
+        f"<span><i class='k{number % 4}'></i>{escape(one.name)}</span>"
+        for number, one in enumerate(policies)
     )
     return f"<p class='legend'>{marks}</p>"
 
 
 def _column_legend() -> str:
     return (
-        "<p class='legend'><i class='once'></i>used once<i class='twice'></i>used twice or more"
-        "<i class='never'></i>never used</p>"
+        "<p class='legend'><span><i class='once'></i>used once</span><span><i class='twice'></i>"
+        "used twice or more</span><span><i class='never'></i>never used</span></p>"
     )
 
 
@@ -277,10 +283,15 @@ def _offsets(policies: Sequence[PolicyFigures]) -> str:
 
 
 def _columns(policies: Sequence[PolicyFigures]) -> str:
-    width = _WIDTH - _NAME_WIDTH - _RIGHT
+    width = _WIDTH - _NAME_WIDTH - _WORDS_WIDTH
     parts = []
     for number, one in enumerate(policies):
         y = number * _ROW + 6
+        _, twice, never = one.shares()
+        words = f"{100 * twice:.1f} % twice, {100 * never:.1f} % never"
+        parts.append(
+            f"<text class='value' x='{_NAME_WIDTH + width + 8}' y='{y + 16}'>{words}</text>"
+        )
         parts.append(f"<text x='0' y='{y + 16}'>{escape(one.name)}</text>")
         x = float(_NAME_WIDTH)
         for kind, share in zip(("once", "twice", "never"), one.shares(), strict=True):
@@ -289,18 +300,13 @@ def _columns(policies: Sequence[PolicyFigures]) -> str:
                 f"<rect class='{kind}' x='{x:.1f}' y='{y}' width='{share * width:.1f}' "
                 f"height='{_ROW - 12}'><title>{escape(text)}</title></rect>"
             )
-            if share > 0.07:
-                parts.append(
-                    f"<text x='{x + 6:.1f}' y='{y + 15}' style='fill:#fff'>"
-                    f"{100 * share:.1f} %</text>"
-                )
             x += share * width
     return _svg(len(policies) * _ROW + 6, parts, "columns used once, twice or never")
 
 
 def _latencies(policies: Sequence[PolicyFigures]) -> str:
     top = max(one.latency_ms.max(initial=1.0) for one in policies) * 1.1
-    width = _WIDTH - _NAME_WIDTH - _RIGHT - 150
+    width = _WIDTH - _NAME_WIDTH - _WORDS_WIDTH
     height = len(policies) * _ROW + 26
     parts = []
     for tick in _ticks(top, 8):
