@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
+ARGUMENTS = "Arguments"
 OTHER = "Options"
 # Longer lines are hard to read.
 MAX_WIDTH = 120
@@ -19,10 +20,7 @@ MAX_WIDTH = 120
 Rows = list[tuple[str, str]]
 # Parameters of each group, in the order of help; what is in none is listed last, as OTHER.
 GROUPS: Mapping[str, tuple[str, ...]] = {
-    "Input": (
-        *("recordings", "rig", "metadata", "decode", "identity_extrinsics", "whole"),
-        *("output_of_convert", "source"),
-    ),
+    "Input": (*("recordings", "rig", "metadata", "decode", "identity_extrinsics", "whole"),),
     "Batching": (
         *("rate", "slices", "split", "max_wait", "keep_partial", "drop_incomplete"),
         *("tolerance", "timeout"),
@@ -56,7 +54,7 @@ def groups_of(command: Any, context: Any) -> dict[str, Rows]:
             names = GROUPS.get(group, ())
             place = names.index(param.name) if param.name in names else len(names)
             found.setdefault(group, []).append((place, record))
-    order = [*GROUPS, OTHER]
+    order = [ARGUMENTS, *GROUPS, OTHER]
     titles = sorted(found, key=lambda group: order.index(group) if group in order else len(order))
     return {
         title: [record for _, record in sorted(found[title], key=lambda row: row[0])]
@@ -67,7 +65,7 @@ def groups_of(command: Any, context: Any) -> dict[str, Rows]:
 def _group(command: str, param: Any) -> str:
     given = getattr(param, "rich_help_panel", None)
     if given or command not in GROUPED:
-        return given or ("Arguments" if param.param_type_name == "argument" else OTHER)
+        return given or (ARGUMENTS if param.param_type_name == "argument" else OTHER)
     return _GROUP_OF.get(param.name, OTHER)
 
 

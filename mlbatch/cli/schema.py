@@ -15,7 +15,7 @@ NAMES = ("rig",)
 def schema(
     name: Annotated[
         str,
-        typer.Argument(help="rig: the rig file.", metavar="[rig]", autocompletion=lambda: NAMES),
+        typer.Argument(help="rig: the rig file.", metavar="NAME", autocompletion=lambda: NAMES),
     ],
 ) -> None:
     """Print the JSON schema of a rig file, for editors and checks."""

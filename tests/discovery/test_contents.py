@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.builders.bags import Body, Recorded
+from mlbatch.discovery.contents import recording_report
+from mlbatch.readers import open_recording
+from mlbatch.types import StreamTable
+from tests.builders.bags import Body, Recorded, fixture_messages
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions import EPOCH_NS, FIXTURE, NS_PER_MS, NS_PER_S, Shell, Unit
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 
@@ -92,6 +98,27 @@ def test_a_bag_without_a_summary_shows_its_length_with_whole(shell: Shell, tmp_p
     assert _inspected(shell, str(bag))["duration_s"] is None
     assert "see --whole" in shell(f"inspect {bag}").out
     assert _inspected(shell, f"{bag} --whole")["duration_s"] > 10
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding", "write"),
+    [
+        ("drive.mcap", "cdr", write_mcap),
+        ("drive.db3", "cdr", write_rosbag2),
+        ("drive.bag", "ros1", write_rosbag1),
+    ],
+)
+def test_the_index_of_a_bag_states_its_end(
+    tmp_path: Path,
+    name: str,
+    encoding: str,
+    write: Callable[[Path, Sequence[Recorded]], Path],
+) -> None:
+    messages = fixture_messages(encoding)
+    bag = write(tmp_path / name, messages)
+    recording = open_recording(bag, StreamTable())
+    assert recording.last_ns == max(one.log_ns for one in messages)
+    assert recording_report(recording).last_host_ns == recording.last_ns
 
 
 def test_a_rig_names_the_sensors(shell: Shell) -> None:
