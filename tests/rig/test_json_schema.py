@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from tests.builders.sessions import REPOSITORY, Shell
 from tests.rig.test_mistakes import VALID
 from tests.rig.test_rig import FULL
 
-PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md")))
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")))
+BLOCK = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 ONE = "sensors: [{name: a, %s}]"
 
 
@@ -46,7 +47,7 @@ def _is_valid(text: str) -> bool:
 def _blocks() -> list[str]:
     """Rigs in README and docs."""
     texts = [
-        text
+        textwrap.dedent(text)
         for page in PAGES
         for language, text in BLOCK.findall(page.read_text(encoding="utf-8"))
         if language in ("", "yaml")
