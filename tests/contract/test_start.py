@@ -52,7 +52,7 @@ NEEDLESS = (
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
-    *("numpy.ma", "rosbags", "rich"),
+    *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
 )
 
 
