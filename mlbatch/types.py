@@ -159,6 +159,8 @@ class Recording:
     counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)
     # Damage of the recording, one line each.
     notes: list[str] = field(default_factory=list, kw_only=True)
+    # Newest log time by the container's own index; None: it has none.
+    last_ns: int | None = field(default=None, kw_only=True)
     # Part of `size_bytes` that the current pass has read.
     position_bytes: int = field(default=0, kw_only=True)
 

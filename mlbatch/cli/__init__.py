@@ -30,7 +30,7 @@ def main() -> None:
     try:
         from mlbatch.cli.app import command_line
 
-        code = command_line(*sys.argv[1:2])(standalone_mode=False)
+        code = command_line(*sys.argv[1:2])(prog_name="mlbatch", standalone_mode=False)
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
         sys.exit(code)

@@ -3,28 +3,54 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 import mlbatch
+from mlbatch.cli import help as help_page
+from mlbatch.cli import rig_options
 from mlbatch.errors import UsageError
 
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
 COMMANDS = (
     *("convert", "inspect", "compare", "sensors", "verify", "report"),
-    *("simulate", "bench"),
+    *("simulate", "schema", "bench"),
 )
 
 
-# Options that may be `-`, standard output: command and parameter.
-PRINTABLE = frozenset({("convert", "report"), ("inspect", "write_rig")})
+HELP = ("-h", "--help")
+
+# What may be `-`, standard output or, as a source, standard input: command and parameter.
+PRINTABLE = frozenset(
+    {
+        *(("convert", "report"), ("inspect", "write_rig")),
+        *(("report", "source"), ("report", "output"), ("compare", "html")),
+    }
+)
+
+
+class Group(TyperGroup):
+    """The root: its help lists the commands."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Options and commands; on a terminal drawn by rich."""
+        if not help_page.is_drawn():
+            return super().get_help(ctx)
+        groups = help_page.groups_of(self, ctx) | {"Commands": help_page.command_rows(self, ctx)}
+        return help_page.drawn(self, ctx, groups)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Commands with their whole summaries, as plain text."""
+        with formatter.section("Commands"):
+            formatter.write_dl(help_page.command_rows(self, ctx))
 
 
 class Command(TyperCommand):
-    """A command that takes `-` for standard output where it can be that, and refuses it elsewhere.
+    """A command that takes `-` for a standard stream where it can be that; refuses it elsewhere.
 
     Otherwise `-` would name a file.
     """
@@ -41,7 +67,25 @@ class Command(TyperCommand):
                     f"{name or param.opts[0]}: expected a path, found -: neither standard input "
                     "nor standard output can be used here; give a file or folder"
                 )
-        return super().invoke(ctx)
+        if self.name != "convert":
+            return super().invoke(ctx)
+        places = rig_options.take(ctx, self.params)
+        try:
+            return super().invoke(ctx)
+        except UsageError as err:
+            raise rig_options.located(err, places) from err
+
+    def get_help(self, ctx: Any) -> str:
+        """Options in groups; on a terminal drawn by rich."""
+        if not help_page.is_drawn():
+            return super().get_help(ctx)
+        return help_page.drawn(self, ctx, help_page.groups_of(self, ctx))
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Options in groups, as plain text."""
+        for title, rows in help_page.groups_of(self, ctx).items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
 
 
 def command_line(first: str = "") -> typer.Typer:
@@ -52,15 +96,28 @@ def command_line(first: str = "") -> typer.Typer:
     app = typer.Typer(
         name="mlbatch",
         help="Time-consistent merged scans from raw packets of many lidars, offline.",
-        add_completion=False,
+        cls=Group,
+        context_settings={"help_option_names": ["-h", "--help"]},
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )
     app.callback(invoke_without_command=True)(root)
     for name in (first,) if first in COMMANDS else COMMANDS:
         module = importlib.import_module(f"mlbatch.cli.{name}")
-        app.command(cls=Command)(getattr(module, name))
+        function = getattr(module, name)
+        # The page of the root shows no options of commands: describing them takes time.
+        described = _summary(function) if first in HELP else function
+        app.command(name, cls=Command)(described)
     return app
+
+
+def _summary(function: Callable[..., None]) -> Callable[[], None]:
+    """A command without options, with the summary of another one."""
+
+    def summary() -> None: ...
+
+    summary.__doc__ = function.__doc__
+    return summary
 
 
 def root(

@@ -7,41 +7,78 @@ from typing import Annotated
 
 import typer
 
+from mlbatch.cli.words import decode_words, format_words, one_of, point_layout_words
+
+LAYOUTS = ("dense", "organized")
+SORTS = ("columns", "points")
+COMPRESSIONS = ("none", "lz4", "zstd")
+CLOCKS = ("sensor", "host")
+ALIGN_TO = ("host", "first")
+ON_JUMP = ("error", "split")
+ENGINES = ("auto", "numpy", "native")
+
 
 def convert(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
     ],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="A .mcap or .bag file, or a folder (one file a scan)."),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="Rig file (YAML).")] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", "-r", help="Rig file (YAML).", metavar="FILE")
+    ] = None,
     rate: Annotated[
         str | None,
-        typer.Option(help="Scan rate, Hz: 10, 29.97, 10/3. [default: rig's, or 10]"),
+        typer.Option(help="Scan rate, Hz: 10, 29.97, 10/3.  [default: rig's, or 10]", metavar="HZ"),
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option(
-            "--format", help="mcap, npz, ply, rosbag1, rosbag2. [default: by OUTPUT; a folder: npz]"
+        one_of(
+            format_words,
+            *("--format", "-f"),
+            help="mcap, npz, ply, rosbag1, rosbag2.  [default: by OUTPUT; a folder: npz]",
+            metavar="FORMAT",
         ),
     ] = None,
     layout: Annotated[
-        str, typer.Option(help="dense: valid points only; organized: slots x columns.")
+        str,
+        one_of(LAYOUTS, "--layout", help="dense: valid points only; organized: slots x columns."),
     ] = "dense",
     sort: Annotated[
         str,
-        typer.Option(help="Order of a scan's points: columns (time of their columns) or points."),
+        one_of(
+            SORTS,
+            "--sort",
+            help="Order of a scan's points: columns (time of their columns) or points.",
+        ),
     ] = "columns",
     point_layout: Annotated[
-        str, typer.Option(help="Fields of a PointCloud2 point (preset).")
+        str,
+        one_of(
+            point_layout_words,
+            "--point-layout",
+            help="Fields of a PointCloud2 point (preset).",
+            metavar="NAME",
+        ),
     ] = "standard",
     compression: Annotated[
         str,
-        typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1)."),
+        one_of(
+            COMPRESSIONS,
+            "--compression",
+            help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1).",
+            metavar="NAME",
+        ),
     ] = "none",
-    slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
+    slices: Annotated[
+        int, typer.Option(help="Sub-scans a window, published one by one.", metavar="N")
+    ] = 1,
     split: Annotated[
         bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
     ] = False,
@@ -56,67 +93,104 @@ def convert(
     ] = 0.0,
     max_wait: Annotated[
         str,
-        typer.Option(help="Idle-source timeout: wait for a silent sensor, s, or inf."),
+        typer.Option(help="Idle-source timeout: wait for a silent sensor, s, or inf.", metavar="S"),
     ] = "1.0",
     start: Annotated[
         str | None,
-        typer.Option(help="First window starts at or after: epoch s, ISO time (UTC), or +S."),
+        typer.Option(
+            help="First window starts at or after: epoch s, ISO time (UTC), or +S.", metavar="T"
+        ),
     ] = None,
-    end: Annotated[str | None, typer.Option(help="Windows start before: as --start.")] = None,
+    end: Annotated[
+        str | None, typer.Option(help="Windows start before: as --start.", metavar="T")
+    ] = None,
     clock: Annotated[
-        str, typer.Option(help="sensor: timestamps in the packets; host: receive times.")
+        str,
+        one_of(CLOCKS, "--clock", help="sensor: timestamps in the packets; host: receive times."),
     ] = "sensor",
     align_clocks: Annotated[
         bool,
         typer.Option("--align-clocks", help="Map all clocks onto one; reads the recording twice."),
     ] = False,
     align_to: Annotated[
-        str, typer.Option(help="host: clock of the capture host; first: of the first sensor.")
+        str,
+        one_of(
+            ALIGN_TO,
+            "--align-to",
+            help="host: clock of the capture host; first: of the first sensor.",
+        ),
     ] = "host",
     on_jump: Annotated[
         str,
-        typer.Option(help="At a clock step: error, or split into outputs named .segN."),
+        one_of(
+            ON_JUMP, "--on-jump", help="At a clock step: error, or split into outputs named .segN."
+        ),
     ] = "error",
-    min_range: Annotated[float, typer.Option(help="Drop nearer points, m.")] = 0.0,
+    min_range: Annotated[float, typer.Option(help="Drop nearer points, m.", metavar="M")] = 0.0,
     max_range: Annotated[
-        float, typer.Option(help="Drop farther points, m.", show_default="none")
+        float, typer.Option(help="Drop farther points, m.", show_default="none", metavar="M")
     ] = float("inf"),
     exclude_box: Annotated[
         list[str] | None,
-        typer.Option(help="Drop points in x0,y0,z0,x1,y1,z1, m, body frame; repeatable."),
+        typer.Option(
+            help="Drop points in x0,y0,z0,x1,y1,z1, m, body frame; repeatable.", metavar="BOX"
+        ),
     ] = None,
     keep_repeated: Annotated[
         bool, typer.Option("--keep-repeated", help="Keep the second of two equal returns.")
     ] = False,
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
+        typer.Option(
+            *("--metadata", "-m"),
+            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+            metavar="FILE",
+        ),
     ] = None,
     identity_extrinsics: Annotated[
         bool, typer.Option("--identity-extrinsics", help="Sensors without extrinsics: at 0, 0, 0.")
     ] = False,
     decode: Annotated[
         list[str] | None,
-        typer.Option(help="KEY=VALUE for decoders: crc=check, firing_azimuth=off; repeatable."),
+        one_of(
+            decode_words,
+            "--decode",
+            help="KEY=VALUE for decoders: crc=check, firing_azimuth=off; repeatable.",
+            metavar="KEY=VALUE",
+        ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Use this sensor (name or serial); repeatable.")
+        list[str] | None,
+        typer.Option(
+            *("--only", "--include-sensor"),
+            help="Use this sensor (name or serial); repeatable.",
+            metavar="NAME",
+        ),
     ] = None,
     ignore: Annotated[
         list[str] | None,
         typer.Option(
-            help="Leave out this sensor (name, serial number, topic or IP:PORT); repeatable."
+            *("--ignore", "--exclude-sensor"),
+            help="Leave out this sensor (name, serial number, topic or IP:PORT); repeatable.",
+            metavar="NAME",
         ),
     ] = None,
     pass_: Annotated[
         list[str] | None,
-        typer.Option("--pass", help="Copy this topic (or pattern) of a bag; repeatable."),
+        typer.Option(
+            *("--pass", "--copy-topic"),
+            help="Copy this topic (or pattern) of a bag; repeatable.",
+            metavar="TOPIC",
+        ),
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="Inject a fault, as drop:left:5% or stall:left:5s-8s; repeatable."),
+        typer.Option(
+            help="Inject a fault, as drop:left:5% or stall:left:5s-8s; repeatable.",
+            metavar="FAULT",
+        ),
     ] = None,
-    fault_seed: Annotated[int, typer.Option(help="Seed of random faults.")] = 0,
+    fault_seed: Annotated[int, typer.Option(help="Seed of random faults.", metavar="N")] = 0,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -126,15 +200,25 @@ def convert(
     ] = False,
     report: Annotated[
         Path | None,
-        typer.Option(help="Path of the report (JSON); -: print it instead of the summary."),
+        typer.Option(
+            help="Path of the report (JSON); -: print it instead of the summary.", metavar="FILE"
+        ),
     ] = None,
     html: Annotated[
-        Path | None, typer.Option(help="Also write a page of the run (HTML), see mlbatch report.")
+        Path | None,
+        typer.Option(
+            help="Also write a page of the run (HTML), see mlbatch report.", metavar="FILE"
+        ),
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Scans made at the same time, a thread each.")] = 1,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            *("--jobs", "-j"), help="Scans made at the same time, a thread each.", metavar="N"
+        ),
+    ] = 1,
     engine: Annotated[
         str,
-        typer.Option(help="Decoder: auto, numpy, or native (compiled)."),
+        one_of(ENGINES, "--engine", help="Decoder: auto, numpy, or native (compiled)."),
     ] = "auto",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
@@ -165,13 +249,14 @@ def convert(
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job, check_sort
+    from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
 
     options.choices(
-        layout=(layout, ("dense", "organized")),
-        clock=(clock, ("sensor", "host")),
-        align_to=(align_to, ("host", "first")),
-        on_jump=(on_jump, ("error", "split")),
+        layout=(layout, LAYOUTS),
+        clock=(clock, CLOCKS),
+        align_to=(align_to, ALIGN_TO),
+        on_jump=(on_jump, ON_JUMP),
     )
     engine = options.engine(engine)
     options.output(output, dry_run=dry_run)
@@ -179,7 +264,7 @@ def convert(
     options.ranges_m(min_range, max_range)
     first, last, are_dates = options.time_limits(start, end)
     job = Job(
-        recordings=tuple(recordings),
+        recordings=expand(recordings),
         selection=SensorSelection(
             rig=rig,
             metadata=tuple(metadata or ()),

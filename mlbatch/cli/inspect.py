@@ -13,11 +13,25 @@ from mlbatch.errors import one_line
 
 def inspect(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one session: pcap, pcapng, MCAP, ROS bags.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
     ],
     metadata: Annotated[
         list[Path] | None,
-        typer.Option(help="Metadata or calibration; repeatable. [default: next to RECORDING]"),
+        typer.Option(
+            *("--metadata", "-m"),
+            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+            metavar="FILE",
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig", "-r", help="Rig file (YAML): its sensors, names and poses.", metavar="FILE"
+        ),
     ] = None,
     whole: Annotated[
         bool,
@@ -25,12 +39,23 @@ def inspect(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     write_rig: Annotated[
-        Path | None, typer.Option(help="Write a rig file that `convert` accepts; -: print only it.")
+        Path | None,
+        typer.Option(
+            help="Write a rig file that `convert` accepts; -: print only it.", metavar="FILE"
+        ),
     ] = None,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
+        ),
+    ] = False,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
-    from mlbatch.cli.tables import table_lines
+    from mlbatch.cli.progress import progress_bar
+    from mlbatch.cli.tables import fits, paragraph, table_lines
     from mlbatch.discovery.inspect import inspect as inspect_recordings
+    from mlbatch.readers.inputs import expand
 
     prints_rig = write_rig == Path("-")
     if prints_rig and as_json:
@@ -39,7 +64,10 @@ def inspect(
         raise UsageError(
             "--write-rig -: expected standard output for the rig alone, found --json; leave one out"
         )
-    found = inspect_recordings(tuple(recordings), tuple(metadata or ()), whole=whole)
+    with progress_bar("inspect", is_shown=whole, is_verbose=verbose) as progress:
+        found = inspect_recordings(
+            expand(recordings), tuple(metadata or ()), rig=rig, whole=whole, progress=progress
+        )
     if prints_rig:
         typer.echo(found.rig_text(Path()), nl=False)
         for note in found.notes:
@@ -59,9 +87,21 @@ def inspect(
         return
     for line in table_lines(found.rows()):
         typer.echo(line)
+    if found.topics:
+        _print("", *table_lines(found.topic_rows()))
+    _print("", *table_lines(found.recording_rows()))
     if found.clocks is not None:
-        typer.echo("\n" + "\n".join(found.clock_lines()))
+        _print("", *map(paragraph, found.clock_lines()))
+        matrix = found.clock_matrix()
+        if matrix:
+            rows = matrix if fits(matrix) else found.clocks_to_reference()
+            _print("", *table_lines(rows))
     for note in found.notes:
-        typer.echo(one_line(f"note: {note}"))
+        typer.echo(paragraph(f"note: {note}"))
     if write_rig is not None:
         typer.echo(f"wrote {write_rig}")
+
+
+def _print(*lines: str) -> None:
+    for line in lines:
+        typer.echo(line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -12,13 +13,16 @@ def report(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A report (JSON), or an output of convert with its report in or next to it.",
+            help="A report (JSON; -: from standard input), or an output of convert with its report "
+            "in or next to it.",
         ),
     ],
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="The page. [default: OUTPUT.html, or REPORT with suffix .html]"
+            "-o",
+            "--output",
+            help="The page; -: print it.  [default: OUTPUT.html, or REPORT with suffix .html]",
         ),
     ] = None,
     report: Annotated[
@@ -30,11 +34,24 @@ def report(
     ),
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
-    from mlbatch.errors import one_line
-    from mlbatch.page import check_page, find_source, write_page
+    from mlbatch.cli.options import is_stdout
+    from mlbatch.errors import UsageError, one_line
+    from mlbatch.page import check_page, find_source, source_of_text, write_page
+    from mlbatch.page.document import page_text
 
-    found = find_source(source, report)
+    if source == Path("-"):
+        if output is None:
+            raise UsageError(
+                "-o: expected a name for the page of standard input, found none; give -o run.html, "
+                "or -o - to print it"
+            )
+        found = source_of_text(Path("standard input"), sys.stdin.read())
+    else:
+        found = find_source(source, report)
     page = output or found.page
+    if is_stdout(output):
+        typer.echo(page_text(found), nl=False)
+        return
     check_page(page, overwrite=overwrite)
     write_page(page, found)
     typer.echo(one_line(f"wrote {page}"))

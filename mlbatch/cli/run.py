@@ -5,17 +5,17 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import typer
 
 from mlbatch.cli import EXIT_LIMIT
+from mlbatch.cli.progress import progress_bar
+from mlbatch.cli.tables import paragraph, table_lines, terminal_width
 from mlbatch.errors import (
     ClockJump,
     ExportError,
@@ -32,7 +32,7 @@ from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
 from mlbatch.report.limits import Limit, exceeded
-from mlbatch.report.report import RunReport, build_report, report_text, summary_lines
+from mlbatch.report.report import RunReport, build_report, report_text, summary_lines, summary_rows
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -126,7 +126,9 @@ def _run_one(job: Job, target: Target) -> list[str]:
         report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
     _check_page(target, report_path, name)
-    with _progress(target.quiet) as progress:
+    stages = ("clocks", "convert") if job.align_clocks_to else ("convert",)
+    shown = not target.quiet
+    with progress_bar(*stages, is_shown=shown, is_verbose=target.verbose) as progress:
         conversion, inputs = _converted(
             job, open_output, progress, resume_log, _report_writer(target, report_path)
         )
@@ -149,9 +151,14 @@ def _print_summary(
 ) -> None:
     if target.verbose:
         _print_sensors(conversion)
-    for line in summary_lines(inputs):
-        if not line.startswith("warning "):
-            typer.echo(one_line(line))
+    lines = [line for line in summary_lines(inputs) if not line.startswith("warning ")]
+    if terminal_width() is not None:
+        rows = summary_rows(inputs)
+        lines = [*table_lines(rows), *map(paragraph, lines[len(rows) :])]
+    else:
+        lines = [one_line(line) for line in lines]
+    for line in lines:
+        typer.echo(line)
     if target.written is not None:
         typer.echo(f"wrote {target.written}, report {report_path}")
 
@@ -390,27 +397,3 @@ def _resume_log(
     else:
         _say(f"{output}: resumed after {log.done} scans")
     return log
-
-
-# -- progress ---------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _progress(quiet: bool) -> Iterator[Progress | None]:
-    """A progress bar with rate and remaining time, on a terminal only."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich import progress
-    from rich.console import Console
-
-    with progress.Progress(
-        progress.BarColumn(),
-        progress.DownloadColumn(),
-        progress.TransferSpeedColumn(),
-        progress.TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    ) as bar:
-        task = bar.add_task("convert", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mlbatch.errors import one_line
-
 if TYPE_CHECKING:
     from mlbatch.verify import Verdict
 
@@ -26,17 +24,25 @@ def verify(
         typer.Option(help="Report of the run (JSON). [default: in OUTPUT or next to it]"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
+        ),
+    ] = False,
 ) -> None:
     """Check grid, order, times, counts and ledgers of an output, from the output alone."""
+    from mlbatch.cli.progress import progress_bar
     from mlbatch.verify import VerifyError
     from mlbatch.verify import verify as check
 
-    verdict = check(output, report)
+    with progress_bar("verify", unit="scans", is_verbose=verbose) as progress:
+        verdict = check(output, report, progress)
     if as_json:
         typer.echo(json.dumps(_values(verdict), indent=1))
     else:
         for line in _lines(verdict):
-            typer.echo(one_line(line))
+            typer.echo(line)
     if not verdict.ok:
         violated = sum(one.violations > 0 for one in verdict.checks)
         raise VerifyError(
@@ -73,7 +79,7 @@ def _values(verdict: Verdict) -> dict[str, object]:
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    from mlbatch.cli.tables import table_lines
+    from mlbatch.cli.tables import paragraph, table_lines
 
     size = f"{verdict.scans} scans, {verdict.points} points"
     if verdict.columns is not None:
@@ -87,10 +93,10 @@ def _lines(verdict: Verdict) -> list[str]:
         )
         for check in verdict.checks
     ]
-    lines = [f"{verdict.path}: {verdict.format}, {size}"]
+    lines = [paragraph(f"{verdict.path}: {verdict.format}, {size}")]
     lines += table_lines([("check", "checked", "outcome", "not checkable"), *rows])
     shown = verdict.violations[:SHOWN]
-    lines += map(str, shown)
+    lines += [paragraph(str(one)) for one in shown]
     if verdict.count > len(shown):
         lines.append(f"and {verdict.count - len(shown)} more")
     return lines

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+from mlbatch.batching.batcher import SLACK_NS
 from mlbatch.batching.windows import Window
 from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
 from mlbatch.compare.sweeps import (
@@ -25,8 +26,9 @@ from mlbatch.compare.sweeps import (
 )
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
+from mlbatch.page.policies import PolicyFigures
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
@@ -95,6 +97,28 @@ class Comparison:
         )
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
 
+    def figures(self) -> list[PolicyFigures]:
+        """What pages and figures show of each policy."""
+        starts_ns = [one.series.first_ns for one in self.reports if one.series is not None]
+        begin_ns = min((int(start.min()) for start in starts_ns if len(start)), default=0)
+        return [
+            PolicyFigures(
+                name=one.policy,
+                sets=one.sets,
+                without_a_sensor=one.without_a_sensor,
+                stale=one.stale,
+                columns=one.columns,
+                used_twice=one.used_twice,
+                never_used=one.never_used,
+                start_s=(one.series.first_ns - begin_ns) / NS_PER_S,
+                span_ms=one.series.span_ns / NS_PER_MS,
+                apart_ms=one.series.apart_ns / NS_PER_MS,
+                latency_ms=one.series.latency_ns / NS_PER_MS,
+            )
+            for one in self.reports
+            if one.series is not None
+        ]
+
     def as_json(self) -> dict[str, Value]:
         """The JSON document."""
         return {
@@ -135,7 +159,7 @@ class Joiner:
             self.lengths_ns[sweep.sensor].append(sweep.ready_ns - sweep.first_ns)
             for policy, statistics in self._policies:
                 for joined in policy.publish(sweep):
-                    statistics.add(joined)
+                    statistics.add(joined, policy.ready_ns)
 
     def reports(self) -> list[SetReport]:
         """Figures of each policy."""
@@ -145,8 +169,13 @@ class Joiner:
         ]
 
 
-def compare(job: Job, settings: Settings | None = None) -> Comparison:
-    """Join the sweeps of a recording by each policy, and batch the same columns by windows."""
+def compare(
+    job: Job, settings: Settings | None = None, progress: Progress | None = None
+) -> Comparison:
+    """Join the sweeps of a recording by each policy, and batch the same columns by windows.
+
+    progress: as of a conversion; its scans are windows.
+    """
     settings = settings or Settings()
     # Extrinsics are not used. Partial windows are read: sweeps may begin or end in them.
     selection = replace(job.selection, identity_extrinsics=True)
@@ -165,7 +194,7 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     )
     joiner = Joiner([_cutter(sensor) for sensor in run.sensors], policies, period_ns)
     windows = SetStatistics(WINDOWS, count, period_ns)
-    columns, length_ns = _run(run, joiner, windows)
+    columns, length_ns = _run(run, joiner, windows, progress)
     return Comparison(
         rate_hz=rate_text(run.grid.rate),
         period_ms=float(NS_PER_S / run.grid.rate / NS_PER_MS),
@@ -178,18 +207,28 @@ def compare(job: Job, settings: Settings | None = None) -> Comparison:
     )
 
 
-def _run(run: Conversion, joiner: Joiner, statistics: SetStatistics) -> tuple[int, int]:
+def _run(
+    run: Conversion, joiner: Joiner, statistics: SetStatistics, progress: Progress | None
+) -> tuple[int, int]:
     """Read all windows; returns the number of columns due in them, and their length in ns."""
     columns = 0
     first_ns: int | None = None
     end_ns = 0
     previous: Window | None = None
-    for window in run.windows():
+    count = 0
+
+    def show(done_bytes: int, size_bytes: int, _: int) -> None:
+        if progress is not None:
+            progress(done_bytes, size_bytes, count)
+
+    for window in run.windows(show):
+        count += 1
         joiner.add(window)
         first_ns = window.start_ns if first_ns is None else first_ns
         end_ns = window.end_ns
         if previous is not None:
-            statistics.add(_sweeps_of(previous, len(run.sensors)))
+            ready_ns = previous.end_ns + SLACK_NS
+            statistics.add(_sweeps_of(previous, len(run.sensors)), ready_ns)
             columns += len(previous.columns)
         # As in a conversion, the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from mlbatch.arrays import I64Array
 from mlbatch.compare.sweeps import Sweep, SweepSet
 from mlbatch.units import NS_PER_MS
 
@@ -19,11 +20,11 @@ HEAD = (
     "without a sensor",
     "stale",
     "span min",
-    "p50",
-    "p99",
-    "max",
+    "span p50",
+    "span p99",
+    "span max",
     "apart p50",
-    "max",
+    "apart max",
     "columns",
     "used twice",
     "never used",
@@ -50,6 +51,20 @@ class Distribution:
 
 
 @dataclass(frozen=True, slots=True)
+class SetSeries:
+    """Times of every set of a policy, in the order of publication, (n,) ns each.
+
+    first_ns: of its first column; span_ns: to its last one; apart_ns: as `SetReport.apart_ms`, 0
+    with one sensor; latency_ns: from its first column until the set is complete.
+    """
+
+    first_ns: I64Array
+    span_ns: I64Array
+    apart_ns: I64Array
+    latency_ns: I64Array
+
+
+@dataclass(frozen=True, slots=True)
 class SetReport:
     """Figures of the sets of one join policy, or of windows."""
 
@@ -69,6 +84,9 @@ class SetReport:
     used_twice: int
     # Columns in no set.
     never_used: int
+    # From the first column of a set until the set is complete.
+    latency_ms: Distribution = Distribution()
+    series: SetSeries | None = field(default=None, compare=False, repr=False)
 
     def row(self) -> list[str]:
         """Cells of the table, as HEAD."""
@@ -97,6 +115,7 @@ class SetReport:
             "columns": self.columns,
             "used_twice": self.used_twice,
             "never_used": self.never_used,
+            "latency_ms": asdict(self.latency_ms),
         }
 
 
@@ -111,6 +130,10 @@ class SetStatistics:
         self._is_reused = [False] * sensors
         self._spans_ns = array("q")
         self._aparts_ns = array("q")
+        # Of every set, also of those with one sensor.
+        self._firsts_ns = array("q")
+        self._all_aparts_ns = array("q")
+        self._latencies_ns = array("q")
         self._sets = 0
         self._without = 0
         self._stale = 0
@@ -118,15 +141,24 @@ class SetStatistics:
         self._used = 0
         self._used_twice = 0
 
-    def add(self, joined: SweepSet) -> None:
-        """Measure a set of at least one sweep."""
+    def add(self, joined: SweepSet, ready_ns: int | None = None) -> None:
+        """Measure a set of at least one sweep; ready_ns: when it is complete.
+
+        None: with the last of its sweeps.
+        """
         present = [sweep for sweep in joined if sweep is not None]
         newest_ns = max(sweep.last_ns for sweep in present)
         middles_ns = [sweep.middle_ns for sweep in present]
         self._sets += 1
         self._without += len(present) < len(joined)
         self._stale += any(sweep.last_ns < newest_ns - self._stale_ns for sweep in present)
-        self._spans_ns.append(newest_ns - min(sweep.first_ns for sweep in present))
+        first_ns = min(sweep.first_ns for sweep in present)
+        if ready_ns is None:
+            ready_ns = max(sweep.ready_ns for sweep in present)
+        self._firsts_ns.append(first_ns)
+        self._spans_ns.append(newest_ns - first_ns)
+        self._latencies_ns.append(ready_ns - first_ns)
+        self._all_aparts_ns.append(max(middles_ns) - min(middles_ns))
         if len(present) > 1:
             self._aparts_ns.append(max(middles_ns) - min(middles_ns))
         for sweep in present:
@@ -145,6 +177,13 @@ class SetStatistics:
             columns=columns - undecided,
             used_twice=self._used_twice,
             never_used=columns - undecided - self._used,
+            latency_ms=Distribution.of(self._latencies_ns),
+            series=SetSeries(
+                np.array(self._firsts_ns, np.int64),
+                np.array(self._spans_ns, np.int64),
+                np.array(self._all_aparts_ns, np.int64),
+                np.array(self._latencies_ns, np.int64),
+            ),
         )
 
     def _use(self, sweep: Sweep) -> None:

@@ -127,9 +127,10 @@ def publication_order(sweeps: Sequence[Sweep]) -> list[Sweep]:
 
 
 class JoinPolicy(Protocol):
-    """How sweeps are joined to sets."""
+    """How sweeps are joined to sets; ready_ns: when the set that was yielded last was complete."""
 
     name: str
+    ready_ns: int
 
     def publish(self, sweep: Sweep) -> Iterator[SweepSet]:
         """Add a sweep; yield every set that it completes."""
@@ -151,10 +152,12 @@ class NewestSweeps:
 
     def __init__(self, sensors: int) -> None:
         self._newest: list[Sweep | None] = [None] * sensors
+        self.ready_ns = 0
 
     def publish(self, sweep: Sweep) -> Iterator[SweepSet]:
         """A set at each sweep of the first sensor."""
         self._newest[sweep.sensor] = sweep
+        self.ready_ns = sweep.ready_ns
         if sweep.sensor == 0 and None not in self._newest:
             yield tuple(self._newest)
 
@@ -176,10 +179,12 @@ class NearestSweeps:
     def __init__(self, sensors: int, tolerance_ns: int) -> None:
         self._queues: list[deque[Sweep]] = [deque() for _ in range(sensors)]
         self._tolerance_ns = tolerance_ns
+        self.ready_ns = 0
 
     def publish(self, sweep: Sweep) -> Iterator[SweepSet]:
         """Sets of all sweeps of the first sensor whose nearest sweeps are known."""
         self._queues[sweep.sensor].append(sweep)
+        self.ready_ns = sweep.ready_ns
         first, *others = self._queues
         while first and all(self._is_known(queue, first[0], sweep.ready_ns) for queue in others):
             leading = first.popleft()
@@ -225,11 +230,14 @@ class CollectedSweeps:
         self._timeout_ns = timeout_ns
         self._open: dict[int, Sweep] = {}
         self._next: dict[int, Sweep] = {}
+        self.ready_ns = 0
 
     def publish(self, sweep: Sweep) -> Iterator[SweepSet]:
         """Sets whose timeout has passed, and the set that this sweep completes."""
         while self._open and sweep.ready_ns > self._opened_ns + self._timeout_ns:
+            self.ready_ns = self._opened_ns + self._timeout_ns
             yield self._close()
+        self.ready_ns = sweep.ready_ns
         if sweep.sensor in self._open:
             self._next[sweep.sensor] = sweep
             return

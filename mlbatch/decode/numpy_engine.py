@@ -9,14 +9,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.decode.engine import EngineSetup
 from mlbatch.decode.projector import Projector, Tile, TileView, points_by_column
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import WindowColumns
+
+# Four NaN of float32 in one number.
+_NO_POINT = np.full(4, np.nan, np.float32).view(np.complex128)
+# The sensor in a label.
+_LIDAR_ID_BIT = np.uint64(56)
 
 
 @dataclass(slots=True)
@@ -190,15 +197,33 @@ class NumpyEngine:
         for part in parts:
             view = part.view
             points += int(np.count_nonzero(view.keep))
-            row, slot = np.nonzero(view.keep)
-            order = number[part.rows]
-            out.clear(order)
-            sensor = columns.sensor[part.rows] + self._first_sensor
-            out.label["lidar_id"][order] = sensor[:, None]
-            target = (order[row], part.projector.number[slot])
-            out.point[target] = view.point[view.keep]
-            if "range_m" in self._extras:
-                out.range_m[target] = view.range_m[view.keep]
-            out.label[target] = view.label[view.keep]
-            out.reflectivity[target] = view.reflectivity[view.keep]
+            rows = number[part.rows]
+            slots = part.projector.slots
+            if slots < out.point.shape[1]:
+                out.clear(rows)
+                out.label["lidar_id"][rows] = (columns.sensor[part.rows] + self._first_sensor)[
+                    :, None
+                ]
+            self._empty(view, columns.sensor[part.rows])
+            # Whole rows, since to choose points costs more than to move the empty slots.
+            element = part.projector.slot_elements()
+            own = (rows, slice(slots)) if slots < out.point.shape[1] else rows
+            pairs: list[tuple[npt.NDArray[Any], npt.NDArray[Any]]] = [
+                (view.point.view(np.complex128)[..., 0], out.point.view(np.complex128)[..., 0]),
+                (view.label.view(np.uint64), out.label.view(np.uint64)),
+                (view.reflectivity, out.reflectivity),
+                (view.range_m, out.range_m),
+            ]
+            for values, target in pairs:
+                target[own] = values if element is None else values.take(element, axis=1)
         return points
+
+    def _empty(self, view: TileView, sensor: I64Array) -> None:
+        """Empty the slots without a point of columns (n,), as `ScanBuffer.clear`."""
+        empty = ~view.keep
+        lidar_id = (sensor + self._first_sensor).astype(np.uint64) << _LIDAR_ID_BIT
+        np.copyto(view.point.view(np.complex128)[..., 0], _NO_POINT, where=empty)
+        np.copyto(view.label.view(np.uint64), lidar_id[:, None], where=empty)
+        np.copyto(view.reflectivity, np.uint16(0), where=empty)
+        is_unknown = empty if "range_m" in self._extras else True
+        np.copyto(view.range_m, np.float32("nan"), where=is_unknown)

@@ -213,6 +213,16 @@ class Projector:
         order = self.order[table]
         return np.take_along_axis(keep, order, axis=1), self._ordered(table).reshape(-1)
 
+    def slot_elements(self) -> I64Array | None:
+        """Return the slot of a column that each slot of an organized row has; None: its own."""
+        slots = np.arange(self.slots)
+        if np.array_equal(self.number, slots):
+            return None
+        elements = self.number.argsort()
+        if not np.array_equal(self.number[elements], slots):
+            raise IndexError(f"expected {self.slots} slots, each once, found {self.number}")
+        return elements
+
     def _ordered(self, table: I64Array) -> I64Array:
         """Return tile elements (n, slots), each column in firing order; table: (n,)."""
         order = np.arange(self.slots)[None] if self.order is None else self.order[table]

@@ -42,6 +42,7 @@ from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
+from mlbatch.sensors.advice import with_advice
 from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -165,7 +166,11 @@ def discover(
         examined = examined or find_calibrations(paths, selection.metadata)[1]
         names = _names(examined, recorded)
         reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures, refused)
-        raise RecordingError(f"{reason}{_hints(recordings, examined, collector)}")
+        text = f"{reason}{_hints(recordings, examined, collector)}"
+        described = [describe(sampler, kind) or "" for kind in lidar_kinds]
+        lacking = [what for what in described if not lacks_decoder(what)]
+        is_missing = bool(lacking) and not matched.failures and not refused
+        raise RecordingError(with_advice(text, lacking[0]) if is_missing else text)
     chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
     left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
     ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
@@ -430,7 +435,7 @@ def _unmatched(
             expected = f"expected metadata that match, found {_known(names)}"
             text = f"{start}; {expected}; give --metadata FILE, or leave it out with {ignore}"
             text += f" ({faults})" if faults else ""
-            note = Note("no_metadata", "", text)
+            note = Note("no_metadata", "", with_advice(text, what))
         notes.append((kind, note))
     return notes
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -12,11 +12,17 @@ from mlbatch import sensors
 from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.batching.loss import PacketLoss
-from mlbatch.clocks.compare import Comparison, compare
+from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
-from mlbatch.clocks.timescale import timescale
+from mlbatch.clocks.timescale import format_difference, timescale
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
 from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.discovery.contents import (
+    RecordingReport,
+    TopicCounter,
+    TopicReport,
+    recording_report,
+)
 from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import (
     Discovery,
@@ -28,7 +34,8 @@ from mlbatch.discovery.discover import (
 )
 from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import describe
-from mlbatch.discovery.probe import first_seconds
+from mlbatch.discovery.overlap import iso
+from mlbatch.discovery.probe import first_seconds, is_without_packets
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
@@ -46,6 +53,10 @@ from mlbatch.rig.write import write_rig
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
+# Called with the bytes read so far, and with those of all recordings.
+Progress = Callable[[int, int], object]
+# Fewer pairs of clocks are described in words, not by a matrix.
+_FEWEST_PAIRS = 3
 MS_PER_S = NS_PER_S // NS_PER_MS
 HEAD = (
     "stream",
@@ -114,6 +125,11 @@ class StreamReport:
         ]
 
 
+TOPIC_HEAD = ("other topic", "type", "messages", "Hz")
+RECORDING_HEAD = ("recording", "container", "MB", "start", "seconds")
+_BYTES_PER_MB = 1_000_000
+
+
 @dataclass(frozen=True, slots=True)
 class Inspection:
     """All streams of the first 10 seconds of a session, or of all of it."""
@@ -126,6 +142,56 @@ class Inspection:
     notes: tuple[str, ...] = ()
     clocks: Comparison | None = None  # None without timestamps
     whole: bool = False  # counts, loss and clocks are those of whole recordings
+    recordings: tuple[RecordingReport, ...] = ()
+    topics: tuple[TopicReport, ...] = ()  # without packets
+
+    @property
+    def first_host_ns(self) -> int | None:
+        """Earliest receive time of a packet or log time of a message."""
+        firsts = [one.first_host_ns for one in self.streams]
+        firsts += [one.first_host_ns for one in self.topics if one.messages]
+        return min(firsts, default=None)
+
+    @property
+    def last_host_ns(self) -> int | None:
+        """Newest receive or log time; None where only `whole` shows it."""
+        lasts = [one.last_host_ns for one in self.streams]
+        lasts += [one.last_host_ns for one in self.topics if one.messages]
+        ends = [one.last_host_ns for one in self.recordings]
+        known = [end for end in ends if end is not None]
+        if not self.whole and len(known) < len(ends):
+            return None
+        # The last packets of a file may be fragments, which only reading joins.
+        return max([*lasts, *known], default=None)
+
+    @property
+    def duration_s(self) -> float | None:
+        """Time from the first to the last packet or message, by the capture host."""
+        if self.first_host_ns is None or self.last_host_ns is None:
+            return None
+        return (self.last_host_ns - self.first_host_ns) / NS_PER_S
+
+    def recording_rows(self) -> list[list[str]]:
+        """The recordings, head first; start and duration are those of all, in the first row."""
+        rows = [
+            [one.path, one.container, f"{one.bytes / _BYTES_PER_MB:.1f}", "", ""]
+            for one in self.recordings
+        ]
+        if rows and self.first_host_ns is not None:
+            duration_s = self.duration_s
+            rows[0][3] = iso(self.first_host_ns)
+            rows[0][4] = "see --whole" if duration_s is None else f"{duration_s:.3f}"
+        return [list(RECORDING_HEAD), *rows]
+
+    def topic_rows(self) -> list[list[str]]:
+        """Topics without packets, head first."""
+        return [
+            list(TOPIC_HEAD),
+            *(
+                [one.topic, one.type, str(one.messages), f"{one.rate_hz:.1f}"]
+                for one in self.topics
+            ),
+        ]
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
@@ -136,14 +202,65 @@ class Inspection:
         return {
             "schema": "mlbatch.inspect/1",
             "whole": self.whole,
+            "recordings": [asdict(one) for one in self.recordings],
+            "start": None if self.first_host_ns is None else iso(self.first_host_ns),
+            "duration_s": self.duration_s,
             "streams": [asdict(stream) for stream in self.streams],
+            "topics": [asdict(topic) for topic in self.topics],
             "notes": list(self.notes),
             "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
         }
 
     def clock_lines(self) -> list[str]:
-        """Verdicts on the clocks, as text."""
-        return [] if self.clocks is None else self.clocks.describe()
+        """Verdicts on the clocks, as text; of many pairs only those that need attention."""
+        if self.clocks is None:
+            return []
+        lines = self.clocks.describe()
+        pairs = self.clocks.pairs
+        if len(pairs) < _FEWEST_PAIRS:
+            return lines
+        reference = self.clocks.reference
+        shown = [
+            pair.describe()
+            for pair in pairs
+            if pair.verdict != SYNCHRONISED and reference in (pair.one, pair.two)
+        ]
+        return [*lines[: len(lines) - len(pairs)], *shown]
+
+    def clock_matrix(self) -> list[list[str]]:
+        """Differences of the clocks, row minus column, head first; empty for one pair."""
+        if self.clocks is None or len(self.clocks.pairs) < _FEWEST_PAIRS:
+            return []
+        names = [name for name, _ in self.clocks.estimates]
+        apart = self._apart_ns()
+        head = ["clock minus clock", *(str(number) for number, _ in enumerate(names, 1))]
+        rows = [
+            [f"{number} {name}", *(format_difference(apart[name, other]) for other in names)]
+            for number, name in enumerate(names, 1)
+        ]
+        return [head, *rows]
+
+    def clocks_to_reference(self) -> list[list[str]]:
+        """The column of the matrix that the others follow from, head first."""
+        if self.clocks is None:
+            return []
+        reference = self.clocks.reference
+        apart = self._apart_ns()
+        rows = [
+            [name, format_difference(apart[name, reference])] for name, _ in self.clocks.estimates
+        ]
+        return [["clock", f"minus clock of {reference}"], *rows]
+
+    def _apart_ns(self) -> dict[tuple[str, str], int]:
+        """How far the first clock of each pair is ahead of the second, both ways."""
+        apart = {}
+        for name, _ in () if self.clocks is None else self.clocks.estimates:
+            apart[name, name] = 0
+        for pair in () if self.clocks is None else self.clocks.pairs:
+            middle_ns = (pair.low_ns + pair.high_ns) // 2
+            apart[pair.two, pair.one] = middle_ns
+            apart[pair.one, pair.two] = -middle_ns
+        return apart
 
     def rig_text(self, folder: Path) -> str:
         """A rig file for these sensors; extrinsics without a source are `unknown`."""
@@ -175,22 +292,29 @@ class Inspection:
 
 
 def inspect(
-    recordings: Sequence[Path], metadata: Sequence[Path], *, whole: bool = False
+    recordings: Sequence[Path],
+    metadata: Sequence[Path],
+    *,
+    rig: Path | None = None,
+    whole: bool = False,
+    progress: Progress | None = None,
 ) -> Inspection:
     """Inspect the first 10 s of recordings, with the metadata given or in their directories.
 
-    whole: count packets and measure loss and clocks on the whole recordings.
+    rig: its sensors and names; whole: count packets and measure loss and clocks on the whole
+    recordings; progress: called with the bytes read so far, and those of all recordings.
     """
     table = StreamTable()
     discovery = discover(
         [open_recording(path, table) for path in recordings],
         table,
-        SensorSelection(metadata=tuple(metadata), identity_extrinsics=True),
+        SensorSelection(rig=rig, metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,
     )
     early = frozenset(discovery.sampler.kinds)
     others: dict[PacketKind, _OtherPackets] = {}
-    measured = _measure(discovery, others, whole=whole)
+    topics = TopicCounter.subscribed(discovery.recordings, (one.topic for one in table.streams))
+    measured = _measure(discovery, others, topics, progress, whole=whole)
     types = packet_types(discovery.recordings)
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
@@ -217,6 +341,8 @@ def inspect(
         ),
         clocks=compare(known) if known else None,
         whole=whole,
+        recordings=tuple(map(recording_report, discovery.recordings)),
+        topics=tuple(topics.reports()),
     )
 
 
@@ -322,12 +448,17 @@ def _other_lidars(
 
 
 def _measure(
-    discovery: Discovery, others: dict[PacketKind, _OtherPackets], *, whole: bool
+    discovery: Discovery,
+    others: dict[PacketKind, _OtherPackets],
+    topics: TopicCounter,
+    progress: Progress | None,
+    *,
+    whole: bool,
 ) -> dict[DetectedSensor, _Measured]:
     """Loss and clock of each sensor, in the first seconds or the whole session.
 
-    others: gets the packets of no sensor; whole: packets of all kinds are counted again, with those
-    that begin later.
+    others: gets the packets of no sensor; topics: gets the messages of the others; whole: packets
+    of all kinds are counted again, with those that begin later.
     """
     sampler = discovery.sampler
     if whole:
@@ -335,7 +466,12 @@ def _measure(
     late: set[PacketKind] = set()
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
-    for batch in merge(recordings) if whole else first_seconds(recordings):
+    size_bytes = sum(recording.size_bytes for recording in recordings)
+    read = merge if whole else first_seconds
+    for batch in read(recordings, is_without_packets):
+        topics.add(batch.messages)
+        if progress is not None:
+            progress(sum(recording.position_bytes for recording in recordings), size_bytes)
         parts = split_by_kind(batch)
         for kind, index in sampler.crowd.followed(batch, parts) if whole else parts:
             if whole and sampler.count(kind, index, batch):

@@ -24,6 +24,7 @@ from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import RigSensor, StreamSelector
+from mlbatch.sensors.advice import with_advice
 from mlbatch.types import StreamTable
 
 
@@ -431,12 +432,19 @@ def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], or
 
 def _refuse_no_metadata(expected: ExpectedSensor, origin: Path) -> NoReturn:
     serial = expected.selector.serial
-    raise RigError(
+    text = (
         f"{origin}: sensor {expected.name}: no metadata"
         + (f" with serial number {serial}" if serial else "")
         + f" among {_paths(expected.calibrations)}; give it as `metadata:` of the sensor, or "
         "with --metadata"
     )
+    raise RigError(with_advice(text, _vendor_of(expected.rig.model or "")))
+
+
+def _vendor_of(model: str) -> str:
+    """Vendor and name of a model of the rig; "" for none."""
+    vendors = (one.vendor for one in sensors.models() if one.name == model)
+    return f"{next(vendors, '')} {model}".strip()
 
 
 def _silent(

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from mlbatch.units import NS_PER_S
 if TYPE_CHECKING:
     from mlbatch.readers.bag.cloud_topics import CloudTopics
 
+ByLogTime: TypeAlias = Callable[[Recording], bool]
 # Length of the part that is probed.
 PROBE_NS = 10 * NS_PER_S
 # Packets of a kind in a batch that are checked for being a lidar's.
@@ -126,14 +127,17 @@ def probe(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler,
     return sampler, collector
 
 
-def first_seconds(recordings: Sequence[Recording]) -> Iterator[PacketBatch]:
-    """Yield all packets up to 10 s after the first lidar packet.
+def first_seconds(
+    recordings: Sequence[Recording], by_log_time: ByLogTime | None = None
+) -> Iterator[PacketBatch]:
+    """Yield all packets up to 10 s after the first lidar packet; by_log_time: as for `merge`.
 
     A capture may start long before the lidars do. The end does not depend on the size of batches.
     """
     end_ns: int | None = None
     crowd = Crowd()
-    with contextlib.closing(merge(recordings)) as batches:
+    merged = merge(recordings) if by_log_time is None else merge(recordings, by_log_time)
+    with contextlib.closing(merged) as batches:
         for batch in batches:
             if end_ns is None:
                 begin_ns = _first_lidar_host_ns(batch, crowd)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.page.document import page_text
-from mlbatch.page.source import Source, find_source
+from mlbatch.page.source import Source, find_source, source_of_text
 
-__all__ = ["Source", "check_page", "find_source", "write_page"]
+__all__ = ["Source", "check_page", "find_source", "source_of_text", "write_page", "write_text_page"]
 
 # First bytes of a page; only files that begin with them are replaced.
 MARK = b"<!DOCTYPE html>\n<!-- mlbatch page -->"
@@ -43,8 +43,13 @@ def check_page(path: Path, *, overwrite: bool) -> None:
 
 def write_page(path: Path, source: Source) -> None:
     """Write the page of a run; the file appears complete or not at all."""
+    write_text_page(path, page_text(source))
+
+
+def write_text_page(path: Path, text: str) -> None:
+    """Write a page given as text; the file appears complete or not at all."""
     # Names in a report may contain bytes that are not UTF-8.
-    data = page_text(source).encode("utf-8", "backslashreplace")
+    data = text.encode("utf-8", "backslashreplace")
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.write_bytes(data)

@@ -74,7 +74,7 @@ def page_text(source: Source) -> str:
     windows = None if source.table is None else read_windows(source.table, slices)
     clouds, why_no_clouds = _clouds(source, windows)
     found = findings(report, windows)
-    script = _asset("page.js")
+    script = asset("page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     title = _title(source)
     body = "\n".join(
@@ -104,7 +104,7 @@ style-src 'unsafe-inline'; script-src 'sha256-{digest}'">
 <link rel="icon" href="data:,">
 <title>{escape(title)} - mlbatch</title>
 <style>
-{_asset("page.css")}</style>
+{asset("page.css")}</style>
 </head>
 <body>
 <main>
@@ -118,7 +118,8 @@ style-src 'unsafe-inline'; script-src 'sha256-{digest}'">
 """
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Text of a file of this package."""
     return resources.files("mlbatch.page").joinpath(name).read_text(encoding="utf-8")
 
 

@@ -41,6 +41,11 @@ def read_report(where: Path, text: str) -> Values:
     return report
 
 
+def source_of_text(where: Path, text: str) -> Source:
+    """The run of a report alone, given as text; where: for errors."""
+    return Source(read_report(where, text), None, None, where.with_suffix(".html"))
+
+
 def find_source(path: Path, report: Path | None = None) -> Source:
     """The run of a report or of an output; report: path of `--report`, if it is not the usual one.
 

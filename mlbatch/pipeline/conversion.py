@@ -30,8 +30,8 @@ from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
 from mlbatch.units import NS_PER_S, rate_text
 
-# Called with the bytes read so far, and with those of all recordings.
-Progress = Callable[[int, int], None]
+# Called with the bytes read so far, those of all recordings, and the number of scans so far.
+Progress = Callable[[int, int, int], None]
 Item = TypeVar("Item")
 
 
@@ -86,11 +86,14 @@ class Conversion:
     already contains; dropped_incomplete: windows left out by `--drop-incomplete`.
     """
 
-    def __init__(self, job: Job, buffers: int = 1) -> None:
-        """buffers: number of scans of a decode worker that are valid at a time."""
+    def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
+        """buffers: number of scans of a decode worker that are valid at a time.
+
+        progress: of the pass that `--align-clocks` makes here.
+        """
         self.stages = Stages()
         self.job = job
-        self.session = Session(job)
+        self.session = Session(job, progress)
         self.sensors: Sequence[Sensor] = self.session.sensors
         rig = self.session.setup.rig
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
@@ -126,6 +129,9 @@ class Conversion:
         smallest first, and cut at the bounds of an absolute grid.
         """
         self.passthrough.subscribe(self.session.recordings)
+        if progress is not None:
+            # A pass begins: that of `--align-clocks` came before.
+            progress(0, self.session.size_bytes, 0)
         oldest_ring_indexes = self._oldest_ring_indexes()
         with contextlib.closing(self.session.packets()) as packets:
             for batch in self.stages.each("read_s", packets):
@@ -136,7 +142,8 @@ class Conversion:
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
                 yield from self.batcher.push(ingested.arrivals, batch.host_ns)
                 if progress is not None:
-                    progress(self.session.position_bytes, self.session.size_bytes)
+                    scans = 0 if self.table is None else self.table.rows
+                    progress(self.session.position_bytes, self.session.size_bytes, scans)
                 if self.batcher.past_end:
                     break
                 oldest_ring_indexes = self._oldest_ring_indexes()

@@ -48,7 +48,7 @@ def convert(
     """
     # One scan more than are waiting to be written: the one that is being decoded.
     decodes_ahead = job.jobs == 1 and open_writer is not None
-    run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1)
+    run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1, progress=progress)
     if resume_log is not None:
         resume_log.join(run)
     output = _Output(run, open_writer, resume_log)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +43,8 @@ class Session:
     warnings so far.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, progress: Callable[[int, int, int], None] | None = None) -> None:
+        """progress: as `conversion.Progress`, of the pass for `--align-clocks`."""
         self.job = job
         self.delivered = 0
         self.notes: list[Note] = []
@@ -67,7 +68,8 @@ class Session:
         self.replay = self._replay()
         self.clocks = ClockMonitor(self.sensors, self.replay)
         if job.align_clocks_to:
-            self.clocks.align(merge(self.recordings), self.setup.router, job.align_clocks_to)
+            batches = self._shown(merge(self.recordings), progress)
+            self.clocks.align(batches, self.setup.router, job.align_clocks_to)
         maps_stamps = bool(job.faults or job.align_clocks_to)
         self.ingest = Ingest(
             self.setup.router,
@@ -75,6 +77,17 @@ class Session:
             self.clocks.map_stamps if maps_stamps else None,
             self._is_ignored if job.selection.only or job.selection.ignore else None,
         )
+
+    def _shown(
+        self,
+        batches: Iterator[PacketBatch],
+        progress: Callable[[int, int, int], None] | None,
+    ) -> Iterator[PacketBatch]:
+        """The batches; each is reported."""
+        for batch in batches:
+            yield batch
+            if progress is not None:
+                progress(self.position_bytes, self.size_bytes, 0)
 
     def _is_ignored(self, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of no sensor the user left out: (P,) bool."""

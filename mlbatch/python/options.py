@@ -15,6 +15,7 @@ from mlbatch.errors import UsageError
 from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, check_sort, wait_ns
 from mlbatch.pipeline.time_limits import limits_of
+from mlbatch.readers.inputs import expand
 from mlbatch.units import parse_rate
 
 AnyPath: TypeAlias = "str | PathLike[str]"
@@ -87,7 +88,7 @@ def session_job(
     choice("clock", clock, ("sensor", "host"))
     choice("engine", engine, (*ENGINES, *ALIASES))
     several = recordings if isinstance(recordings, tuple) else (recordings,)
-    found = tuple(path for one in several for path in paths_of("recording", one))
+    found = expand(path for one in several for path in paths_of("recording", one))
     if not found:
         raise UsageError("recording: expected at least one path, found none; name a recording")
     return Job(

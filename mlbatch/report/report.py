@@ -212,11 +212,16 @@ def imbalances(run: RunReport) -> list[str]:
     return lines
 
 
-def summary_lines(run: RunReport) -> list[str]:
-    """Result of a run as a text table and two lines."""
+def summary_rows(run: RunReport) -> list[tuple[str, ...]]:
+    """Counts of each sensor, head first."""
     head = ("sensor", "model", "packets", "lost", "rejected", "columns", "dropped", "points")
-    rows = [head, *(_summary_row(sensor) for sensor in run.sensors)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    return [head, *(_summary_row(sensor) for sensor in run.sensors)]
+
+
+def summary_lines(run: RunReport) -> list[str]:
+    """Result of a run as a text table, of `summary_rows`, and two lines."""
+    rows = summary_rows(run)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join(
             cell.ljust(width) if i < 2 else cell.rjust(width)

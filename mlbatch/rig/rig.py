@@ -13,6 +13,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.types import Stream
 
 if TYPE_CHECKING:
+    from mlbatch.rig.convert_keys import RigOption
     from mlbatch.ros.point_times import PointRule
 
 DEFAULT_BODY_FRAME = "base_link"
@@ -89,13 +90,15 @@ def no_boxes() -> F64Array:
 class Rig:
     """The sensors in the order of `lidar_id`, and settings of all.
 
-    exclude_boxes_m: (k, 6) float64, x0, y0, z0, x1, y1, z1 in the body frame.
+    exclude_boxes_m: (k, 6) float64, x0, y0, z0, x1, y1, z1 in the body frame; options: of
+    `mlbatch convert`.
     """
 
     sensors: tuple[RigSensor, ...]
     body_frame: str = DEFAULT_BODY_FRAME
     rate: Fraction | None = None
     exclude_boxes_m: F64Array = field(default_factory=no_boxes)
+    options: tuple[RigOption, ...] = ()
 
 
 def read_rig(path: Path) -> Rig:

@@ -9,10 +9,9 @@ import ipaddress
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +19,24 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
 from mlbatch.lidar.limits import MAX_TRANSLATION_M
+from mlbatch.rig import convert_keys
+from mlbatch.rig.convert_keys import RigOption
+from mlbatch.rig.keys import (
+    FLAG,
+    NUMBER,
+    OPTIONS,
+    RANGE_M,
+    TEXT,
+    WORD,
+    Form,
+    Key,
+    choice_form,
+    mapping_form,
+    names,
+    numbers_form,
+    text_form,
+    whole_form,
+)
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,
@@ -45,30 +62,6 @@ _FRAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _TEXT = re.compile(r"\S(.*\S)?")
 # No blanks, no control characters, no surrogates (which no output can store).
 _WORD = re.compile(r"[^\s\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
-
-T = TypeVar("T")
-
-
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Key(Generic[T]):
-    """A key of a mapping: its name, the reader of its value, and the value without the key."""
-
-    name: str
-    read: Callable[[Node], T]
-    default: T
-
-    def of(self, fields: Mapping[str, Node]) -> T:
-        """Return the value in a mapping."""
-        return self.read(fields[self.name]) if self.name in fields else self.default
-
-
-def _names(*keys: _Named) -> list[str]:
-    return [key.name for key in keys]
 
 
 def _word(what: str, pattern: re.Pattern[str] = _WORD) -> Callable[[Node], str]:
@@ -131,7 +124,7 @@ def _options(node: Node) -> dict[str, str]:
 
 
 def _stream(node: Node) -> StreamSelector:
-    fields = _some_fields(node, _STREAM_KEYS)
+    fields = _some_fields(node, names(_STREAM_KEYS))
     return StreamSelector(
         source_ip=_SOURCE_IP.of(fields),
         port=_PORT.of(fields),
@@ -147,7 +140,7 @@ def _points(node: Node) -> PointRule:
     # Few rigs have it.
     from mlbatch.ros.point_times import UNITS_NS, PointRule
 
-    fields = _some_fields(node, _POINTS_KEYS)
+    fields = _some_fields(node, names(_POINTS_KEYS))
     return PointRule(
         time=_POINT_TIME.of(fields),
         unit_ns=UNITS_NS.get(_POINT_UNIT.of(fields), 0),
@@ -158,14 +151,14 @@ def _points(node: Node) -> PointRule:
 
 
 def _clock(node: Node) -> Mapping[str, Node]:
-    return node.fields(_CLOCK_KEYS)
+    return node.fields(names(_CLOCK_KEYS))
 
 
 def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics:
     """Return (4, 4) body_from_sensor, m, the name of a frame of the recording, or unknown."""
     if node.kind == "scalar" and node.text == UNKNOWN:
         return UnknownExtrinsics(node.place)
-    fields = _some_fields(node, _EXTRINSICS_KEYS)
+    fields = _some_fields(node, names(_EXTRINSICS_KEYS))
     frame = _FRAME_OF_RECORDING.of(fields)
     if frame:
         return frame
@@ -220,33 +213,97 @@ def _sensors(node: Node) -> tuple[RigSensor, ...]:
 
 # The keys of each mapping.
 
-_SOURCE_IP = Key("source_ip", _ip_address, "")
-_PORT = Key("port", lambda node: node.whole(1, 65535), 0)
-_TOPIC = Key("topic", _word("a topic without spaces"), "")
+_SOURCE_IP = Key("source_ip", _ip_address, "", WORD, "source IP of the packets")
+_PORT = Key("port", lambda node: node.whole(1, 65535), 0, whole_form(1, 65535), "destination port")
+_TOPIC = Key("topic", _word("a topic without spaces"), "", WORD, "topic of a bag")
 # Text, since leading zeros count.
-_SERIAL = Key("serial", _word("a serial number without spaces"), "")
+_SERIAL = Key(
+    "serial", _word("a serial number without spaces"), "", WORD, "serial number in the packets"
+)
 # Of one of several lidars whose clouds share a topic.
-_FRAME_ID = Key("frame_id", _word("a frame_id without spaces"), "")
-_LIDAR_ID: Key[int | None] = Key("lidar_id", lambda node: node.whole(0, 65535), None)
-_STREAM_KEYS = _names(_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
+_FRAME_ID = Key(
+    "frame_id",
+    _word("a frame_id without spaces"),
+    "",
+    WORD,
+    "frame of one of several lidars whose clouds share a topic",
+)
+_LIDAR_ID: Key[int | None] = Key(
+    "lidar_id",
+    lambda node: node.whole(0, 65535),
+    None,
+    whole_form(0, 65535),
+    "number of one of several lidars whose clouds share a topic",
+)
+_STREAM_KEYS = (_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
 # Of streams, with the key that they need.
 _NEEDS = {"frame_id": "topic", "lidar_id": "topic"}
 
-_POINT_TIME = Key("time", _word("the name of a field"), "")
-_POINT_UNIT = Key("unit", _choice("s", "ms", "us", "ns"), "")
-_POINT_ORIGIN = Key("from", _choice("start", "end", "absolute"), "")
-_POINT_RING = Key("ring", _word("the name of a field"), "")
-_POINTS_KEYS = _names(_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING)
+_POINT_TIME = Key("time", _word("the name of a field"), "", WORD, "field with the time of a point")
+_POINT_UNIT = Key(
+    "unit",
+    _choice("s", "ms", "us", "ns"),
+    "",
+    choice_form("s", "ms", "us", "ns"),
+    "unit of that field",
+)
+_POINT_ORIGIN = Key(
+    "from",
+    _choice("start", "end", "absolute"),
+    "",
+    choice_form("start", "end", "absolute"),
+    "the header's stamp is that of the first point, of the last one; or times count from 1970",
+)
+_POINT_RING = Key("ring", _word("the name of a field"), "", WORD, "field with the ring of a point")
+_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING)
 
-_CLOCK_SOURCE: Key[str | None] = Key("source", _choice("sensor", "host"), None)
-_CLOCK_EPOCH: Key[str | None] = Key("epoch", _choice("utc", "tai", "gps"), None)
-_CLOCK_OFFSET = Key("offset_s", _offset_ns, 0)
-_CLOCK_KEYS = _names(_CLOCK_SOURCE, _CLOCK_EPOCH, _CLOCK_OFFSET)
+_CLOCK_SOURCE: Key[str | None] = Key(
+    "source",
+    _choice("sensor", "host"),
+    None,
+    choice_form("sensor", "host"),
+    "timestamps of packets, or their receive times",
+)
+_CLOCK_EPOCH: Key[str | None] = Key(
+    "epoch",
+    _choice("utc", "tai", "gps"),
+    None,
+    choice_form("utc", "tai", "gps"),
+    "what the timestamps count; converted to UTC",
+)
+_CLOCK_OFFSET = Key(
+    "offset_s",
+    _offset_ns,
+    0,
+    {"type": "number", "minimum": -MAX_OFFSET_S, "maximum": MAX_OFFSET_S},
+    "added to the timestamps, s",
+)
+_CLOCK_KEYS = (_CLOCK_SOURCE, _CLOCK_EPOCH, _CLOCK_OFFSET)
 
-_TRANSLATION = Key("translation_m", _translation, [0.0, 0.0, 0.0])
-_ROTATION_RPY = Key("rotation_rpy_deg", lambda node: node.numbers(3), [0.0, 0.0, 0.0])
-_FRAME_OF_RECORDING = Key("frame", _word("a frame of the recording"), "")
-_EXTRINSICS_KEYS = ["translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix", "frame"]
+_TRANSLATION = Key(
+    "translation_m", _translation, [0.0, 0.0, 0.0], numbers_form(3), "x, y, z, m, body frame"
+)
+_ROTATION_RPY = Key(
+    "rotation_rpy_deg",
+    lambda node: node.numbers(3),
+    [0.0, 0.0, 0.0],
+    numbers_form(3),
+    "roll, pitch, yaw about the fixed axes x, y, z, degrees",
+)
+_ROTATION_XYZW: Key[list[float] | None] = Key(
+    "rotation_xyzw", lambda node: node.numbers(4), None, numbers_form(4), "unit quaternion"
+)
+_MATRIX: Key[F64Array | None] = Key(
+    "matrix",
+    _matrix,
+    None,
+    {"type": "array", "items": numbers_form(4), "minItems": 3, "maxItems": 4},
+    "body_from_sensor, 4 x 4 or 3 x 4, m",
+)
+_FRAME_OF_RECORDING = Key(
+    "frame", _word("a frame of the recording"), "", WORD, "a frame of the recording's transforms"
+)
+_EXTRINSICS_KEYS = (_TRANSLATION, _ROTATION_RPY, _ROTATION_XYZW, _MATRIX, _FRAME_OF_RECORDING)
 # Keys of streams and extrinsics that exclude others.
 _EXCLUDES = {
     "rotation_xyzw": ("rotation_rpy_deg",),
@@ -254,22 +311,50 @@ _EXCLUDES = {
     "frame": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
     "topic": ("source_ip", "port"),
 }
+_EXTRINSICS_FORM: Form = {
+    "anyOf": [
+        {"const": UNKNOWN},
+        mapping_form(_EXTRINSICS_KEYS, excludes=_EXCLUDES, may_be_empty=False),
+    ]
+}
 
 # A name fits ROS topics, frames and file names.
 _SENSOR_NAME = Key(
-    "name", _word("a name of letters, digits and _ that does not start with a digit", _NAME), ""
+    "name",
+    _word("a name of letters, digits and _ that does not start with a digit", _NAME),
+    "",
+    text_form(r"[A-Za-z_][A-Za-z0-9_]*"),
+    "name in topics, folders and frames",
 )
-_MODEL: Key[str | None] = Key("model", _model, None)
-_STREAM: Key[StreamSelector | None] = Key("stream", _stream, None)
-_METADATA: Key[Path | None] = Key("metadata", _existing_file, None)
-_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | None] = Key("extrinsics", _extrinsics, None)
-_CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {})
-_MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None)
-_MAX_RANGE: Key[float | None] = Key("max_range_m", _range_m, None)
-_OPTIONAL = Key("optional", Node.flag, False)
-_DECODE: Key[dict[str, str]] = Key("decode", _options, {})
-_POINTS: Key[PointRule | None] = Key("points", _points, None)
-_SENSOR_KEYS = _names(
+_MODEL: Key[str | None] = Key("model", _model, None, TEXT, "auto, or a name of `mlbatch sensors`")
+_STREAM: Key[StreamSelector | None] = Key(
+    "stream",
+    _stream,
+    None,
+    mapping_form(_STREAM_KEYS, excludes=_EXCLUDES, needs=_NEEDS, may_be_empty=False),
+    "its packets; default: any that match its calibration",
+)
+_METADATA: Key[Path | None] = Key(
+    "metadata", _existing_file, None, TEXT, "metadata or calibration, relative to this file"
+)
+_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | None] = Key(
+    "extrinsics", _extrinsics, None, _EXTRINSICS_FORM, "body_from_sensor; default: the recording's"
+)
+_CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {}, mapping_form(_CLOCK_KEYS), "its clock")
+_MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None, RANGE_M, "drop nearer points, m")
+_MAX_RANGE: Key[float | None] = Key(
+    "max_range_m", _range_m, None, RANGE_M, "drop farther points, m"
+)
+_OPTIONAL = Key("optional", Node.flag, False, FLAG, "may be absent from a recording")
+_DECODE: Key[dict[str, str]] = Key("decode", _options, {}, OPTIONS, "options of its decoder")
+_POINTS: Key[PointRule | None] = Key(
+    "points",
+    _points,
+    None,
+    mapping_form(_POINTS_KEYS, may_be_empty=False),
+    "how decoded clouds are read; only with a topic",
+)
+_SENSOR_KEYS = (
     _SENSOR_NAME,
     _MODEL,
     _STREAM,
@@ -288,28 +373,71 @@ _BODY_FRAME = Key(
     "body_frame",
     _word("a frame name of letters, digits, _ and / that does not start with a digit", _FRAME),
     DEFAULT_BODY_FRAME,
+    text_form(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"),
+    "frame of all points",
 )
-_RATE: Key[Fraction | None] = Key("rate_hz", _rate, None)
-_SENSORS: Key[tuple[RigSensor, ...]] = Key("sensors", _sensors, ())
-_BOXES = Key("exclude_boxes_m", _boxes, no_boxes())
-_RIG_KEYS = _names(_BODY_FRAME, _RATE, _SENSORS, _BOXES)
+_RATE: Key[Fraction | None] = Key(
+    "rate_hz",
+    _rate,
+    None,
+    {"anyOf": [{**NUMBER, "exclusiveMinimum": 0}, text_form(r"[0-9./]+")]},
+    "scans a second: 10, 29.97, 10/3",
+)
+_SENSORS: Key[tuple[RigSensor, ...]] = Key(
+    "sensors",
+    _sensors,
+    (),
+    {
+        "type": "array",
+        "items": mapping_form(_SENSOR_KEYS, required=("name",)),
+        "minItems": 1,
+        "maxItems": MAX_SENSORS,
+    },
+    "sensors in the order of lidar_id",
+)
+_BOXES = Key(
+    "exclude_boxes_m",
+    _boxes,
+    no_boxes(),
+    {"type": "array", "items": numbers_form(6)},
+    "boxes x0, y0, z0, x1, y1, z1, m, body frame, without points",
+)
+_CONVERT: Key[tuple[RigOption, ...]] = Key(
+    "convert",
+    convert_keys.read_options,
+    (),
+    convert_keys.FORM,
+    "options of `mlbatch convert`; the command line overrides them",
+)
+_RIG_KEYS = (_BODY_FRAME, _RATE, _SENSORS, _BOXES, _CONVERT)
+_REQUIRED = ("sensors",)
+
+
+def rig_schema() -> dict[str, object]:
+    """JSON schema of a rig file; what it cannot state is checked when a rig is read."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Rig of mlbatch",
+        **mapping_form(_RIG_KEYS, required=_REQUIRED),
+    }
 
 
 def rig_from(root: Node) -> Rig:
     """Return the rig that a tree describes; RigError for the first mistake."""
-    fields = root.fields(_RIG_KEYS, required=("sensors",))
+    fields = root.fields(names(_RIG_KEYS), required=_REQUIRED)
     rig = Rig(
         body_frame=_BODY_FRAME.of(fields),
         rate=_RATE.of(fields),
         sensors=_SENSORS.of(fields),
         exclude_boxes_m=_BOXES.of(fields),
+        options=_CONVERT.of(fields),
     )
     _check_distinct(fields["sensors"], rig)
     return rig
 
 
 def _sensor(node: Node) -> RigSensor:
-    fields = node.fields(_SENSOR_KEYS, required=("name",))
+    fields = node.fields(names(_SENSOR_KEYS), required=("name",))
     clock = _CLOCK.of(fields)
     sensor = RigSensor(
         name=_SENSOR_NAME.of(fields),

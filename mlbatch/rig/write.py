@@ -9,11 +9,14 @@ from pathlib import Path
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
+from mlbatch.rig.convert_keys import RigOption
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./-]*", re.ASCII)
+# Numbers and flags.
+_SCALAR = re.compile(r"-?\d+(\.\d+)?|true|false", re.ASCII)
 _RESERVED = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
 _HEADER = """\
 # Rig of mlbatch: which sensors there are and where they sit. Edit it, then
@@ -44,7 +47,18 @@ def write_rig(rig: Rig, folder: Path, notes: Mapping[str, str] | None = None) ->
     if len(rig.exclude_boxes_m):
         lines.append("exclude_boxes_m:")
         lines += [f"  - {_floats(box)}" for box in rig.exclude_boxes_m]
+    if rig.options:
+        lines.append("convert:")
+        lines += [f"  {option.name}: {_option_text(option)}" for option in rig.options]
     return _HEADER + "\n".join(lines) + "\n"
+
+
+def _option_text(option: RigOption) -> str:
+    if option.name == "decode":
+        pairs = (value.partition("=") for value in option.values)
+        return _braces({_text(key): _text(value) for key, _, value in pairs})
+    texts = [value if _SCALAR.fullmatch(value) else _text(value) for value in option.values]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
 
 
 def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:

@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from types import ModuleType
 
+from mlbatch.verify.examination import Progress
 from mlbatch.verify.outputs import Output, check_output
 from mlbatch.verify.report_checks import ReportPlaces
 from mlbatch.verify.verdict import (
@@ -27,9 +28,14 @@ __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 _PARTIAL = ".partial"
 
 
-def verify(path: str | PathLike[str], report: str | PathLike[str] | None = None) -> Verdict:
+def verify(
+    path: str | PathLike[str],
+    report: str | PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> Verdict:
     """Check an output; report: path of `--report`, None for the usual one.
 
+    progress: called with the number of scans checked, and of all scans (0: unknown).
     Raises VerifyError if there is nothing to check.
     """
     path = Path(path)
@@ -47,7 +53,7 @@ def verify(path: str | PathLike[str], report: str | PathLike[str] | None = None)
     log.ok("container")
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
-    return check_output(Output(path, ReportPlaces.of(path, report), log))
+    return check_output(Output(path, ReportPlaces.of(path, report), log, progress))
 
 
 class _CallableModule(ModuleType):

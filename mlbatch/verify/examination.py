@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -27,6 +28,8 @@ from mlbatch.verify.scan_checks import (
 from mlbatch.verify.table import OutputTotals, check_table
 from mlbatch.verify.verdict import CheckLog
 
+# Called with the number of scans checked, and of all scans (0: unknown).
+Progress = Callable[[int, int], object]
 # Values of one byte, for outputs without the number of sensors.
 _MOST_SENSORS = 256
 # Stamps end at 2^31 s; times of points are added to them in 64 bits.
@@ -37,8 +40,16 @@ class Examination:
     """Takes the scans of an output one after the other; arrays are only used during the call."""
 
     def __init__(
-        self, log: CheckLog, where: str, metadata: RunMetadata, files: ReportFiles
+        self,
+        log: CheckLog,
+        where: str,
+        metadata: RunMetadata,
+        files: ReportFiles,
+        progress: Progress | None = None,
     ) -> None:
+        """progress: called after each scan."""
+        self._progress = progress
+        self._all = 0 if files.table is None else len(files.table.index)
         self.log = log
         self._files = files
         self._grid = metadata.grid(where)
@@ -61,6 +72,11 @@ class Examination:
 
     def scan(self, scan: StoredScan) -> None:
         """Check one scan."""
+        self._check(scan)
+        if self._progress is not None:
+            self._progress(self.totals.scans, self._all)
+
+    def _check(self, scan: StoredScan) -> None:
         log = self.log
         scan.by_time = self._by_time
         for name, at_ns in (("start_ns", scan.start_ns), ("end_ns", scan.end_ns)):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.verify import messages, npz, ply
-from mlbatch.verify.examination import Examination
+from mlbatch.verify.examination import Examination, Progress
 from mlbatch.verify.folders import entries, scan_files
 from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
 from mlbatch.verify.report_checks import (
@@ -38,6 +38,7 @@ class Output:
     path: Path
     places: ReportPlaces
     log: CheckLog
+    progress: Progress | None = None
 
     def verdict(
         self, name: str, examination: Examination, limits: dict[str, str], files: ReportFiles
@@ -122,7 +123,7 @@ def _check_files(
             f"{scans[0].path}: {err}; restore the first scan, or convert again"
         ) from err
     metadata = files.metadata(log, own)
-    examination = Examination(log, str(output.path), metadata, files)
+    examination = Examination(log, str(output.path), metadata, files, output.progress)
     for scan in reader.scans(scans):
         examination.scan(scan)
     examination.finish(split=scans[0].sensor is not None)
@@ -164,7 +165,7 @@ def _check_mcap(
     files = ReportFiles.inside(log, path, file.metadata.get("mlbatch.report"), attachment)
     files.check_copies(log, attachment, output.places)
     metadata = files.metadata(log, metadata_of_grid(log, where, grid))
-    examination = Examination(log, str(path), metadata, files)
+    examination = Examination(log, str(path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
     for message in file.messages():
         topics.check(message)
@@ -181,7 +182,7 @@ def _check_bag(output: Output) -> Verdict:
     path = output.path
     files = ReportFiles.read(log, output.places)
     metadata = files.metadata(log, RunMetadata())
-    examination = Examination(log, str(path), metadata, files)
+    examination = Examination(log, str(path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
     for message in BagFile(log, path, path.name).messages():
         topics.check(message)

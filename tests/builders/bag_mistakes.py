@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests.builders.advice import OUSTER
+
 # As in `mistakes.py`.
 BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
     "clouds only": (
@@ -135,7 +137,7 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "stranger.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: "
         "needs its metadata; expected metadata that match, found only /roof/ouster/metadata; give "
-        "the sensor's with --metadata FILE",
+        "the sensor's with --metadata FILE" + OUSTER,
     ),
     "garbage metadata": (
         "garbage.db3",
@@ -143,14 +145,14 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "garbage.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: "
         "needs its metadata; expected metadata that match, found none in the recording's "
         "directory; give the sensor's with --metadata FILE (/roof/ouster/metadata: expected the "
-        "metadata of a lidar, found another text)",
+        "metadata of a lidar, found another text)" + OUSTER,
     ),
     "no metadata": (
         "bare.db3",
         1,
         "bare.db3: /roof/ouster/lidar_packets carries Ouster lidar, serial 111, 1280 bytes: needs "
         "its metadata; expected metadata that match, found none in the recording's directory; "
-        "give the sensor's with --metadata FILE",
+        "give the sensor's with --metadata FILE" + OUSTER,
     ),
     "unknown topic to pass": (
         "drive.mcap --pass /imu/dat -o scans.mcap",

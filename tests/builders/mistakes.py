@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests.builders.advice import OUSTER
+
 FIX = "fix/two_lidars.pcap --rig fix/rig.yaml"
 DIGEST = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10_digest.json"
 ONE_UNIT = "R/ouster/os0-128_v2.3.0_rng15/OS-0-128-U1_v2.3.0_1024x10"
@@ -32,9 +34,9 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "none.pcap: expected a recording, found no such file; check the path",
     ),
     "folder": (
-        "fix",
+        "folders",
         1,
-        "fix: expected a recording, found a folder without .db3 or .mcap files; "
+        "folders: expected a recording, found a folder without .db3 or .mcap files; "
         "name the files inside it",
     ),
     "empty file": (
@@ -345,14 +347,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
         "needs its metadata; expected metadata that match, found only 222.json; give the sensor's "
-        "with --metadata FILE",
+        "with --metadata FILE" + OUSTER,
     ),
     "no metadata": (
         "bare/drive.pcap",
         1,
         "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
         "needs its metadata; expected metadata that match, found none in the recording's "
-        "directory; give the sensor's with --metadata FILE",
+        "directory; give the sensor's with --metadata FILE" + OUSTER,
     ),
     "two lidars without extrinsics": (
         "pair/drive.pcap",

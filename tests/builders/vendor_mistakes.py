@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests.builders.advice import HESAI
+
 _PLACED = "extrinsics: {matrix: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}"
 _LEFT = f"name: left, metadata: silent/111.json, stream: {{source_ip: 10.0.0.1}}, {_PLACED}"
 _TOP = f"name: top, stream: {{source_ip: 10.0.0.8}}, {_PLACED}"
@@ -44,28 +46,28 @@ VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found none in the recording's directory; give the "
-        "sensor's with --metadata FILE",
+        "sensor's with --metadata FILE" + HESAI,
     ),
     "angles of another HESAI next to the recording": (
         "xt16_other/drive.pcap",
         1,
         "xt16_other/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 32.csv; give the sensor's with "
-        "--metadata FILE",
+        "--metadata FILE" + HESAI,
     ),
     "angles of another HESAI": (
         "xt16_bare/drive.pcap --metadata xt16_other/32.csv",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 32.csv; give the sensor's with "
-        "--metadata FILE",
+        "--metadata FILE" + HESAI,
     ),
     "angles of another vendor": (
         "xt16_bare/drive.pcap --metadata files/rs16.csv",
         1,
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only rs16.csv; give the sensor's with "
-        "--metadata FILE",
+        "--metadata FILE" + HESAI,
     ),
     "angles of another vendor in the rig": (
         "xt16_bare/drive.pcap --rig rs16_csv.yaml",
@@ -86,7 +88,7 @@ VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
         "xt16_broken/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 16.csv; give the sensor's with "
         "--metadata FILE (xt16_broken/16.csv: HESAI angles, line 2: expected azimuth from -360 to "
-        "360 deg, found zero; read the correction file from the lidar again)",
+        "360 deg, found zero; read the correction file from the lidar again)" + HESAI,
     ),
     "broken angles": (
         "xt16_broken/drive.pcap --metadata xt16_broken/16.csv",

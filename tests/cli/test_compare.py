@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,4 +102,93 @@ def test_times_are_seconds_above_0(shell: Shell, option: str, text: str) -> None
 def test_mistakes_are_one_line(shell: Shell, words: str, code: int, message: str) -> None:
     outcome = shell(f"compare {CAPTURE} {words}")
     assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1)
+    assert message in outcome.err
+
+
+def test_latencies_of_the_fixture(shell: Shell) -> None:
+    """Sweeps of 100 ms, 37 ms apart (SOURCE.md): a set is complete as its last sweep ends.
+
+    Windows end 10 ms after their period, which waits for late packets.
+    """
+    outcome = shell(f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --json")
+    ways = {one["way"]: one["latency_ms"] for one in json.loads(outcome.out)["ways"]}
+    expected = {
+        "latest sweeps": 163,
+        "approximate time": 137,
+        "timeout collate": 163,
+        "windows (mlbatch)": 110,
+    }
+    found = {name: latency["p50"] for name, latency in ways.items()}
+    assert found == pytest.approx(expected, abs=0.6)
+
+
+FIGURES = ["columns", "latency", "offsets", "spans"]
+
+
+def test_a_page_and_figures(shell: Shell, tmp_path: Path) -> None:
+    words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --html run.html --figures plots"
+    outcome = shell(words)
+    assert (outcome.code, outcome.err) == (0, "")
+    page = (tmp_path / "run.html").read_text()
+    assert "Joined sweeps span up to 163 ms (latest sweeps), windows up to 100 ms" in page
+    # 163 ms at 13.889 m/s.
+    assert "moves 2.26 m within such a set" in page
+    written = sorted(path.name for path in (tmp_path / "plots").iterdir())
+    assert written == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("pdf", "png"))
+    lines = outcome.out.splitlines()
+    assert lines[-1] == "wrote run.html"
+    assert sum(line.startswith("wrote plots/") for line in lines) == len(written)
+    first = {path.name: path.read_bytes() for path in (tmp_path / "plots").iterdir()}
+    assert all(data.startswith((b"%PDF", b"\x89PNG")) for data in first.values())
+    refused = shell(words)
+    assert refused.code == 1
+    assert "replace it with --overwrite" in refused.err
+    assert shell(f"{words} --overwrite").code == 0
+    assert first == {path.name: path.read_bytes() for path in (tmp_path / "plots").iterdir()}
+
+
+def test_a_page_may_be_printed(shell: Shell, tmp_path: Path) -> None:
+    words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --html -"
+    outcome = shell(words)
+    assert outcome.code == 0
+    assert outcome.out.startswith("<!DOCTYPE html>")
+    assert outcome.out.endswith("</html>\n")
+    assert list(tmp_path.iterdir()) == []
+    assert shell(f"{words} --json").code == 2
+
+
+def test_json_stays_json(shell: Shell) -> None:
+    words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --json --html run.html"
+    assert json.loads(shell(words).out)["schema"] == "mlbatch.compare/1"
+    assert Path("run.html").is_file()
+
+
+def test_figures_without_matplotlib(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    outcome = shell(f"compare {CAPTURE} --figures plots")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err == (
+        "mlbatch: error: --figures: expected matplotlib, found none; install it with `pip install "
+        "mlbatch[plot]`\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--figures file", "file: expected a folder for figures, found a file"),
+        ("--figures no/plots", "no/plots: expected an existing folder around it"),
+        ("--figures old", "old: expected no figures, found spans.pdf"),
+        ("--html no/run.html", "no/run.html: expected a page in an existing folder"),
+        ("--html file", "file: expected a new file or an earlier page"),
+    ],
+)
+def test_places_are_checked_first(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, words: str, message: str
+) -> None:
+    Path("file").write_text("x")
+    Path("old").mkdir()
+    Path("old/spans.pdf").touch()
+    outcome = shell(f"compare none.pcap {words}")
+    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (1, "", 1)
     assert message in outcome.err

@@ -48,6 +48,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "serial.yaml").write_text('sensors:\n- {name: left, stream: {serial: "5"}}\n')
     (folder / "text.txt").write_text("hello\n")
     (folder / "empty.pcap").touch()
+    (folder / "folders").mkdir()
     (folder / "old").mkdir()
     (folder / "old" / "diary.txt").touch()
     if RECORDINGS.is_dir():

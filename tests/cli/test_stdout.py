@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def _paths() -> list[tuple[str, str, bool]]:
         for param in group.commands[command].params:  # type: ignore[attr-defined]
             is_argument = param.param_type_name == "argument"
             if param.type.name == "path" and (command, param.name) not in PRINTABLE:
-                found += [(command, param.opts[-1], is_argument)]
+                found += [(command, max(param.opts, key=len), is_argument)]
     return found
 
 
@@ -95,3 +96,39 @@ def test_a_rig_and_json_cannot_both_be_printed(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE} --write-rig - --json")
     assert (outcome.code, outcome.out) == (2, "")
     assert "expected standard output for the rig alone, found --json" in outcome.err
+
+
+def _stdin(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+
+
+def test_a_page_of_a_report_from_standard_input(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = shell(f"convert {CAPTURE} --rig {RIG} --dry-run").out
+    _stdin(monkeypatch, report)
+    assert shell("report - -o run.html").out == "wrote run.html\n"
+    (tmp_path / "report.json").write_text(report)
+    assert shell("report report.json -o same.html").code == 0
+    page = (tmp_path / "run.html").read_text()
+    assert page.startswith("<!DOCTYPE html>")
+    assert page == (tmp_path / "same.html").read_text()
+    _stdin(monkeypatch, report)
+    assert shell("report - -o -").out == page
+    assert not (tmp_path / "-").exists()
+
+
+def test_a_page_of_standard_input_needs_a_name(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _stdin(monkeypatch, "{}")
+    outcome = shell("report -")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("mlbatch: error: -o: expected a name for the page of standard")
+
+
+def test_standard_input_that_is_no_report(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    _stdin(monkeypatch, "nothing")
+    outcome = shell("report - -o -")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err.startswith("mlbatch: error: standard input: expected a report in JSON")

@@ -40,3 +40,16 @@ def test_figures() -> None:
 def test_without_sets_there_are_no_figures() -> None:
     report = SetStatistics("some", 2, NS_PER_MS).report(0)
     assert report.row() == ["some", "0", "0", "0", *["-"] * 6, "0", "-", "-"]
+
+
+def test_latency_is_the_age_of_the_first_column() -> None:
+    statistics = SetStatistics("some", 2, 100 * NS_PER_MS)
+    # Ready with the later sweep, at 140 ms; then 25 ms later, by another sweep.
+    statistics.add((_sweep(0, 0), _sweep(1, 40)))
+    statistics.add((_sweep(0, 100), _sweep(1, 140)), ready_ns=265 * NS_PER_MS)
+    report = statistics.report(400)
+    assert (report.latency_ms.min, report.latency_ms.max) == (140, 165)
+    assert report.series is not None
+    assert report.series.first_ns.tolist() == [0, 100 * NS_PER_MS]
+    assert report.series.latency_ns.tolist() == [140 * NS_PER_MS, 165 * NS_PER_MS]
+    assert report.series.apart_ns.tolist() == [40 * NS_PER_MS] * 2

@@ -162,6 +162,7 @@ def _parse(arguments: list[str]) -> None:
 FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir", "--seed"} | {
     "--target",
     "--version",
+    "--install-completion",
 }
 OPTION = re.compile(r"(?<![\w-])(--[a-z][\w-]*)")
 

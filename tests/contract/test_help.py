@@ -38,11 +38,14 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--keep-repeated": "second",
         "--drop-incomplete": "%",
         "--pass": "topic",
+        "--copy-topic": "topic",
         "--metadata": "repeatable",
         "--identity-extrinsics": "without extrinsics",
         "--decode": "KEY=VALUE.*repeatable",
         "--only": "repeatable",
+        "--include-sensor": "repeatable",
         "--ignore": "repeatable",
+        "--exclude-sensor": "repeatable",
         "--fault": "repeatable",
         "--fault-seed": "random",
         "--html": "page.*HTML",
@@ -60,7 +63,9 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--verbose": "chosen",
     },
     "inspect": {
+        "--rig": "YAML",
         "--whole": "whole",
+        "--verbose": "minute",
         "--metadata": "repeatable",
         "--json": "JSON",
         "--write-rig": "convert",
@@ -72,10 +77,14 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--clock": "sensor.*host",
         "--tolerance": r"\bs\b.*other",
         "--timeout": r"\bs\b",
+        "--html": "page.*HTML",
+        "--figures": "PDF, PNG.*plot",
+        "--overwrite": "existing",
+        "--verbose": "minute",
         "--json": "JSON",
     },
     "sensors": {"--json": "JSON"},
-    "verify": {"--report": "JSON.*next to", "--json": "JSON"},
+    "verify": {"--report": "JSON.*next to", "--json": "JSON", "--verbose": "minute"},
     "report": {
         "--output": r"page.*OUTPUT\.html",
         "--report": "JSON.*next to",
@@ -88,6 +97,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--overwrite": "existing",
         "--quiet": "nothing",
     },
+    "schema": {},
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",
@@ -164,12 +174,112 @@ def test_help_shows_every_option(command: str) -> None:
         assert re.search(rf"{name}\b", page), name
 
 
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_both_words_show_the_same_help(word: str) -> None:
+    runner = CliRunner()
+    page = runner.invoke(command_line("convert"), ["convert", word])
+    assert page.exit_code == 0
+    assert page.stdout.startswith("Usage: ")
+    first = runner.invoke(command_line(word), [word])
+    assert first.exit_code == 0
+    # Summaries are whole, and those of the commands themselves.
+    words = " ".join(first.stdout.split())
+    for name, command in _commands().items():
+        assert f"{name} {' '.join((command.help or '').split())}" in words
+
+
+GROUPS = ("Input", "Batching", "Selection", "Output", "Clocks", "Run")
+
+
+def test_every_option_of_convert_is_in_a_group() -> None:
+    page = CliRunner().invoke(command_line("convert"), ["convert", "-h"]).stdout
+    assert tuple(re.findall(r"^(\w+):$", page, re.MULTILINE)) == GROUPS, (
+        "list the option in GROUPS of mlbatch/cli/help.py"
+    )
+
+
+SHORT = {
+    "convert": {
+        *("-o --output", "-r --rig", "-f --format", "-j --jobs", "-m --metadata"),
+        *("-q --quiet", "-v --verbose"),
+    },
+    "inspect": {"-r --rig", "-m --metadata", "-v --verbose"},
+    "compare": {"-r --rig", "-m --metadata", "-v --verbose"},
+    "verify": {"-v --verbose"},
+}
+
+
+@pytest.mark.parametrize("command", SHORT)
+def test_short_options(command: str) -> None:
+    names = [param.opts for param in _commands()[command].params]
+    short = {" ".join(sorted(one, key=len)) for one in names if any(len(name) == 2 for name in one)}
+    assert short == SHORT[command]
+
+
+@pytest.mark.parametrize("columns", [80, 100, 200])
+@pytest.mark.parametrize("command", ["", *OPTIONS])
+def test_help_fits_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, command: str, columns: int
+) -> None:
+    monkeypatch.setattr("mlbatch.cli.help.is_drawn", lambda: True)
+    words = [command, "-h"] if command else ["-h"]
+    environment = {"COLUMNS": str(columns), "TERM": "xterm", "NO_COLOR": "1"}
+    result = CliRunner().invoke(command_line(words[0]), words, env=environment)
+    assert result.exit_code == 0
+    lines = [re.sub(r"\x1b\[\d*m", "", line) for line in result.stdout.splitlines()]
+    assert max(map(len, lines)) <= min(columns, 120)
+    for name in OPTIONS.get(command, COMMANDS):
+        assert any(re.search(rf"[ │]{name}\b", line) for line in lines), name
+
+
+def test_a_shell_completes_words_of_options() -> None:
+    # Layouts, engines, formats and decoder options by docs/commands.md and docs/sensors.md.
+    completed = {
+        "--layout": {"dense", "organized"},
+        "--engine": {"auto", "numpy", "native"},
+        "--format": {"mcap", "npz", "ply", "rosbag1", "rosbag2"},
+        "--point-layout": {"standard", "kiss-icp"},
+        "--decode": {"crc=check", "firing_azimuth=off"},
+    }
+    for option, words in completed.items():
+        printed = run_python(
+            "import os, sys\n"
+            "os.environ |= {'_MLBATCH_COMPLETE': 'complete_bash', 'COMP_CWORD': '3', "
+            f"'COMP_WORDS': 'mlbatch convert {option} '}}\n"
+            "sys.argv = ['mlbatch']\n"
+            "from mlbatch.cli import main\n"
+            "main()\n"
+        )
+        assert words <= set(printed.split()), option
+
+
+def test_words_of_options_are_those_of_a_job() -> None:
+    from mlbatch import native
+    from mlbatch.cli import convert
+    from mlbatch.pipeline import job
+
+    assert convert.SORTS == job.SORTS
+    assert convert.ENGINES == native.ENGINES
+
+
 def test_help_loads_nothing_heavy() -> None:
     loaded = run_python(
         "import sys\nfrom mlbatch.cli.app import command_line\ncommand_line()\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )
     assert loaded.strip() == "[]"
+
+
+def test_drawn_help_loads_no_parser_of_markdown() -> None:
+    """It takes longer than all else in `--help`."""
+    loaded = run_python(
+        "import sys\nfrom mlbatch.cli import help\nfrom mlbatch.cli.app import command_line\n"
+        "help.is_drawn = lambda: True\n"
+        "command_line('convert')(['convert', '-h'], standalone_mode=False)\n"
+        f"print([name for name in {(*HEAVY, 'markdown_it', 'rich.markdown')!r} "
+        "if name in sys.modules])"
+    )
+    assert loaded.splitlines()[-1] == "[]"
 
 
 def test_the_root_offers_its_names_without_loading_them() -> None:

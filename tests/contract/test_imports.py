@@ -12,7 +12,8 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
-    ("api", "compare", "bench", "page", "simulate"),
+    ("api", "compare", "bench", "simulate"),
+    ("page",),
     ("python",),
     ("pipeline",),
     ("discovery", "outputs"),

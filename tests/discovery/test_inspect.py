@@ -49,7 +49,7 @@ def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
 def test_the_table_of_the_fixture(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE}")
     assert (outcome.code, outcome.err) == (0, "")
-    table_text, clocks = outcome.out.split("\n\n")
+    table_text, recordings, clocks = outcome.out.split("\n\n")
     head, *rows = table_text.splitlines()
     starts = [head.index(word) for word in head.split()]
     ends = [*starts[1:], None]
@@ -71,6 +71,10 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     assert len(table) == 5
     assert re.match(r"clocks: synchronised within \d\.\d+ ms\n", clocks)
     assert clocks.count("clock: UTC, -") == 2
+    # Size of the file; times of its first and last frame, 20.150 ms and 869.839 ms.
+    lines = [re.split(r" {2,}", line) for line in recordings.splitlines()]
+    assert lines[0] == ["recording", "container", "MB", "start", "seconds"]
+    assert lines[1:] == [[str(CAPTURE), "pcap", "2.5", "2026-05-04T08:00:00.020Z", "0.850"]]
 
 
 def test_json_has_the_same_values_with_all_digits(shell: Shell) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.builders import advice
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     EPOCH_NS,
@@ -388,7 +389,7 @@ def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option
     assert outcome.err == (
         f"mlbatch: error: {capture}: 10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected "
         "metadata that match, found only 111.json; give --metadata FILE, or leave it out with "
-        "--ignore 10.0.0.2:7502\n"
+        f"--ignore 10.0.0.2:7502{advice.OUSTER}\n"
     )
     assert not (tmp_path / "out").exists()
     # Without a conversion it is a row of the table.

@@ -102,13 +102,29 @@ def test_progress_rises_to_the_size_of_the_recordings(tmp_path: Path) -> None:
         write_session(tmp_path / name, replace(Unit(), begin_ns=EPOCH_NS + at * NS_PER_S))
         for name, at in (("1", 1), ("2", 2))
     )
-    reported: list[tuple[int, int]] = []
-    convert(
-        Job(captures, keep_partial=True), None, lambda done, total: reported.append((done, total))
+    reported: list[tuple[int, int, int]] = []
+    result, _ = convert(
+        Job(captures, keep_partial=True), None, lambda *progress: reported.append(progress)
     )
     size = sum(capture.stat().st_size for capture in captures)
     assert reported == sorted(reported)
-    assert reported[-1] == (size, size)
+    assert reported[0] == (0, size, 0)
+    assert reported[-1][:2] == (size, size)
+    assert result.table is not None
+    # Windows close behind what is read.
+    assert 0 < reported[-1][2] <= result.table.rows
+
+
+def test_the_pass_that_aligns_clocks_is_reported_as_well(tmp_path: Path) -> None:
+    capture = write_session(tmp_path, Unit(turns=10))
+    reported: list[tuple[int, int, int]] = []
+    convert(
+        Job((capture,), align_clocks_to="host"), None, lambda *progress: reported.append(progress)
+    )
+    size = capture.stat().st_size
+    second = reported.index((0, size, 0))
+    assert reported[second - 1] == (size, size, 0)
+    assert reported[-1][:2] == (size, size)
 
 
 def test_the_stages_take_no_longer_than_the_run() -> None:

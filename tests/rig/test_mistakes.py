@@ -70,9 +70,9 @@ FIX = "correct it or remove the key"
 MISTAKES: list[tuple[str, str]] = [
     # The form of the file.
     ("", "1: expected a mapping with keys of body_frame, rate_hz, sensors, exclude_boxes_m, "
-         "found nothing; write `key: value`"),
+         "convert, found nothing; write `key: value`"),
     ("- name: left\n", "1: expected a mapping with keys of body_frame, rate_hz, sensors, "
-                       "exclude_boxes_m, found a list of 1; write `key: value`"),
+                       "exclude_boxes_m, convert, found a list of 1; write `key: value`"),
     ("rate_hz: 10\n", "1: expected the key sensors, found none; add it"),
     ("sensors:\n  - name: a\n - name: b\n",
      "3: expected YAML, found a mistake (expected <block end>, but found '<block sequence "
@@ -103,8 +103,8 @@ MISTAKES: list[tuple[str, str]] = [
      f"3: {S}.modle: expected a key of {SENSOR_KEYS}, found 'modle'; the nearest known key is "
      "model"),
     ("rate: 10\nsensors: [{name: a}]\n",
-     "1: rate: expected a key of body_frame, rate_hz, sensors, exclude_boxes_m, found 'rate'; "
-     "the nearest known key is rate_hz"),
+     "1: rate: expected a key of body_frame, rate_hz, sensors, exclude_boxes_m, convert, "
+     "found 'rate'; the nearest known key is rate_hz"),
     (one("extrinsics: {rotation_rpy: [0, 0, 0]}"),
      f"3: {X}.rotation_rpy: expected a key of {X_KEYS}, found 'rotation_rpy'; "
      "the nearest known key is rotation_rpy_deg"),

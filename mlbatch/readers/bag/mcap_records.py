@@ -36,6 +36,7 @@ class Op(IntEnum):
     MESSAGE = 0x05
     CHUNK = 0x06
     CHUNK_INDEX = 0x08
+    STATISTICS = 0x0B
     DATA_END = 0x0F
     PRIVATE = 0x80  # From here on records of applications, which are skipped.
 
@@ -50,6 +51,8 @@ CHUNK_HEAD_BYTES = _CHUNK_HEAD.size + _LONGEST_NAME + _LENGTH.size
 # Record of two places and a CRC; with the magic the last bytes of a whole file.
 _FOOTER = struct.Struct("<BQQQI")
 FOOTER_BYTES = _FOOTER.size + len(MAGIC)
+# Messages, schemas, channels, attachments, metadata, chunks, first and last log time.
+_STATISTICS = struct.Struct("<QHIIIIQQ")
 _INDEX_HEAD = struct.Struct("<QQQQI")
 _INDEX_ENTRY = struct.Struct("<HQ")
 
@@ -146,6 +149,14 @@ def summary_start(tail: bytes) -> int | None:
         return None
     opcode, length, start, _, _ = _FOOTER.unpack_from(tail)
     return start if (opcode, length) == (Op.FOOTER, _FOOTER.size - HEAD.size) else None
+
+
+def last_log_ns(statistics: bytes) -> int | None:
+    """Newest log time by the body of a statistics record; None without a message."""
+    if len(statistics) < _STATISTICS.size:
+        return None
+    messages, *_, last_ns = _STATISTICS.unpack_from(statistics)
+    return int(last_ns) if messages else None
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:

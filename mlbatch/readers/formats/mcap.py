@@ -23,6 +23,7 @@ from mlbatch.readers.bag.mcap_records import (
     Channels,
     Op,
     chunk_of_index,
+    last_log_ns,
     records_of,
     summary_start,
 )
@@ -63,9 +64,12 @@ def open_folder(
     # Equal times, and files without messages, keep their order.
     ordered = sorted(files, key=_first_ns) if len(files) > 1 else list(files)
     topics: dict[Topic, None] = {}
+    last_ns: list[int | None] = []
     for file in ordered:
         with Source(file) as source:
-            topics |= dict.fromkeys(_channels(source, buffer_bytes).topics.values())
+            summary = _summary(source)
+            topics |= dict.fromkeys(_channels(source, summary, buffer_bytes).topics.values())
+            last_ns.append(summary.last_ns)
     size_bytes = sum(file.stat().st_size for file in ordered)
     portions = partial(_portions, files=tuple(ordered), buffer_bytes=buffer_bytes)
     return BagRecording(
@@ -76,6 +80,7 @@ def open_folder(
         portions,
         tuple(notes),
         topics=tuple(topics),
+        last_ns=None if None in last_ns else max(filter(None, last_ns), default=None),
     )
 
 
@@ -92,6 +97,8 @@ class _Summary:
 
     channels: Channels = field(default_factory=Channels)
     chunks: dict[int, frozenset[int]] = field(default_factory=dict)
+    # Newest log time, None where it is not stated.
+    last_ns: int | None = None
 
 
 def _summary(source: Source) -> _Summary:
@@ -102,7 +109,7 @@ def _summary(source: Source) -> _Summary:
     if not start or not 0 < place - start <= MAX_RECORD_BYTES:
         return found
     # A channel is known by its schema, which may be behind it here.
-    used = (Op.SCHEMA, Op.CHANNEL, Op.CHUNK_INDEX)
+    used = (Op.SCHEMA, Op.CHANNEL, Op.CHUNK_INDEX, Op.STATISTICS)
     every = records_of(source.look_at(start, place - start))
     records = list(itertools.islice((one for one in every if one[0] in used), _MOST_RECORDS))
     if len(records) == _MOST_RECORDS:
@@ -110,14 +117,16 @@ def _summary(source: Source) -> _Summary:
     for opcode, body in sorted(records, key=lambda record: record[0]):
         if opcode in (Op.SCHEMA, Op.CHANNEL):
             found.channels.add(opcode, body)
+        elif opcode == Op.STATISTICS:
+            found.last_ns = last_log_ns(body)
         elif opcode == Op.CHUNK_INDEX and (chunk := chunk_of_index(body)) is not None:
             found.chunks[chunk[0]] = chunk[1]
     return found
 
 
-def _channels(source: Source, buffer_bytes: int) -> Channels:
+def _channels(source: Source, summary: _Summary, buffer_bytes: int) -> Channels:
     """The channels of a file: by its summary, else by a search from its front."""
-    channels = _summary(source).channels
+    channels = summary.channels
     if not channels.topics:
         walk = Walk(source, _nothing, channels, limit=_SEARCH_BYTES, buffer_bytes=buffer_bytes)
         for _ in walk.messages():

@@ -39,6 +39,7 @@ _COMPRESSIONS = ("lz4", "bz2")
 _U32 = struct.Struct("<I")
 _WORD_BYTES = 4
 # The field `op=` with the length of a value of one byte before it.
+_TIME = struct.Struct("<II")
 _OP = b"\x04\0\0\0op="
 # The longest header contains the name of a topic; the shortest the kind of the record.
 _MAX_HEAD_BYTES = 1 << 20
@@ -66,11 +67,18 @@ def open_packets(path: Path, streams: StreamTable, buffer_bytes: int = BUFFER_BY
         )
     with Source(path) as source:
         size_bytes = source.size_bytes
-        topics, note = _indexed_topics(source, path, buffer_bytes)
+        topics, last_ns, note = _index(source, path, buffer_bytes)
     opening_notes = (note,) if note else ()
     portions = partial(_portions, buffer_bytes)
     recording = BagRecording(
-        path, CONTAINER, size_bytes, streams, portions, opening_notes, topics=topics
+        path,
+        CONTAINER,
+        size_bytes,
+        streams,
+        portions,
+        opening_notes,
+        topics=topics,
+        last_ns=last_ns,
     )
     if not topics:
         # A connection precedes its first message: all messages have to be read.
@@ -80,14 +88,19 @@ def open_packets(path: Path, streams: StreamTable, buffer_bytes: int = BUFFER_BY
     return recording
 
 
-def _indexed_topics(source: Source, path: Path, buffer_bytes: int) -> tuple[tuple[Topic, ...], str]:
-    """Topics by the index at a bag's end, or none and why (a note, if something is wrong)."""
+def _index(
+    source: Source, path: Path, buffer_bytes: int
+) -> tuple[tuple[Topic, ...], int | None, str]:
+    """Topics and newest log time by the index at a bag's end, or none and why.
+
+    The reason is a note, if something is wrong.
+    """
     window = Window(source, buffer_bytes)
     window.begin = len(_MAGIC)
     try:
         while not len((walked := _walk(window.data, window.begin, window.end)).head):
             if _claims_too_much(window) or not window.refill():
-                return (), "the bag ends within its header"
+                return (), None, "the bag ends within its header"
         fields = _head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
         place = _number(fields, "index_pos")
         count = _number(fields, "conn_count")
@@ -97,17 +110,20 @@ def _indexed_topics(source: Source, path: Path, buffer_bytes: int) -> tuple[tupl
                 f"({fields['encryptor'].decode('latin-1')}); decrypt it with `rosbag decrypt`"
             )
         if not place:
-            return (), "the bag was not closed and has no index; it is read record by record"
+            note = "the bag was not closed and has no index; it is read record by record"
+            return (), None, note
         if not source.is_plain:
             # A file compressed as a whole is only read in order; its index may be intact.
-            return (), ""
+            return (), None, ""
         index = np.frombuffer(source.look_at(place, _MAX_INDEX_BYTES), np.uint8)
-        topics = [topic for _, topic in _connections(index, _walk(index, 0, len(index)))]
+        records = _walk(index, 0, len(index))
+        topics = [topic for _, topic in _connections(index, records)]
+        last_ns = _last_ns(index, records)
     except _HeadError as err:
-        return (), f"the bag's index is damaged ({err}); it is read record by record"
+        return (), None, f"the bag's index is damaged ({err}); it is read record by record"
     if len(topics) < count:
-        return (), "the bag's index is incomplete; it is read record by record"
-    return tuple(dict.fromkeys(topics)), ""
+        return (), None, "the bag's index is incomplete; it is read record by record"
+    return tuple(dict.fromkeys(topics)), last_ns, ""
 
 
 # -- records --------------------------------------------------------------------------------------
@@ -357,6 +373,23 @@ def _connections(data: U8Array, walked: _Records) -> Iterator[tuple[int, Topic]]
         fields = _head_fields(_bytes(data, head, head_size))
         if _number(fields, "op") == _Op.CONNECTION:
             yield _connection_topic(fields, _bytes(data, body, size))
+
+
+def _last_ns(data: U8Array, walked: _Records) -> int | None:
+    """Newest log time by the chunk infos of an index; None where it is not stated for all."""
+    if len(walked.head) == _MOST_RECORDS:
+        return None
+    ends_ns = []
+    for head, head_size, _, _ in _rows(walked):
+        fields = _head_fields(_bytes(data, head, head_size))
+        if _number(fields, "op") != _Op.CHUNK_INFO:
+            continue
+        end = fields.get("end_time", b"")
+        if len(end) != _TIME.size:
+            return None
+        seconds, rest_ns = _TIME.unpack(end)
+        ends_ns.append(seconds * NS_PER_S + rest_ns)
+    return max(ends_ns, default=None)
 
 
 def _claims_too_much(window: Window) -> str:

@@ -94,6 +94,7 @@ def open_folder(
         partial(_portions, databases, buffer_bytes),
         tuple(opening_notes),
         topics=tuple(topics),
+        last_ns=max((one.last_ns for one in databases if one.last_ns is not None), default=None),
     )
 
 
@@ -139,8 +140,8 @@ class _Damage:
 class _Database:
     """An opened file.
 
-    topics: by their numbers in this file; first_ns: time of its first message, or None; notes:
-    what is wrong with it.
+    topics: by their numbers in this file; first_ns, last_ns: times of its first and last message,
+    or None; notes: what is wrong with it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -152,7 +153,8 @@ class _Database:
             with contextlib.closing(self._connect()) as connection:
                 self.topics = _topics(connection)
                 self._indexed = _has_time_index(connection)
-                self.first_ns = self._first_ns(connection)
+                self.first_ns = self._edge_ns(connection, "ASC")
+                self.last_ns = self._edge_ns(connection, "DESC")
         except (sqlite3.Error, LookupError, TypeError, ValueError) as err:
             raise RecordingError(
                 f"{path}: expected a ROS 2 bag (tables topics and messages), found a database that "
@@ -202,12 +204,12 @@ class _Database:
         connection.execute("PRAGMA writable_schema = ON")
         return connection
 
-    def _first_ns(self, connection: sqlite3.Connection) -> int | None:
-        """Time of the first message, for the order of files; None if there is none."""
+    def _edge_ns(self, connection: sqlite3.Connection, direction: str) -> int | None:
+        """Time of the first (ASC) or last (DESC) message; None if there is none."""
         order = "timestamp" if self._indexed else "id"
         try:
             row = connection.execute(
-                f"SELECT timestamp FROM messages ORDER BY {order} LIMIT 1"
+                f"SELECT timestamp FROM messages ORDER BY {order} {direction} LIMIT 1"
             ).fetchone()
         except sqlite3.DatabaseError:
             # Reported when the table is read.

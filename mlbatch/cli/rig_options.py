@@ -1,0 +1,47 @@
+"""Options of `mlbatch convert` that the rig file keeps; the command line overrides them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mlbatch.errors import MlbatchError, RigError, UsageError
+
+_SECTION = b"convert"
+
+
+def take(context: Any, params: Sequence[Any]) -> Mapping[str, str]:
+    """Set options that the command line leaves out to those of the rig; their places by name."""
+    given = context.params.get("rig")
+    rig = Path(given or "")
+    if given is None or not _may_have_section(rig):
+        return {}
+    from mlbatch.rig.rig import read_rig
+
+    by_key = {str(param.name).rstrip("_"): param for param in params}
+    places = {}
+    for option in read_rig(rig).options:
+        param = by_key[option.name]
+        if context.get_parameter_source(param.name).name != "DEFAULT":
+            continue
+        value = list(option.values) if param.multiple else option.values[0]
+        context.params[param.name] = param.type_cast_value(context, value)
+        places[f"--{option.name.replace('_', '-')}"] = option.place
+    return places
+
+
+def located(err: UsageError, places: Mapping[str, str]) -> MlbatchError:
+    """An error about an option; with its place if that is in the rig."""
+    words = str(err).replace(":", " ").split(maxsplit=1)
+    place = places.get(words[0]) if words else None
+    return err if place is None else RigError(f"{place}: {err}")
+
+
+def _may_have_section(rig: Path) -> bool:
+    """False if a rig has no such section for certain; most need not be read twice."""
+    try:
+        return _SECTION in rig.read_bytes()
+    except OSError:
+        # Reported where the rig is read.
+        return False

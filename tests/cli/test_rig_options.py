@@ -1,0 +1,92 @@
+"""Options kept in the rig: taken where the command line is silent, refused with their place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.builders.sessions import FIXTURE, Shell, names, report_of
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """The rig of the fixture, to which tests add a section."""
+    text = (FIXTURE / "rig.yaml").read_text(encoding="utf-8")
+    for name in ("left.json", "right.json"):
+        (tmp_path / name).symlink_to(FIXTURE / name)
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    return path
+
+
+def _add(rig: Path, section: str) -> None:
+    rig.write_text(f"{rig.read_text()}\nconvert:\n{section}")
+
+
+def test_options_of_the_rig_are_those_of_the_command_line(shell: Shell, rig: Path) -> None:
+    _add(rig, "  format: ply\n  slices: 2\n  only: [left]\n  max_range: 20\n  keep_partial: true\n")
+    assert shell(f"convert {CAPTURE} -r {rig} -o by_rig").code == 0
+    plain = FIXTURE / "rig.yaml"
+    words = "-f ply --slices 2 --only left --max-range 20 --keep-partial"
+    assert shell(f"convert {CAPTURE} -r {plain} -o by_words {words}").code == 0
+    files = names("by_rig", ".ply")
+    assert files == names("by_words", ".ply")
+    assert any("-1" in name for name in files)
+    for name in files:
+        assert Path("by_rig", name).read_bytes() == Path("by_words", name).read_bytes()
+
+
+def test_the_command_line_wins(shell: Shell, rig: Path) -> None:
+    _add(rig, "  slices: 2\n  only: [left]\n  format: ply\n")
+    words = "--slices 1 --include-sensor right -f npz"
+    assert shell(f"convert {CAPTURE} -r {rig} -o out {words}").code == 0
+    report = report_of("out/report.json")
+    assert report["grid"]["slices"] == 1
+    assert [one["name"] for one in report["sensors"]] == ["right"]
+    assert names("out")
+
+
+def test_a_default_value_on_the_command_line_wins_as_well(shell: Shell, rig: Path) -> None:
+    _add(rig, "  layout: organized\n")
+    assert shell(f"convert {CAPTURE} -r {rig} -o out.mcap --layout dense").code == 0
+    assert shell("verify out.mcap").code == 0
+    assert ", organized" not in shell("verify out.mcap").out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("max_wait: -1", "convert.max_wait: --max-wait: expected seconds above 0, or inf"),
+        ("fail_on: [loses>1]", "convert.fail_on: --fail-on"),
+        ("decode: {crc: never}", "convert.decode: --decode crc: expected "),
+        ("start: yesterday", "convert.start: --start"),
+        ("jobz: 2", "convert.jobz: expected a key of "),
+    ],
+)
+def test_mistakes_are_one_line_with_their_place(
+    shell: Shell, rig: Path, line: str, message: str
+) -> None:
+    number = len(rig.read_text().splitlines()) + 3
+    _add(rig, f"  {line}\n")
+    outcome = shell(f"convert {CAPTURE} -r {rig} -o out")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"mlbatch: error: {rig}:{number}: {message}")
+
+
+def test_a_mistake_of_the_command_line_has_no_place(shell: Shell, rig: Path) -> None:
+    _add(rig, "  max_wait: 2\n")
+    outcome = shell(f"convert {CAPTURE} -r {rig} -o out --max-wait 0")
+    assert outcome.code == 2
+    assert outcome.err.startswith("mlbatch: error: --max-wait: expected seconds above 0")
+
+
+@pytest.mark.parametrize("command", ["inspect", "compare"])
+def test_other_commands_ignore_them(shell: Shell, rig: Path, command: str) -> None:
+    before = shell(f"{command} {CAPTURE} -r {rig}")
+    _add(rig, "  only: [left]\n")
+    after = shell(f"{command} {CAPTURE} -r {rig}")
+    assert (after.code, after.out) == (0, before.out)

@@ -1,0 +1,157 @@
+"""The page of a comparison: figures by hand, nothing foreign, drawn without errors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.page import write_text_page
+from mlbatch.page.comparison import binned, comparison_page, nice_step
+from mlbatch.page.policies import PolicyFigures, offset_m, quantile
+from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
+
+HOSTILE = "<script>alert(1)</script>&'\""
+
+
+def _policy(
+    name: str, span_ms: float, apart_ms: float, latency_ms: float, sets: int = 50
+) -> PolicyFigures:
+    return PolicyFigures(
+        name=name,
+        sets=sets,
+        without_a_sensor=1,
+        stale=2,
+        columns=1000,
+        used_twice=100,
+        never_used=250,
+        start_s=np.arange(sets) / 10,
+        span_ms=np.full(sets, float(span_ms)),
+        apart_ms=np.full(sets, float(apart_ms)),
+        latency_ms=np.full(sets, float(latency_ms)),
+    )
+
+
+POLICIES = (_policy("latest sweeps", 180, 36, 200), _policy("windows (mlbatch)", 100, 0, 110))
+
+
+def _page(policies: tuple[PolicyFigures, ...] = POLICIES, title: str = "drive.pcap") -> str:
+    return comparison_page(title, f"of {title}", policies, [f"loss: {title}"], f"mlbatch {title}")
+
+
+def test_the_way_of_an_object() -> None:
+    # 50 km/h = 13.889 m/s.
+    assert offset_m(50, 180) == pytest.approx(2.5)
+    assert offset_m(36, 100) == pytest.approx(1.0)
+
+
+def test_the_verdict_is_in_words() -> None:
+    page = _page()
+    assert "Joined sweeps span up to 180 ms (latest sweeps), windows up to 100 ms" in page
+    # 180 ms, 100 ms and 36 ms at 13.889 m/s.
+    assert "moves 2.50 m within such a set, 1.39 m within a window" in page
+    assert "36 ms apart (latest sweeps, median): 0.50 m" in page
+    assert "<div class='verdict warning'" in page
+    alike = (_policy("latest sweeps", 100, 0, 100), POLICIES[1])
+    assert "<div class='verdict good'" in _page(alike)
+
+
+def test_offsets_columns_and_latencies_are_shown() -> None:
+    page = _page()
+    # At 10, 30, 50, 100 km/h: 36 and 180 ms.
+    for speed, median, worst in (
+        ("10", "0.100", "0.500"),
+        ("30", "0.300", "1.500"),
+        ("50", "0.500", "2.500"),
+        ("100", "1.000", "5.000"),
+    ):
+        text = f"latest sweeps, {speed} km/h: median {median} m, worst case {worst} m"
+        assert text in page
+    assert "10.0 % twice, 25.0 % never" in page
+    assert "latest sweeps: 65.0 % used once" in page
+    assert "110 ms (to 110 ms)" in page
+
+
+def test_nothing_of_a_recording_is_code_or_loaded() -> None:
+    page = _page((_policy(HOSTILE, 1, 1, 1), POLICIES[1]), HOSTILE)
+    tags: list[str] = []
+
+    class Parser(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            tags.append(tag)
+            assert not {name for name, _ in attrs} & {"src", "onload", "onclick"}
+
+    Parser().feed(page)
+    assert "script" not in tags
+    assert "default-src 'none'" in page
+    assert re.findall(r"(?:https?:)?//\w", page) == []
+
+
+def test_a_policy_without_sets_is_shown() -> None:
+    assert "approximate time" in _page((_policy("approximate time", 0, 0, 0, sets=0), POLICIES[1]))
+
+
+def test_long_recordings_make_no_long_pages() -> None:
+    long = tuple(_policy(name, 150, 50, 160, sets=36_000) for name in ("latest sweeps", "windows"))
+    assert len(_page(long)) < 200_000
+
+
+@given(st.floats(1e-6, 1e9), st.integers(2, 12))
+def test_steps_are_round(span: float, count: int) -> None:
+    step = nice_step(span, count)
+    assert span / count * 0.999 <= step <= span / count * 5.001
+    assert float(f"{step:.0e}") == pytest.approx(step)
+    assert f"{step:.0e}"[0] in "125"
+
+
+@given(st.lists(st.tuples(st.floats(0, 100), st.floats(0, 1e4)), min_size=1, max_size=50))
+def test_parts_contain_every_extreme(pairs: list[tuple[float, float]]) -> None:
+    at = np.array([one for one, _ in pairs])
+    values = np.array([two for _, two in pairs])
+    parts = binned(at, values, 100.0, 7)
+    assert len(parts) <= 7
+    assert [one[0] for one in parts] == sorted(one[0] for one in parts)
+    assert min(low for _, low, _ in parts) == values.min()
+    assert max(high for _, _, high in parts) == values.max()
+    width = 100 / 7
+    for place, low, high in parts:
+        inside = values[np.abs(at - place) <= width / 2 * (1 + 1e-9)]
+        assert low in inside
+        assert high in inside
+
+
+def test_quantiles_are_by_nearest_rank() -> None:
+    assert quantile(np.array([4.0, 1.0, 3.0, 2.0]), 0.5) == 2.0
+    assert quantile(np.zeros(0), 0.5) == 0.0
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [400, 1400])
+def test_it_is_drawn_in_a_browser(tab: Browser, tmp_path: Path, width: int, dark: bool) -> None:
+    path = tmp_path / "page.html"
+    write_text_page(path, _page())
+    tab.open(path, width=width, dark=dark)
+    assert tab.errors == []
+    assert tab.requests == [path.as_uri()]
+    plots = tab.run(
+        "[...document.querySelectorAll('svg')].map(s => [s.clientWidth, s.clientHeight, "
+        "s.querySelectorAll('rect, path').length])"
+    )
+    assert len(plots) == 4
+    assert all(wide > 300 and high > 40 and shapes >= 2 for wide, high, shapes in plots)
+    # Plots scroll, the page does not.
+    assert tab.run("document.documentElement.scrollWidth") <= width

@@ -1,0 +1,112 @@
+"""`convert:` of a rig: options as on the command line, with file, line and key of mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mlbatch.errors import RigError
+from mlbatch.rig.convert_keys import CONVERT, RigOption
+from mlbatch.rig.rig import Rig, RigSensor, read_rig
+from mlbatch.rig.write import write_rig
+from tests.contract.test_help import OPTIONS
+
+SENSORS = "sensors: [{name: a}]\n"
+# Options of one run, and those that the rig has a key for.
+NOT_IN_A_RIG = {
+    *("--rig", "--output", "--report", "--html", "--dry-run", "--resume", "--overwrite"),
+    *("--rate", "--metadata", "--exclude-box"),
+}
+ALIASES = {"--include-sensor", "--exclude-sensor", "--copy-topic"}
+
+
+def _read(folder: Path, section: str) -> Rig:
+    file = folder / "rig.yaml"
+    file.write_text(SENSORS + section)
+    return read_rig(file)
+
+
+def test_every_option_of_convert_is_a_key() -> None:
+    options = set(OPTIONS["convert"]) - NOT_IN_A_RIG - ALIASES
+    keys = {f"--{key.name.replace('_', '-')}" for key in CONVERT}
+    assert keys == options, "list new options in mlbatch/rig/convert_keys.py, or NOT_IN_A_RIG here"
+
+
+def test_options_are_read_as_on_the_command_line(tmp_path: Path) -> None:
+    section = """\
+convert:
+  format: mcap
+  max_wait: 2.50
+  split: yes
+  keep_partial: no
+  jobs: 4
+  only: [left, 001234]
+  ignore: 10.0.0.9:7502
+  decode: {firing_azimuth: off, crc: check}
+"""
+    found = _read(tmp_path, section).options
+    assert {option.name: option.values for option in found} == {
+        "format": ("mcap",),
+        "max_wait": ("2.50",),
+        "split": ("true",),
+        "keep_partial": ("false",),
+        "jobs": ("4",),
+        "only": ("left", "001234"),
+        "ignore": ("10.0.0.9:7502",),
+        "decode": ("firing_azimuth=off", "crc=check"),
+    }
+    places = {option.name: option.place for option in found}
+    assert places["jobs"] == f"{tmp_path / 'rig.yaml'}:7: convert.jobs"
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("convert:\n  job: 4\n", ":3: convert.job: expected a key of format, layout, "),
+        ("convert:\n  job: 4\n", ", found 'job'; the nearest known key is jobs"),
+        ("convert: {rate: 20}\n", "found 'rate'; the nearest known key is "),
+        ("convert: 4\n", ":2: convert: expected a mapping with keys of "),
+        (
+            "convert: {jobs: 0}\n",
+            ":2: convert.jobs: expected a whole number from 1 to 64, found '0'; ",
+        ),
+        ("convert: {jobs: many}\n", ":2: convert.jobs: expected a finite number, found 'many'; "),
+        ("convert: {split: 1}\n", ":2: convert.split: expected true or false, found '1'; "),
+        (
+            "convert: {layout: flat}\n",
+            ":2: convert.layout: expected dense or organized, found 'flat'; use one of these words",
+        ),
+        (
+            "convert: {drop_incomplete: 101}\n",
+            ":2: convert.drop_incomplete: expected a share from 0 to 100 %, found '101'; ",
+        ),
+        ("convert: {min_range: -1}\n", ":2: convert.min_range: expected a range of 0 m or more, "),
+        ("convert: {only: {a: b}}\n", ":2: convert.only: expected text, or a list of texts, "),
+        ("convert: {decode: crc}\n", ":2: convert.decode: expected a mapping of options, "),
+        ("convert: {format: }\n", ":2: convert.format: expected text, found nothing; "),
+    ],
+)
+def test_mistakes_name_file_line_and_key(tmp_path: Path, section: str, message: str) -> None:
+    with pytest.raises(RigError) as raised:
+        _read(tmp_path, section)
+    text = str(raised.value)
+    assert text.startswith(str(tmp_path / "rig.yaml"))
+    assert message in text
+    assert "\n" not in text
+
+
+def test_written_options_are_read_back(tmp_path: Path) -> None:
+    options = (
+        RigOption("compression", ("zstd:3",)),
+        RigOption("split", ("true",)),
+        RigOption("max_wait", ("2.50",)),
+        RigOption("max_range", ("80",)),
+        RigOption("only", ("left", "001234")),
+        RigOption("decode", ("firing_azimuth=off", "crc=check")),
+        RigOption("fail_on", ("loss>0.1%,underfilled>0",)),
+    )
+    file = tmp_path / "rig.yaml"
+    file.write_text(write_rig(Rig((RigSensor("a"),), options=options), tmp_path))
+    found = {option.name: option.values for option in read_rig(file).options}
+    assert found == {option.name: option.values for option in options}
