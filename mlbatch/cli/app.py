@@ -13,7 +13,17 @@ from mlbatch.errors import UsageError
 
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
-COMMANDS = ("convert", "inspect", "compare", "sensors", "verify", "report", "bench")
+COMMANDS = (
+    "convert",
+    "inspect",
+    "compare",
+    "sensors",
+    "verify",
+    "report",
+    "digest",
+    "diff",
+    "bench",
+)
 
 
 # Options that may be `-`, standard output: command and parameter.

@@ -81,6 +81,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--report": "JSON.*next to",
         "--overwrite": "existing",
     },
+    "digest": {
+        "--output": "golden.*JSON",
+        "--against": "golden.*exit.*1",
+        "--tolerance": r"\bm\b.*bytes",
+        "--overwrite": "existing",
+    },
+    "diff": {"--tolerance": r"\bm\b", "--json": "JSON"},
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",
@@ -171,5 +178,7 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
         "assert 'numpy' not in sys.modules\n"
         "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
     )
-    names = [*("MlbatchError", "Recording", "Run", "Scan", "convert", "inspect", "open", "read")]
-    assert printed.strip() == str([*names, "scans", "verify"])
+    names = [
+        *("MlbatchError", "Recording", "Run", "Scan", "convert", "digest", "inspect", "open"),
+    ]
+    assert printed.strip() == str([*names, "read", "scans", "verify"])

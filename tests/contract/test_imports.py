@@ -13,7 +13,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
     ("api", "compare", "bench", "page"),
-    ("python",),
+    ("python", "digest"),
     ("pipeline",),
     ("discovery", "outputs"),
     ("readers", "sensors", "writers", "verify", "faults"),
