@@ -16,7 +16,6 @@ from mlbatch.digest.diff import diff
 from tests.builders.run import command
 from tests.digest.test_digest import FORMATS, MOVED, convert, other_rig
 
-
 Array = npt.NDArray[Any]
 
 
@@ -44,7 +43,7 @@ def test_an_output_is_the_same_as_itself(kind: str, tmp_path: Path) -> None:
     output = convert(tmp_path, kind)
     found = diff(output, output)
     assert found.same
-    # The tail has 354 of 512 columns (tests/golden/test_fixture.py): its first half is a whole slice.
+    # The tail has 354 of 512 columns (SOURCE.md): its first half is a slice.
     assert found.compared == {"split": 14, "mcap split": 2 * (2 * 7 + 1)}.get(kind, 7)
 
 
