@@ -14,15 +14,8 @@ from mlbatch.errors import UsageError
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
 COMMANDS = (
-    "convert",
-    "inspect",
-    "compare",
-    "sensors",
-    "verify",
-    "report",
-    "digest",
-    "diff",
-    "bench",
+    *("convert", "batch", "inspect", "compare", "sensors", "verify", "report", "digest", "diff"),
+    *("bench",),
 )
 
 

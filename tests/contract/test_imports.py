@@ -12,6 +12,7 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
+    ("batch",),
     ("api", "compare", "bench", "page"),
     ("python", "digest"),
     ("pipeline",),
