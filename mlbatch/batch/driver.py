@@ -122,6 +122,8 @@ def _by_threads(
                 break
             result = result_of(task, stop)
             if result is not None:
+                if fail_fast and result.failed:
+                    closed.set()
                 results.put(result)
         results.put(None)
 
@@ -136,8 +138,6 @@ def _by_threads(
             if result is None:
                 alive -= 1
                 continue
-            if fail_fast and result.failed:
-                closed.set()
             yield result
     finally:
         if alive:

@@ -30,8 +30,11 @@ _BLOCKS = 16
 Key = dict[str, str]
 
 
-def session_key(session: Session) -> Key:
-    """The key of a session as texts; RecordingError where a recording does not exist."""
+def session_key(session: Session, cwd: Path) -> Key:
+    """The key of a session as texts; cwd: that paths in options are relative to.
+
+    Raises RecordingError where a recording does not exist.
+    """
     import numpy as np
 
     local = [Path(one) for one in session.inputs if not is_url(one)]
@@ -48,7 +51,7 @@ def session_key(session: Session) -> Key:
     }
     named = [option for option in session.options if option.name == "--metadata"]
     texts = [value for option in named for value in option.values]
-    found["metadata"] = "; ".join(f"{text} {_digest(Path(text))}" for text in texts)
+    found["metadata"] = "; ".join(f"{text} {_digest(cwd / text)}" for text in texts)
     return found
 
 

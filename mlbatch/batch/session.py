@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mlbatch.errors import UsageError
@@ -53,6 +53,11 @@ class Session:
     rig: str | None = None
     options: tuple[Option, ...] = ()
 
+    def absolute(self) -> Session:
+        """The session with absolute paths, for processes with other working folders."""
+        rig = None if self.rig is None else _absolute(self.rig)
+        return replace(self, inputs=tuple(map(_absolute, self.inputs)), rig=rig)
+
     @property
     def format(self) -> str:
         """Output format."""
@@ -99,6 +104,10 @@ def check_unique(sessions: Sequence[Session]) -> None:
 def is_url(text: str) -> bool:
     """Whether an input or output is in object storage, or on a web server."""
     return "://" in text
+
+
+def _absolute(text: str) -> str:
+    return text if is_url(text) else str(Path(text).absolute())
 
 
 def own_files(folder: Path) -> list[Path]:

@@ -19,7 +19,11 @@ class OutputFolder:
 
     def tasks(self, sessions: Sequence[Session], *, retries: int, pages: bool) -> list[Task]:
         """The tasks of sessions."""
-        return [Task(one, self.folder / one.name, retries, pages) for one in sessions]
+        # Workers have other working folders.
+        folder = self.folder.absolute()
+        return [
+            Task(one.absolute(), folder / one.name, Path.cwd(), retries, pages) for one in sessions
+        ]
 
 
 def open_output(output: str, cache: Path | None, cache_gb: float) -> OutputFolder:

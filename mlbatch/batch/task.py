@@ -54,10 +54,11 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A session to run; folder: of its output."""
+    """A session to run; folder: of its output; cwd: that paths in options are relative to."""
 
     session: Session
     folder: Path
+    cwd: Path
     retries: int = 1
     pages: bool = True
 
@@ -96,7 +97,9 @@ def finished(task: Task) -> SessionRecord | None:
     record = read_record(task.folder)
     if record is None or any(not (task.folder / name).exists() for name in record.outputs):
         return None
-    return record if is_same(record.key, session_key(task.session), task.session) else None
+    return (
+        record if is_same(record.key, session_key(task.session, task.cwd), task.session) else None
+    )
 
 
 def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
@@ -108,7 +111,7 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
     session = task.session
     began_s = time.monotonic()
     try:
-        key = session_key(session)
+        key = session_key(session, task.cwd)
     except MlbatchError as err:
         key = {}
         failed = SessionRecord(session.name, FAILED, 1, str(err), key, inputs=[*session.inputs])
@@ -210,7 +213,12 @@ def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
 def _run(task: Task, log: BinaryIO, stop: Stop) -> int:
     command = [sys.executable, "-m", "mlbatch.cli.child", *words_of(task)]
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+        command,
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=log,
+        cwd=task.cwd,
+        start_new_session=True,
     )
     with stop.watched(process):
         try:

@@ -11,11 +11,11 @@ from typer.core import TyperCommand
 import mlbatch
 from mlbatch.errors import UsageError
 
-# Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
+# Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
-    *("convert", "batch", "inspect", "compare", "sensors", "verify", "report", "digest", "diff"),
-    *("bench",),
+    *("convert", "batch", "batch-status", "inspect", "compare", "sensors", "verify", "report"),
+    *("digest", "diff", "bench"),
 )
 
 
@@ -58,8 +58,9 @@ def command_line(first: str = "") -> typer.Typer:
     )
     app.callback(invoke_without_command=True)(root)
     for name in (first,) if first in COMMANDS else COMMANDS:
-        module = importlib.import_module(f"mlbatch.cli.{name}")
-        app.command(cls=Command)(getattr(module, name))
+        word = name.replace("-", "_")
+        module = importlib.import_module(f"mlbatch.cli.{word}")
+        app.command(cls=Command)(getattr(module, word))
     return app
 
 

@@ -121,7 +121,9 @@ def _forwarded() -> dict[str, inspect.Parameter]:
 def _long_name(name: str, parameter: inspect.Parameter) -> str:
     """An option as typed."""
     info = typing.get_args(parameter.annotation)[1]
-    named = [word for word in info.param_decls or () if word.startswith("--")]
+    # typer has the first name in the place of a default.
+    words = [info.default, *(info.param_decls or ())]
+    named = [word for word in words if str(word).startswith("--")]
     return str(named[0]) if named else f"--{name.replace('_', '-')}"
 
 
@@ -237,9 +239,9 @@ def _print_table(results: list[Result], count: int) -> None:
             result.name,
             result.word,
             str(result.record.scans or ""),
-            _percent(result.record.lost, result.record.packets + result.record.lost),
+            percent_text(result.record.lost, result.record.packets + result.record.lost),
             "" if result.record.fill is None else f"{result.record.fill:.3f}",
-            _bytes(result.record.output_bytes),
+            bytes_text(result.record.output_bytes) if result.record.outputs else "",
             f"{result.record.wall_s:.1f} s" if result.ran else "",
             result.record.line,
         )
@@ -263,7 +265,7 @@ def _print_plan(plan: Plan) -> None:
             one.name,
             one.word,
             str(one.inputs),
-            "?" if one.bytes is None else _bytes(one.bytes),
+            "?" if one.bytes is None else bytes_text(one.bytes),
             one.problem,
         )
         for one in plan.sessions
@@ -274,21 +276,23 @@ def _print_plan(plan: Plan) -> None:
         f"from {plan.measured} finished sessions" if plan.measured else "usual values, not measured"
     )
     typer.echo(
-        f"{len(plan.to_run)} of {len(plan.sessions)} sessions to convert: {_bytes(plan.bytes_in)} "
-        f"in, about {_bytes(plan.bytes_out)} out, about {_hours(plan.hours)} with {plan.workers} "
-        f"worker(s) ({source})"
+        f"{len(plan.to_run)} of {len(plan.sessions)} sessions to convert: "
+        f"{bytes_text(plan.bytes_in)} in, about {bytes_text(plan.bytes_out)} out, "
+        f"about {_hours(plan.hours)} with {plan.workers} worker(s) ({source})"
     )
 
 
-def _percent(part: int, whole: int) -> str:
+def percent_text(part: int, whole: int) -> str:
+    """A share, for tables."""
     return f"{100 * part / whole:.2f} %" if whole else ""
 
 
-def _bytes(count: int) -> str:
+def bytes_text(count: int) -> str:
+    """A size, for tables."""
     for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.1f} {unit}"
-    return f"{count} B" if count else ""
+    return f"{count} B"
 
 
 def _hours(hours: float) -> str:

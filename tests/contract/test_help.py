@@ -59,6 +59,24 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--quiet": "progress",
         "--verbose": "chosen",
     },
+    "batch": {
+        "--output": "[Ff]older.*URL",
+        "--rig": "YAML",
+        "--workers": "same time",
+        "--jobs": "same time",
+        "--retries": "crashed or was killed",
+        "--part": "K/N",
+        "--only": "repeatable",
+        "--plan": "nothing",
+        "--fail-fast": "first failure",
+        "--retry-failed": "failed before",
+        "--no-pages": "HTML",
+        "--scheduler": "Dask.*tcp://",
+        "--cache": "object storage",
+        "--cache-gb": "GB",
+        "--quiet": "progress",
+    },
+    "batch-status": {"--json": "JSON", "--page": "HTML"},
     "inspect": {
         "--whole": "whole",
         "--metadata": "repeatable",
@@ -99,6 +117,10 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--json": "JSON",
     },
 }
+# Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
+_OWN = ("--output", "--rig", "--jobs", "--only", "--overwrite", "--resume", "--quiet", "--verbose")
+_PASSED = set(OPTIONS["convert"]) - {*_OWN, "--report", "--html", "--dry-run"}
+OPTIONS["batch"] |= {name: OPTIONS["convert"][name] for name in sorted(_PASSED)}
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
 
