@@ -24,7 +24,10 @@ _CONNECT_S = 10
 def by_dask(
     tasks: Sequence[Task], address: str, *, fail_fast: bool
 ) -> Generator[Result, None, None]:
-    """Results as they come. Raises UsageError without distributed, ExportError without scheduler."""
+    """Results as they come.
+
+    Raises UsageError without distributed, ExportError without a scheduler.
+    """
     try:
         from distributed import as_completed
     except ImportError as err:
@@ -39,7 +42,7 @@ def by_dask(
         count = sum(client.nthreads().values()) if fail_fast else len(tasks)
         first = [waiting.pop() for _ in range(min(max(count, 1), len(tasks)))]
         running = {_submitted(client, task): task for task in first}
-        results = as_completed(running)
+        results = as_completed(list(running), loop=client.loop)
         for future in results:
             result = _result(running[future], future)
             yield result
