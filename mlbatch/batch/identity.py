@@ -117,6 +117,8 @@ def _digest(file: Path) -> str:
 
 def _rig(rig: str) -> str:
     """Digests of a rig and of the calibrations that it names."""
+    if is_url(rig):
+        return "; ".join(_remote([rig]))
     from mlbatch.rig.rig import read_rig
 
     path = Path(rig)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.batch.record import SessionRecord, read_record
-from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON
+from mlbatch.batch.record import SessionRecord, parse_record, read_record
+from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
 
 # Warnings of clocks, as in the page of a run.
@@ -54,6 +54,8 @@ class BatchStatus:
 
 def status_of(output: str) -> BatchStatus:
     """Read the state of a batch; RecordingError where there is none."""
+    if is_url(output):
+        return _remote_status(output)
     folder = Path(output)
     if not folder.is_dir():
         raise RecordingError(
@@ -66,6 +68,27 @@ def status_of(output: str) -> BatchStatus:
             f"{folder}: expected the output of `mlbatch batch`, found no session in it; check the "
             "name"
         )
+    return BatchStatus(output, tuple(sessions))
+
+
+def _remote_status(output: str) -> BatchStatus:
+    from mlbatch.batch.remote import listed, read_text
+
+    root = output.rstrip("/")
+    files = [one.url.removeprefix(f"{root}/").split("/") for one in listed(root)]
+    names = sorted({parts[0] for parts in files if parts[1:] in ([SESSION_JSON], [LOG_TXT])})
+    if not names:
+        raise RecordingError(
+            f"{output}: expected the output of `mlbatch batch`, found no session in it; check the "
+            "name"
+        )
+    pages = {parts[0]: "/".join(parts) for parts in files if parts[-1].startswith("page")}
+    sessions = [
+        SessionStatus(
+            name, parse_record(read_text(f"{root}/{name}/{SESSION_JSON}")), pages.get(name, "")
+        )
+        for name in names
+    ]
     return BatchStatus(output, tuple(sessions))
 
 

@@ -1,34 +1,34 @@
-"""Where the sessions of a batch go: a folder, or object storage by a local cache."""
+"""Where the sessions of a batch go: a folder, or object storage by way of the cache."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.batch.session import Session
+from mlbatch.batch.cache import Cache
+from mlbatch.batch.session import Session, is_url
 from mlbatch.batch.task import Task
 from mlbatch.errors import ExportError
 
 
-@dataclass(frozen=True, slots=True)
-class OutputFolder:
-    """A local output."""
-
-    folder: Path
-
-    def tasks(self, sessions: Sequence[Session], *, retries: int, pages: bool) -> list[Task]:
-        """The tasks of sessions."""
-        # Workers have other working folders.
-        folder = self.folder.absolute()
-        return [
-            Task(one.absolute(), folder / one.name, Path.cwd(), retries, pages) for one in sessions
-        ]
-
-
-def open_output(output: str, cache: Path | None, cache_gb: float) -> OutputFolder:
-    """The output of a batch; ExportError where it cannot be one."""
-    folder = Path(output)
+def tasks_of(
+    sessions: Sequence[Session], output: str, cache: Cache, *, retries: int, pages: bool
+) -> list[Task]:
+    """The tasks of sessions; ExportError where the output cannot be one."""
+    uploads = is_url(output)
+    # Workers have other working folders.
+    folder = cache.output(output) if uploads else Path(output).absolute()
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: expected a folder, found a file; choose another output")
-    return OutputFolder(folder)
+    return [
+        Task(
+            session=session.absolute(),
+            folder=folder / session.name,
+            cwd=Path.cwd(),
+            cache=cache,
+            upload=f"{output.rstrip('/')}/{session.name}" if uploads else "",
+            retries=retries,
+            pages=pages,
+        )
+        for session in sessions
+    ]

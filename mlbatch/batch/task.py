@@ -16,15 +16,17 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mlbatch.batch.cache import Cache
 from mlbatch.batch.identity import CONTENT, Key, content, is_same, session_key
 from mlbatch.batch.record import (
     DONE,
     FAILED,
     SessionRecord,
+    parse_record,
     read_record,
     read_started,
     write_record,
@@ -38,6 +40,7 @@ from mlbatch.batch.session import (
     SESSION_JSON,
     STARTED_JSON,
     Session,
+    is_url,
     own_files,
 )
 from mlbatch.errors import ExportError, Interrupted, MlbatchError, one_line
@@ -54,11 +57,16 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A session to run; folder: of its output; cwd: that paths in options are relative to."""
+    """A session to run; cwd: that paths in options are relative to.
+
+    folder: of its output; upload: URL of the folder that the output is copied to, "" without.
+    """
 
     session: Session
     folder: Path
     cwd: Path
+    cache: Cache
+    upload: str = ""
     retries: int = 1
     pages: bool = True
 
@@ -94,12 +102,24 @@ class Stop:
 
 def finished(task: Task) -> SessionRecord | None:
     """The record of a session whose inputs, options and versions did not change since."""
-    record = read_record(task.folder)
-    if record is None or any(not (task.folder / name).exists() for name in record.outputs):
+    record = _earlier(task)
+    if record is None:
         return None
     return (
         record if is_same(record.key, session_key(task.session, task.cwd), task.session) else None
     )
+
+
+def _earlier(task: Task) -> SessionRecord | None:
+    """The record of an earlier run whose outputs are there."""
+    if task.upload:
+        from mlbatch.batch.remote import read_text
+
+        return parse_record(read_text(f"{task.upload}/{SESSION_JSON}"))
+    record = read_record(task.folder)
+    if record is None or any(not (task.folder / name).exists() for name in record.outputs):
+        return None
+    return record
 
 
 def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
@@ -116,7 +136,7 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
         key = {}
         failed = SessionRecord(session.name, FAILED, 1, str(err), key, inputs=[*session.inputs])
         task.folder.mkdir(parents=True, exist_ok=True)
-        write_record(task.folder, failed)
+        _publish(task, failed)
         return failed
     with _locked(task.folder, stop) as log:
         done = finished(task)
@@ -124,7 +144,8 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
             # Another driver has made it meanwhile.
             return done
         _prepare(task, key)
-        code, attempts = _attempts(task, log, stop)
+        with _staged(task) as local:
+            code, attempts = _attempts(local, log, stop)
         record = SessionRecord(
             session.name,
             DONE if code == 0 else FAILED,
@@ -136,8 +157,55 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
             wall_s=round(time.monotonic() - began_s, 3),
         )
         _add_figures(record, task)
-        write_record(task.folder, record)
+        _publish(task, record)
         return record
+
+
+@contextlib.contextmanager
+def _staged(task: Task) -> Iterator[Task]:
+    """The task with local copies of remote files, kept while it runs."""
+    session = task.session
+    urls = [one for one in (*session.inputs, session.rig or "") if is_url(one)]
+    if not urls:
+        yield task
+        return
+    with task.cache.staged(urls) as copies:
+        local = {url: str(path) for url, path in copies.items()}
+        inputs = tuple(local.get(one, one) for one in session.inputs)
+        rig = None if session.rig is None else local.get(session.rig, session.rig)
+        yield replace(task, session=replace(session, inputs=inputs, rig=rig))
+
+
+def _publish(task: Task, record: SessionRecord) -> None:
+    """Write session.json, after all else; with an upload there, and what is here is removed."""
+    if not task.upload:
+        write_record(task.folder, record)
+        return
+    from mlbatch.batch import remote
+
+    # While files are replaced, nothing may say that they are complete.
+    remote.remove(f"{task.upload}/{SESSION_JSON}")
+    files = [path for path in _all_files(task.folder) if path.name != STARTED_JSON]
+    names = {path.relative_to(task.folder).as_posix() for path in files}
+    for path in files:
+        remote.upload(path, f"{task.upload}/{path.relative_to(task.folder).as_posix()}")
+    for one in remote.listed(task.upload):
+        name = one.url.removeprefix(f"{task.upload}/")
+        if name not in names and OWN.fullmatch(name.partition("/")[0]):
+            remote.remove(one.url)
+    write_record(task.folder, record)
+    remote.upload(task.folder / SESSION_JSON, f"{task.upload}/{SESSION_JSON}")
+    for path in own_files(task.folder):
+        if path.name != LOG_TXT:
+            _remove(path)
+
+
+def _all_files(folder: Path) -> list[Path]:
+    """All files that a run wrote to the folder of a session."""
+    found = []
+    for path in own_files(folder):
+        found += [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
+    return found
 
 
 @contextlib.contextmanager

@@ -74,10 +74,11 @@ def batch(
     **options: Any,
 ) -> None:
     """Convert many sessions, a process each; a second run does what is missing or changed."""
+    from mlbatch.batch.cache import Cache
     from mlbatch.batch.driver import Batch
     from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
     from mlbatch.batch.plan import plan_of
-    from mlbatch.batch.store import open_output
+    from mlbatch.batch.store import tasks_of
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.pipeline.interrupts import interruptible
 
@@ -85,9 +86,9 @@ def batch(
     numbers = parse_part(part)
     given = Common(rig, tuple(_given(context, options, jobs)))
     sessions = chosen(sessions_of(sources, given, _kinds()), only or (), numbers)
-    out = open_output(output, cache, cache_gb)
+    copies = Cache.of(cache, cache_gb)
     with interruptible():
-        tasks = out.tasks(sessions, retries=retries, pages=not no_pages)
+        tasks = tasks_of(sessions, output, copies, retries=retries, pages=not no_pages)
         if plan:
             _print_plan(plan_of(tasks, workers, retry_failed=retry_failed))
             return
