@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,10 @@ def test_a_crash_and_a_kill_cost_no_other_session(data: Dataset, tmp_path: Path)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
+def _any(out: Path, name: str) -> bool:
+    return any(out.glob(f"*/{name}"))
+
+
 def test_a_killed_driver_leaves_no_process_and_a_second_run_equals_the_first(
     good: Dataset, tmp_path: Path
 ) -> None:
@@ -91,7 +96,7 @@ def test_a_killed_driver_leaves_no_process_and_a_second_run_equals_the_first(
     out = tmp_path / "out"
     for name in ("started.json", "session.json"):
         driver = start(good, out, "--workers", "2")
-        wait_for(lambda name=name: list(out.glob(f"*/{name}")))
+        wait_for(partial(_any, out, name))
         driver.kill()
         driver.communicate()
         wait_for(lambda: not list(processes_of(str(out))))

@@ -93,8 +93,8 @@ def test_from_and_to_the_server(
 ) -> None:
     """The network is cut while recordings are read, or while outputs are written."""
     prefix = f"out-{cut_after}/"
-    words = ("s3://data/raw/*/", "-o", f"s3://data/{prefix}", "--cache", tmp_path / "cache")
-    words = (*words, "--rate", "20", "--workers", "2")
+    places = ("s3://data/raw/*/", "-o", f"s3://data/{prefix}", "--cache", tmp_path / "cache")
+    words = (*places, "--rate", "20", "--workers", "2")
     cuts = cloud.network.cuts
     cloud.network.cut_after = cut_after
     ended = cloud.run("batch", *words)
@@ -123,8 +123,8 @@ def test_another_server_of_files_is_a_changed_input(cloud: Cloud, tmp_path: Path
     cloud.client.put_object(Bucket="data", Key="new/a1/drive.pcap", Body=data)
     meta = (cloud.data.folder / "raw" / "a1" / "111.json").read_bytes()
     cloud.client.put_object(Bucket="data", Key="new/a1/111.json", Body=meta)
-    words = ("batch", "s3://data/new/a1/*.pcap", "-o", tmp_path / "out")
-    words = (*words, "--cache", tmp_path / "cache")
+    places = ("-o", tmp_path / "out", "--cache", tmp_path / "cache")
+    words = ("batch", "s3://data/new/a1/*.pcap", *places)
     assert cloud.run(*words).table == {"drive": "done"}
     assert cloud.run(*words).table == {"drive": "skipped"}
     cloud.client.put_object(Bucket="data", Key="new/a1/drive.pcap", Body=data[:-3000])

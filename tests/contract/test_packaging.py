@@ -69,12 +69,15 @@ def test_the_lowest_versions_are_those_that_are_tested() -> None:
 
 def test_the_package_needs_exactly_what_it_imports() -> None:
     needed = _modules_of(cast(list[str], _settings("project")["dependencies"]))
-    fast = _modules_of(cast(list[str], _settings("project", "optional-dependencies")["fast"]))
+    extras = _settings("project", "optional-dependencies")
+    optional = [
+        text for name in ("fast", "dask", "remote") for text in cast(list[str], extras[name])
+    ]
     # The programs of peers run in an interpreter of their own, with what the peer brings.
     own = [module for module in modules() if module.name != "bench.programs"]
     found = {_top(node) for module in own for node in ast.walk(module.tree)} - {""}
     foreign = found - set(sys.stdlib_module_names) - {"mlbatch"}
-    assert needed <= foreign <= needed | fast
+    assert needed <= foreign <= needed | _modules_of(optional)
 
 
 def _modules_of(requirements: list[str]) -> set[str]:
