@@ -111,10 +111,9 @@ def batch(
 
 def _forwarded() -> dict[str, inspect.Parameter]:
     """Options of `convert` that are passed to every session."""
-    hints = typing.get_type_hints(convert, include_extras=True)
     return {
-        name: parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
-        for name, parameter in inspect.signature(convert).parameters.items()
+        name: parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(convert, eval_str=True).parameters.items()
         if name not in _WITHOUT
     }
 
@@ -175,10 +174,9 @@ def _check_counts(**counts: int) -> None:
 
 def _signature() -> inspect.Signature:
     """Own options, then those of `convert`: the parser describes a command by its signature."""
-    hints = typing.get_type_hints(batch, include_extras=True)
     own = [
-        parameter.replace(annotation=hints[name])
-        for name, parameter in inspect.signature(batch).parameters.items()
+        parameter
+        for name, parameter in inspect.signature(batch, eval_str=True).parameters.items()
         if name != "options"
     ]
     return inspect.Signature([*own, *_forwarded().values()])
