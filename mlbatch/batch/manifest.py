@@ -126,12 +126,13 @@ def _of_manifest(path: Path, given: Common, kinds: OptionKinds) -> Iterator[Sess
     root["schema"].choice((SCHEMA,))
     options = _options(root.get("options"), kinds)
     rig = _path(root["rig"]) if "rig" in root else None
+    mine = {option.name.removeprefix("--"): option for option in given.options}
     for node in root["sessions"].elements("sessions"):
         entries = node.fields(_SESSION_KEYS)
         own = _options(entries.get("options"), kinds)
         common = Common(
             given.rig or (_path(entries["rig"]) if "rig" in entries else rig),
-            _joined(options, own, given.options),
+            _joined(options, own, mine),
         )
         yield from _of_entry(node, entries, common)
 
@@ -152,8 +153,8 @@ def _of_entry(node: Node, entries: Mapping[str, Node], common: Common) -> Iterat
     for word in _FIELDS.findall(template):
         if word not in _TEMPLATE_WORDS:
             known = ", ".join(f"{{{one}}}" for one in _TEMPLATE_WORDS)
-            assert_node = name or node
-            raise assert_node.error(known, f"{{{word}}}", "use one of them")
+            place = name or node
+            raise place.error(known, f"{{{word}}}", "use one of them")
     yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place)
 
 
@@ -170,22 +171,20 @@ def _path(node: Node) -> str:
     return f"{node.file.parent / text}{slash}"
 
 
-def _options(node: Node | None, kinds: OptionKinds) -> tuple[Option, ...]:
-    """Options of `convert`, named with `_` or `-`: flags as true or false, lists as lists."""
+def _options(node: Node | None, kinds: OptionKinds) -> dict[str, Option | None]:
+    """Options of `convert`, named with `_` or `-`: flags as true or false (None), lists as lists."""
     if node is None or node.is_null():
-        return ()
+        return {}
     names = {name.replace("-", "_"): name for name in kinds}
     written = {key: key.replace("-", "_") for key in node.entries}
     for key, plain in written.items():
         if plain not in names:
             node.fields(tuple(names))
             raise node.entries[key].error("another option", key, "remove it")
-    found = []
-    for key, plain in written.items():
-        option = _option(node.entries[key], f"--{names[plain]}", kinds[names[plain]])
-        if option is not None:
-            found.append(option)
-    return tuple(found)
+    return {
+        names[plain]: _option(node.entries[key], f"--{names[plain]}", kinds[names[plain]])
+        for key, plain in written.items()
+    }
 
 
 def _option(node: Node, name: str, kind: str) -> Option | None:
@@ -196,10 +195,10 @@ def _option(node: Node, name: str, kind: str) -> Option | None:
     return Option(name, (_text(node),))
 
 
-def _joined(*several: Sequence[Option]) -> tuple[Option, ...]:
+def _joined(*several: Mapping[str, Option | None]) -> tuple[Option, ...]:
     """Options; later ones replace those of the same name."""
-    found = {option.name: option for options in several for option in options}
-    return tuple(found.values())
+    found = {name: option for options in several for name, option in options.items()}
+    return tuple(option for option in found.values() if option is not None)
 
 
 # -- a part of them ---------------------------------------------------------------------------

@@ -146,6 +146,7 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
         _prepare(task, key)
         with _staged(task) as local:
             code, attempts = _attempts(local, log, stop)
+            _add_page(local, code, log, stop)
         record = SessionRecord(
             session.name,
             DONE if code == 0 else FAILED,
@@ -270,7 +271,7 @@ def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
     while attempt <= task.retries:
         attempt += 1
         log.truncate(0)
-        code = _run(task, log, stop)
+        code = _run(words_of(task), task, log, stop)
         if stop.event.is_set():
             raise Interrupted("interrupted")
         if code in _FINAL:
@@ -278,8 +279,8 @@ def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
     return code, attempt
 
 
-def _run(task: Task, log: BinaryIO, stop: Stop) -> int:
-    command = [sys.executable, "-m", "mlbatch.cli.child", *words_of(task)]
+def _run(words: list[str], task: Task, log: BinaryIO, stop: Stop) -> int:
+    command = [sys.executable, "-m", "mlbatch.cli.child", *words]
     process = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
@@ -294,6 +295,15 @@ def _run(task: Task, log: BinaryIO, stop: Stop) -> int:
         finally:
             if process.stdin is not None:
                 process.stdin.close()
+
+
+def _add_page(task: Task, code: int, log: BinaryIO, stop: Stop) -> None:
+    """Write the page of a run that was killed after its output and before its page."""
+    output = task.folder / task.session.output
+    is_there = any(path.name.startswith("page") for path in own_files(task.folder))
+    if code in (0, _LIMIT) and task.pages and output.exists() and not is_there:
+        words = ["report", str(output), "--report", str(task.folder / REPORT_JSON)]
+        _run([*words, "-o", str(task.folder / PAGE_HTML)], task, log, stop)
 
 
 def words_of(task: Task) -> list[str]:
