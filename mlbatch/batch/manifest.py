@@ -172,7 +172,7 @@ def _path(node: Node) -> str:
 
 
 def _options(node: Node | None, kinds: OptionKinds) -> dict[str, Option | None]:
-    """Options of `convert`, named with `_` or `-`: flags as true or false (None), lists as lists."""
+    """Options of `convert`, named with `_` or `-`; None: a flag that is false."""
     if node is None or node.is_null():
         return {}
     names = {name.replace("-", "_"): name for name in kinds}
