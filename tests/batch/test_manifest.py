@@ -147,17 +147,14 @@ def test_wrong_parts_are_refused(text: str) -> None:
         parse_part(text)
 
 
+OWN_FILES = (
+    *("scans.mcap", "scans", "scans.bag", "scans.mcap.partial", "scans.mcap.partial.state"),
+    *("scans.seg2.mcap", "scans.mcap.scans.csv", "report.json", "report.seg2.json"),
+    *("page.html", "log.txt", "session.json", "started.json", "session.json.partial"),
+)
+OTHER_FILES = ("scans.txt", "my scans.mcap", "scans.mcap.bak", "report.pdf", "rig.yaml")
+
+
 def test_only_files_of_runs_are_removed() -> None:
-    own = ("scans.mcap", "scans", "scans.bag", "scans.mcap.partial", "scans.mcap.partial.state")
-    own += ("scans.seg2.mcap", "scans.mcap.scans.csv", "report.json", "report.seg2.json")
-    own += ("page.html", "log.txt", "session.json", "started.json", "session.json.partial")
-    assert all(OWN.fullmatch(name) for name in own)
-    others = (
-        "scans.txt",
-        "my scans.mcap",
-        "thesis.txt",
-        "scans.mcap.bak",
-        "report.pdf",
-        "rig.yaml",
-    )
-    assert not any(OWN.fullmatch(name) for name in others)
+    assert all(OWN.fullmatch(name) for name in OWN_FILES)
+    assert not any(OWN.fullmatch(name) for name in OTHER_FILES)
