@@ -21,7 +21,8 @@ _FILL_WARNING = 0.9
 _BADGES = {"failed": "problem", UNFINISHED: "warning", "done": "good"}
 _STYLE = """
 .good .badge { background: var(--good); }
-.number { text-align: right; }
+td strong.warning { color: var(--warning); }
+td strong.problem { color: var(--problem); }
 """
 
 

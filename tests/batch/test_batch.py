@@ -264,6 +264,22 @@ def test_a_foreign_folder_is_not_touched(good: Dataset, tmp_path: Path) -> None:
     assert (out / "a1" / "thesis.txt").read_text(encoding="utf-8") == "mine"
 
 
+def test_segments_between_clock_steps_are_one_session(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", ["a1"], turns=6)
+    out = tmp_path / "out"
+    words = ("--on-jump", "split", "--fault", "jump:ouster_111:37s@0.3s", "--keep-partial")
+    assert run(data, out, *words).code == 0
+    record = json.loads((out / "a1" / "session.json").read_text(encoding="utf-8"))
+    outputs = [name for name in record["outputs"] if name.endswith(".mcap")]
+    assert outputs == ["scans.seg1.mcap", "scans.seg2.mcap"]
+    reports = [
+        json.loads((out / "a1" / f"report.seg{number}.json").read_text(encoding="utf-8"))
+        for number in (1, 2)
+    ]
+    assert record["scans"] == sum(one["scans"]["written"] for one in reports)
+    assert run(data, out, *words).table == {"a1": "skipped"}
+
+
 @pytest.mark.parametrize("kind", ["npz", "rosbag1", "rosbag2", "ply"])
 def test_every_format(kind: str, good: Dataset, tmp_path: Path) -> None:
     out = tmp_path / "out"

@@ -70,7 +70,9 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cloud]:
         client.create_bucket(Bucket="data")
         for path in (data.folder / "raw").rglob("*"):
             if path.is_file():
-                client.upload_file(str(path), "data", path.relative_to(data.folder).as_posix())
+                key = path.relative_to(data.folder).as_posix()
+                # Also for clients without credentials.
+                client.upload_file(str(path), "data", key, ExtraArgs={"ACL": "public-read"})
         yield Cloud(network, env, client, data)
 
 
@@ -162,6 +164,19 @@ def test_convert_alone(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyP
     again = cloud.run("convert", *words, "--quiet")
     assert (again.code, len(again.err.splitlines())) == (1, 1)
     assert "--overwrite" in again.err
+
+
+def test_a_web_server(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without lists of files, calibrations are named."""
+    monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
+    server = f"{cloud.env['AWS_ENDPOINT_URL']}/data/raw/a1"
+    folder = cloud.data.folder / "raw" / "a1"
+    words = ("--rate", "20", "--metadata", folder / "111.json", "--quiet")
+    ended = cloud.run("convert", f"{server}/drive.pcap", "-o", tmp_path / "web.mcap", *words)
+    assert ended.code == 0, ended.err
+    near = tmp_path / "near.mcap"
+    assert cloud.run("convert", folder / "drive.pcap", "-o", near, *words).code == 0
+    assert (tmp_path / "web.mcap").read_bytes() == near.read_bytes()
 
 
 @pytest.mark.parametrize(
