@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 
@@ -13,6 +14,8 @@ from mlbatch.batch.task import Stop, Task, finished, run_session
 from mlbatch.errors import Interrupted, MlbatchError
 
 SKIPPED = "skipped"
+# Requests to a store at the same time.
+_REQUESTS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +60,7 @@ class Batch:
         """
         results: dict[str, Result] = {}
         left = []
-        for task in tasks:
-            record = _before(task)
+        for task, record in zip(tasks, _records(tasks), strict=True):
             if record is None or (self.retry_failed and not record.is_done):
                 left.append(task)
                 continue
@@ -83,6 +85,15 @@ class Batch:
         from mlbatch.batch.cluster import by_dask
 
         return by_dask(tasks, self.scheduler, fail_fast=self.fail_fast)
+
+
+def _records(tasks: Sequence[Task]) -> list[SessionRecord | None]:
+    """Records of earlier runs that count."""
+    if not any(task.is_remote for task in tasks):
+        return list(map(_before, tasks))
+    # Requests take their time in the network.
+    with ThreadPoolExecutor(_REQUESTS) as pool:
+        return list(pool.map(_before, tasks))
 
 
 def _before(task: Task) -> SessionRecord | None:

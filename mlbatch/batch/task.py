@@ -70,6 +70,11 @@ class Task:
     retries: int = 1
     pages: bool = True
 
+    @property
+    def is_remote(self) -> bool:
+        """Whether its state or its recordings are in a store."""
+        return bool(self.upload) or any(map(is_url, self.session.inputs))
+
 
 @dataclass(slots=True)
 class Stop:

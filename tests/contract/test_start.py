@@ -52,6 +52,8 @@ NEEDLESS = (
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
+    *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
+    *("mlbatch.cli.digest", "mlbatch.digest.golden"),
     *("numpy.ma", "rosbags", "rich"),
 )
 
