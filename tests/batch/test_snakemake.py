@@ -14,7 +14,7 @@ import pytest
 from tests.batch.sessions import run, scans, write_dataset
 from tests.builders.run import ROOT
 
-RULE = re.compile(r"^Snakemake:\n\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+RULE = re.compile(r"^Snakemake:\n\n```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("snakemake") is None, reason="needs snakemake")
