@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from mlbatch.api import open as open
     from mlbatch.api import read as read
     from mlbatch.api import scans as scans
+    from mlbatch.digest import digest as digest
     from mlbatch.errors import MlbatchError as MlbatchError
     from mlbatch.outputs.scan import Scan as Scan
     from mlbatch.python.recording import Recording as Recording
@@ -23,6 +24,7 @@ __all__ = [
     "Run",
     "Scan",
     "convert",
+    "digest",
     "inspect",
     "open",
     "read",
@@ -37,15 +39,16 @@ _PLACES = {
     "Scan": "mlbatch.outputs.scan",
     **dict.fromkeys(("convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
 }
+_CALLABLE_PACKAGES = ("digest", "verify")
 
 
 def __getattr__(name: str) -> object:
     """Load what is asked for: `mlbatch --help` must not wait for numpy."""
     import importlib
 
-    if name == "verify":
-        # A package that can be called: importing it replaces any function of this name here.
-        return importlib.import_module("mlbatch.verify")
+    if name in _CALLABLE_PACKAGES:
+        # Importing them replaces any function of their name here.
+        return importlib.import_module(f"mlbatch.{name}")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

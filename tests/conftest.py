@@ -15,7 +15,12 @@ settings.load_profile("mlbatch")
 
 # Whole suites of cases, a folder or a file each: `make test-quick` leaves them out.
 LONG = (
+    "batch/test_batch.py",
+    "batch/test_dask.py",
+    "batch/test_remote.py",
+    "batch/test_snakemake.py",
     "bench/",
+    "digest/",
     "fuzz/",
     "golden/",
     "matrix/",

@@ -14,11 +14,11 @@ from mlbatch.cli import help as help_page
 from mlbatch.cli import rig_options
 from mlbatch.errors import UsageError
 
-# Modules of this package, each with a function of the same name, in the order of `--help`.
 _PATH_TYPES = ("path", "file", "directory")
+# Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
-    *("convert", "inspect", "compare", "sensors", "verify", "report"),
-    *("simulate", "schema", "bench"),
+    *("convert", "batch", "batch-status", "inspect", "compare", "sensors", "verify", "report"),
+    *("digest", "diff", "simulate", "schema", "bench"),
 )
 
 
@@ -103,8 +103,9 @@ def command_line(first: str = "") -> typer.Typer:
     )
     app.callback(invoke_without_command=True)(root)
     for name in (first,) if first in COMMANDS else COMMANDS:
-        module = importlib.import_module(f"mlbatch.cli.{name}")
-        function = getattr(module, name)
+        word = name.replace("-", "_")
+        module = importlib.import_module(f"mlbatch.cli.{word}")
+        function = getattr(module, word)
         # The page of the root shows no options of commands: describing them takes time.
         described = _summary(function) if first in HELP else function
         app.command(name, cls=Command)(described)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -245,6 +246,12 @@ def convert(
     ] = False,
 ) -> None:
     """Turn raw lidar packets into merged scans at an exact rate."""
+    # As a path, s3://bucket/name is s3:/bucket/name.
+    paths = [str(path).partition(":/") for path in (*recordings, output, rig)]
+    if any(colon and scheme.isalnum() for scheme, colon, _ in paths):
+        from mlbatch.cli.convert_remote import convert_remote
+
+        return convert_remote(sys.argv[2:])
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection

@@ -111,4 +111,5 @@ def scan_of_cloud(place: CloudPlace, rows: Rows, complete: bool) -> Scan:
         overlap=row.overlap,
         fill=np.array(row.fill, np.float32),
         absent=frozenset({*empty, *_COLUMN_ARRAYS, "ring_base"}),
+        sensor="" if place.only is None else place.info.sensors[place.only].name,
     )

@@ -238,6 +238,7 @@ def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterato
         if table is None and run.about is not None:
             table = run.about.table()
         only = None if file.sensor is None else index
+        scan.sensor = file.sensor or ""
         row = row_of(table, scan.index, scan.slice, only)
         if row is not None:
             scan.columns_per_sensor = row.columns

@@ -38,6 +38,8 @@ _POINT_ARRAYS = (
     "return_type",
     "lidar_id",
 )
+# What scans of conversions do not have.
+_OF_OUTPUTS = ("absent", "sensor")
 # Arrays from which the fields of a point layout are made; the others are made of `xyz`.
 _NEEDED = {
     "intensity": "intensity",
@@ -92,11 +94,13 @@ class Scan:
     # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     absent: frozenset[str] = frozenset()
+    sensor: str = ""  # the only one, of an output with `--split`
 
     @classmethod
     def copied(cls, scan: types.Scan) -> Scan:
         """A scan of a conversion with arrays of its own, contiguous."""
-        values = {one.name: getattr(scan, one.name) for one in fields(cls) if one.name != "absent"}
+        names = [one.name for one in fields(cls) if one.name not in _OF_OUTPUTS]
+        values = {name: getattr(scan, name) for name in names}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 values[name] = np.array(value, order="C")
@@ -278,7 +282,8 @@ class Scan:
 
     def _record(self) -> types.Scan:
         """The same arrays as conversions pass them to writers."""
-        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "absent"}
+        names = [one.name for one in fields(self) if one.name not in _OF_OUTPUTS]
+        values = {name: getattr(self, name) for name in names}
         for name in self.absent & set(_POINT_ARRAYS):
             if values[name] is not None:
                 # Not used by the layout, but of the shape of all others.

@@ -62,6 +62,24 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--quiet": "progress",
         "--verbose": "chosen",
     },
+    "batch": {
+        "--output": "[Ff]older.*URL",
+        "--rig": "YAML",
+        "--workers": "same time",
+        "--jobs": "same time",
+        "--retries": "crashed or was killed",
+        "--part": "K/N",
+        "--only": "repeatable",
+        "--plan": "nothing",
+        "--fail-fast": "first failure",
+        "--retry-failed": "failed before",
+        "--no-pages": "HTML",
+        "--scheduler": "Dask.*tcp://",
+        "--cache": "object storage",
+        "--cache-gb": "GB",
+        "--quiet": "progress",
+    },
+    "batch-status": {"--json": "JSON", "--page": "HTML"},
     "inspect": {
         "--rig": "YAML",
         "--whole": "whole",
@@ -98,6 +116,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--quiet": "nothing",
     },
     "schema": {},
+    "digest": {
+        "--output": "golden.*JSON",
+        "--against": "golden.*exit.*1",
+        "--tolerance": r"\bm\b.*bytes",
+        "--overwrite": "existing",
+    },
+    "diff": {"--tolerance": r"\bm\b", "--json": "JSON"},
     "bench": {
         "--seconds": r"\bs\b",
         "--repeat": "program",
@@ -109,6 +134,10 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--json": "JSON",
     },
 }
+# Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
+_OWN = ("--output", "--rig", "--jobs", "--only", "--overwrite", "--resume", "--quiet", "--verbose")
+_PASSED = set(OPTIONS["convert"]) - {*_OWN, "--report", "--html", "--dry-run"}
+OPTIONS["batch"] |= {name: OPTIONS["convert"][name] for name in sorted(_PASSED)}
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
 
@@ -288,5 +317,7 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
         "assert 'numpy' not in sys.modules\n"
         "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
     )
-    names = [*("MlbatchError", "Recording", "Run", "Scan", "convert", "inspect", "open", "read")]
-    assert printed.strip() == str([*names, "scans", "verify"])
+    names = [
+        *("MlbatchError", "Recording", "Run", "Scan", "convert", "digest", "inspect", "open"),
+    ]
+    assert printed.strip() == str([*names, "read", "scans", "verify"])

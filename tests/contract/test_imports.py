@@ -12,9 +12,10 @@ from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
+    ("batch",),
     ("api", "compare", "bench", "simulate"),
     ("page",),
-    ("python",),
+    ("python", "digest"),
     ("pipeline",),
     ("discovery", "outputs"),
     ("readers", "sensors", "writers", "verify", "faults"),

@@ -54,6 +54,8 @@ NEEDLESS = (
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
     *("mlbatch.cli.simulate", "mlbatch.simulate.recording", "mlbatch.sensors.ouster.encode"),
     *("mlbatch.sensors.ouster.simulate", "mlbatch.lidar.simulated"),
+    *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
+    *("mlbatch.cli.digest", "mlbatch.digest.golden"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
 )
 

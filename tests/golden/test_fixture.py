@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -12,7 +11,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+import mlbatch
 from mlbatch.arrays import F64Array, I64Array
+from mlbatch.digest import compare, read_golden
 from tests.builders.make_fixtures import END_NS, SECOND_NS, START_NS, TURNS
 from tests.builders.run import FIXTURE, Cloud, load, scan_files, to_file
 from tests.builders.scene import MACHINE_HIGH_M, MACHINE_LOW_M, hall
@@ -25,7 +26,7 @@ from tests.builders.two_lidars import (
     body_from_sensor,
     column_stamps,
 )
-from tests.golden.expected import EXPECTED, describe
+from tests.golden.expected import FIXTURES, converted, expected
 
 LIDARS = (LEFT, RIGHT)
 PERIOD_NS = 100_000_000
@@ -85,10 +86,11 @@ def same(one: Cloud, other: Cloud) -> None:
         assert left.tobytes() == right.tobytes(), part.name
 
 
-def test_digests(folder: Path) -> None:
-    expected = json.loads(EXPECTED.read_text(encoding="utf-8"))
-    got = describe(folder)
-    assert got == expected
+@pytest.mark.parametrize("fixture", FIXTURES)
+def test_digests(fixture: str, tmp_path: Path) -> None:
+    golden = read_golden(expected(fixture))
+    result = compare(golden, mlbatch.digest(converted(fixture, tmp_path)), tolerance=0)
+    assert result.ok, list(map(str, result.differences[:9]))
 
 
 def test_counts_are_those_of_the_scene(folder: Path) -> None:

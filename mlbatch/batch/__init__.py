@@ -1,0 +1,4 @@
+"""Many recordings: one `mlbatch convert` process a session, see docs/batch.md.
+
+There is no database: the state of a session is what lies in its folder.
+"""

@@ -1,0 +1,149 @@
+"""The key of a session: a run is repeated only if it changes.
+
+Recordings are compared by name, size and time of change; where only the time differs, by samples of
+their content. Of rigs and calibrations the whole content counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import mlbatch
+from mlbatch.batch.session import Session, is_url
+from mlbatch.errors import MlbatchError, RecordingError
+
+CONTENT = "content"
+TIMES = "times"
+_DIGITS = 16
+# Files next to a recording that may be calibrations: as `convert` looks for them.
+LARGEST_CALIBRATION = 2_000_000
+CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
+# Documents of mlbatch: manifests, reports, golden files.
+_DOCUMENT = re.compile(rb"schema\W{1,5}mlbatch\.")
+_HEAD_BYTES = 256
+_END_BYTES = 1 << 16
+_BLOCKS = 16
+
+Key = dict[str, str]
+
+
+def session_key(session: Session, cwd: Path) -> Key:
+    """The key of a session as texts; cwd: that paths in options are relative to.
+
+    Raises RecordingError where a recording does not exist.
+    """
+    import numpy as np
+
+    local = [Path(one) for one in session.inputs if not is_url(one)]
+    files = [file for path in local for file in _files(path)]
+    sizes = [f"{file.name} {file.stat().st_size}" for file in files]
+    found = {
+        "mlbatch": mlbatch.__version__,
+        "numpy": np.__version__,
+        "options": " ".join(session.key_words),
+        "recordings": "; ".join([*sizes, *_remote(session.inputs)]),
+        TIMES: "; ".join(str(file.stat().st_mtime_ns) for file in files),
+        "rig": "" if session.rig is None else _rig(session.rig),
+        "calibrations": _calibrations(local),
+    }
+    named = [option for option in session.options if option.name == "--metadata"]
+    texts = [value for option in named for value in option.values]
+    found["metadata"] = "; ".join(f"{text} {_digest(cwd / text)}" for text in texts)
+    return found
+
+
+def content(session: Session) -> str:
+    """Digest of samples of the local recordings: start, end and blocks between."""
+    digest = hashlib.sha256()
+    for one in session.inputs:
+        for file in [] if is_url(one) else _files(Path(one)):
+            for sample in _samples(file):
+                digest.update(sample)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def is_same(old: Mapping[str, str], new: Key, session: Session) -> bool:
+    """Whether a run with the key `old` had the same inputs, options and versions."""
+    if any(old.get(name) != value for name, value in new.items() if name != TIMES):
+        return False
+    return old.get(TIMES) == new[TIMES] or old.get(CONTENT) == content(session)
+
+
+def changed(old: Mapping[str, str], new: Key) -> str:
+    """The names of what differs between two keys."""
+    return ", ".join(name for name, value in new.items() if old.get(name) != value)
+
+
+# -- files ------------------------------------------------------------------------------------
+
+
+def _files(path: Path) -> list[Path]:
+    """A recording, or all files of its folder."""
+    if path.is_dir():
+        return sorted(one for one in path.rglob("*") if one.is_file())
+    if not path.exists():
+        raise RecordingError(f"{path}: expected a recording, found no such file; check the name")
+    return [path]
+
+
+def _remote(inputs: Sequence[str]) -> Iterator[str]:
+    """Name, size and version of recordings in object storage, and of calibrations next to them."""
+    urls = [one for one in inputs if is_url(one)]
+    if urls:
+        from mlbatch.batch.remote import describe
+
+        yield from describe(urls)
+
+
+def _samples(file: Path) -> Iterator[bytes]:
+    size = file.stat().st_size
+    step = max((size - _END_BYTES) // _BLOCKS, _END_BYTES)
+    with file.open("rb", buffering=0) as opened:
+        for start in (*range(0, size, step), max(size - _END_BYTES, 0)):
+            opened.seek(start)
+            yield opened.read(_END_BYTES)
+
+
+def _digest(file: Path) -> str:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:_DIGITS]
+    except OSError:
+        # `convert` names what is wrong with it.
+        return "unreadable"
+
+
+def _rig(rig: str) -> str:
+    """Digests of a rig and of the calibrations that it names."""
+    if is_url(rig):
+        return "; ".join(_remote([rig]))
+    from mlbatch.rig.rig import read_rig
+
+    path = Path(rig)
+    try:
+        named = [sensor.metadata for sensor in read_rig(path).sensors]
+    except MlbatchError:
+        named = []
+    files = [path, *(one for one in named if one is not None)]
+    return " ".join(_digest(file) for file in files)
+
+
+def _calibrations(recordings: list[Path]) -> str:
+    """Digest of all files that may be calibrations in the folders of recordings."""
+    digest = hashlib.sha256()
+    for folder in sorted({path.resolve().parent for path in recordings}):
+        for file in sorted(folder.iterdir()):
+            if _may_be_calibration(file):
+                digest.update(f"{file.name} {_digest(file)}\n".encode())
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _may_be_calibration(file: Path) -> bool:
+    if file.suffix.lower() not in CALIBRATION_SUFFIXES or not file.is_file():
+        return False
+    if file.stat().st_size > LARGEST_CALIBRATION:
+        return False
+    with file.open("rb") as opened:
+        return not _DOCUMENT.search(opened.read(_HEAD_BYTES))

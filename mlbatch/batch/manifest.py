@@ -1,0 +1,240 @@
+"""The sessions of a batch: from a manifest (YAML), or from glob patterns."""
+
+from __future__ import annotations
+
+import glob as globbing
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url
+from mlbatch.errors import RigError, UsageError
+from mlbatch.rig.yaml_tree import Node, read_yaml
+
+SCHEMA = "mlbatch.batch/1"
+_KEYS = ("schema", "rig", "options", "sessions")
+_SESSION_KEYS = ("glob", "name", "inputs", "rig", "options")
+_TEXT = re.compile(r"\S(.*\S)?")
+_FIELDS = re.compile(r"\{(\w*)\}")
+_TEMPLATE_WORDS = ("folder", "stem", "name")
+# Files of a folder that are recordings; gzip and zstd of them, too.
+_RECORDINGS = re.compile(r".*\.(pcap|pcapng|cap|mcap|bag|db3)(\.gz|\.zst|\.zstd)?", re.IGNORECASE)
+_BAG_METADATA = "metadata.yaml"
+_WILD = re.compile(r"[*?\[]")
+
+# Options of `convert` by name without dashes: flag, value or list.
+OptionKinds = Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """What all sessions share, unless they have their own."""
+
+    rig: str | None = None
+    options: tuple[Option, ...] = ()
+
+
+def sessions_of(sources: Sequence[str], given: Common, kinds: OptionKinds) -> tuple[Session, ...]:
+    """The sessions of manifests and patterns in their order.
+
+    given: by the command line; its options replace those of a manifest. Raises UsageError and
+    RigError for mistakes, also where a pattern matches nothing.
+    """
+    found: list[Session] = []
+    for source in sources:
+        if source.lower().endswith((".yaml", ".yml")) and not is_url(source):
+            found += _of_manifest(Path(source), given, kinds)
+        else:
+            found += _of_pattern(source, "{stem}", given, source)
+    check_unique(found)
+    return tuple(found)
+
+
+# -- patterns ---------------------------------------------------------------------------------
+
+
+def _of_pattern(pattern: str, template: str, common: Common, where: str) -> Iterator[Session]:
+    """A session for each file or folder that matches."""
+    matches = _matches(pattern)
+    if not matches:
+        raise UsageError(
+            f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
+            "pattern"
+        )
+    for match in matches:
+        inputs = _inputs(match)
+        if inputs:
+            name = check_name(_named(template, match), where)
+            yield Session(name, inputs, common.rig, common.options)
+
+
+def _matches(pattern: str) -> list[str]:
+    if is_url(pattern):
+        if not _WILD.search(pattern):
+            return [pattern]
+        from mlbatch.batch.remote import matching
+
+        return matching(pattern)
+    return sorted(path.rstrip("/") for path in globbing.glob(pattern, recursive=True))
+
+
+def _inputs(match: str) -> tuple[str, ...]:
+    """The recordings of a match: itself, or those of a folder; none: it has none."""
+    if is_url(match):
+        if not match.endswith("/"):
+            return (match,)
+        from mlbatch.batch.remote import inside
+
+        return tuple(url for url in inside(match) if _RECORDINGS.fullmatch(url))
+    path = Path(match)
+    if not path.is_dir() or (path / _BAG_METADATA).is_file():
+        return (match,)
+    entries = sorted(path.iterdir())
+    return tuple(
+        str(entry)
+        for entry in entries
+        if (_RECORDINGS.fullmatch(entry.name) and entry.is_file())
+        or (entry / _BAG_METADATA).is_file()
+    )
+
+
+def _named(template: str, match: str) -> str:
+    """The name of a session: folder, stem (without suffixes of recordings) and name of a match."""
+    path = PurePosixPath(match.rstrip("/"))
+    is_folder = match.endswith("/") or (not is_url(match) and Path(match).is_dir())
+    stem = path.name
+    while not is_folder and (
+        cut := re.sub(r"\.(gz|zstd?|pcapng|pcap|cap|mcap|bag|db3)$", "", stem)
+    ):
+        if cut == stem:
+            break
+        stem = cut
+    words = {
+        "folder": path.name if is_folder else path.parent.name,
+        "stem": stem,
+        "name": path.name,
+    }
+    return _FIELDS.sub(lambda found: words.get(found[1], found[0]), template)
+
+
+# -- manifests --------------------------------------------------------------------------------
+
+
+def _of_manifest(path: Path, given: Common, kinds: OptionKinds) -> Iterator[Session]:
+    root = read_yaml(path).fields(_KEYS, ("schema", "sessions"))
+    root["schema"].choice((SCHEMA,))
+    options = _options(root.get("options"), kinds)
+    rig = _path(root["rig"]) if "rig" in root else None
+    mine = {option.name.removeprefix("--"): option for option in given.options}
+    for node in root["sessions"].elements("sessions"):
+        entries = node.fields(_SESSION_KEYS)
+        own = _options(entries.get("options"), kinds)
+        common = Common(
+            given.rig or (_path(entries["rig"]) if "rig" in entries else rig),
+            _joined(options, own, mine),
+        )
+        yield from _of_entry(node, entries, common)
+
+
+def _of_entry(node: Node, entries: Mapping[str, Node], common: Common) -> Iterator[Session]:
+    if ("glob" in entries) == ("inputs" in entries):
+        found = "both" if "glob" in entries else "none"
+        raise node.error("one of the keys glob and inputs", found, "give one of them")
+    name = entries.get("name")
+    if "inputs" in entries:
+        inputs = tuple(_path(one) for one in entries["inputs"].elements("recordings"))
+        if not inputs:
+            raise entries["inputs"].error("a list of recordings", "an empty one", "add one")
+        text = _named("{stem}", inputs[0]) if name is None else _text(name)
+        yield Session(check_name(text, node.place), inputs, common.rig, common.options)
+        return
+    template = "{stem}" if name is None else _text(name)
+    for word in _FIELDS.findall(template):
+        if word not in _TEMPLATE_WORDS:
+            known = ", ".join(f"{{{one}}}" for one in _TEMPLATE_WORDS)
+            place = name or node
+            raise place.error(known, f"{{{word}}}", "use one of them")
+    yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place)
+
+
+def _text(node: Node) -> str:
+    return node.word("a text", _TEXT)
+
+
+def _path(node: Node) -> str:
+    """A path, relative to the manifest, or a URL."""
+    text = _text(node)
+    if is_url(text):
+        return text
+    slash = "/" if text.endswith("/") else ""
+    return f"{node.file.parent / text}{slash}"
+
+
+def _options(node: Node | None, kinds: OptionKinds) -> dict[str, Option | None]:
+    """Options of `convert`, named with `_` or `-`; None: a flag that is false."""
+    if node is None or node.is_null():
+        return {}
+    names = {name.replace("-", "_"): name for name in kinds}
+    written = {key: key.replace("-", "_") for key in node.entries}
+    for key, plain in written.items():
+        if plain not in names:
+            node.fields(tuple(names))
+            raise node.entries[key].error("another option", key, "remove it")
+    return {
+        names[plain]: _option(node.entries[key], f"--{names[plain]}", kinds[names[plain]])
+        for key, plain in written.items()
+    }
+
+
+def _option(node: Node, name: str, kind: str) -> Option | None:
+    if kind == "flag":
+        return Option(name) if node.flag() else None
+    if kind == "list" and node.kind == "list":
+        return Option(name, tuple(_text(one) for one in node.items))
+    return Option(name, (_text(node),))
+
+
+def _joined(*several: Mapping[str, Option | None]) -> tuple[Option, ...]:
+    """Options; later ones replace those of the same name."""
+    found = {name: option for options in several for name, option in options.items()}
+    return tuple(option for option in found.values() if option is not None)
+
+
+# -- a part of them ---------------------------------------------------------------------------
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """`--part K/N`: K from 1 to N."""
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    number, count = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= number <= count:
+        raise UsageError(
+            f"--part: expected K/N with K from 1 to N, found {text!r}; write --part 1/16"
+        )
+    return number, count
+
+
+def chosen(
+    sessions: Sequence[Session], only: Sequence[str], part: tuple[int, int]
+) -> tuple[Session, ...]:
+    """The sessions of `--only` and `--part`: of N parts, each Nth session by name."""
+    names = {session.name for session in sessions}
+    for name in only:
+        if name not in names:
+            import difflib
+
+            nearest = difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.0)[0]
+            raise UsageError(
+                f"--only: expected the name of a session, found {name!r}; the nearest is {nearest}"
+            )
+    number, count = part
+    mine = {session.name for session in sorted(sessions, key=_by_name)[number - 1 :: count]}
+    return tuple(one for one in sessions if one.name in mine and (not only or one.name in only))
+
+
+def _by_name(session: Session) -> str:
+    return session.name
+
+
+__all__ = ["Common", "RigError", "chosen", "parse_part", "sessions_of"]

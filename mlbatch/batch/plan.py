@@ -1,0 +1,107 @@
+"""What a batch would do: sessions, bytes and time, from earlier sessions of the same output."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mlbatch.batch.record import SessionRecord, read_record
+from mlbatch.batch.session import Session, is_url
+from mlbatch.batch.task import Task, finished
+from mlbatch.errors import MlbatchError
+
+# Without a finished session: outputs of whole recordings took 0.51 to 7 times their bytes
+# (docs/performance.md), and two cores convert at least 50 MB of a recording in a second.
+USUAL_RATIO = 2.0
+USUAL_BYTES_PER_S = 50e6
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSession:
+    """A session of a plan; word: missing, changed, done or failed; bytes: of its inputs."""
+
+    name: str
+    word: str
+    inputs: int
+    bytes: int | None  # None: unknown
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Sessions and estimates for those that would run."""
+
+    sessions: tuple[PlannedSession, ...]
+    ratio: float  # bytes of output for a byte of input
+    bytes_per_s: float  # of input, by a worker
+    measured: int  # number of finished sessions that the two are from; 0: usual values
+    workers: int
+
+    @property
+    def to_run(self) -> tuple[PlannedSession, ...]:
+        """Sessions that would run."""
+        return tuple(one for one in self.sessions if one.word in ("missing", "changed"))
+
+    @property
+    def bytes_in(self) -> int:
+        """Bytes of the recordings of the sessions that would run."""
+        return sum(one.bytes or 0 for one in self.to_run)
+
+    @property
+    def bytes_out(self) -> int:
+        """Bytes of their outputs."""
+        return round(self.bytes_in * self.ratio)
+
+    @property
+    def hours(self) -> float:
+        """Time with all workers."""
+        return self.bytes_in / self.bytes_per_s / self.workers / 3600
+
+
+def plan_of(tasks: Sequence[Task], workers: int, *, retry_failed: bool = False) -> Plan:
+    """Look at all sessions; nothing is written."""
+    records = [read_record(task.folder) for task in tasks]
+    done = [record for record in records if record is not None and record.is_done]
+    kept = [one for one in done if one.input_bytes and one.wall_s]
+    bytes_in = sum(one.input_bytes for one in kept)
+    ratio = sum(one.output_bytes for one in kept) / bytes_in if kept else USUAL_RATIO
+    speed = bytes_in / sum(one.wall_s for one in kept) if kept else USUAL_BYTES_PER_S
+    sessions = tuple(
+        _planned(task, record, retry_failed=retry_failed)
+        for task, record in zip(tasks, records, strict=True)
+    )
+    return Plan(sessions, ratio, speed, len(kept), workers)
+
+
+def _planned(task: Task, record: SessionRecord | None, *, retry_failed: bool) -> PlannedSession:
+    session = task.session
+    size = _bytes(session)
+    count = len(session.inputs)
+    try:
+        same = finished(task)
+    except MlbatchError as err:
+        return PlannedSession(session.name, "missing", count, size, str(err))
+    if same is not None and (same.is_done or not retry_failed):
+        return PlannedSession(session.name, same.state, count, size, same.line)
+    return PlannedSession(session.name, "missing" if record is None else "changed", count, size)
+
+
+def _bytes(session: Session) -> int | None:
+    """Bytes of the recordings; None where one is missing."""
+    total = 0
+    for one in session.inputs:
+        if is_url(one):
+            from mlbatch.batch.remote import size_of
+
+            size = size_of(one)
+            if size is None:
+                return None
+            total += size
+            continue
+        path = Path(one)
+        files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+        if not files:
+            return None
+        total += sum(file.stat().st_size for file in files)
+    return total

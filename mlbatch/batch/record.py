@@ -1,0 +1,92 @@
+"""session.json: how the last run of a session ended. Written last, complete or not at all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+from mlbatch.batch.session import SESSION_JSON, STARTED_JSON
+from mlbatch.writers import write_text
+
+SCHEMA = "mlbatch.session/1"
+DONE = "done"
+FAILED = "failed"
+
+
+@dataclass(slots=True)
+class SessionRecord:
+    """How a session ended; counts are those of its reports."""
+
+    name: str
+    state: str  # done or failed
+    exit_code: int  # of convert; negative: the signal that ended it
+    line: str  # the error, or the limits that were exceeded; "" if done
+    key: dict[str, str]
+    attempts: int = 1
+    inputs: list[str] = field(default_factory=list)
+    outputs: list[str] = field(default_factory=list)
+    input_bytes: int = 0
+    output_bytes: int = 0
+    wall_s: float = 0.0
+    recorded_s: float = 0.0
+    scans: int = 0
+    points: int = 0
+    incomplete: int = 0
+    packets: int = 0
+    lost: int = 0
+    rejected: int = 0
+    fill: float | None = None  # least mean fill of a sensor
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the output is there and within its limits."""
+        return self.state == DONE
+
+
+def read_record(folder: Path) -> SessionRecord | None:
+    """The record of a session; None if there is none, or one of another version."""
+    return parse_record(_text(folder / SESSION_JSON))
+
+
+def parse_record(text: str) -> SessionRecord | None:
+    """A record from its text; None for another text."""
+    try:
+        found = json.loads(text)
+        if found.pop("schema") != SCHEMA:
+            return None
+        known = {one.name for one in fields(SessionRecord)}
+        record = SessionRecord(**{key: value for key, value in found.items() if key in known})
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    is_valid = isinstance(record.key, dict) and record.state in (DONE, FAILED)
+    return record if is_valid else None
+
+
+def write_record(folder: Path, record: SessionRecord) -> None:
+    """Write session.json, and remove the note that a run has begun."""
+    document = {"schema": SCHEMA, **asdict(record)}
+    write_text(folder / SESSION_JSON, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    (folder / STARTED_JSON).unlink(missing_ok=True)
+
+
+def read_started(folder: Path) -> dict[str, str] | None:
+    """The key of a run that has begun and not ended."""
+    try:
+        found = json.loads(_text(folder / STARTED_JSON))
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def write_started(folder: Path, key: dict[str, str]) -> None:
+    """Note the key of a run, before it."""
+    write_text(folder / STARTED_JSON, json.dumps(key, indent=1, ensure_ascii=False) + "\n")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""

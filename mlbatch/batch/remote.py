@@ -1,0 +1,271 @@
+"""Files in object storage and on web servers: described, listed, copied here and back.
+
+obstore (object_store) reads s3://, gs://, az:// and https://; credentials and endpoints are those
+of its environment variables (AWS_..., GOOGLE_..., AZURE_...).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import os
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from datetime import timedelta
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from mlbatch.batch.identity import CALIBRATION_SUFFIXES, LARGEST_CALIBRATION
+from mlbatch.errors import MlbatchError, RecordingError, UsageError
+
+T = TypeVar("T")
+
+_WILD = re.compile(r"[*?\[]")
+_WEB = ("http", "https")
+# Bytes of a request; one that fails is repeated, not the whole file.
+_BLOCK_BYTES = 8 << 20
+# Waits between attempts, s: a network that is cut for a minute is no failure.
+_WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
+_TIMEOUT = "60s"
+
+
+class RemoteFile(NamedTuple):
+    """A file of a store; version: changes with its content."""
+
+    url: str
+    size: int
+    version: str
+
+    @property
+    def name(self) -> str:
+        """The last part of its URL."""
+        return self.url.rpartition("/")[2]
+
+
+# -- stores -----------------------------------------------------------------------------------
+
+
+class _Place(NamedTuple):
+    store: Any
+    root: str  # scheme://bucket
+    path: str
+
+
+def _place(url: str) -> _Place:
+    scheme, _, rest = url.partition("://")
+    bucket, _, path = rest.partition("/")
+    root = f"{scheme}://{bucket}"
+    return _Place(_store(root), root, path)
+
+
+@lru_cache(maxsize=64)
+def _store(root: str) -> Any:
+    try:
+        from obstore.store import from_url
+    except ImportError as err:
+        raise UsageError(
+            f"{root}: expected the package obstore for URLs, found none ({err}); "
+            'pip install "mlbatch[remote]"'
+        ) from err
+    allows_http = root.startswith("http://") or os.environ.get("AWS_ALLOW_HTTP") == "true"
+    retry = {"max_retries": 2, "retry_timeout": timedelta(seconds=10)}
+    options = {"timeout": _TIMEOUT, "connect_timeout": "10s", "allow_http": allows_http}
+    try:
+        return from_url(root, client_options=options, retry_config=retry)
+    except Exception as err:
+        raise UsageError(
+            f"{root}: expected a URL of object storage (s3, gs, az) or https, found "
+            f"{_first_line(err)}; check it"
+        ) from err
+
+
+def _repeated(url: str, call: Callable[[], T]) -> T:
+    """Repeat a request until it succeeds; RecordingError in the end, or at once if it is final."""
+    for wait_s in (*_WAITS_S, None):
+        try:
+            return call()
+        except Exception as err:
+            if isinstance(err, MlbatchError):
+                raise
+            is_final = isinstance(err, FileNotFoundError) or type(err).__name__ in (
+                *("NotFoundError", "PermissionDeniedError", "UnauthenticatedError"),
+                *("InvalidPathError", "NotSupportedError", "NotImplementedError"),
+            )
+            if is_final or wait_s is None:
+                raise RecordingError(
+                    f"{url}: expected to reach it, found {_first_line(err)}; check the name, the "
+                    "network, and credentials and endpoint (environment)"
+                ) from err
+        time.sleep(wait_s)
+    raise AssertionError("unreachable")
+
+
+def _first_line(err: Exception) -> str:
+    return next(iter(str(err).strip().splitlines()), type(err).__name__)[:300]
+
+
+# -- description ------------------------------------------------------------------------------
+
+
+def head(url: str) -> RemoteFile:
+    """Size and version of a file; RecordingError without one."""
+    import obstore
+
+    place = _place(url)
+    found = _repeated(url, lambda: obstore.head(place.store, place.path))
+    return _remote_file(place.root, found, url)
+
+
+def _remote_file(root: str, meta: Any, url: str = "") -> RemoteFile:
+    version = str(meta.get("e_tag") or meta.get("last_modified"))
+    return RemoteFile(url or f"{root}/{meta['path']}", int(meta["size"]), version)
+
+
+def listed(url: str) -> list[RemoteFile]:
+    """All files below a folder, by name; none of a web server, which has no lists."""
+    import obstore
+
+    if url.partition("://")[0] in _WEB:
+        return []
+    place = _place(url if url.endswith("/") else f"{url}/")
+
+    def pages() -> list[RemoteFile]:
+        batches = obstore.list(place.store, prefix=place.path.rstrip("/") or None)
+        return [_remote_file(place.root, meta) for batch in batches for meta in batch]
+
+    return sorted(_repeated(url, pages))
+
+
+def size_of(url: str) -> int | None:
+    """Bytes of a file; None without one."""
+    try:
+        return head(url).size
+    except RecordingError:
+        return None
+
+
+def describe(urls: Sequence[str]) -> Iterator[str]:
+    """Name, size and version of files, and of the calibrations next to them."""
+    files = [head(url) for url in urls]
+    near = {one.url: one for url in urls for one in calibrations(url)}
+    for file in (*files, *near.values()):
+        yield f"{file.name} {file.size} {file.version}"
+
+
+def calibrations(url: str) -> list[RemoteFile]:
+    """Files in the folder of a recording that may be calibrations."""
+    folder = url.rpartition("/")[0]
+    return [
+        one
+        for one in listed(folder)
+        if one.url.rpartition("/")[0] == folder
+        and one.name.lower().endswith(CALIBRATION_SUFFIXES)
+        and one.size <= LARGEST_CALIBRATION
+    ]
+
+
+def inside(url: str) -> list[str]:
+    """URLs of the files right in a folder."""
+    folder = url.rstrip("/")
+    return [one.url for one in listed(folder) if one.url.rpartition("/")[0] == folder]
+
+
+def matching(pattern: str) -> list[str]:
+    """URLs of files, or of folders where the pattern ends with a slash."""
+    if pattern.partition("://")[0] in _WEB:
+        raise UsageError(
+            f"{pattern}: expected a URL without pattern, since web servers have no lists of files, "
+            "found one; name the files"
+        )
+    wild = _WILD.search(pattern)
+    folder = pattern[: wild.start() if wild else None].rpartition("/")[0]
+    is_folder = pattern.endswith("/")
+    depth = pattern.rstrip("/").count("/")
+    found = set()
+    for one in listed(folder):
+        parts = one.url.split("/")
+        # A star does not match a slash.
+        name = "/".join(parts[: depth + 1])
+        if is_folder == (len(parts) > depth + 1) and _matches(name, pattern.rstrip("/")):
+            found.add(f"{name}/" if is_folder else name)
+    return sorted(found)
+
+
+def _matches(name: str, pattern: str) -> bool:
+    pairs = zip(name.split("/"), pattern.split("/"), strict=False)
+    return name.count("/") == pattern.count("/") and all(
+        fnmatch.fnmatchcase(one, part) for one, part in pairs
+    )
+
+
+# -- copies -----------------------------------------------------------------------------------
+
+
+def download(file: RemoteFile, target: Path) -> None:
+    """Copy a file here, in blocks; it appears complete or not at all.
+
+    A copy that was interrupted continues, if the file has the same version.
+    """
+    import obstore
+
+    place = _place(file.url)
+    partial = target.with_name(f"{target.name}.{_plain(file.version)}.partial")
+    with partial.open("ab") as copy:
+        at = copy.tell()
+        while at < file.size:
+            length = min(_BLOCK_BYTES, file.size - at)
+            data = _repeated(file.url, _range(obstore, place, at, length))
+            copy.write(data)
+            at += len(data)
+    if at != file.size:
+        partial.unlink()
+        raise RecordingError(
+            f"{file.url}: expected {file.size} bytes, found {at}; it changed meanwhile: try again"
+        )
+    partial.replace(target)
+
+
+def _range(obstore: Any, place: _Place, at: int, length: int) -> Callable[[], bytes]:
+    def read() -> bytes:
+        data = bytes(obstore.get_range(place.store, place.path, start=at, length=length))
+        if len(data) != length:
+            raise OSError(f"{len(data)} bytes instead of {length}")
+        return data
+
+    return read
+
+
+def _plain(version: str) -> str:
+    """A version as a part of a file name."""
+    return re.sub(r"\W", "", version)[:40]
+
+
+def upload(path: Path, url: str) -> None:
+    """Copy a file to a store, in parts; it appears complete or not at all."""
+    import obstore
+
+    place = _place(url)
+    _repeated(url, lambda: obstore.put(place.store, place.path, path))
+
+
+def read_text(url: str) -> str:
+    """The text of a small file; "" without one."""
+    import obstore
+
+    place = _place(url)
+    with contextlib.suppress(RecordingError):
+        return bytes(_repeated(url, lambda: obstore.get(place.store, place.path).bytes())).decode(
+            "utf-8", "replace"
+        )
+    return ""
+
+
+def remove(url: str) -> None:
+    """Remove a file, if it exists."""
+    import obstore
+
+    place = _place(url)
+    with contextlib.suppress(RecordingError):
+        _repeated(url, lambda: obstore.delete(place.store, place.path))

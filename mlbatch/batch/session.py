@@ -1,0 +1,117 @@
+"""A session of a batch, and the files of its folder."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mlbatch.errors import UsageError
+
+SESSION_JSON = "session.json"
+# The key of a run that has begun; removed when session.json is there.
+STARTED_JSON = "started.json"
+REPORT_JSON = "report.json"
+LOG_TXT = "log.txt"
+PAGE_HTML = "page.html"
+OUTPUT = "scans"
+# Output formats that are one file; others are folders.
+_SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
+# What a run writes to the folder of its session, with `--on-jump split` for each segment.
+OWN = re.compile(
+    r"scans(\.seg\d+)?(\.mcap|\.bag)?(\.scans\.csv)?(\.partial)?(\.state|\.old)?"
+    r"|(report|page)(\.seg\d+)?\.(json|html)(\.partial)?|log\.txt"
+    r"|(session|started)\.json(\.partial)?"
+)
+_NAME = re.compile(r"[^\s/.\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]{0,199}")
+# Options that cannot change an output.
+_NOT_IN_KEY = frozenset({"--jobs", "--engine", "--no-fsync"})
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option of `convert` and its values; none: a flag."""
+
+    name: str  # as typed: --max-wait
+    values: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> list[str]:
+        """The option as words of a command line."""
+        if not self.values:
+            return [self.name]
+        return [word for value in self.values for word in (self.name, value)]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """Recordings that are converted together; inputs and rig: paths or URLs."""
+
+    name: str
+    inputs: tuple[str, ...]
+    rig: str | None = None
+    options: tuple[Option, ...] = ()
+
+    def absolute(self) -> Session:
+        """The session with absolute paths, for processes with other working folders."""
+        rig = None if self.rig is None else _absolute(self.rig)
+        return replace(self, inputs=tuple(map(_absolute, self.inputs)), rig=rig)
+
+    @property
+    def format(self) -> str:
+        """Output format."""
+        named = [one.values[-1] for one in self.options if one.name == "--format"]
+        return named[-1] if named else "mcap"
+
+    @property
+    def output(self) -> str:
+        """Name of the output in the folder of the session."""
+        return OUTPUT + _SUFFIX.get(self.format, "")
+
+    @property
+    def key_words(self) -> list[str]:
+        """The options that may change the output, in a fixed order."""
+        kept = sorted(
+            (one for one in self.options if one.name not in _NOT_IN_KEY), key=lambda one: one.name
+        )
+        return [word for one in kept for word in one.words]
+
+
+def check_name(name: str, where: str) -> str:
+    """A name of a session, which is that of a folder; UsageError otherwise."""
+    if not _NAME.fullmatch(name) or name.endswith((" ", ".partial")):
+        raise UsageError(
+            f"{where}: expected a session name that is a folder name (no slash, no leading dot), "
+            f"found {name!r}; give another by `name`"
+        )
+    return name
+
+
+def check_unique(sessions: Sequence[Session]) -> None:
+    """Raise UsageError if two sessions have one name, also where case does not count."""
+    seen: dict[str, Session] = {}
+    for session in sessions:
+        other = seen.setdefault(session.name.casefold(), session)
+        if other is not session:
+            raise UsageError(
+                f"sessions: expected different names, found {session.name!r} for "
+                f"{', '.join(other.inputs)} and for {', '.join(session.inputs)}; use a manifest "
+                'with `name: "{folder}-{stem}"`'
+            )
+
+
+def is_url(text: str) -> bool:
+    """Whether an input or output is in object storage, or on a web server."""
+    return "://" in text
+
+
+def _absolute(text: str) -> str:
+    return text if is_url(text) else str(Path(text).absolute())
+
+
+def own_files(folder: Path) -> list[Path]:
+    """What a run wrote to the folder of a session."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if OWN.fullmatch(path.name))

@@ -1,0 +1,181 @@
+"""The page of a batch: one HTML file in the style of the page of a run, with links to those."""
+
+from __future__ import annotations
+
+from html import escape
+from importlib import resources
+from pathlib import Path
+from urllib.parse import quote
+
+import mlbatch
+from mlbatch.batch.record import SessionRecord
+from mlbatch.batch.status import UNFINISHED, BatchStatus, SessionStatus
+from mlbatch.errors import ExportError
+from mlbatch.page import MARK, check_page
+
+_ORDER = {"failed": 0, UNFINISHED: 1, "done": 2}
+# Levels of loss in %, as in docs/page.md.
+_LOSS_WARNING = 0.1
+_LOSS_PROBLEM = 1.0
+_FILL_WARNING = 0.9
+_BADGES = {"failed": "problem", UNFINISHED: "warning", "done": "good"}
+_STYLE = """
+.good .badge { background: var(--good); }
+td strong.warning { color: var(--warning); }
+td strong.problem { color: var(--problem); }
+"""
+
+
+def write_status_page(path: Path, status: BatchStatus) -> None:
+    """Write the page; an earlier page is replaced, any other file never."""
+    check_page(path, overwrite=True)
+    data = _page(path, status).encode("utf-8", "backslashreplace")
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as err:
+        partial.unlink(missing_ok=True)
+        raise ExportError(
+            f"{path}: expected to write the page, found {err.strerror!r}; choose another place"
+        ) from err
+
+
+def _page(path: Path, status: BatchStatus) -> str:
+    style = resources.files("mlbatch.page").joinpath("page.css").read_text(encoding="utf-8")
+    title = Path(status.output).name or status.output
+    rows = sorted(status.sessions, key=lambda one: (_ORDER[one.state], one.name))
+    body = "\n".join([_header(title, status), _cards(status), _table(path, status, rows)])
+    return f"""{MARK.decode()}
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
+style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta name="generator" content="mlbatch {escape(mlbatch.__version__)}">
+<link rel="icon" href="data:,">
+<title>{escape(title)} - mlbatch</title>
+<style>
+{style}{_STYLE}</style>
+</head>
+<body>
+<main>
+{body}
+</main>
+</body>
+</html>
+"""
+
+
+def _header(title: str, status: BatchStatus) -> str:
+    failed = status.count("failed")
+    unfinished = status.count(UNFINISHED)
+    level = "problem" if failed else "warning" if unfinished else "good"
+    heading = f"{failed} of {len(status.sessions)} sessions failed" if failed else ""
+    if not heading:
+        done = status.count("done")
+        heading = f"{done} of {len(status.sessions)} sessions are done"
+    others = f"{unfinished} unfinished: running, or interrupted." if unfinished else ""
+    return (
+        f"<header>\n<h1>{escape(title)}</h1>\n<div class='verdict {level}' id='verdict'>"
+        f"<em>{level}</em><strong>{escape(heading)}</strong><p>{escape(others)}</p></div>\n</header>"
+    )
+
+
+def _cards(status: BatchStatus) -> str:
+    records = status.records
+    packets = sum(one.packets + one.lost for one in records)
+    lost = sum(one.lost for one in records)
+    cards = {
+        "done": f"{status.count('done'):,}",
+        "failed": f"{status.count('failed'):,}",
+        "unfinished": f"{status.count(UNFINISHED):,}",
+        "scans": f"{sum(one.scans for one in records):,}",
+        "lost packets": f"{100 * lost / packets:.3f} %" if packets else "",
+        "sessions with clock trouble": f"{sum(bool(one.clock_codes) for one in status.sessions):,}",
+        "output": _gb(sum(one.output_bytes for one in records)),
+        "recorded": _duration(sum(one.recorded_s for one in records)),
+        "time of all sessions": _duration(sum(one.wall_s for one in records)),
+    }
+    items = "".join(
+        f"<div class='card'><b>{escape(value)}</b><span>{escape(name)}</span></div>"
+        for name, value in cards.items()
+        if value
+    )
+    return f"<div class='cards'>{items}</div>"
+
+
+def _table(path: Path, status: BatchStatus, rows: list[SessionStatus]) -> str:
+    head = ("session", "state", "scans", "loss", "fill", "clocks", "output", "time", "")
+    cells = "".join(f"<th>{one}</th>" for one in head)
+    lines = "".join(_row(path, status, one) for one in rows)
+    return (
+        "<section>\n<h2>Sessions</h2>\n<div class='scroll'><table>"
+        f"<tr>{cells}</tr>{lines}</table></div>\n</section>"
+    )
+
+
+def _row(path: Path, status: BatchStatus, one: SessionStatus) -> str:
+    record = one.record
+    name = escape(one.name)
+    if one.page:
+        name = f"<a href='{_link(path, status, one.page)}'>{name}</a>"
+    state = f"<span class='{_BADGES[one.state]}'><span class='badge'>{one.state}</span></span>"
+    cells = [name, state]
+    if record is None:
+        cells += [""] * 7
+    else:
+        cells += [
+            f"{record.scans:,}",
+            _loss(record),
+            _fill(record),
+            escape(", ".join(one.clock_codes)),
+            _gb(record.output_bytes),
+            _duration(record.wall_s),
+            escape(record.line or ", ".join(record.warnings)),
+        ]
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def _link(path: Path, status: BatchStatus, page: str) -> str:
+    """A page as seen from this one."""
+    if "://" in status.output:
+        return escape(quote(page), quote=True)
+    import os
+
+    target = Path(status.output) / page
+    relative = os.path.relpath(target.resolve(), path.resolve().parent)
+    return escape(quote(relative), quote=True)
+
+
+def _loss(record: SessionRecord) -> str:
+    packets = record.packets + record.lost
+    if not packets:
+        return ""
+    percent = 100 * record.lost / packets
+    level = "problem" if percent >= _LOSS_PROBLEM else "warning"
+    text = f"{percent:.3f} %"
+    return text if percent < _LOSS_WARNING else f"<strong class='{level}'>{text}</strong>"
+
+
+def _fill(record: SessionRecord) -> str:
+    if record.fill is None:
+        return ""
+    text = f"{100 * record.fill:.1f} %"
+    return text if record.fill >= _FILL_WARNING else f"<strong class='warning'>{text}</strong>"
+
+
+def _gb(count: int) -> str:
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count:,} B"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"

@@ -1,0 +1,34 @@
+"""Where the sessions of a batch go: a folder, or object storage by way of the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mlbatch.batch.cache import Cache
+from mlbatch.batch.session import Session, is_url
+from mlbatch.batch.task import Task
+from mlbatch.errors import ExportError
+
+
+def tasks_of(
+    sessions: Sequence[Session], output: str, cache: Cache, *, retries: int, pages: bool
+) -> list[Task]:
+    """The tasks of sessions; ExportError where the output cannot be one."""
+    uploads = is_url(output)
+    # Workers have other working folders.
+    folder = cache.output(output) if uploads else Path(output).absolute()
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder}: expected a folder, found a file; choose another output")
+    return [
+        Task(
+            session=session.absolute(),
+            folder=folder / session.name,
+            cwd=Path.cwd(),
+            cache=cache,
+            upload=f"{output.rstrip('/')}/{session.name}" if uploads else "",
+            retries=retries,
+            pages=pages,
+        )
+        for session in sessions
+    ]

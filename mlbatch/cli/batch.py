@@ -1,0 +1,298 @@
+"""`mlbatch batch`: many sessions."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import typing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mlbatch.cli.convert import convert
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from mlbatch.batch.driver import Progress, Result
+    from mlbatch.batch.plan import Plan
+    from mlbatch.batch.session import Option
+
+# Options of `convert` that a batch has itself, or that have no meaning for many sessions.
+_OWN = ("recordings", "output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
+_WITHOUT = (*_OWN, "report", "html", "dry_run")
+
+
+def batch(
+    context: typer.Context,
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="MANIFEST.yaml|GLOB...",
+            help="A manifest, or patterns: a file or folder is a session.",
+        ),
+    ],
+    output: Annotated[
+        str, typer.Option("-o", "--output", help="Folder (or s3:// URL); a folder a session in it.")
+    ],
+    rig: Annotated[
+        str | None, typer.Option(help="Rig file (YAML) of all sessions. [default: manifest's]")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Sessions converted at the same time.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Scans made at the same time, by each session.")] = 1,
+    retries: Annotated[
+        int, typer.Option(help="Further attempts of a session that crashed or was killed.")
+    ] = 1,
+    part: Annotated[
+        str, typer.Option(help="K/N: the Kth of N parts of the sessions, as for an array job.")
+    ] = "1/1",
+    only: Annotated[
+        list[str] | None, typer.Option(help="This session; repeatable.", metavar="NAME")
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Print sessions, bytes and hours; convert nothing.")
+    ] = False,
+    fail_fast: Annotated[
+        bool, typer.Option("--fail-fast", help="After the first failure begin no other session.")
+    ] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Also run sessions that failed before.")
+    ] = False,
+    no_pages: Annotated[
+        bool, typer.Option("--no-pages", help="Do not write a page (HTML) for each session.")
+    ] = False,
+    scheduler: Annotated[
+        str,
+        typer.Option(help="Dask scheduler to run the sessions, as tcp://HOST:8786.", metavar="URL"),
+    ] = "",
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder for files of object storage.", metavar="DIR")
+    ] = None,
+    cache_gb: Annotated[float, typer.Option(help="Largest size of the cache, GB.")] = 100.0,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No table, no progress.")] = False,
+    **options: Any,
+) -> None:
+    """Convert many sessions, a process each; a second run does what is missing or changed."""
+    from mlbatch.batch.cache import Cache
+    from mlbatch.batch.driver import Batch
+    from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
+    from mlbatch.batch.plan import plan_of
+    from mlbatch.batch.store import tasks_of
+    from mlbatch.cli import EXIT_LIMIT
+    from mlbatch.pipeline.interrupts import interruptible
+
+    _check_counts(workers=workers, jobs=jobs, retries=retries)
+    numbers = parse_part(part)
+    given = Common(rig, tuple(_given(context, options, jobs)))
+    sessions = chosen(sessions_of(sources, given, _kinds()), only or (), numbers)
+    copies = Cache.of(cache, cache_gb)
+    with interruptible():
+        tasks = tasks_of(sessions, output, copies, retries=retries, pages=not no_pages)
+        if plan:
+            _print_plan(plan_of(tasks, workers, retry_failed=retry_failed))
+            return
+        with _progress(len(tasks), quiet=quiet) as progress:
+            results = Batch(
+                workers=workers,
+                fail_fast=fail_fast,
+                retry_failed=retry_failed,
+                scheduler=scheduler,
+                progress=progress,
+            ).run(tasks)
+    if not quiet:
+        _print_table(results, len(tasks))
+    if any(result.failed for result in results):
+        raise typer.Exit(EXIT_LIMIT)
+
+
+# -- options of `convert` ---------------------------------------------------------------------
+
+
+def _forwarded() -> dict[str, inspect.Parameter]:
+    """Options of `convert` that are passed to every session."""
+    return {
+        name: parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(convert, eval_str=True).parameters.items()
+        if name not in _WITHOUT
+    }
+
+
+def _long_name(name: str, parameter: inspect.Parameter) -> str:
+    """An option as typed."""
+    info = typing.get_args(parameter.annotation)[1]
+    # typer has the first name in the place of a default.
+    words = [info.default, *(info.param_decls or ())]
+    named = [word for word in words if str(word).startswith("--")]
+    return str(named[0]) if named else f"--{name.replace('_', '-')}"
+
+
+def _kind(parameter: inspect.Parameter) -> str:
+    kind = typing.get_args(parameter.annotation)[0]
+    if kind is bool:
+        return "flag"
+    return "list" if "list" in str(kind) else "value"
+
+
+def _kinds() -> dict[str, str]:
+    """Options that a manifest may have, by name without dashes."""
+    found = {
+        _long_name(name, parameter).removeprefix("--"): _kind(parameter)
+        for name, parameter in _forwarded().items()
+    }
+    # `--only` of the batch names sessions.
+    return found | {"only": "list", "jobs": "value"}
+
+
+def _given(context: typer.Context, options: dict[str, Any], jobs: int) -> Iterator[Option]:
+    """The options of `convert` on this command line."""
+    from mlbatch.batch.session import Option
+
+    forwarded = _forwarded()
+    for name, value in options.items():
+        source = context.get_parameter_source(name)
+        if source is None or source.name == "DEFAULT":
+            continue
+        long_name = _long_name(name, forwarded[name])
+        if isinstance(value, bool):
+            yield Option(long_name)
+        else:
+            several = value if isinstance(value, (list, tuple)) else [value]
+            yield Option(long_name, tuple(map(str, several)))
+    if jobs != 1:
+        yield Option("--jobs", (str(jobs),))
+
+
+def _check_counts(**counts: int) -> None:
+    from mlbatch.errors import UsageError
+
+    for name, count in counts.items():
+        least = 0 if name == "retries" else 1
+        if not least <= count <= 1000:
+            raise UsageError(f"--{name}: expected {least} to 1000, found {count}; correct it")
+
+
+def _signature() -> inspect.Signature:
+    """Own options, then those of `convert`: the parser describes a command by its signature."""
+    own = [
+        parameter
+        for name, parameter in inspect.signature(batch, eval_str=True).parameters.items()
+        if name != "options"
+    ]
+    return inspect.Signature([*own, *_forwarded().values()])
+
+
+_found = _signature()
+batch.__signature__ = _found  # type: ignore[attr-defined]
+batch.__annotations__ = {name: one.annotation for name, one in _found.parameters.items()}
+
+
+# -- output -----------------------------------------------------------------------------------
+
+
+def _progress(count: int, *, quiet: bool) -> Any:
+    """A bar over the sessions with remaining time, on a terminal; failures as lines."""
+    import contextlib
+
+    from mlbatch.errors import one_line
+
+    def say(result: Result) -> None:
+        if result.failed and result.ran:
+            typer.echo(one_line(f"mlbatch: session {result.name}: {result.record.line}"), err=True)
+
+    @contextlib.contextmanager
+    def shown() -> Iterator[Progress]:
+        if quiet or not sys.stderr.isatty():
+            yield say
+            return
+        from rich import progress
+        from rich.console import Console
+
+        with progress.Progress(
+            progress.TextColumn("{task.completed}/{task.total} sessions"),
+            progress.BarColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("ETA"),
+            progress.TimeRemainingColumn(elapsed_when_finished=False),
+            console=Console(stderr=True),
+            transient=True,
+        ) as bar:
+            task = bar.add_task("sessions", total=count)
+
+            def advance(result: Result) -> None:
+                say(result)
+                bar.advance(task)
+
+            yield advance
+
+    return shown()
+
+
+def _print_table(results: list[Result], count: int) -> None:
+    from mlbatch.cli.tables import table_lines
+    from mlbatch.errors import one_line
+
+    head = ("session", "state", "scans", "lost", "fill", "output", "time", "")
+    rows = [
+        (
+            result.name,
+            result.word,
+            str(result.record.scans or ""),
+            percent_text(result.record.lost, result.record.packets + result.record.lost),
+            "" if result.record.fill is None else f"{result.record.fill:.3f}",
+            bytes_text(result.record.output_bytes) if result.record.outputs else "",
+            f"{result.record.wall_s:.1f} s" if result.ran else "",
+            result.record.line,
+        )
+        for result in results
+    ]
+    for line in table_lines([head, *rows]) if rows else ():
+        typer.echo(line)
+    words = [result.word for result in results]
+    counts = [f"{words.count(word)} {word}" for word in ("done", "skipped", "failed")]
+    not_begun = count - len(results)
+    tail = f", {not_begun} not begun (--fail-fast)" if not_begun else ""
+    typer.echo(one_line(f"{count} sessions: {', '.join(counts)}{tail}"))
+
+
+def _print_plan(plan: Plan) -> None:
+    from mlbatch.cli.tables import table_lines
+
+    rows = [("session", "state", "recordings", "bytes", "")]
+    rows += [
+        (
+            one.name,
+            one.word,
+            str(one.inputs),
+            "?" if one.bytes is None else bytes_text(one.bytes),
+            one.problem,
+        )
+        for one in plan.sessions
+    ]
+    for line in table_lines(rows):
+        typer.echo(line)
+    source = (
+        f"from {plan.measured} finished sessions" if plan.measured else "usual values, not measured"
+    )
+    typer.echo(
+        f"{len(plan.to_run)} of {len(plan.sessions)} sessions to convert: "
+        f"{bytes_text(plan.bytes_in)} in, about {bytes_text(plan.bytes_out)} out, "
+        f"about {_hours(plan.hours)} with {plan.workers} worker(s) ({source})"
+    )
+
+
+def percent_text(part: int, whole: int) -> str:
+    """A share, for tables."""
+    return f"{100 * part / whole:.2f} %" if whole else ""
+
+
+def bytes_text(count: int) -> str:
+    """A size, for tables."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count} B"
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:.1f} h" if hours >= 0.1 else f"{hours * 3600:.0f} s"

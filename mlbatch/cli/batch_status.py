@@ -1,0 +1,83 @@
+"""`mlbatch batch-status`: the state of a batch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mlbatch.batch.status import BatchStatus
+
+
+def batch_status(
+    output: Annotated[str, typer.Argument(help="Output of mlbatch batch: a folder, or a URL.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="Write a page (HTML) of all sessions.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Show the sessions of a batch: state, loss, fill, clocks, bytes, time."""
+    from mlbatch.batch.status import status_of
+    from mlbatch.errors import one_line
+
+    status = status_of(output)
+    if as_json:
+        typer.echo(json.dumps(_values(status), indent=1))
+    elif page is None:
+        for line in _lines(status):
+            typer.echo(one_line(line))
+    if page is not None:
+        from mlbatch.batch.status_page import write_status_page
+
+        write_status_page(page, status)
+        typer.echo(one_line(f"wrote {page}"), err=as_json)
+
+
+def _values(status: BatchStatus) -> dict[str, object]:
+    from dataclasses import asdict
+
+    return {
+        "schema": "mlbatch.status/1",
+        "output": status.output,
+        "states": {state: status.count(state) for state in ("done", "failed", "unfinished")},
+        "sessions": [
+            {
+                "name": one.name,
+                "state": one.state,
+                "page": one.page,
+                "clocks": one.clock_codes,
+                "record": None if one.record is None else asdict(one.record),
+            }
+            for one in status.sessions
+        ],
+    }
+
+
+def _lines(status: BatchStatus) -> list[str]:
+    from mlbatch.cli.batch import bytes_text, percent_text
+    from mlbatch.cli.tables import table_lines
+
+    rows = [("session", "state", "scans", "lost", "fill", "clocks", "output", "time", "")]
+    for one in status.sessions:
+        record = one.record
+        if record is None:
+            rows.append((one.name, one.state, "", "", "", "", "", "", ""))
+            continue
+        rows.append(
+            (
+                one.name,
+                one.state,
+                str(record.scans or ""),
+                percent_text(record.lost, record.packets + record.lost),
+                "" if record.fill is None else f"{record.fill:.3f}",
+                ", ".join(one.clock_codes),
+                bytes_text(record.output_bytes) if record.outputs else "",
+                f"{record.wall_s:.1f} s",
+                record.line,
+            )
+        )
+    counts = [f"{status.count(state)} {state}" for state in ("done", "failed", "unfinished")]
+    return [*table_lines(rows), f"{len(status.sessions)} sessions: {', '.join(counts)}"]

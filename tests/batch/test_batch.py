@@ -1,0 +1,290 @@
+"""Batches of many sessions: crashes, kills, second runs, changes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from tests.batch.sessions import (
+    Dataset,
+    end,
+    processes_of,
+    run,
+    scans,
+    start,
+    wait_for,
+    write_dataset,
+)
+from tests.builders.run import command
+
+GOOD = ["a1", "a2", "b1", "b2"]
+NAMES = [*GOOD, "crash", "hopeless1", "hopeless2", "killed"]
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Dataset:
+    return write_dataset(tmp_path / "data", NAMES)
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Dataset:
+    return write_dataset(tmp_path / "good", GOOD)
+
+
+def converted(data: Dataset, name: str, folder: Path) -> bytes:
+    """The output of `mlbatch convert` alone."""
+    output = folder / f"{name}.mcap"
+    capture = data.folder / "raw" / name / "drive.pcap"
+    assert command("convert", capture, "-o", output, "--rate", "20", "--quiet").code == 0
+    return output.read_bytes()
+
+
+def states(out: Path) -> dict[str, str]:
+    """States of all session.json."""
+    return {
+        path.parent.name: json.loads(path.read_text(encoding="utf-8"))["state"]
+        for path in out.glob("*/session.json")
+    }
+
+
+def test_a_crash_and_a_kill_cost_no_other_session(data: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = run(data, out, "--workers", "2")
+    assert ended.code == 3
+    failed = {"crash": "failed", "hopeless1": "failed", "hopeless2": "failed"}
+    done = dict.fromkeys([*GOOD, "killed"], "done")
+    assert ended.table == done | failed
+    assert ended.last == "8 sessions: 5 done, 0 skipped, 3 failed"
+    assert states(out) == done | failed
+    # Every failure is a line, when it happens and in the table.
+    assert len(ended.err.splitlines()) == 3
+    assert "SIGSEGV" in ended.out
+    assert "expected a recording" in ended.out
+    for name in (*GOOD, "killed"):
+        assert (out / name / "scans.mcap").read_bytes() == converted(data, name, tmp_path)
+        assert {path.name for path in (out / name).iterdir()} == {
+            *("scans.mcap", "scans.mcap.scans.csv", "report.json", "page.html"),
+            *("log.txt", "session.json"),
+        }
+    attempts = {
+        name: json.loads((out / name / "session.json").read_text())["attempts"] for name in NAMES
+    }
+    # Crashed and killed sessions are retried once; exits 1 and 2 are final.
+    assert attempts == dict.fromkeys(NAMES, 1) | {"crash": 2, "killed": 2}
+
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    again = run(data, out, "--workers", "2")
+    assert again.code == 3
+    assert again.table == dict.fromkeys([*GOOD, "killed"], "skipped") | failed
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def _any(out: Path, name: str) -> bool:
+    return any(out.glob(f"*/{name}"))
+
+
+def test_a_killed_driver_leaves_no_process_and_a_second_run_equals_the_first(
+    good: Dataset, tmp_path: Path
+) -> None:
+    whole = tmp_path / "whole"
+    assert run(good, whole, "--workers", "2").code == 0
+    out = tmp_path / "out"
+    for name in ("started.json", "session.json"):
+        driver = start(good, out, "--workers", "2")
+        wait_for(partial(_any, out, name))
+        driver.kill()
+        driver.communicate()
+        wait_for(lambda: not list(processes_of(str(out))))
+        # What is not complete does not look like it.
+        for folder in out.iterdir():
+            if (folder / "session.json").exists():
+                assert (folder / "scans.mcap").exists()
+                assert not (folder / "scans.mcap.partial").exists()
+    ended = run(good, out, "--workers", "2")
+    assert ended.code == 0
+    assert set(ended.table.values()) <= {"done", "skipped"}
+    assert scans(out) == scans(whole)
+    assert states(out) == dict.fromkeys(GOOD, "done")
+    assert not list(out.glob("*/started.json"))
+
+
+def test_an_interrupt_ends_in_order(good: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    driver = start(good, out, "--workers", "2")
+    wait_for(lambda: list(out.glob("*/log.txt")))
+    driver.send_signal(signal.SIGINT)
+    ended = end(driver)
+    assert ended.code == 130
+    (line,) = ended.err.splitlines()
+    assert "interrupted; " in line
+    assert "of 4 sessions have ended" in line
+    assert not list(processes_of(str(out)))
+    assert run(good, out).code == 0
+
+
+def test_two_drivers_share_a_batch(good: Dataset, tmp_path: Path) -> None:
+    """A session that another driver converts is waited for, not converted twice."""
+    out = tmp_path / "out"
+    drivers = [start(good, out) for _ in range(2)]
+    for ended in map(end, drivers):
+        assert ended.code == 0, ended.err
+    assert states(out) == dict.fromkeys(GOOD, "done")
+
+
+def test_parts_are_disjoint_and_whole(good: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = run(good, out, "--part", "1/2")
+    second = run(good, out, "--part", "2/2")
+    assert (first.code, second.code) == (0, 0)
+    assert set(first.table) & set(second.table) == set()
+    assert set(first.table) | set(second.table) == set(GOOD)
+    whole = tmp_path / "whole"
+    run(good, whole)
+    assert scans(out) == scans(whole)
+
+
+CHANGES = {
+    "option": (["--rate", "10"], "", GOOD),
+    "other number of jobs": (["--jobs", "2"], "", []),
+    "recording": ([], "raw/a2/drive.pcap", ["a2"]),
+    "time of change only": ([], "touch raw/a2/drive.pcap", []),
+    "calibration": ([], "raw/b1/111.json", ["b1"]),
+    "a report next to a recording": ([], "raw/b1/old.json", []),
+    "output removed": ([], "rm out/b2/scans.mcap", ["b2"]),
+    "state removed": ([], "rm out/b2/session.json", ["b2"]),
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A batch that is done, in the folder `out`; to be copied."""
+    data = write_dataset(tmp_path_factory.mktemp("finished") / "good", GOOD)
+    assert run(data, data.folder / "out", "--workers", "2").code == 0
+    return data
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_only_what_changed_is_converted_again(name: str, finished: Dataset, tmp_path: Path) -> None:
+    # Times of change are copied, too; where a batch lies does not matter.
+    good = Dataset(Path(shutil.copytree(finished.folder, tmp_path / "good")))
+    out = good.folder / "out"
+    words, change, expected = CHANGES[name]
+    what, _, path = change.rpartition(" ")
+    target = good.folder / path
+    if what == "touch":
+        os.utime(target, ns=(1, 1))
+    elif what == "rm":
+        target.unlink()
+    elif path.endswith("old.json"):
+        target.write_text('{"schema": "mlbatch.report/1"}', encoding="utf-8")
+    elif path.endswith(".json"):
+        target.write_text(target.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    elif path:
+        # The last packet is lost.
+        target.write_bytes(target.read_bytes()[:-3000])
+    ended = run(good, out, *words)
+    assert ended.code == 0, ended.out
+    assert {name for name, word in ended.table.items() if word == "done"} == set(expected)
+    if name == "option":
+        assert (out / "a1" / "scans.mcap").read_bytes() != converted(good, "a1", tmp_path)
+    elif not expected or "removed" in name:
+        assert (out / "b2" / "scans.mcap").read_bytes() == converted(good, "b2", tmp_path)
+
+
+def test_a_run_with_other_options_is_not_resumed(good: Dataset, tmp_path: Path) -> None:
+    """Killed after the output was complete and before session.json; then other options."""
+    out = tmp_path / "out"
+    assert run(good, out, "--only", "a1").code == 0
+    record = json.loads((out / "a1" / "session.json").read_text(encoding="utf-8"))
+    (out / "a1" / "session.json").unlink()
+    (out / "a1" / "started.json").write_text(json.dumps(record["key"]), encoding="utf-8")
+    before = (out / "a1" / "scans.mcap").stat().st_ino
+    assert run(good, out, "--only", "a1").table == {"a1": "done"}
+    assert (out / "a1" / "scans.mcap").stat().st_ino == before, "it was complete"
+    (out / "a1" / "session.json").unlink()
+    (out / "a1" / "started.json").write_text(json.dumps(record["key"]), encoding="utf-8")
+    assert run(good, out, "--only", "a1", "--rate", "10").code == 0
+    assert (out / "a1" / "scans.mcap").read_bytes() != converted(good, "a1", tmp_path)
+
+
+def test_failed_sessions_are_run_again_only_on_request(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", ["a1", "hopeless1"])
+    out = tmp_path / "out"
+    assert run(data, out).code == 3
+    log = out / "hopeless1" / "log.txt"
+    before = log.stat().st_mtime_ns
+    assert run(data, out).code == 3
+    assert log.stat().st_mtime_ns == before
+    assert run(data, out, "--retry-failed").code == 3
+    assert log.stat().st_mtime_ns > before
+
+
+def test_fail_fast_begins_no_other_session(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", ["hopeless", "x1", "x2"])
+    ended = run(data, tmp_path / "out", "--fail-fast")
+    assert ended.code == 3
+    assert ended.table == {"hopeless": "failed"}
+    assert ended.last == "3 sessions: 0 done, 0 skipped, 1 failed, 2 not begun (--fail-fast)"
+
+
+def test_a_limit_is_a_failure_with_an_output(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", ["a1"])
+    out = tmp_path / "out"
+    ended = run(data, out, "--fail-on", "loss>1%", "--fault", "drop:ouster_111:20%")
+    lost = run(data, out, "--fail-on", "loss>1%")
+    assert (ended.code, lost.code) == (3, 0), ended.out + lost.out
+    assert "limit exceeded: " in ended.out
+    assert (out / "a1" / "scans.mcap").exists()
+
+
+def test_a_plan_writes_nothing(data: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = run(data, out, "--plan", "--workers", "2")
+    assert (ended.code, ended.err) == (0, "")
+    assert not out.exists()
+    assert ended.table == dict.fromkeys(NAMES, "missing")
+    assert ended.last.startswith("8 of 8 sessions to convert: ")
+    assert "usual values" in ended.last
+
+
+def test_a_foreign_folder_is_not_touched(good: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "a1").mkdir(parents=True)
+    (out / "a1" / "thesis.txt").write_text("mine", encoding="utf-8")
+    ended = run(good, out)
+    assert ended.code == 3
+    assert ended.table["a1"] == "failed"
+    assert "thesis.txt" in ended.out
+    assert (out / "a1" / "thesis.txt").read_text(encoding="utf-8") == "mine"
+
+
+def test_segments_between_clock_steps_are_one_session(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", ["a1"], turns=6)
+    out = tmp_path / "out"
+    words = ("--on-jump", "split", "--fault", "jump:ouster_111:37s@0.3s", "--keep-partial")
+    assert run(data, out, *words).code == 0
+    record = json.loads((out / "a1" / "session.json").read_text(encoding="utf-8"))
+    outputs = [name for name in record["outputs"] if name.endswith(".mcap")]
+    assert outputs == ["scans.seg1.mcap", "scans.seg2.mcap"]
+    reports = [
+        json.loads((out / "a1" / f"report.seg{number}.json").read_text(encoding="utf-8"))
+        for number in (1, 2)
+    ]
+    assert record["scans"] == sum(one["scans"]["written"] for one in reports)
+    assert run(data, out, *words).table == {"a1": "skipped"}
+
+
+@pytest.mark.parametrize("kind", ["npz", "rosbag1", "rosbag2", "ply"])
+def test_every_format(kind: str, good: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = run(good, out, "--format", kind, "--only", "a1", "--retries", "0")
+    assert ended.code == 0, ended.out
+    name = "scans.bag" if kind == "rosbag1" else "scans"
+    assert command("verify", out / "a1" / name, "--report", out / "a1" / "report.json").code == 0
+    assert run(good, out, "--format", kind, "--only", "a1").table == {"a1": "skipped"}

@@ -1,0 +1,159 @@
+"""`mlbatch diff`: the first difference, how large differences are, scans of one output only."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from mlbatch.digest.diff import diff
+from tests.builders.run import command
+from tests.digest.test_digest import FORMATS, MOVED, convert, other_rig
+
+Array = npt.NDArray[Any]
+
+
+def change(path: Path, **values: Callable[[Array], Array]) -> None:
+    """Replace arrays of an npz file: each function gets the old array and returns the new one."""
+    with np.load(path) as found:
+        arrays = dict(found)
+    for name, edit in values.items():
+        arrays[name] = edit(arrays[name].copy())
+    np.savez(path, **arrays)
+
+
+def at(place: Any, amount: float) -> Callable[[Array], Array]:
+    """An edit that adds to one value."""
+
+    def edit(array: Array) -> Array:
+        array[place] += amount
+        return array
+
+    return edit
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_an_output_is_the_same_as_itself(kind: str, tmp_path: Path) -> None:
+    output = convert(tmp_path, kind)
+    found = diff(output, output)
+    assert found.same
+    # The tail has 354 of 512 columns (SOURCE.md): its first half is a slice.
+    assert found.compared == {"split": 14, "mcap split": 2 * (2 * 7 + 1)}.get(kind, 7)
+
+
+def test_formats_are_compared_in_what_both_store(tmp_path: Path) -> None:
+    npz = convert(tmp_path / "a", "npz")
+    mcap = convert(tmp_path / "b", "mcap")
+    found = diff(npz, mcap)
+    # float32 seconds are up to 8 ns early: docs/python.md.
+    assert list(found.fields) == ["time_ns"]
+    assert found.fields["time_ns"].by is not None
+    assert 0 < found.fields["time_ns"].by <= 8
+    assert {one.where.split(".")[-1] for one in found.run} <= {"no_place", "dropped", "written"}
+
+
+def test_scans_of_sensors_meet_in_folders_and_files(tmp_path: Path) -> None:
+    folder = convert(tmp_path / "a", "split")
+    file = convert(tmp_path / "b", "mcap", "--split")
+    found = diff(folder, file)
+    assert (found.compared, found.only_in_a, found.only_in_b) == (14, [], [])
+    assert list(found.fields) == ["time_ns"]
+
+
+def test_the_first_difference_and_the_largest(tmp_path: Path) -> None:
+    a = convert(tmp_path / "a", "npz")
+    b = tmp_path / "b"
+    shutil.copytree(a, b)
+    change(b / "000002.npz", xyz=at((5, 1), 0.5), ring=at(7, 3))
+    change(b / "000004.npz", xyz=at((slice(2, 4), 2), 2.0))
+    found = diff(a, b)
+    assert (found.run, found.only_in_a, found.only_in_b, found.compared) == ([], [], [], 7)
+    first = found.first
+    assert first is not None
+    assert (first.scan, first.field, first.point) == ("000002", "xyz", 5)
+    assert first.by == pytest.approx(2.0, abs=1e-6)
+    assert (first.scans, first.values) == (2, 3)
+    ring = found.fields["ring"]
+    assert (ring.point, ring.by, ring.scans, ring.values) == (7, 3.0, 1, 1)
+    assert isinstance(ring.a, int)
+    assert isinstance(ring.b, int)
+    assert ring.b - ring.a == 3
+    # Of integers there is no tolerance.
+    assert list(diff(a, b, tolerance=3).fields) == ["ring"]
+
+
+def test_stamps_are_compared_to_the_nanosecond(tmp_path: Path) -> None:
+    a = convert(tmp_path / "a", "npz")
+    b = tmp_path / "b"
+    shutil.copytree(a, b)
+    change(b / "000000.npz", column_stamp_ns=at(9, 1))
+    found = diff(a, b)
+    assert [(one.field, one.point, one.by) for one in found.fields.values()] == [
+        ("column_stamp_ns", 9, 1.0)
+    ]
+
+
+def test_a_missing_point_is_the_first_difference(tmp_path: Path) -> None:
+    a = convert(tmp_path / "a", "npz")
+    b = tmp_path / "b"
+    shutil.copytree(a, b)
+    change(b / "000003.npz", intensity=lambda array: np.delete(array, 100))
+    (first,) = diff(a, b).fields.values()
+    assert (first.scan, first.a, first.b, first.by) == ("000003", [27998], [27997], None)
+    assert first.point is not None
+    with np.load(a / "000003.npz") as scan:
+        values = scan["intensity"]
+    # The first of equal neighbours cannot be distinguished from the next.
+    assert first.point >= 100
+    assert (values[100 : first.point + 1] == values[100]).all()
+    assert values[first.point + 1] != values[100]
+
+
+@pytest.mark.parametrize("kind", ["npz", "mcap"])
+def test_scans_of_one_output_only(kind: str, tmp_path: Path) -> None:
+    whole = convert(tmp_path / "a", kind)
+    part = convert(tmp_path / "b", kind, "--start", "+0.3")
+    found = diff(whole, part)
+    assert found.only_in_a == ["000000", "000001", "000002"]
+    assert (found.only_in_b, found.compared, found.fields) == ([], 4, {})
+    assert diff(part, whole).only_in_b == found.only_in_a
+
+
+def test_the_command_prints_what_differs(tmp_path: Path) -> None:
+    a = convert(tmp_path / "a", "mcap")
+    b = convert(tmp_path / "b", "mcap", rig=other_rig(tmp_path, MOVED))
+    found = command("diff", a, b)
+    assert found.code == 1
+    lines = found.out.splitlines()
+    assert lines[0] == "sensors[0].body_from_sensor[1][3]: 0.95 in A, 0.9501 in B"
+    assert lines[1].startswith("first difference: scan 000000, xyz, point ")
+    assert lines[-1].split()[:2] == ["xyz", "7"]
+    assert float(lines[-1].split()[-1]) == pytest.approx(0.0001, abs=2e-6)
+    assert len(found.err.splitlines()) == 1
+    assert command("diff", a, a).out == "the same: 7 scans\n"
+
+
+def test_json(tmp_path: Path) -> None:
+    a = convert(tmp_path / "a", "mcap")
+    b = convert(tmp_path / "b", "mcap", rig=other_rig(tmp_path, MOVED))
+    found = command("diff", a, b, "--json")
+    document = json.loads(found.out)
+    assert found.code == 1
+    assert (document["schema"], document["same"], document["compared"]) == (
+        *("mlbatch.diff/1", False, 7),
+    )
+    assert document["first"] == document["fields"][0]
+    assert document["first"]["field"] == "xyz"
+    assert json.loads(command("diff", a, a, "--json").out)["same"] is True
+
+
+def test_no_output_is_one_line(tmp_path: Path) -> None:
+    found = command("diff", tmp_path / "nothing", tmp_path / "nowhere")
+    assert (found.code, found.out) == (1, "")
+    assert len(found.err.splitlines()) == 1

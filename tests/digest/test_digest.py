@@ -1,0 +1,319 @@
+"""Golden files: what they contain, that equal outputs are equal, and what is found."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mlbatch
+from mlbatch.digest import compare, golden_text, read_golden
+from mlbatch.digest.fields import describe
+from mlbatch.errors import MlbatchError
+from mlbatch.native.library import trouble
+from tests.builders.run import TWO_LIDARS, command
+from tests.golden.digest_recordings import rig_of, write_recordings
+
+CAPTURE = TWO_LIDARS / "two_lidars.pcap"
+RIG = TWO_LIDARS / "rig.yaml"
+FORMATS = {
+    "npz": ("out", ()),
+    "organized": ("out", ("--layout", "organized")),
+    "split": ("out", ("--split",)),
+    "ply": ("out", ("--format", "ply")),
+    "mcap": ("out.mcap", ()),
+    "mcap split": ("out.mcap", ("--split", "--slices", "2")),
+    "rosbag1": ("out.bag", ()),
+    "rosbag2": ("out", ("--format", "rosbag2", "--compression", "zstd")),
+}
+# The first sensor is moved by 0.1 mm; its clock is 1 us ahead.
+MOVED = ("translation_m: [0.3, 0.95, 2.45]", "translation_m: [0.3, 0.9501, 2.45]")
+LATER = ("    metadata: left.json", "    metadata: left.json\n    clock: {offset_s: 0.000001}")
+Golden = dict[str, Any]
+
+
+def convert(folder: Path, kind: str, *options: str | Path, rig: Path = RIG) -> Path:
+    """The fixture in a format."""
+    name, own = FORMATS[kind]
+    folder.mkdir(exist_ok=True)
+    words = (CAPTURE, "--rig", rig, "-o", folder / name, "--quiet", *own, *options)
+    done = command("convert", *words)
+    assert done.code == 0, done.err
+    return folder / name
+
+
+def other_rig(folder: Path, change: tuple[str, str]) -> Path:
+    """The rig of the fixture with a text replaced."""
+    text = RIG.read_text(encoding="utf-8")
+    assert change[0] in text
+    for name in ("left.json", "right.json"):
+        (folder / name).write_bytes((TWO_LIDARS / name).read_bytes())
+    (folder / "rig.yaml").write_text(text.replace(*change), encoding="utf-8")
+    return folder / "rig.yaml"
+
+
+def without_report(golden: Golden) -> Golden:
+    """The scans alone: what their points and stamps say."""
+    return golden | {"run": {}}
+
+
+def fields(golden: Golden, scan: int = 0) -> Golden:
+    """The fields of a scan."""
+    found: Golden = golden["scans"][scan]["fields"]
+    return found
+
+
+# -- content ----------------------------------------------------------------------------------
+
+
+def test_a_field_is_described_by_checksum_statistics_and_four_points() -> None:
+    array = np.array([1.5, 0.25, 9.0, -2.0, 0.125, 4.0, 1.0], np.float32)
+    # printf "\\0\\0\\300\\077..." | sha256sum, the bytes of IEEE 754 written by hand.
+    found = describe(array, None)
+    assert found == {
+        "sha256": "aef6e6143f2f43fa",
+        "mean": pytest.approx(13.875 / 7, abs=1e-9),
+        "min": -2.0,
+        "max": 9.0,
+        "four": [1.5, 9.0, 0.125, 1.0],
+    }
+
+
+def test_empty_slots_have_no_part_in_statistics() -> None:
+    array = np.array([[np.nan, 3.0], [5.0, np.nan]], np.float32)
+    found = describe(array, np.isfinite(array))
+    assert (found["mean"], found["min"], found["max"]) == (4.0, 3.0, 5.0)
+    assert found["four"] == [3.0, 3.0, 3.0, 5.0]
+
+
+def test_an_array_without_values_has_only_a_checksum() -> None:
+    # SHA-256 of nothing.
+    assert describe(np.zeros(0, np.uint8), None) == {"sha256": "e3b0c44298fc1c14"}
+
+
+def test_counts_are_those_of_the_scene(tmp_path: Path) -> None:
+    """Figures of fixtures/two_lidars/SOURCE.md."""
+    golden: Golden = mlbatch.digest(convert(tmp_path, "npz"))
+    assert [scan["points"] for scan in golden["scans"]] == [27998] * 7
+    assert [scan["columns"] for scan in golden["scans"]] == [[512, 512]] * 7
+    assert golden["run"]["grid"]["t_init_ns"] == golden["scans"][0]["start_ns"]
+    assert [one["packets"]["read"] for one in golden["run"]["sensors"]] == [271, 271]
+    assert golden["run"]["warnings"] == []
+
+
+def test_a_file_gives_the_document_back(tmp_path: Path) -> None:
+    golden = mlbatch.digest(convert(tmp_path, "mcap"))
+    path = tmp_path / "golden.json"
+    path.write_text(golden_text(golden), encoding="utf-8")
+    assert read_golden(path) == golden
+    # A line a scan.
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert sum('"index"' in line for line in lines) == 7
+
+
+# -- the same ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_engines_and_jobs_give_the_same(kind: str, tmp_path: Path) -> None:
+    runs = [("--engine", "numpy"), ("--engine", "numpy", "--jobs", "3")]
+    if not trouble():
+        runs.append(("--engine", "native"))
+        runs.append(("--engine", "native", "--jobs", "3"))
+    texts = {
+        golden_text(mlbatch.digest(convert(tmp_path / str(number), kind, *run)))
+        for number, run in enumerate(runs)
+    }
+    assert len(texts) == 1
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fixtures in every container."""
+    folder = tmp_path_factory.mktemp("recordings")
+    write_recordings(folder / "in")
+    return folder / "in"
+
+
+@pytest.mark.parametrize("recording", ["two_lidars", "four_makers"])
+@pytest.mark.parametrize("kind", ["npz", "mcap"])
+def test_containers_give_the_same(
+    recording: str, kind: str, recordings: Path, tmp_path: Path
+) -> None:
+    found = []
+    for container in ("pcap", "pcapng", "mcap", "bag", "db3"):
+        folder = recordings / recording
+        output = tmp_path / container / FORMATS[kind][0]
+        output.parent.mkdir()
+        rig = folder / rig_of(recording, container)
+        words = ("--rig", rig, "-o", output, "--quiet")
+        assert command("convert", folder / f"drive.{container}", *words).code == 0
+        found.append(mlbatch.digest(output))
+    for other in found[1:]:
+        assert list(map(str, compare(found[0], other, tolerance=0).differences)) == []
+
+
+def test_an_mcap_file_alone_has_its_report_inside(tmp_path: Path) -> None:
+    output = convert(tmp_path, "mcap")
+    golden = mlbatch.digest(output)
+    alone = tmp_path / "alone.mcap"
+    output.rename(alone)
+    assert mlbatch.digest(alone) == golden
+
+
+# -- found ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_tenth_of_a_millimetre_is_found(kind: str, tmp_path: Path) -> None:
+    rig = other_rig(tmp_path, MOVED)
+    golden = mlbatch.digest(convert(tmp_path / "a", kind))
+    moved = mlbatch.digest(convert(tmp_path / "b", kind, rig=rig))
+    places = [one.where for one in compare(golden, moved).differences]
+    assert "run.sensors[0].body_from_sensor[1][3]" in places
+    # Also where there is no report, and with the tolerance of the issue.
+    bare = without_report(golden), without_report(moved)
+    assert any(" xyz " in one.where for one in compare(*bare).differences)
+    assert not compare(golden, moved, tolerance=0.0001).ok
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_one_percent_of_loss_is_found(kind: str, tmp_path: Path) -> None:
+    golden = mlbatch.digest(convert(tmp_path / "a", kind))
+    lost = mlbatch.digest(convert(tmp_path / "b", kind, "--fault", "drop:left:1%"))
+    places = [one.where for one in compare(golden, lost).differences]
+    assert "run.sensors[0].packets.lost" in places
+    bare = without_report(golden), without_report(lost)
+    assert any(one.where.endswith(" points") for one in compare(*bare).differences)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_microsecond_of_clock_is_found(kind: str, tmp_path: Path) -> None:
+    rig = other_rig(tmp_path, LATER)
+    golden = mlbatch.digest(convert(tmp_path / "a", kind))
+    later = mlbatch.digest(convert(tmp_path / "b", kind, rig=rig))
+    bare = without_report(golden), without_report(later)
+    assert any(" time_ns " in one.where for one in compare(*bare).differences)
+
+
+# Changes of a document: path, new value, and whether it is within the usual tolerance.
+CHANGES = {
+    "real": (("fields", "xyz", "mean", 1), 0.00004, True),
+    "real beyond": (("fields", "xyz", "mean", 1), 0.00006, False),
+    "one of four points": (("fields", "range_m", "four", 2), -0.001, False),
+    "integer": (("fields", "ring", "max"), 1, False),
+    "fill": (("fill", 0), -0.0001, False),
+    "points": (("points",), -1, False),
+    "column": (("columns", 1), 1, False),
+    "start": (("start_ns",), 1, False),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_is_judged_by_its_kind(name: str, tmp_path: Path) -> None:
+    path, amount, is_within = CHANGES[name]
+    golden: Golden = mlbatch.digest(convert(tmp_path, "npz"))
+    other = copy.deepcopy(golden)
+    place = other["scans"][3]
+    if path[0] == "fields":
+        place["fields"][path[1]]["sha256"] = "0" * 16
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] += amount
+    result = compare(golden, other)
+    assert result.ok == is_within
+    assert not compare(golden, other, tolerance=0).ok
+    assert result.within == ({path[1]: 1} if is_within else {})
+
+
+@pytest.mark.parametrize(("field", "is_found"), [("time_ns", True), ("intensity", False)])
+def test_other_bytes_with_the_same_figures(field: str, is_found: bool, tmp_path: Path) -> None:
+    golden: Golden = mlbatch.digest(convert(tmp_path, "npz"))
+    other = copy.deepcopy(golden)
+    fields(other)[field]["sha256"] = "0" * 16
+    assert compare(golden, other).ok != is_found
+    assert not compare(golden, other, tolerance=0).ok
+
+
+def test_missing_and_added_scans_fields_and_warnings_are_found(tmp_path: Path) -> None:
+    golden: Golden = mlbatch.digest(convert(tmp_path, "npz"))
+    other = copy.deepcopy(golden)
+    del other["scans"][2]
+    del fields(other)["ring"]
+    other["run"]["warnings"] = ["loss left"]
+    for one, two in ((golden, other), (other, golden)):
+        places = {difference.where for difference in compare(one, two).differences}
+        assert places == {"run.warnings", "scan 000002 points", "scan 000000 ring"}
+
+
+# -- the command ------------------------------------------------------------------------------
+
+
+def test_the_command_writes_and_compares(tmp_path: Path) -> None:
+    output = convert(tmp_path, "npz")
+    golden = tmp_path / "golden.json"
+    assert command("digest", output, "-o", golden).out == f"wrote {golden}\n"
+    printed = command("digest", output)
+    assert (printed.code, printed.out) == (0, golden.read_text(encoding="utf-8"))
+    same = command("digest", output, "--against", golden)
+    assert (same.code, same.out, same.err) == (0, f"{output}: as described in {golden}\n", "")
+    refused = command("digest", output, "-o", golden)
+    assert refused.code == 1
+    assert "--overwrite" in refused.err
+    assert command("digest", output, "-o", golden, "--overwrite").code == 0
+
+
+def test_the_command_lists_differences(tmp_path: Path) -> None:
+    golden = tmp_path / "golden.json"
+    command("digest", convert(tmp_path / "a", "npz"), "-o", golden)
+    moved = convert(tmp_path / "b", "npz", rig=other_rig(tmp_path, MOVED))
+    found = command("digest", moved, "--against", golden)
+    assert found.code == 1
+    lines = found.out.splitlines()
+    expected = "run.sensors[0].body_from_sensor[1][3]: expected 0.95, found 0.9501 (+0.0001)"
+    assert lines[0] == expected
+    assert len(found.err.splitlines()) == 1
+    assert str(golden) in found.err
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"schema": "mlbatch.report/1"}', "null"])
+def test_another_file_is_no_golden_file(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "golden.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MlbatchError, match="golden file"):
+        read_golden(path)
+
+
+def test_any_json_in_a_golden_file_is_a_difference(tmp_path: Path) -> None:
+    golden: Golden = mlbatch.digest(convert(tmp_path, "npz"))
+    several: tuple[list[Any], ...] = (
+        [None],
+        [1, "a"],
+        [{"index": {}}],
+        [{"index": 0, "fields": 3}],
+    )
+    for scans in several:
+        broken = json.loads(json.dumps({"schema": golden["schema"], "scans": scans}))
+        assert not compare(broken, golden).ok
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        (("--tolerance", "0.1"), 2),
+        (("--against", "golden.json", "-o", "new.json"), 2),
+        (("--against", "golden.json", "--tolerance", "-1"), 2),
+        (("--against", "golden.json", "--tolerance", "nan"), 2),
+        (("--against", "nothing.json"), 1),
+        (("-o", "nowhere/golden.json"), 1),
+    ],
+)
+def test_wrong_options_are_one_line(options: tuple[str, ...], code: int, tmp_path: Path) -> None:
+    found = command("digest", tmp_path / "nothing", *options)
+    assert (found.code, found.out) == (code, "")
+    assert len(found.err.splitlines()) == 1
+    assert "expected" in found.err
