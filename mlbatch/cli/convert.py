@@ -24,7 +24,9 @@ def convert(
     format_: Annotated[
         str | None,
         typer.Option(
-            "--format", help="mcap, npz, ply, rosbag1, rosbag2. [default: by OUTPUT; a folder: npz]"
+            "--format",
+            help="mcap, npz, ply, pcd, las, laz, kitti, nuscenes, rosbag1, rosbag2. "
+            "[default: by OUTPUT; a folder: npz]",
         ),
     ] = None,
     layout: Annotated[
@@ -41,6 +43,10 @@ def convert(
         str,
         typer.Option(help="Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1)."),
     ] = "none",
+    ply_style: Annotated[
+        str,
+        typer.Option(help="PLY properties: standard, cloudcompare, float (small_gicp)."),
+    ] = "standard",
     slices: Annotated[int, typer.Option(help="Sub-scans a window, published one by one.")] = 1,
     split: Annotated[
         bool, typer.Option("--split", help="One scan a sensor instead of merged ones.")
@@ -220,6 +226,7 @@ def convert(
             format=format_,
             point_layout=point_layout,
             compression=compression,
+            ply_style=ply_style,
             dry_run=dry_run,
             report=None if options.is_stdout(report) else report,
             prints_report=options.is_stdout(report),
