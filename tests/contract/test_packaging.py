@@ -62,19 +62,21 @@ def test_the_lowest_versions_are_those_that_are_tested() -> None:
     bounds = {one[1]: one[2] for one in found if one is not None}
     lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8").splitlines()
     tested = dict(line.split("==") for line in lines if not line.startswith("#"))
-    needed = [*cast(list[str], lists[0]), *cast(list[str], extras["fast"]), "dpkt"]
+    optional = [*cast(list[str], extras["fast"]), *cast(list[str], extras["las"])]
+    needed = [*cast(list[str], lists[0]), *optional, "dpkt"]
     names = [re.split(r"[^\w-]", text, maxsplit=1)[0] for text in needed]
     assert tested == {name: bounds[name] for name in names}
 
 
 def test_the_package_needs_exactly_what_it_imports() -> None:
     needed = _modules_of(cast(list[str], _settings("project")["dependencies"]))
-    fast = _modules_of(cast(list[str], _settings("project", "optional-dependencies")["fast"]))
+    extras = _settings("project", "optional-dependencies")
+    optional = _modules_of([*cast(list[str], extras["fast"]), *cast(list[str], extras["las"])])
     # The programs of peers run in an interpreter of their own, with what the peer brings.
     own = [module for module in modules() if module.name != "bench.programs"]
     found = {_top(node) for module in own for node in ast.walk(module.tree)} - {""}
     foreign = found - set(sys.stdlib_module_names) - {"mlbatch"}
-    assert needed <= foreign <= needed | fast
+    assert needed <= foreign <= needed | optional
 
 
 def _modules_of(requirements: list[str]) -> set[str]:
