@@ -122,7 +122,6 @@ class RowReader:
 
     def begin(self, file: ScanFile) -> RunMetadata:
         """Nothing: rows have no header."""
-        start_of(file, self._starts)
         return RunMetadata()
 
     def know(self, metadata: RunMetadata) -> None:
