@@ -17,7 +17,7 @@ from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError
 
 _NS = 1e9
-_MOST_NS = 4e9
+_MOST_S = 4.0
 
 Values: TypeAlias = npt.NDArray[np.generic]
 
@@ -110,15 +110,15 @@ class CommentedReader:
             if points.time_ns is None:
                 raise DamageError("times of points", "none")
             return points.time_ns, 0
-        finite: BoolArray = np.isfinite(time_s)
-        bad: BoolArray = np.logical_not(finite)
+        bad: BoolArray = np.logical_not(np.isfinite(time_s))
         self.log.none("times", where, bad.reshape(-1), "a finite number", time_s.reshape(-1).item)
-        exact: F64Array = np.nan_to_num(time_s).astype(np.float64) * _NS
-        step_ns = 0
-        if time_s.dtype.itemsize == np.dtype("f4").itemsize:
-            largest = np.float32(np.abs(time_s[finite]).max(initial=0))
-            step_ns = int(np.ceil(float(np.spacing(largest)) * _NS))
-        return np.rint(np.clip(exact, -_MOST_NS, _MOST_NS)).astype(np.int64), step_ns
+        # Before the conversion, which warns of signalling NaN.
+        exact_s: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
+        if time_s.dtype.itemsize > np.dtype("f4").itemsize:
+            return np.rint(exact_s * _NS).astype(np.int64), 0
+        # Rounded toward zero: never later than the true time.
+        step_s = float(np.spacing(np.float32(np.abs(exact_s).max(initial=0))))
+        return np.floor(exact_s * _NS).astype(np.int64), int(step_s * _NS) + 1
 
     def _labels(
         self, check: str, where: str, values: Values, kind: np.dtype[np.unsignedinteger[Any]]
@@ -127,8 +127,8 @@ class CommentedReader:
         if values.dtype.kind == "u" and values.dtype.itemsize <= kind.itemsize:
             return values.astype(np.int64)
         most = int(np.iinfo(kind).max)
-        exact: F64Array = values.astype(np.float64)
-        cut: I64Array = np.clip(np.rint(np.nan_to_num(exact)), 0, most).astype(np.int64)
+        exact: F64Array = np.nan_to_num(values, nan=-1.0).astype(np.float64)
+        cut: I64Array = np.clip(np.rint(exact), 0, most).astype(np.int64)
         bad: BoolArray = (cut != exact).reshape(-1)
         name = {"rings": "ring", "returns": "return type", "sensors": "sensor"}[check]
         self.log.none(check, where, bad, f"a {name} from 0 to {most}", values.reshape(-1).item)

@@ -173,8 +173,9 @@ class RowReader:
         scan.lidar_id = self._whole("sensors", scan, lidar, 255).astype(np.uint8)
 
     def _whole(self, check: str, scan: StoredScan, values: F32Array, most: int) -> I64Array:
-        cut: I64Array = np.clip(np.rint(np.nan_to_num(values)), 0, most).astype(np.int64)
-        bad: BoolArray = cut != values
+        exact: F64Array = np.nan_to_num(values, nan=-1.0).astype(np.float64)
+        cut: I64Array = np.clip(np.rint(exact), 0, most).astype(np.int64)
+        bad: BoolArray = cut != exact
         expected = f"a whole number from 0 to {most}"
         self.log.none(check, scan.point, bad, expected, values.item)
         return cut

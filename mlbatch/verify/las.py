@@ -6,6 +6,7 @@ The format: docs/formats.md; ASPRS, "LAS specification 1.4 R15".
 from __future__ import annotations
 
 import importlib
+import struct
 from dataclasses import dataclass
 from io import BytesIO
 from types import ModuleType
@@ -21,6 +22,13 @@ from mlbatch.verify.verdict import DamageError, VerifyError
 
 LAS_SUFFIX = ".las"
 LAZ_SUFFIX = ".laz"
+# Table 3: signature; size of the header, offset of the points, number of records, format and bytes
+# of a point; wave data, number of extended records; number of points.
+_HEAD = struct.Struct("<4s90xHIIBH120xQ8xIQ")
+_HEAD_BYTES = 375
+_MOST_RECORDS = 16
+# Flag of the point format, set by LASzip.
+_COMPRESSED = 0x80
 _POINT_FORMAT = 6
 _SCALE_M = 1e-4
 _EXTRA_BYTES = {
@@ -84,15 +92,41 @@ def load_laspy(what: str) -> ModuleType:
         ) from err
 
 
+def check_head(data: bytes) -> None:
+    """Check numbers of the header that laspy and lazrs allocate for; DamageError for others."""
+    if len(data) < _HEAD.size:
+        raise DamageError(f"a header of {_HEAD.size} bytes", f"{len(data)} bytes")
+    signature, size, begin, records, kind, step, waves, extended, count = _HEAD.unpack_from(data)
+    found = (signature, size, waves, extended, kind & ~_COMPRESSED)
+    expected = (b"LASF", _HEAD_BYTES, 0, 0, _POINT_FORMAT)
+    if found != expected or records > _MOST_RECORDS or begin > len(data):
+        raise DamageError("the header of a LAS file of mlbatch", f"{found}, {records} records")
+    check_unpacked_size(count * step, len(data))
+    if kind & _COMPRESSED:
+        _check_chunks(data, begin)
+    elif len(data) != begin + count * step:
+        raise DamageError(f"{count} points of {step} bytes", f"{len(data) - begin} bytes")
+
+
+def _check_chunks(data: bytes, begin: int) -> None:
+    """Check the number of chunks; LASzip: points begin with the offset of the table of chunks."""
+    if begin + 8 > len(data):
+        raise DamageError("the offset of a table of chunks", "the end of the file")
+    table = int.from_bytes(data[begin : begin + 8], "little", signed=True)
+    if not begin < table <= len(data) - 8:
+        raise DamageError("a table of chunks in the file", f"one at byte {table}")
+    chunks = int.from_bytes(data[table + 4 : table + 8], "little")
+    if chunks > len(data):
+        raise DamageError(f"at most {len(data)} chunks", str(chunks))
+
+
 def read_las(data: bytes) -> LasFile:
     """A file of mlbatch; DamageError for another one."""
     laspy = load_laspy("LAS files")
     with library_errors("a LAS or LAZ file"):
-        with laspy.open(BytesIO(data)) as stream:
-            header = stream.header
-            # Of the header, before anything is allocated.
-            check_unpacked_size(header.point_count * header.point_format.size, len(data))
-            found = stream.read()
+        check_head(data)
+        found = _read(laspy, data)
+        header = found.header
         # Points that are missing at the end are read as fewer.
         if len(found.points) != header.point_count:
             raise DamageError(f"{header.point_count} points", str(len(found.points)))
@@ -113,6 +147,17 @@ def read_las(data: bytes) -> LasFile:
         axes = [np.asarray(found.points[name]) * _SCALE_M for name in "XYZ"]
         xyz: F32Array = np.stack(axes, axis=-1).astype(np.float32)
         return LasFile(comments, found.points, xyz, "reflectivity" in extra)
+
+
+def _read(laspy: ModuleType, data: bytes) -> Any:
+    """The file as laspy has it; laspy has no types."""
+    try:
+        return laspy.read(BytesIO(data))
+    except BaseException as err:
+        # lazrs raises its own BaseException on damaged chunks.
+        if type(err).__name__ == "PanicException":
+            raise DamageError("compressed points", str(err)) from err
+        raise
 
 
 class LasReader(CommentedReader):
@@ -166,7 +211,7 @@ class LasReader(CommentedReader):
             bad: BoolArray = found != _RETURNS[kind, axis]
             self.log.none("returns", f"{where} {name} of point", bad, "by return_type", found.item)
         exact: F64Array = np.clip(
-            np.rint(file.values("intensity_f32").astype(np.float64)), 0, _MOST_INTENSITY
+            np.rint(np.nan_to_num(file.values("intensity_f32"))), 0, _MOST_INTENSITY
         )
         intensity: I64Array = file.values("intensity").astype(np.int64)
         different: BoolArray = intensity != exact
