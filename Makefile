@@ -7,6 +7,7 @@
 #   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
+#   make test-consumers   programs of others read our outputs, each in an environment of its own
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make fuzz-sanitized   its targets of compiled loops, with sanitizers in the C code
 #   make clean   remove what the others made
@@ -16,6 +17,7 @@ PYTHON ?= python3
 LOWEST_PYTHON ?= $(PYTHON)
 VENV := .venv
 LOWEST := .venv-lowest
+CONSUMERS := .venv-consumers
 BIN := $(VENV)/bin
 RIG := fixtures/two_lidars
 # Of the compiled engine, which an installation builds.
@@ -23,7 +25,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick test-lowest lint bench fuzz fuzz-sanitized clean
+.PHONY: help demo test coverage test-quick test-lowest test-consumers lint bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -46,6 +48,10 @@ test-quick: $(VENV)/dev.stamp
 
 test-lowest: $(LOWEST)/dev.stamp
 	$(LOWEST)/bin/python -m pytest -n 2 -m 'not slow and not long'
+
+# PCL and CloudCompare: apt-get install pcl-tools cloudcompare; the reader of JavaScript: node, npm.
+test-consumers: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest tests/consumers/check_consumers.py -v -rs
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
@@ -73,7 +79,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
 
 # The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:

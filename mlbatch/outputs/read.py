@@ -353,7 +353,9 @@ def _commented_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
     layout = "organized" if points.organized else "dense"
     info = run.shared(about, metadata.frame_id or "", layout)
     start_ns = comments.number("start_ns")
-    place = CloudPlace(info, index, part, start_ns, comments.number("end_ns"), None)
+    only = _sensor_index(file, names)
+    end_ns = comments.number("end_ns")
+    place = CloudPlace(info, index, part, start_ns, end_ns, None, only)
     fields = {
         "intensity": points.intensity,
         "reflectivity": points.reflectivity,
@@ -365,7 +367,7 @@ def _commented_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
     }
     stored = {name: values for name, values in fields.items() if values is not None}
     scan = scan_of_fields(place, points.xyz, stored, comments.is_complete())
-    return scan, _sensor_index(file, names)
+    return scan, only
 
 
 def _rows_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:

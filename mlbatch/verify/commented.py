@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array
 from mlbatch.verify.comments import ScanComments
 from mlbatch.verify.folders import ScanFile
 from mlbatch.verify.report_checks import RunMetadata
@@ -24,15 +24,15 @@ Values: TypeAlias = npt.NDArray[np.generic]
 
 @dataclass(slots=True)
 class StoredPoints:
-    """Point arrays as stored: (p,), or (n, slots) in an organized scan."""
+    """Point arrays as stored: (p,), or (n, slots) in an organized scan; None: not stored."""
 
     xyz: F32Array
     # One of both: float s after the start, or ns.
     time_s: F32Array | F64Array | None
     time_ns: I64Array | None
-    ring: Values
-    return_type: Values
-    lidar_id: Values
+    ring: Values | None
+    return_type: Values | None
+    lidar_id: Values | None
     intensity: F32Array | None = None
     organized: bool = False
     reflectivity: Values | None = None
@@ -94,12 +94,8 @@ class CommentedReader:
             time_ns=time_ns,
             time_step_ns=step_ns,
             ring=self._labels("rings", where, points.ring, np.dtype("u2")),
-            return_type=self._labels("returns", where, points.return_type, np.dtype("u1")).astype(
-                np.uint8
-            ),
-            lidar_id=self._labels("sensors", where, points.lidar_id, np.dtype("u1")).astype(
-                np.uint8
-            ),
+            return_type=_bytes(self._labels("returns", where, points.return_type, np.dtype("u1"))),
+            lidar_id=_bytes(self._labels("sensors", where, points.lidar_id, np.dtype("u1"))),
             fill=comments.fill(),
         )
 
@@ -121,15 +117,25 @@ class CommentedReader:
         return np.floor(exact_s * _NS).astype(np.int64), int(step_s * _NS) + 1
 
     def _labels(
-        self, check: str, where: str, values: Values, kind: np.dtype[np.unsignedinteger[Any]]
-    ) -> I64Array:
+        self,
+        check: str,
+        where: str,
+        values: Values | None,
+        kind: np.dtype[np.unsignedinteger[Any]],
+    ) -> I64Array | None:
         """Whole numbers of an unsigned type; others are violations, and cut."""
+        if values is None:
+            return None
         if values.dtype.kind == "u" and values.dtype.itemsize <= kind.itemsize:
             return values.astype(np.int64)
         most = int(np.iinfo(kind).max)
-        exact: F64Array = np.nan_to_num(values, nan=-1.0).astype(np.float64)
-        cut: I64Array = np.clip(np.rint(exact), 0, most).astype(np.int64)
-        bad: BoolArray = (cut != exact).reshape(-1)
+        whole: I64Array = values.astype(np.int64)
+        cut: I64Array = np.clip(whole, 0, most)
+        bad: BoolArray = (cut != whole).reshape(-1)
         name = {"rings": "ring", "returns": "return type", "sensors": "sensor"}[check]
         self.log.none(check, where, bad, f"a {name} from 0 to {most}", values.reshape(-1).item)
         return cut
+
+
+def _bytes(values: I64Array | None) -> U8Array | None:
+    return None if values is None else values.astype(np.uint8)

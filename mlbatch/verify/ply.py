@@ -68,7 +68,7 @@ class _Style:
 _STYLES = (
     _Style("", _XYZ | _STANDARD),
     _Style("scalar_", _XYZ | {f"scalar_{name}": kind for name, kind in _STANDARD.items()}),
-    _Style("", _XYZ | dict.fromkeys(_STANDARD, "float")),
+    _Style("", _XYZ | {"time": "float"}),
 )
 
 
@@ -85,14 +85,19 @@ class PlyReader(CommentedReader):
             expected = f"{vertices} vertices of {vertex.itemsize} bytes"
             raise DamageError(expected, f"{len(data) - begin} bytes after the header")
         points = np.frombuffer(data, vertex, vertices, begin)
+        fields = {
+            name: points[style.prefix + name]
+            for name in _STANDARD
+            if style.prefix + name in style.properties
+        }
         return comments, StoredPoints(
             xyz=points["xyz"],
-            time_s=points[f"{style.prefix}time"],
+            time_s=fields["time"],
             time_ns=None,
-            ring=points[f"{style.prefix}ring"],
-            return_type=points[f"{style.prefix}return_type"],
-            lidar_id=points[f"{style.prefix}lidar_id"],
-            intensity=points[f"{style.prefix}intensity"],
+            ring=fields.get("ring"),
+            return_type=fields.get("return_type"),
+            lidar_id=fields.get("lidar_id"),
+            intensity=fields.get("intensity"),
         )
 
 

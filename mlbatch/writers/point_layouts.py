@@ -435,17 +435,11 @@ CLOUD_LAYOUTS = {
 PLY_LAYOUT = Layout("ply", 30, _PLY)
 # CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
 _SCALARS = tuple(replace(field, name=f"scalar_{field.name}") for field in _PLY[3:])
-_FLOATS = (
-    *_XYZ,
-    _intensity(12),
-    _time(16),
-    _ring(20, "<f4"),
-    Field("return_type", "<f4", 24, lambda points: points.return_type),
-    Field("lidar_id", "<f4", 28, lambda points: points.lidar_id),
-)
+# small_gicp reads four floats a vertex, whatever the header says.
+_FLOATS = (*_XYZ, _time(12))
 # By the styles of `--ply-style`.
 PLY_LAYOUTS = {
     "standard": PLY_LAYOUT,
     "cloudcompare": Layout("ply-cloudcompare", 30, (*_XYZ, *_SCALARS)),
-    "float": Layout("ply-float", 32, _FLOATS),
+    "float": Layout("ply-float", 16, _FLOATS),
 }

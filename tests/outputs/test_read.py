@@ -156,6 +156,7 @@ def test_slices_of_single_sensors_come_back(
 def test_every_ply_style_is_read(style: str, rec: Recording, tmp_path: Path) -> None:
     mlbatch.convert(rec, tmp_path / "out", format="ply", ply_style=style)
     for one, other in zip(mlbatch.read(tmp_path / "out"), rec.scans(), strict=True):
+        assert ("ring" in one.absent) == (style == "float")
         _assert_same(one, other, FLOAT32_STEP_NS if style == "float" else 0)
 
 
