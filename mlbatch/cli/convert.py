@@ -37,7 +37,8 @@ def convert(
         typer.Option(help="Order of a scan's points: columns (time of their columns) or points."),
     ] = "columns",
     point_layout: Annotated[
-        str, typer.Option(help="Fields of a PointCloud2 point (preset).")
+        str,
+        typer.Option(help="Fields of a PointCloud2 point (preset). FAST-LIO2: 128 rings at most."),
     ] = "standard",
     compression: Annotated[
         str,
