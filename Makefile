@@ -6,6 +6,7 @@
 #   make test-quick   the tests of daily work, within a minute
 #   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
+#   make docs    the documentation as a site, build/site/index.html
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make test-consumers   programs of others read our outputs, each in an environment of its own
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
@@ -25,7 +26,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick test-lowest test-consumers lint bench fuzz fuzz-sanitized clean
+.PHONY: help demo test coverage test-quick test-lowest test-consumers lint docs bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -57,6 +58,10 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/mypy
+
+# The variable removes a notice about the next version of mkdocs.
+docs: $(VENV)/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow
@@ -99,6 +104,11 @@ $(VENV)/dev.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch and its tools into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ $(VENV)/core.stamp
+
+$(VENV)/docs.stamp: $(VENV)/dev.stamp
+	@echo "installing the tools of the site into $(VENV)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
 
 $(LOWEST)/dev.stamp: pyproject.toml .ci/lowest.txt
 	@$(LOWEST_PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' || { \

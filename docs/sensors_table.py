@@ -1,4 +1,4 @@
-"""Write the sensor table of the README from the models: `python docs/sensors_table.py`.
+"""Write the sensor table of docs/models.md from the models: `python docs/sensors_table.py`.
 
 Models that differ only in their name share a row.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from mlbatch.lidar.interface import SensorModel
 from mlbatch.sensors import models
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+PAGE = Path(__file__).resolve().parent / "models.md"
 BEGIN, END = "<!-- sensors: python docs/sensors_table.py -->", "<!-- end of sensors -->"
 HEAD = ("vendor", "models (channels)", "returns", "clock", "calibration", "verified")
 
@@ -50,5 +50,5 @@ def _name(model: SensorModel) -> str:
 
 
 if __name__ == "__main__":
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else README
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else PAGE
     target.write_text(with_table(target.read_text(encoding="utf-8")), encoding="utf-8")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
+if TYPE_CHECKING:
+    from mlbatch.native.arena import PacketArena
 
-@dataclass(frozen=True, slots=True)
-class Stream:
+
+class Stream(NamedTuple):
     """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.
 
     Source ports are ephemeral and no part of it. frame_id, lidar_id: only where a topic has decoded
@@ -110,6 +113,7 @@ class PacketBatch:
     stream: I64Array  # (n,) numbers in a `StreamTable`
     host_ns: I64Array  # (n,) receive time at the capture host, of the completing fragment
     messages: tuple[Message, ...] = ()  # of the topics in `Recording.keep`, in file order
+    place: int | None = None  # of `data[0]` in the `PacketArena` of the pass; None: elsewhere
 
     def __len__(self) -> int:
         return len(self.start)
@@ -117,7 +121,12 @@ class PacketBatch:
     def take(self, index: I64Array | slice) -> PacketBatch:
         """The packets at `index`, over the same bytes, without messages."""
         return PacketBatch(
-            self.data, self.start[index], self.size[index], self.stream[index], self.host_ns[index]
+            self.data,
+            self.start[index],
+            self.size[index],
+            self.stream[index],
+            self.host_ns[index],
+            place=self.place,
         )
 
 
@@ -170,6 +179,10 @@ class Recording:
     def use_engine(self, engine: str) -> None:
         """Read by `numpy` or `native`; ignored by containers that have one implementation."""
 
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Read the next pass into an arena; False for containers that cannot."""
+        return False
+
 
 class WrappedRecording(Recording):
     """A recording that changes the packets of another one.
@@ -191,6 +204,10 @@ class WrappedRecording(Recording):
         """Pass the engine on."""
         self.inner.use_engine(engine)
 
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Not passed on, since packets change; see `Recording`."""
+        return False
+
 
 @dataclass(slots=True)
 class Columns:
@@ -206,6 +223,45 @@ class Columns:
     def take(self, index: I64Array | BoolArray | slice) -> Columns:
         """The columns at `index`."""
         return Columns(self.stamp_ns[index], self.ring_index[index], self.encoder[index])
+
+
+class ColumnFigures(NamedTuple):
+    """Columns of one sensor in one window; coverage and overlap as in `Scan`."""
+
+    columns: int
+    max_gap_ns: int  # between two of them
+    coverage: float
+    overlap: float
+    # Timestamps; 0 without a column.
+    first_ns: int
+    last_ns: int
+
+
+NO_COLUMNS = ColumnFigures(0, 0, 0.0, 0.0, 0, 0)
+# Of all sensors in one window.
+WindowFigures: TypeAlias = Sequence[ColumnFigures]
+
+
+@dataclass(slots=True)
+class WindowColumns:
+    """Columns of all sensors by stamp, then sensor, then order of delivery; arrays (n,) int64."""
+
+    stamp_ns: I64Array  # common clock
+    sensor: I64Array  # index of the column's sensor
+    ring_index: I64Array  # as in `Columns`
+    encoder: I64Array  # as in `Columns`
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, index: slice | I64Array) -> WindowColumns:
+        """Return the columns at `index`."""
+        return WindowColumns(
+            self.stamp_ns[index],
+            self.sensor[index],
+            self.ring_index[index],
+            self.encoder[index],
+        )
 
 
 @dataclass(slots=True)

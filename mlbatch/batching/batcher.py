@@ -27,10 +27,11 @@ from mlbatch.batching.fill import UNKNOWN_PACE, FillMeter, Pace
 from mlbatch.batching.gaps import EdgeGaps
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Arrival, Intake, JumpGuard
+from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.errors import ClockJump
-from mlbatch.types import Columns
+from mlbatch.types import Columns, WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_MS
 
 # Allowed lateness.
@@ -79,11 +80,12 @@ class Batcher:
         policy: Policy,
         guards: Sequence[JumpGuard] = (),
         paces: Sequence[Pace] = (),
+        merge: ColumnMerge | None = None,
     ) -> None:
         """Arguments of a run.
 
         intakes: one a sensor; guards: one a sensor, or none where clocks are not checked; paces:
-        one a sensor, or none where the rates are unknown.
+        one a sensor, or none where the rates are unknown; merge: None: by numpy.
         """
         self._grid = grid
         self._policy = policy
@@ -94,7 +96,9 @@ class Batcher:
         self._until = NEVER
         self._guards = tuple(guards)
         self._gaps = EdgeGaps(len(self._tracks))
-        self._fill = FillMeter(paces or [UNKNOWN_PACE] * len(self._tracks))
+        paces = paces or [UNKNOWN_PACE] * len(self._tracks)
+        self._fill = FillMeter(paces)
+        self._merge = merge or ColumnMerge([pace.positions for pace in paces])
 
     # -- main loop ----------------------------------------------------------------------------
 
@@ -170,6 +174,10 @@ class Batcher:
             None if track.offset_ns is None else (track.first_ns, track.first_ns - track.offset_ns)
             for track in self._tracks
         ]
+
+    def host_offset_ns(self, sensor: int) -> int | None:
+        """First stamp of a sensor minus the receive time of its packet; None without a stamp."""
+        return self._tracks[sensor].offset_ns
 
     def loss(self, sensor: int) -> tuple[int, int]:
         """Lost and reordered packets of a sensor."""
@@ -322,7 +330,10 @@ class Batcher:
         if not count:
             return
         per_packet = headers.valid.shape[1]
-        ring_index = arrival.ring_index[:, None] + np.arange(per_packet)
+        offsets = arrival.column_offsets
+        if offsets is None:
+            offsets = np.arange(per_packet)
+        ring_index = arrival.ring_index[:, None] + offsets
         columns = Columns(
             headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
         )
@@ -388,24 +399,22 @@ class Batcher:
         if until <= self._until:
             return
         self._until = until
-        columns, sensor = self._take_until(until)
-        done = 0
-        while done < len(columns):
-            window = self._grid.index_of(int(columns.stamp_ns[done]))
+        merged = self._take_until(until)
+        cuts = self._cuts(merged.stamp_ns)
+        figures = self._merge.figures(merged, [stop for _, stop in cuts])
+        begin = 0
+        for (window, stop), own in zip(cuts, figures, strict=True):
             start = self._grid.bound(window)
             end = self._grid.bound(window + 1)
-            upto = int(np.searchsorted(columns.stamp_ns, end))
-            closed_by = int(np.searchsorted(progress.watermark, end))
-            part = slice(done, upto)
-            done = upto
+            closed_by = int(progress.watermark.searchsorted(end))
+            columns = merged.take(slice(begin, stop))
+            begin = stop
             # Also of windows that are dropped: later ones must not depend on options.
-            gaps_ns = self._gaps.measure(start, end, columns.stamp_ns[part], sensor[part])
-            fill = self._fill.measure(
-                end - start, columns.stamp_ns[part], sensor[part], columns.encoder[part]
-            )
+            gaps_ns = self._gaps.measure(start, end, own)
+            fill = self._fill.measure(end - start, own, columns)
             reason = self._schedule.enter(window, last_of_all)
             if reason:
-                self._drop(sensor[part], reason)
+                self._drop(own, reason)
                 continue
             yield Window(
                 index=self._schedule.index_of(window),
@@ -414,10 +423,8 @@ class Batcher:
                 end_ns=end,
                 complete=self._complete(progress, closed_by, start, end),
                 ready_host_ns=int(progress.host_ns[closed_by - 1]),
-                stamp_ns=columns.stamp_ns[part],
-                sensor=sensor[part],
-                ring_index=columns.ring_index[part],
-                encoder=columns.encoder[part],
+                columns=columns,
+                figures=own,
                 edge_gap_ns=gaps_ns,
                 fill=fill,
                 is_partial=self._schedule.is_partial(window, last_of_all),
@@ -425,21 +432,23 @@ class Batcher:
         for track in self._tracks:
             track.gaps = [gap for gap in track.gaps if gap[1] > until]
 
-    def _take_until(self, until: int) -> tuple[Columns, I64Array]:
-        """Take waiting columns before `until`, by stamp, sensor, order of delivery; their sensors.
-
-        The stable sort is the merge of the paper: smallest stamp first.
-        """
-        taken = []
+    def _take_until(self, until: int) -> WindowColumns:
+        """Take the waiting columns before `until`, merged."""
+        merged = self._merge.take_until([track.waiting for track in self._tracks], until)
         for track in self._tracks:
-            due, left = split_at(joined(track.waiting), until)
-            taken.append(due)
-            track.waiting = [left] if len(left) else []
-            track.oldest_ring_index = int(left.ring_index.min(initial=FOREVER))
-        merged = joined(taken)
-        sensor = np.arange(len(taken)).repeat([len(columns) for columns in taken])
-        order = merged.stamp_ns.argsort(kind="stable")
-        return merged.take(order), sensor[order]
+            oldest = (int(one.ring_index.min(initial=FOREVER)) for one in track.waiting)
+            track.oldest_ring_index = min(oldest, default=FOREVER)
+        return merged
+
+    def _cuts(self, stamp_ns: I64Array) -> list[tuple[int, int]]:
+        """Windows of columns (n,): number, column after its last; windows without are left out."""
+        cuts = []
+        done = 0
+        while done < len(stamp_ns):
+            window = self._grid.index_of(int(stamp_ns[done]))
+            done = int(stamp_ns.searchsorted(self._grid.bound(window + 1)))
+            cuts.append((window, done))
+        return cuts
 
     def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:
         """True if every sensor began by the start, reached the end, and no stall overlaps."""
@@ -449,9 +458,9 @@ class Batcher:
             for track in self._tracks
         )
 
-    def _drop(self, sensor: I64Array, reason: str) -> None:
-        for number, count in enumerate(np.bincount(sensor, minlength=len(self._tracks))):
-            self._tracks[number].drop(reason, int(count))
+    def _drop(self, figures: WindowFigures, reason: str) -> None:
+        for track, own in zip(self._tracks, figures, strict=True):
+            track.drop(reason, own.columns)
 
 
 def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Array]:
@@ -467,26 +476,3 @@ def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Arra
     rank[order] = np.arange(len(order))
     cuts = np.cumsum([len(event) for event in events])[:-1]
     return np.split(rank, cuts), position[order]
-
-
-def split_at(columns: Columns, until: int) -> tuple[Columns, Columns]:
-    """Columns with stamps before `until`, and the others; each in their order."""
-    stamp = columns.stamp_ns
-    if bool((stamp[1:] >= stamp[:-1]).all()):
-        at = int(stamp.searchsorted(until))
-        return columns.take(slice(None, at)), columns.take(slice(at, None))
-    due = stamp < until
-    return columns.take(due), columns.take(~due)
-
-
-def joined(parts: Sequence[Columns]) -> Columns:
-    """Columns of all parts, in order."""
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        return Columns(_NONE, _NONE, _NONE)
-    return Columns(
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.ring_index for part in parts]),
-        np.concatenate([part.encoder for part in parts]),
-    )

@@ -16,6 +16,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array, median
 from mlbatch.lidar.geometry import SECTORS, rotor_ticks, sectors
+from mlbatch.types import WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_S
 
 # Of fewer expected columns one more or less, by jitter, would be a large share.
@@ -52,18 +53,16 @@ class FillMeter:
     def __init__(self, paces: Sequence[Pace]) -> None:
         self._sensors = [_Expectation(pace) for pace in paces]
 
-    def measure(
-        self, length_ns: int, stamp_ns: I64Array, sensor: I64Array, encoder: I64Array
-    ) -> F32Array:
-        """Fill (s,) of a window of this length, from its columns (n,); NaN: unknown."""
-        counts = np.bincount(sensor, minlength=len(self._sensors)).tolist()
-        fill = np.empty(len(self._sensors), np.float32)
+    def measure(self, length_ns: int, figures: WindowFigures, columns: WindowColumns) -> F32Array:
+        """Fill (s,) of a window of this length, from its columns; NaN: unknown."""
+        fills = []
         for number, one in enumerate(self._sensors):
-            if one.learns and counts[number]:
-                own = np.flatnonzero(sensor == number)
-                one.learn(stamp_ns[own], encoder[own])
-            fill[number] = _share(counts[number], one.columns(length_ns))
-        return fill
+            count = figures[number].columns
+            if one.learns and count:
+                own = np.flatnonzero(columns.sensor == number)
+                one.learn(columns.stamp_ns[own], columns.encoder[own])
+            fills.append(_share(count, one.columns(length_ns)))
+        return np.array(fills, np.float32)
 
 
 def _share(count: int, expected: float) -> float:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from mlbatch.arrays import I64Array
+from mlbatch.types import WindowFigures
 
 
 class EdgeGaps:
@@ -18,22 +16,18 @@ class EdgeGaps:
     def __init__(self, sensors: int) -> None:
         self._last_ns: list[int | None] = [None] * sensors
 
-    def measure(
-        self, start_ns: int, end_ns: int, stamp_ns: I64Array, sensor: I64Array
-    ) -> tuple[int, ...]:
+    def measure(self, start_ns: int, end_ns: int, figures: WindowFigures) -> tuple[int, ...]:
         """Widest gap at either bound of a window, ns, by sensor; windows in order of time.
 
-        stamp_ns, sensor: (n,) its columns. Without an earlier column a gap counts from the start.
+        Without an earlier column a gap counts from the start.
         """
         gaps_ns = []
         for number, last_ns in enumerate(self._last_ns):
             before_ns = start_ns if last_ns is None else last_ns
-            own = np.flatnonzero(sensor == number)
-            if len(own):
-                first_ns = int(stamp_ns[own[0]])
-                last_ns = int(stamp_ns[own[-1]])
-                self._last_ns[number] = last_ns
-                gaps_ns.append(max(first_ns - before_ns, end_ns - last_ns))
+            own = figures[number]
+            if own.columns:
+                self._last_ns[number] = own.last_ns
+                gaps_ns.append(max(own.first_ns - before_ns, end_ns - own.last_ns))
             else:
                 gaps_ns.append(end_ns - before_ns)
         return tuple(gaps_ns)

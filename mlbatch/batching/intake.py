@@ -40,6 +40,8 @@ class Arrival:
     key: I64Array  # (P,) int64, equal for duplicates, negative for packets without identity
     headers: ColumnHeaders  # their columns, sensor clock
     ring_index: I64Array  # (P,) int64, ring index of the packet's first column
+    # (C,) int64, ring indexes of a packet's columns relative to the first; None: they count up.
+    column_offsets: I64Array | None = None
 
     def take(self, index: BoolArray | I64Array) -> Arrival:
         """The packets at `index`."""
@@ -50,6 +52,7 @@ class Arrival:
             self.key[index],
             ColumnHeaders(headers.stamp_ns[index], headers.encoder[index], headers.valid[index]),
             self.ring_index[index],
+            self.column_offsets,
         )
 
 
@@ -296,6 +299,7 @@ def _joined(first: Arrival, second: Arrival) -> Arrival:
         np.concatenate([first.key, second.key]),
         headers,
         np.concatenate([first.ring_index, second.ring_index]),
+        first.column_offsets,
     )
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mlbatch.arrays import F32Array, I64Array
+from mlbatch.arrays import F32Array
 from mlbatch.batching.grid import Grid
+from mlbatch.types import WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_S
 
 
@@ -46,10 +47,8 @@ class Window:
     end_ns: int  # exclusive
     complete: bool  # every sensor covers the window in time
     ready_host_ns: int  # receive time of the packet that closed it
-    stamp_ns: I64Array  # (n,) common clock
-    sensor: I64Array  # (n,) index of the column's sensor
-    ring_index: I64Array  # (n,) as in `Columns`
-    encoder: I64Array  # (n,) as in `Columns`
+    columns: WindowColumns
+    figures: WindowFigures  # by sensor
     # By sensor: see `gaps.EdgeGaps` and `fill.FillMeter`.
     edge_gap_ns: tuple[int, ...]
     fill: F32Array

@@ -8,8 +8,7 @@ uncertainty.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -45,8 +44,7 @@ _FREE_PPM = 100.0
 Named: TypeAlias = tuple[str, ClockEstimate]
 
 
-@dataclass(frozen=True, slots=True)
-class Correction:
+class Correction(NamedTuple):
     """Correction that makes the stamps of a sensor comparable with those of `reference`."""
 
     sensor: str
@@ -65,8 +63,7 @@ class Correction:
         return f"clock: {{offset_s: {sign}{seconds}{fraction}}}"
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
+class Pair(NamedTuple):
     """Difference of two clocks: how far that of `two` is ahead of that of `one`, ns."""
 
     one: str
@@ -101,8 +98,7 @@ class Pair:
         return text
 
 
-@dataclass(frozen=True, slots=True)
-class Comparison:
+class Comparison(NamedTuple):
     """Clocks of all sensors of a recording."""
 
     verdict: str
@@ -192,8 +188,8 @@ def mark_host_steps(estimates: Sequence[Named]) -> tuple[Named, ...]:
     named = []
     for name, estimate in estimates:
         others = [other for other_name, other in estimates if other_name != name]
-        jumps = tuple(replace(jump, kind=_kind(jump, others)) for jump in estimate.jumps)
-        named.append((name, replace(estimate, jumps=jumps)))
+        jumps = tuple(jump._replace(kind=_kind(jump, others)) for jump in estimate.jumps)
+        named.append((name, estimate._replace(jumps=jumps)))
     return tuple(named)
 
 
@@ -251,13 +247,13 @@ def _pair(one: Named, two: Named, bound_ns: int) -> Pair:
     )
     broken = [f"{who} jumps" for who, what in (one, two) if what.sensor_jumps or what.unsteady]
     if broken:
-        return replace(pair, why=", ".join(broken))
+        return pair._replace(why=", ".join(broken))
     if uncertainty_ns > bound_ns:
         sure = "apart, and " if pair.least_ns > bound_ns else ""
-        return replace(pair, why=f"{sure}too few packets, or too irregular, for an exact estimate")
+        return pair._replace(why=f"{sure}too few packets, or too irregular, for an exact estimate")
     apart_ppm = _apart_ppm(estimate, other)
     if pair.bound_ns <= bound_ns and not apart_ppm:
-        return replace(pair, verdict=SYNCHRONISED, why=f"within {pair.bound_ns / NS_PER_MS:.3f} ms")
+        return pair._replace(verdict=SYNCHRONISED, why=f"within {pair.bound_ns / NS_PER_MS:.3f} ms")
     offset_ns = known[0] if known is not None else middle_ns
     left_ns = max(abs(low_ns - offset_ns), abs(high_ns - offset_ns)) + uncertainty_ns
     if known is not None and left_ns > bound_ns:
@@ -267,13 +263,12 @@ def _pair(one: Named, two: Named, bound_ns: int) -> Pair:
     if left_ns > bound_ns:
         why = "they run apart" if apart_ppm else "their difference changes"
         why += f" by {format_difference(high_ns - low_ns)}"
-        return replace(pair, whole=whole, why=why)
+        return pair._replace(whole=whole, why=why)
     epoch = _epoch(estimate.domain, other.domain) if whole else ""
     why = whole or "a constant offset"
     if apart_ppm:
         why += f", running apart by {apart_ppm:.2f} ppm"
-    return replace(
-        pair,
+    return pair._replace(
         whole=whole,
         verdict=CORRECTABLE,
         correction=Correction(other_name, name, -offset_ns, epoch, left_ns),

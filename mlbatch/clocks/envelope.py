@@ -10,7 +10,7 @@ envelope of a range of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +34,7 @@ BACK = slice(12, 16)
 _WIDTH = 16
 
 
-@dataclass(frozen=True, slots=True)
-class BinTable:
+class BinTable(NamedTuple):
     """Bins of packets without a break: rows (bins, 16) int64, ns, in order of receive time."""
 
     rows: I64Array
@@ -168,8 +167,7 @@ _OUTLIER_NS = NS_PER_MS
 _OUTLIER_SCALES = 10
 
 
-@dataclass(frozen=True, slots=True)
-class BinRange:
+class BinRange(NamedTuple):
     """Rows `begin` to `end` of a table: a clock that runs without a step."""
 
     table: BinTable
@@ -251,8 +249,7 @@ _MAD_SIGMA = 1.4826
 _MEDIAN_ERROR = 1.25
 
 
-@dataclass(frozen=True, slots=True)
-class Envelope:
+class Envelope(NamedTuple):
     """The envelope of a range: the offset at knots, straight between them, ns."""
 
     host_ns: I64Array  # (k,) receive times of the knots, k >= 1

@@ -8,7 +8,7 @@ located in the bins. Smaller steps are not reported: the envelope follows them a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +44,7 @@ _PAUSE_NS = 20 * NS_PER_MS
 _PAUSE_PERIODS = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """A step between two ranges: stamp and receive time of the packets before and after it, ns."""
 
     before: tuple[int, int]
@@ -54,8 +53,7 @@ class Step:
     side: str  # `sensor` if the stamps step, `host` if the receive times do, "" if a pause hides it
 
 
-@dataclass(frozen=True, slots=True)
-class ClockTrack:
+class ClockTrack(NamedTuple):
     """A clock from its first packet to its last: ranges, their envelopes, steps between them."""
 
     parts: tuple[BinRange, ...]
@@ -162,8 +160,7 @@ def _level_changes(level: F64Array) -> F64Array:
     return size
 
 
-@dataclass(frozen=True, slots=True)
-class StepLocation:
+class StepLocation(NamedTuple):
     """A step in the rows of a table, and the packets before and after it (stamp, receive time)."""
 
     end: int  # end of the rows before the step

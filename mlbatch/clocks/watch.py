@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,7 @@ BURST_NS = 20 * NS_PER_MS
 _PPM = 1e6
 
 
-@dataclass(frozen=True, slots=True)
-class Jump:
+class Jump(NamedTuple):
     """A step of a clock."""
 
     host_ns: int  # receive time of the first packet after it
@@ -72,8 +71,7 @@ class Jump:
         return f"{self.kind} by {size}: from {before_s:.6f} s to {after_s:.6f} s"
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(NamedTuple):
     """A clock between two jumps: first and last stamp and receive time (ns), domain, envelope."""
 
     first_stamp_ns: int
@@ -85,8 +83,7 @@ class Segment:
     envelope: Envelope
 
 
-@dataclass(frozen=True, slots=True)
-class ClockEstimate:
+class ClockEstimate(NamedTuple):
     """Estimate of a sensor's clock."""
 
     packets: int
@@ -274,14 +271,12 @@ def without_host_steps(
     for jump, one in zip(estimate.jumps, estimate.segments[1:], strict=True):
         if jump.kind in kinds:
             moved_ns -= jump.size_ns
-        envelope = replace(
-            one.envelope,
+        envelope = one.envelope._replace(
             host_ns=one.envelope.host_ns - moved_ns,
             offset_ns=one.envelope.offset_ns + moved_ns,
         )
         segments.append(
-            replace(
-                one,
+            one._replace(
                 first_host_ns=one.first_host_ns - moved_ns,
                 last_host_ns=one.last_host_ns - moved_ns,
                 envelope=envelope,

@@ -128,8 +128,8 @@ class Joiner:
         """Add the columns of the next window."""
         ended = []
         for index, cutter in enumerate(self._cutters):
-            own = window.sensor == index
-            ended += cutter.push(window.stamp_ns[own], window.encoder[own])
+            own = window.columns.sensor == index
+            ended += cutter.push(window.columns.stamp_ns[own], window.columns.encoder[own])
         for sweep in publication_order(ended):
             self._columns += sweep.columns
             self.lengths_ns[sweep.sensor].append(sweep.ready_ns - sweep.first_ns)
@@ -190,7 +190,7 @@ def _run(run: Conversion, joiner: Joiner, statistics: SetStatistics) -> tuple[in
         end_ns = window.end_ns
         if previous is not None:
             statistics.add(_sweeps_of(previous, len(run.sensors)))
-            columns += len(previous.stamp_ns)
+            columns += len(previous.columns)
         # As in a conversion, the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None
     run.session.refuse_absent()
@@ -204,7 +204,7 @@ def _sweeps_of(window: Window, sensors: int) -> SweepSet:
     """The columns of each sensor in a window."""
     parts: list[Sweep | None] = []
     for index in range(sensors):
-        stamp_ns = window.stamp_ns[window.sensor == index]
+        stamp_ns = window.columns.stamp_ns[window.columns.sensor == index]
         part = None
         if len(stamp_ns):
             first_ns = int(stamp_ns[0])

@@ -10,24 +10,22 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import sub
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.decode.coverage import NO_COLUMNS, ColumnStats
 from mlbatch.decode.engine import Engine, EngineSetup
 from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns, by_time
+from mlbatch.decode.scan_buffer import ScanBuffer, by_time
 from mlbatch.report.ledger import PointCounts
-from mlbatch.types import EXTRAS, RunInfo, Scan
+from mlbatch.types import EXTRAS, NO_COLUMNS, RunInfo, Scan, WindowColumns, WindowFigures
 
 __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
 # Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
-Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +38,7 @@ class ScanHeader:
     end_ns: int
     complete: bool
     ready_host_ns: int
+    figures: WindowFigures = ()  # by sensor
     edge_gap_ns: tuple[int, ...] = ()  # by sensor, widest gap at either bound
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     is_partial: bool = False
@@ -120,9 +119,7 @@ class Decoder:
             organized_slots=self._slots if self._is_organized else 0,
         )
         self._engine = choice.make(setup)
-        angles = [source.lidar.beams.angle_rad for source in sources]
-        positions = [None if one is None else len(one) for one in angles]
-        self._statistics = self._engine.column_statistics(positions)
+        self._counts = [self._projectors[which].counts[member] for which, member in self._seat]
         self._buffer = self._new_buffer(0)
         # With `sort` the points before they are sorted; no scan has views of it.
         self._unsorted = self._new_buffer(0)
@@ -131,7 +128,7 @@ class Decoder:
     @property
     def counts(self) -> list[PointCounts]:
         """Point counters of each sensor."""
-        return [self._projectors[which].counts[member] for which, member in self._seat]
+        return self._counts
 
     def scan(
         self,
@@ -186,9 +183,12 @@ class Decoder:
         return ScanBuffer(rows, self._slots if self._is_organized else None)
 
     def _written(self) -> list[int]:
-        """Return the points so far of each sensor of the run."""
-        own = [one.written for one in self.counts]
-        return self._of_all(own, 0)
+        """Return the points so far of each sensor of the run; 0 without a decoder here."""
+        own = [one.written for one in self._counts]
+        if self._only is None:
+            return own
+        others = [0] * (len(self._info.sensors) - 1)
+        return [*others[: self._only], *own, *others[self._only :]]
 
     def _scan(
         self, columns: WindowColumns, header: ScanHeader, points: int, before: Sequence[int]
@@ -196,8 +196,8 @@ class Decoder:
         """before: points of each sensor before this scan."""
         rows = slice(0, len(columns) if self._is_organized else points)
         buffer = self._buffer
-        stats = self._column_stats(columns)
-        edge_gap_ns = header.edge_gap_ns or (0,) * len(stats)
+        figures = header.figures or (NO_COLUMNS,) * len(self._info.sensors)
+        edge_gap_ns = header.edge_gap_ns or (0,) * len(figures)
         has_column = "column" in self._extras and not self._is_organized
         return Scan(
             info=self._info,
@@ -211,19 +211,19 @@ class Decoder:
             intensity=buffer.point[rows, ..., 3],
             reflectivity=buffer.reflectivity[rows] if self._has_reflectivity else None,
             range_m=buffer.range_m[rows] if "range_m" in self._extras else None,
-            time_ns=buffer.label["time_ns"][rows],
-            ring=buffer.label["ring"][rows],
-            return_type=buffer.label["return_type"][rows],
-            lidar_id=buffer.label["lidar_id"][rows],
+            time_ns=buffer.time_ns[rows],
+            ring=buffer.ring[rows],
+            return_type=buffer.return_type[rows],
+            lidar_id=buffer.lidar_id[rows],
             column=buffer.column[rows] if has_column else None,
             column_stamp_ns=columns.stamp_ns,
             column_lidar_id=self._lidar_id(columns),
             points=points,
-            columns_per_sensor=tuple(one.columns for one in stats),
+            columns_per_sensor=tuple([one.columns for one in figures]),
             points_per_sensor=tuple(map(sub, self._written(), before)),
-            max_gap_ns=tuple(map(max, (one.max_gap_ns for one in stats), edge_gap_ns)),
-            coverage=tuple(one.coverage for one in stats),
-            overlap=tuple(one.overlap for one in stats),
+            max_gap_ns=tuple(map(max, [one.max_gap_ns for one in figures], edge_gap_ns)),
+            coverage=tuple([one.coverage for one in figures]),
+            overlap=tuple([one.overlap for one in figures]),
             fill=header.fill,
             is_partial=header.is_partial,
         )
@@ -232,17 +232,6 @@ class Decoder:
         if self._only is not None:
             return np.full(len(columns), self._only, np.uint8)
         return columns.sensor.astype(np.uint8)
-
-    def _column_stats(self, columns: WindowColumns) -> list[ColumnStats]:
-        """Return the column statistics of all sensors of the run."""
-        return self._of_all(self._statistics.measure(columns), NO_COLUMNS)
-
-    def _of_all(self, own: list[Value], nothing: Value) -> list[Value]:
-        """Return values of all sensors of the run; nothing: of those without a decoder here."""
-        if self._only is None:
-            return own
-        others = [nothing] * (len(self._info.sensors) - 1)
-        return [*others[: self._only], *own, *others[self._only :]]
 
 
 def _groups(sources: Sequence[Source], joins_rotors: bool) -> list[list[int]]:

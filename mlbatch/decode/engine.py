@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from mlbatch.arrays import I64Array
-from mlbatch.decode.coverage import ColumnStatistics
 from mlbatch.decode.projector import Extras, Projector
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
+from mlbatch.decode.scan_buffer import ScanBuffer
+from mlbatch.types import WindowColumns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,8 +40,4 @@ class Engine(Protocol):
 
         start_ns: start of the scan; first_number: number of the first column in the scan.
         """
-        ...
-
-    def column_statistics(self, positions: Sequence[int | None]) -> ColumnStatistics:
-        """Return an object that measures columns; positions: as of `ColumnStatistics`."""
         ...

@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, I64Array
-from mlbatch.decode.coverage import ColumnStatistics, ColumnStats
 from mlbatch.decode.engine import EngineSetup
 from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Projector
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
-from mlbatch.lidar.geometry import SECTORS, Tabled, Turning, rotor_angles
+from mlbatch.decode.scan_buffer import ScanBuffer
+from mlbatch.lidar.geometry import Tabled, Turning, rotor_angles
 from mlbatch.lidar.interface import Lidar
 from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
 from mlbatch.native.library import Field, Group, Ring, Scan, address, library
+from mlbatch.types import WindowColumns
 
 # As in `native.h`.
 _TABLED, _TURNING, _COPIED = range(3)
@@ -34,8 +34,8 @@ _MOST_WORDS = 3
 _WORD_BYTES = 4
 # Beams of a plane are a multiple of this.
 _BEAMS_TOGETHER = 16
+_BEAMS_OF_FOUR = 4
 _COUNTS = 5
-_FIGURES = 6
 _UNSURE = np.float32(2)
 _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
 # The return type in a label.
@@ -51,6 +51,8 @@ class NativeEngine:
         self._copies: list[_CopiedGroup] = []
         self._groups: list[_DecodedGroup] = []
         self._organized_numpy: list[NumpyEngine] = []
+        # Of the last call; None: before the first.
+        self._out: ScanBuffer | None = None
         sensors = len(setup.seat)
         self._group_of = np.full(sensors, -1, np.int64)
         self._member_of = np.zeros(sensors, np.int64)
@@ -89,18 +91,16 @@ class NativeEngine:
         # Columns in one call: what numpy decodes is copied from a buffer.
         self._most_columns = setup.tile_columns if self._copies else None
 
-    def column_statistics(self, positions: Sequence[int | None]) -> ColumnStatistics:
-        """See `Engine`."""
-        return NativeColumnStatistics(positions)
-
     def decode(
         self, columns: WindowColumns, start_ns: int, first_number: int, out: ScanBuffer
     ) -> int:
         """See `Engine.decode`."""
         scan = self._scan
-        # Kept until the call returns: another thread may let a ring grow.
-        kept = [group.use_rings() for group in self._groups]
+        # The arrays are kept until the call returns: another thread may let a ring grow.
+        for group in self._groups:
+            group.use_rings()
         self._use_outputs(out)
+        kept: list[list[npt.NDArray[Any]]] = []
         scan.start_ns = start_ns
         most = self._most_columns or max(len(columns), 1)
         row = 0
@@ -152,6 +152,9 @@ class NativeEngine:
 
     def _use_outputs(self, out: ScanBuffer) -> None:
         """Point the struct to the arrays of a scan; organized rows are written as a whole."""
+        if out is self._out:
+            return
+        self._out = out
         scan = self._scan
         extras = self._extras
         scan.point = address(out.point)
@@ -178,7 +181,11 @@ class _DecodedGroup:
         self._slots = projectors[0].slots
         self._counts = np.zeros((len(self._counters), _COUNTS), np.int64)
         self._arrays: list[Any] = []
+        # Of the last call; None: before the first.
+        self._pieces: list[npt.NDArray[np.void] | None] = [None] * len(self._rings)
+        self._ring_structs = (Ring * len(self._rings))()
         self.struct = struct
+        struct.rings = ctypes.addressof(self._ring_structs)
         struct.beams = lidar.channels
         struct.width = _width(lidar)
         struct.returns = lidar.returns
@@ -193,27 +200,31 @@ class _DecodedGroup:
             rotors = [one.projection for one in projectors]
             self._set_rotors([one for one in rotors if isinstance(one, Turning)], lidar.channels)
         self._set_slots(projectors[0])
+        struct.fits_fours = _fits_fours(projectors[0], table)
         self._set_labels(projectors)
         if any(one.is_limited for one in projectors):
             limits_m = np.concatenate([one.limits_m for one in projectors])
             self.struct.limits_m = self._kept(limits_m)
 
-    def use_rings(self) -> list[Any]:
-        """Point the struct to the rings as they are; return the arrays to keep."""
-        pieces = [ring.pieces for ring in self._rings]
-        # Arrays of columns (rows, columns of a row).
-        rings = (Ring * len(pieces))(
-            *(Ring(one.ctypes.data, *one.shape, *one.strides) for one in pieces)
-        )
-        self.struct.rings = ctypes.addressof(rings)
-        self._counts[:] = 0
-        return [pieces, rings]
+    def use_rings(self) -> None:
+        """Point the struct to the rings as they are, and keep their arrays."""
+        self._counts.fill(0)
+        for number, ring in enumerate(self._rings):
+            # Columns (rows, columns of a row).
+            pieces, origin = ring.view
+            if pieces is not self._pieces[number]:
+                self._pieces[number] = pieces
+                self._ring_structs[number] = Ring(
+                    pieces.ctypes.data, *pieces.shape, *pieces.strides, origin
+                )
 
     def add_counts(self) -> None:
         """Add the counts since `use_rings` to the point counters."""
         slots = self._slots
         for counts, row in zip(self._counters, self._counts.tolist(), strict=True):
             columns, found, distinct, in_range, outside = row
+            if not columns:
+                continue
             counts.slots += columns * slots
             counts.no_return += columns * slots - found
             counts.repeated += found - distinct
@@ -338,38 +349,6 @@ class _CopiedGroup:
         self._engine.decode(columns, start_ns, first_number, self._decoded, points)
 
 
-class NativeColumnStatistics(ColumnStatistics):
-    """Column statistics of every sensor in one pass."""
-
-    def __init__(self, positions: Sequence[int | None]) -> None:
-        super().__init__(positions)
-        self._library = library()
-        self._figures = np.zeros((len(positions), _FIGURES), np.int64)
-        self._position_counts = np.array([one or 0 for one in positions], np.int64)
-        self._entered = np.zeros((len(positions), SECTORS), np.int64)
-
-    def measure(self, columns: WindowColumns) -> list[ColumnStats]:
-        """See `ColumnStatistics`; numpy measures if a position is beyond the revolution."""
-        arrays = [
-            np.ascontiguousarray(array, np.int64)
-            for array in (columns.stamp_ns, columns.sensor, columns.encoder)
-        ]
-        if self._library.mlbatch_statistics(
-            len(columns),
-            *map(address, arrays),
-            len(self._figures),
-            SECTORS,
-            address(self._position_counts),
-            address(self._entered),
-            address(self._figures),
-        ):
-            return super().measure(columns)
-        return [
-            ColumnStats(count, gap_ns, passed / SECTORS, passed_again / SECTORS)
-            for count, gap_ns, passed, passed_again, *_ in self._figures.tolist()
-        ]
-
-
 def native_angles(words: I64Array) -> tuple[F32Array, F32Array]:
     """Return the result of `rotor_angles` for rotor words (n,), equal to the last bit."""
     words = np.ascontiguousarray(words)
@@ -418,6 +397,19 @@ def _is_inside_return(lidar: Lidar, table: PixelTable, layout: ReturnLayout) -> 
         and run.channel + run.channels <= lidar.channels
         for run in layout.runs
     )
+
+
+def _fits_fours(projector: Projector, table: PixelTable) -> bool:
+    """Return whether the beams of a column can be decoded four at a time, in wire order."""
+    lidar = projector.lidar
+    if lidar.returns > 1 or projector.order is not None or table.dark:
+        return False
+    channel = 0
+    for run in table.returns[0].runs:
+        if run.channel != channel or run.channels % _BEAMS_OF_FOUR:
+            return False
+        channel += run.channels
+    return channel == lidar.channels == projector.slots
 
 
 def _fields(layout: ReturnLayout) -> tuple[list[int], list[tuple[int, int, int, bool]]]:

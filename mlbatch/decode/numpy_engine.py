@@ -13,10 +13,10 @@ from itertools import pairwise
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.decode.coverage import ColumnStatistics
 from mlbatch.decode.engine import EngineSetup
 from mlbatch.decode.projector import Projector, Tile, TileView, points_by_column
-from mlbatch.decode.scan_buffer import ScanBuffer, WindowColumns
+from mlbatch.decode.scan_buffer import ScanBuffer
+from mlbatch.types import WindowColumns
 
 
 @dataclass(slots=True)
@@ -59,10 +59,6 @@ class NumpyEngine:
         first = np.array([0, *self._ends])[seat[:, 0]]
         skipped = len(self._member)
         self._seat = np.where(seat[:, 0] < 0, skipped, first + seat[:, 1]).astype(np.uint8)
-
-    def column_statistics(self, positions: Sequence[int | None]) -> ColumnStatistics:
-        """See `Engine`."""
-        return ColumnStatistics(positions)
 
     def decode(
         self,

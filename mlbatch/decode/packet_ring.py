@@ -36,15 +36,18 @@ class PacketRing:
         self._sums: U64Array = np.zeros(_FIRST_PACKETS, np.uint64)
         self._use(self._allocate(_FIRST_PACKETS), _FIRST_PACKETS)
 
-    @property
-    def pieces(self) -> npt.NDArray[np.void]:
-        """View of all columns, (rows, columns of a row), one element of `records.size` bytes each.
+    def column_offsets(self, columns: int) -> I64Array:
+        """Return the ring indexes of the columns of a packet, relative to the first: (columns,)."""
+        return np.arange(columns)
 
-        The column at `ring_index` has the flat index `ring_index` modulo the size. `store` may
-        replace the view by a larger one at any time: take it once, then use that.
+    @property
+    def view(self) -> tuple[npt.NDArray[np.void], int]:
+        """All columns, (rows, columns of a row), one element of `records.size` bytes each; origin.
+
+        The column at `ring_index` has the flat index `ring_index - origin` modulo the size. `store`
+        may replace the view by a larger one at any time: take it once, then use that.
         """
-        pieces: npt.NDArray[np.void] = self._pieces
-        return pieces
+        return self._pieces, 0
 
     @property
     def nbytes(self) -> int:
@@ -52,12 +55,16 @@ class PacketRing:
         return self._bytes.nbytes
 
     def store(
-        self, data: U8Array, start: I64Array, oldest_ring_index: int | None
+        self,
+        data: U8Array,
+        start: I64Array,
+        oldest_ring_index: int | None,
+        place: int | None = None,
     ) -> tuple[U8Array, I64Array]:
         """Copy packets in; return a view (P, packet_size) and each packet's first ring index (P,).
 
-        data, start: as in `PacketBatch`; oldest_ring_index: first ring index that is still needed,
-        None if none is. The view is valid until the next call.
+        data, start, place: as in `PacketBatch`; oldest_ring_index: first ring index that is still
+        needed, None if none is. The view is valid until the next call.
         """
         count = len(start)
         oldest = self._next if oldest_ring_index is None else oldest_ring_index // self._places
@@ -75,7 +82,7 @@ class PacketRing:
                 at += stride
         if count and self._has_sums:
             sums = self._sums[slot % self._capacity :][:count]
-            np.cumsum(_sums(packets), out=sums)
+            np.cumsum(packet_sums(packets), out=sums)
             sums += self._sum
             self._sum = sums[-1]
         self._next = slot + count
@@ -88,7 +95,7 @@ class PacketRing:
     def sum_until(self, ring_index: int) -> int:
         """Return the sum of all packets since `keep_sums`, up to that of a column still needed.
 
-        See `_sums`. Only for the thread that stores packets.
+        See `packet_sums`. Only for the thread that stores packets.
         """
         return int(self._sums[ring_index // self._places % self._capacity])
 
@@ -171,7 +178,7 @@ class PacketRing:
         self._use(new, larger)
 
 
-def _sums(packets: U8Array) -> U64Array:
+def packet_sums(packets: U8Array) -> U64Array:
     """Return the checksums of packets (n, size): sums of their 64-bit words, modulo 2^64.
 
     They cost a hundredth of what CRC-32 of zlib costs. Every change of a single byte changes the

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
+from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, Labels
 from mlbatch.lidar.geometry import Projection, Tabled, Turning, blocks, read_rotor_words
@@ -42,7 +43,7 @@ class Source:
     """
 
     lidar: Lidar
-    ring: PacketRing
+    ring: PacketRing | ArenaRing
     body_from_sensor: F64Array
     ring_base: int
     min_range_m: float = 0.0

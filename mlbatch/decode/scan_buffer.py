@@ -1,8 +1,7 @@
-"""Input and output of decoding: the columns of a window, the arrays of a scan."""
+"""Output of decoding: the arrays of a scan."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -15,28 +14,6 @@ from mlbatch.arrays import I64Array
 LABEL = np.dtype([("time_ns", "<u4"), ("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
 Labels: TypeAlias = npt.NDArray[np.void]
 _NAN = np.float32("nan")
-
-
-@dataclass(slots=True)
-class WindowColumns:
-    """Columns of a window in their final order; all arrays (n,) int64, fields as in `Columns`."""
-
-    stamp_ns: I64Array
-    sensor: I64Array
-    ring_index: I64Array
-    encoder: I64Array
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
-    def take(self, index: slice | I64Array) -> WindowColumns:
-        """Return the columns at `index`."""
-        return WindowColumns(
-            self.stamp_ns[index],
-            self.sensor[index],
-            self.ring_index[index],
-            self.encoder[index],
-        )
 
 
 class ScanBuffer:
@@ -57,6 +34,14 @@ class ScanBuffer:
         self.reflectivity = np.empty(shape, np.uint16)
         self.label = np.empty(shape, LABEL)
         self.column = np.empty(rows if slots is None else 0, np.uint32)
+        self.view_labels()
+
+    def view_labels(self) -> None:
+        """Make views of the fields of the labels, since to make them costs more than to cut."""
+        self.time_ns = self.label["time_ns"]
+        self.ring = self.label["ring"]
+        self.return_type = self.label["return_type"]
+        self.lidar_id = self.label["lidar_id"]
 
     def clear(self, rows: I64Array) -> None:
         """Empty all slots of some rows: NaN in float arrays, 0 in integer arrays."""

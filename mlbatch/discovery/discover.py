@@ -5,10 +5,10 @@ from __future__ import annotations
 import difflib
 import ipaddress
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from mlbatch.discovery.match import (
     is_model,
     match,
     match_rig,
+    senders,
 )
 from mlbatch.discovery.probe import (
     MetadataCollector,
@@ -66,8 +67,7 @@ class SensorSelection:
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
 
 
-@dataclass(frozen=True, slots=True)
-class Ignored:
+class Ignored(NamedTuple):
     """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
 
     sensors: tuple[DetectedSensor, ...] = ()
@@ -313,11 +313,11 @@ def _match(
     for sensor in rig.sensors:
         _refuse_undecodable(sampler, sensor, origin)
         _refuse_unknown_model(sensor, origin)
-    # Built-in calibrations load all vendors, and are not needed where the rig names all files.
+    sent_by = senders(sampler)
     expected = [
         ExpectedSensor(
             sensor,
-            [*calibrations, *sensors.built_in()]
+            [*calibrations, *_built_in(sent_by, sensor)]
             if sensor.metadata is None
             else [read_given(sensor.metadata)],
             selection.decode,
@@ -335,6 +335,16 @@ def _match(
                 f"metadata of {detected.lidar.model}; correct model or metadata"
             )
     return matched
+
+
+def _built_in(sent_by: Collection[str], sensor: RigSensor) -> tuple[Calibration, ...]:
+    """Built-in calibrations of vendors that sent packets, and of the vendor of the rig's model.
+
+    More than one, else all: a sensor that sent no packet is decided by how many there are.
+    """
+    named = () if sensor.model is None else sensors.vendor_of(sensor.model)
+    found = sensors.built_in({*sent_by, *named})
+    return found if len(found) > 1 else sensors.built_in()
 
 
 def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:
@@ -355,15 +365,17 @@ def _is_readable(sampler: Sampler, kinds: Sequence[PacketKind], sensor: RigSenso
     """Whether packets of unknown model can be decoded as the model that the rig names."""
     if sensor.model is None:
         return False
-    named = [one for one in sensors.built_in() if one.model == sensor.model]
+    vendor = sensors.vendor_of(sensor.model)
+    named = [one for one in sensors.built_in(vendor) if one.model == sensor.model]
     return any(one.match_score(sampler.evidence(kind)) for one in named for kind in kinds)
 
 
 def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
     if sensor.model is None:
         return
-    known = [model.name for model in sensors.models()]
-    if sensor.model not in known:
+    likely = sensors.models(sensors.vendor_of(sensor.model))
+    if all(row.name != sensor.model for row in likely):
+        known = [model.name for model in sensors.models()]
         # Another case is more likely than other letters.
         near = [name for name in known if name.lower() == sensor.model.lower()]
         near = near or difflib.get_close_matches(sensor.model, known, 1)
@@ -619,7 +631,7 @@ def _choose(
             if word not in known
             and not _is_address(word)
             and not any(
-                _is_ignored(sampler, replace(others, words=(word,)), kind) for kind in lidar_kinds
+                _is_ignored(sampler, others._replace(words=(word,)), kind) for kind in lidar_kinds
             )
         ]
     for word in unknown:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NoReturn, TypeAlias
+from typing import Literal, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
 
@@ -261,8 +261,7 @@ class _FramesFound:
     reasons: dict[str, str] = field(default_factory=dict)  # why the other sensors have none
 
 
-@dataclass(frozen=True, slots=True)
-class _FrameFinder:
+class _FrameFinder(NamedTuple):
     """Finds the frames of sensors in a tree."""
 
     tree: FrameTree

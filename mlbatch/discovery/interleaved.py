@@ -8,7 +8,7 @@ sequence. Two lidars send packets that overlap, or are of two clocks, while both
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,8 +64,7 @@ def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
     return ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Packets:
+class _Packets(NamedTuple):
     """Sampled packets of one kind, in receive order; (n,) each.
 
     position: among all packets of the kind; stamp_ns: of the first column; rotor: revolutions,

@@ -39,8 +39,7 @@ class Matched:
 # -- the scorer -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(NamedTuple):
     """A calibration that matches packets."""
 
     score: int
@@ -144,6 +143,18 @@ def _other_size(table: StreamTable, lidar: Lidar, kind: PacketKind) -> list[str]
     ]
 
 
+def senders(sampler: Sampler) -> set[str]:
+    """Names of the built-in vendors that may have sent packets of a recording.
+
+    Built-in calibrations of others match none of them.
+    """
+    return {
+        name
+        for kind, samples in sampler.kinds.items()
+        for name in sensors.senders(kind.size, samples.arrays()[0])
+    }
+
+
 # -- without a rig --------------------------------------------------------------------------------
 
 
@@ -154,7 +165,7 @@ def match(
 
     Raises RecordingError where several calibrations match packets equally well.
     """
-    every = [*calibrations, *sensors.built_in()]
+    every = [*calibrations, *sensors.built_in(senders(sampler))]
     # By index of the calibration, and by stream where it is shared.
     found: dict[tuple[int, int], DetectedSensor] = {}
     matched = Matched([], [])
@@ -308,7 +319,8 @@ def match_rig(sampler: Sampler, expected: Sequence[ExpectedSensor], origin: Path
 
 def is_model(expected: str, found: str) -> bool:
     """True if a lidar may be of the model that the rig names."""
-    reported_as = {model.same_packets_as for model in sensors.models() if model.name == expected}
+    rows = sensors.models(sensors.vendor_of(expected))
+    reported_as = {row.same_packets_as for row in rows if row.name == expected}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
     return found in reported_as or found.replace("-", "").startswith(expected.replace("-", ""))
 

@@ -7,8 +7,8 @@ appears later joins a sensor only if its packets identify the sensor.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from mlbatch.arrays import U8Array
 from mlbatch.discovery.sampler import are_neighbours
@@ -26,8 +26,7 @@ class Role(Enum):
     UNASSIGNED = "unassigned"
 
 
-@dataclass(frozen=True, slots=True)
-class Route:
+class Route(NamedTuple):
     """Destination of the packets of a kind."""
 
     role: Role

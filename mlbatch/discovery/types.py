@@ -23,8 +23,7 @@ class PacketKind(NamedTuple):
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Note:
+class Note(NamedTuple):
     """A warning: a short code, the name of the sensor concerned (or ""), one line of text."""
 
     code: str

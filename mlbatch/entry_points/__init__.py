@@ -7,8 +7,12 @@ built-in plug-in fits: `importlib.metadata` takes up to 0.05 s to import and to 
 from __future__ import annotations
 
 import importlib
+import os
+import sys
 from collections.abc import Collection
 from functools import cache
+from importlib.machinery import PathFinder
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import UsageError
@@ -86,6 +90,8 @@ def _distribution(entry_point: EntryPoint) -> str:
 @cache
 def _entry_points(group: str) -> dict[str, list[EntryPoint]]:
     """Entry points by name; the same one is found twice where a path is listed twice."""
+    if not _may_be_installed(group):
+        return {}
     # Slow to import.
     metadata = importlib.import_module("importlib.metadata")
     found: dict[str, list[EntryPoint]] = {}
@@ -94,3 +100,35 @@ def _entry_points(group: str) -> dict[str, list[EntryPoint]]:
         if entry_point not in known:
             known.append(entry_point)
     return found
+
+
+def _may_be_installed(group: str) -> bool:
+    """False if no distribution on the path has entry points of a group.
+
+    Their files are searched for its name, in a twentieth of the time that `importlib.metadata`
+    takes. True if something on the path is not a folder, or is searched by an own finder.
+    """
+    finders = (finder for finder in sys.meta_path if hasattr(finder, "find_distributions"))
+    if any(finder is not PathFinder for finder in finders):
+        return True
+    head = f"[{group}]".encode()
+    return any(_may_have(Path(place), head) for place in sys.path)
+
+
+def _may_have(place: Path, head: bytes) -> bool:
+    """Whether a folder of the path may have a distribution whose entry points have this head."""
+    if place.is_file() or place.suffix == ".egg":
+        return True
+    try:
+        names = os.listdir(place)
+    except OSError:
+        return False
+    for name in names:
+        if name.lower().endswith((".dist-info", ".egg-info")):
+            try:
+                found = head in (place / name / "entry_points.txt").read_bytes()
+            except OSError:
+                continue
+            if found:
+                return True
+    return False

@@ -313,7 +313,7 @@ def _flip_bit(batch: PacketBatch, rows: I64Array, drawn: U64Array) -> PacketBatc
     data: U8Array = np.concatenate([batch.data[first:last], flipped.data])
     start = batch.start - first
     start[rows] = last - first + flipped.start
-    return replace(batch, data=data, start=start)
+    return replace(batch, data=data, start=start, place=None)
 
 
 # By kind, in the order of application: function, and smallest payload that can be damaged.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.tree import clean
@@ -24,8 +25,7 @@ class Candidate:
     sensor_from_frame: F64Array | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Naming:
+class Naming(NamedTuple):
     """Frame names of a vendor's driver.
 
     points: frames of the points; lidar: frames rotated against them by the metadata; nick: words

@@ -11,6 +11,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,8 +52,7 @@ class Chain:
         return " -> ".join(self.frames)
 
 
-@dataclass(frozen=True, slots=True)
-class _Climb:
+class _Climb(NamedTuple):
     """The path from a frame to its root; problem: why it ends before, "" at a root."""
 
     frames: list[str]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable, Projection
@@ -16,8 +16,7 @@ from mlbatch.types import ColumnHeaders, ImuSamples, Pixels, Stream
 FAULTS = ("", "bad_size", "bad_header", "bad_crc")
 
 
-@dataclass(frozen=True, slots=True)
-class SensorModel:
+class SensorModel(NamedTuple):
     """A row of `mlbatch sensors`: a supported model.
 
     returns: supported numbers of returns; clock, calibration: their sources; verified: how the
@@ -100,8 +99,7 @@ class ModelFile(Calibration, Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Records:
+class Records(NamedTuple):
     """Positions of the columns of a packet.
 
     Column c begins `start + (c // per_row) * stride + (c % per_row) * step` bytes from the start
@@ -172,6 +170,11 @@ class Lidar(Protocol):
     # Source of the calibration, for people.
     calibration: str
     notes: tuple[str, ...]
+
+    @property
+    def header_bytes(self) -> I64Array:
+        """All that is read of packets but pixels: (k, 2), first byte and number of bytes."""
+        ...
 
     @property
     def columns_per_s(self) -> float:

@@ -189,6 +189,14 @@ static void combine(const float *restrict vectors, int64_t width, int64_t used,
     }
 }
 
+/* Speed of the rotor in a rotor word, radians in a ns. */
+static float speed_of(int64_t encoder)
+{
+    const int64_t field = encoder >> SPEED_BIT & (2 * SPEED_SIGN - 1);
+    /* The constant is 2 pi / 2**48 as Python computes it. */
+    return (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
+}
+
 /* Turning: each beam fires at its own angle of the rotor. */
 static void project_turning(const Group *group, int64_t member, int64_t encoder, int64_t table,
                             int64_t column, Planes *planes)
@@ -196,10 +204,7 @@ static void project_turning(const Group *group, int64_t member, int64_t encoder,
     _Alignas(64) float cosine[MOST_BEAMS], sine[MOST_BEAMS];
     _Alignas(64) float direction[3][MOST_BEAMS], origin[3][MOST_BEAMS];
     const int64_t width = group->width;
-    const int64_t field = encoder >> SPEED_BIT & (2 * SPEED_SIGN - 1);
-    /* Radians in a ns; the constant is 2 pi / 2**48 as Python computes it. */
-    const float speed =
-        (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
+    const float speed = speed_of(encoder);
     for (int64_t beam = 0; beam < width; beam++) {
         cosine[beam] = group->cosine[column];
         sine[beam] = group->sine[column];
@@ -332,11 +337,11 @@ static inline void put_point(float *point, const Planes *planes, int64_t element
 #if defined(__SSE2__)
 /* Store the points and labels of the lanes in `kept` to rows from `row`; others are overwritten by
    the next point. p0 to p3: x, y, z, level of four beams. Return the next row. */
-static inline int64_t store_kept(const Scan *scan, int64_t row, int kept, __m128 p0, __m128 p1,
-                                 __m128 p2, __m128 p3, __m128i low, __m128i high)
+static inline int64_t store_kept(float *point, int64_t *labels, int64_t row, int kept, __m128 p0,
+                                 __m128 p1, __m128 p2, __m128 p3, __m128i low, __m128i high)
 {
-    float *point = scan->point + 4 * row;
-    int64_t *labels = scan->label + row;
+    point += 4 * row;
+    labels += row;
     _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
     if (kept == 15) {
         _mm_storeu_ps(point, p0);
@@ -362,86 +367,280 @@ static inline int64_t store_kept(const Scan *scan, int64_t row, int kept, __m128
 }
 #endif
 
-/* Points of one return in wire order without filters, whose planes are ready; labels are made on
-   the way. Return the next row. */
-static int64_t emit_plain(const Scan *scan, const Group *group, const int64_t *words,
-                          int64_t offset_ns, int64_t row, const Planes *planes)
-{
-    int64_t beam = 0;
+/* -- the usual case in one pass ----------------------------------------------------------------- */
+
 #if defined(__SSE2__)
-    const __m128i offsets = _mm_set1_epi64x(offset_ns);
-    for (; beam + 4 <= group->slots; beam += 4) {
-        const int kept = _mm_movemask_ps(
-            _mm_cmpgt_ps(_mm_load_ps(planes->range_m + beam), _mm_setzero_ps()));
+/* What the beams of a column have in common. Beams are done by fours, from pixels to rows. */
+typedef struct {
+    __m128i mask, level_mask, reflectivity_mask, silent, offsets;
+    __m128i shift, level_shift, reflectivity_shift;
+    __m128 factor, divisor, cosine, sine, speed;
+    __m128 low_m, high_m;
+    __m128 origin[3]; /* TABLED */
+    const float *direction, *origins, *reach, *firing_ns;
+    const int64_t *words;
+    float *point;
+    int64_t *label;
+    int64_t used, width, distance_byte, level_byte, reflectivity_byte;
+    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras;
+} Column;
+
+static const uint8_t LANES[16] = {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4};
+
+static inline __m128i load_four(const uint8_t *from, int64_t step)
+{
+    if (step == 4)
+        return _mm_loadu_si128((const __m128i *)from);
+    int32_t words[4];
+    for (int lane = 0; lane < 4; lane++)
+        memcpy(words + lane, from + lane * step, 4);
+    return _mm_set_epi32(words[3], words[2], words[1], words[0]);
+}
+
+static inline __m128 multiply_add(__m128 a, __m128 b, __m128 c, __m128 d)
+{
+    return _mm_add_ps(_mm_mul_ps(a, b), _mm_mul_ps(c, d));
+}
+
+/* cos * V1 + sin * V2 + V3 of one axis, as `combine`. */
+static inline __m128 combine_four(const float *vectors, int64_t width, int64_t used, __m128 cosine,
+                                  __m128 sine)
+{
+    const __m128 third = _mm_loadu_ps(vectors + 6 * width);
+    if (!(used & 1))
+        return third;
+    const __m128 turned = multiply_add(cosine, _mm_loadu_ps(vectors), sine,
+                                       _mm_loadu_ps(vectors + 3 * width));
+    return used >> 3 & 1 ? _mm_add_ps(turned, third) : turned;
+}
+
+static inline void place_tabled(const Column *own, int64_t width, int64_t beam, __m128 range_m,
+                                __m128 *xyz)
+{
+    const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(own->reach + beam));
+    for (int axis = 0; axis < 3; axis++) {
+        const float *vectors = own->direction + axis * width + beam;
+        const __m128 turned = multiply_add(own->cosine, _mm_loadu_ps(vectors), own->sine,
+                                           _mm_loadu_ps(vectors + 3 * width));
+        const __m128 direction = _mm_add_ps(turned, _mm_loadu_ps(vectors + 6 * width));
+        xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), own->origin[axis]);
+    }
+}
+
+static inline void place_turning(const Column *own, int64_t width, int64_t beam, __m128 range_m,
+                                 __m128 *xyz)
+{
+    __m128 cosine = own->cosine, sine = own->sine;
+    if (own->firing_ns) {
+        const __m128 turned = _mm_mul_ps(own->speed, _mm_loadu_ps(own->firing_ns + beam));
+        const __m128 half = _mm_mul_ps(turned, _mm_set1_ps(0.5f));
+        const __m128 before = cosine, across = sine;
+        cosine = _mm_sub_ps(
+            before, _mm_mul_ps(_mm_add_ps(_mm_mul_ps(half, before), across), turned));
+        sine = _mm_add_ps(
+            across, _mm_mul_ps(_mm_sub_ps(before, _mm_mul_ps(half, across)), turned));
+    }
+    if (own->reach)
+        range_m = _mm_add_ps(range_m, _mm_loadu_ps(own->reach + beam));
+    for (int axis = 0; axis < 3; axis++) {
+        const float *directions = own->direction + axis * width + beam;
+        const float *origins = own->origins + axis * width + beam;
+        const __m128 direction =
+            combine_four(directions, width, own->used >> axis, cosine, sine);
+        const __m128 origin =
+            combine_four(origins, width, own->used >> (6 + axis), cosine, sine);
+        xyz[axis] = _mm_add_ps(_mm_mul_ps(range_m, direction), origin);
+    }
+}
+
+/* Lanes of points outside of all boxes. */
+static inline int outside_boxes(const Scan *scan, const __m128 *xyz)
+{
+    __m128 inside = _mm_setzero_ps();
+    for (int64_t number = 0; number < scan->box_count; number++) {
+        const float *box = scan->boxes_m + 6 * number;
+        __m128 both = _mm_cmpeq_ps(_mm_setzero_ps(), _mm_setzero_ps());
+        for (int axis = 0; axis < 3; axis++) {
+            both = _mm_and_ps(both, _mm_cmpge_ps(xyz[axis], _mm_set1_ps(box[axis])));
+            both = _mm_and_ps(both, _mm_cmple_ps(xyz[axis], _mm_set1_ps(box[axis + 3])));
+        }
+        inside = _mm_or_ps(inside, both);
+    }
+    return ~_mm_movemask_ps(inside) & 15;
+}
+
+/* Ranges and reflectivities of the lanes in `kept` to rows from `row`. */
+static inline void store_extras(const Scan *scan, int64_t row, int kept, __m128 range_m,
+                                __m128i reflectivity)
+{
+    float ranges_m[4];
+    int32_t reflectivities[4];
+    _mm_storeu_ps(ranges_m, range_m);
+    _mm_storeu_si128((__m128i *)reflectivities, reflectivity);
+    for (int lane = 0; lane < 4; lane++) {
+        if (scan->range_m)
+            scan->range_m[row] = ranges_m[lane];
+        if (scan->reflectivity)
+            scan->reflectivity[row] = (uint16_t)reflectivities[lane];
+        row += kept >> lane & 1;
+    }
+}
+
+static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
+{
+    return _mm_and_si128(_mm_srl_epi32(words, shift), mask);
+}
+
+/* Four beams of a run: their pixels begin at `from`, or (TABLED) their words are in `near` and
+   `levels`. Return the next row. */
+static inline int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
+                                  int64_t kind, int64_t step, int is_plain, const uint8_t *from,
+                                  const uint32_t *near, const uint32_t *levels, int64_t beam, int64_t row, int64_t *counts)
+{
+    /* The distance is in the first word, as fields are listed. */
+    const __m128i first = kind == TABLED ? _mm_load_si128((const __m128i *)near)
+                                         : load_four(from + own->distance_byte, step);
+    __m128i value = _mm_srl_epi32(first, own->shift);
+    if (own->is_big) {
+        const __m128i byte = _mm_set1_epi32(0xFF);
+        value = _mm_or_si128(_mm_slli_epi32(_mm_and_si128(value, byte), 8),
+                             _mm_and_si128(_mm_srli_epi32(value, 8), byte));
+    }
+    value = _mm_and_si128(value, own->mask);
+    const __m128i found = _mm_cmpgt_epi32(value, own->silent);
+    int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
+    if (!kept)
+        return row;
+    const __m128 range_m = _mm_div_ps(
+        _mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), own->factor), own->divisor);
+    if (!is_plain && own->is_filtered)
+        counts[FOUND] += LANES[kept];
+    if (!is_plain && own->is_limited) {
+        kept &= _mm_movemask_ps(_mm_and_ps(_mm_cmpge_ps(range_m, own->low_m),
+                                           _mm_cmple_ps(range_m, own->high_m)));
         if (!kept)
-            continue;
-        const __m128i *own = (const __m128i *)(words + beam);
-        row = store_kept(scan, row, kept, _mm_load_ps(planes->x + beam),
-                         _mm_load_ps(planes->y + beam), _mm_load_ps(planes->z + beam),
-                         _mm_load_ps(planes->level + beam),
-                         _mm_add_epi64(_mm_loadu_si128(own), offsets),
-                         _mm_add_epi64(_mm_loadu_si128(own + 1), offsets));
+            return row;
     }
-#endif
-    for (; beam < group->slots; beam++) {
-        put_point(scan->point + 4 * row, planes, beam);
-        scan->label[row] = words[beam] + offset_ns;
-        row += planes->range_m[beam] > 0.0f;
+    if (!is_plain && own->has_boxes)
+        counts[IN_RANGE] += LANES[kept];
+    __m128 xyz[3];
+    if (kind == TABLED)
+        place_tabled(own, own->width, beam, range_m, xyz);
+    else
+        place_turning(own, own->width, beam, range_m, xyz);
+    if (!is_plain && own->has_boxes)
+        kept &= outside_boxes(scan, xyz);
+    __m128i second = first;
+    if (kind == TABLED)
+        second = _mm_load_si128((const __m128i *)levels);
+    else if (own->level_word)
+        second = load_four(from + own->level_byte, step);
+    const __m128i level = field_of(second, own->level_shift, own->level_mask);
+    if (!is_plain && own->has_extras) {
+        __m128i reflectivity = _mm_setzero_si128();
+        if (group->has_reflectivity)
+            reflectivity = field_of(load_four(from + own->reflectivity_byte, step),
+                                    own->reflectivity_shift, own->reflectivity_mask);
+        store_extras(scan, row, kept, range_m, reflectivity);
     }
+    const __m128i *labels = (const __m128i *)(own->words + beam);
+    return store_kept(own->point, own->label, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(level),
+                      _mm_add_epi64(_mm_loadu_si128(labels), own->offsets),
+                      _mm_add_epi64(_mm_loadu_si128(labels + 1), own->offsets));
+}
+
+/* All runs of a column; with constant steps and kinds the compiler leaves out what is not used. */
+static inline int64_t decode_runs(const Scan *scan, const Group *group, const Column *own,
+                                  int64_t kind, int64_t step, int is_plain,
+                                  const uint8_t *record, int64_t row, int64_t *counts)
+{
+    int64_t own_counts[COUNTS] = {0};
+    const int64_t first_row = row;
+    const int64_t *run = group->runs;
+    for (int64_t number = 0; number < group->run_count; number++, run += 3) {
+        const uint8_t *from = record + run[0];
+        const int64_t beams = run[2], first_beam = run[1];
+        _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
+        if (kind == TABLED) {
+            /* Reads the column as a whole, since the passes below would wait for each piece. */
+            gather_every(from + own->distance_byte, step, beams, near);
+            if (own->level_word)
+                gather_every(from + own->level_byte, step, beams, levels);
+        }
+        for (int64_t beam = 0; beam < beams; beam += 4)
+            row = decode_four(scan, group, own, kind, step, is_plain,
+                              from + beam * step, near + beam,
+                              (own->level_word ? levels : near) + beam, first_beam + beam, row,
+                              own_counts);
+    }
+    /* What no filter leaves out are points. */
+    const int64_t points = row - first_row;
+    const int64_t found = own->is_filtered ? own_counts[FOUND] : points;
+    counts[FOUND] += found;
+    counts[DISTINCT] += found;
+    counts[IN_RANGE] += own->has_boxes ? own_counts[IN_RANGE] : points;
+    counts[OUTSIDE_BOXES] += points;
     return row;
 }
 
-#if defined(__SSE2__)
-/* The usual case in one pass over the beams: TABLED, one return, wire order, no filters. Writes
-   ranges and reflectivities to the planes only for `emit_extras`. Return the next row. */
-static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member, int64_t encoder,
-                            const uint8_t *record, const int64_t *words, int64_t offset_ns,
-                            int64_t row, Planes *planes)
+/* A column of a group that `fits_fours`; known: row of its labels. Return the next row. */
+static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                            int64_t known, const uint8_t *record, int64_t row)
 {
-    const int64_t width = group->width, at = table_row(group, member, encoder);
+    const int64_t width = group->width, encoder = scan->encoder[column];
     const Field *fields = group->fields;
-    const Field distance = fields[DISTANCE], level = fields[INTENSITY];
-    read_words(group, record, 0, planes);
-    const uint32_t *distances = planes->words[distance.word], *levels = planes->words[level.word];
-    const float *vectors = group->direction + member * 9 * width;
-    const float *reach = group->reach + member * width, *origin = group->origin + at * 3;
-    const __m128i mask = _mm_set1_epi32((int32_t)distance.mask);
-    const __m128i level_mask = _mm_set1_epi32((int32_t)level.mask);
-    const __m128i shift = _mm_cvtsi32_si128((int32_t)distance.shift);
-    const __m128i level_shift = _mm_cvtsi32_si128((int32_t)level.shift);
-    const __m128i silent = _mm_set1_epi32((int32_t)group->silent);
-    const __m128 factor = _mm_set1_ps(group->scale[0]), divisor = _mm_set1_ps(group->scale[1]);
-    const __m128 cosine = _mm_set1_ps(group->cosine[at]), sine = _mm_set1_ps(group->sine[at]);
-    const __m128i offsets = _mm_set1_epi64x(offset_ns);
-    /* Padded beams have no return: whole planes are the same as the slots. */
-    for (int64_t beam = 0; beam + 4 <= group->slots; beam += 4) {
-        __m128i value = _mm_load_si128((const __m128i *)(distances + beam));
-        value = _mm_and_si128(_mm_srl_epi32(value, shift), mask);
-        const __m128i found = _mm_cmpgt_epi32(value, silent);
-        const int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
-        if (!kept)
-            continue;
-        const __m128 range_m =
-            _mm_div_ps(_mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), factor), divisor);
-        const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(reach + beam));
-        __m128 xyz[3];
-        for (int axis = 0; axis < 3; axis++) {
-            const float *own = vectors + axis * width + beam;
-            const __m128 direction = _mm_add_ps(
-                _mm_add_ps(_mm_mul_ps(cosine, _mm_loadu_ps(own)),
-                           _mm_mul_ps(sine, _mm_loadu_ps(own + 3 * width))),
-                _mm_loadu_ps(own + 6 * width));
-            xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), _mm_set1_ps(origin[axis]));
-        }
-        const __m128i signal = _mm_and_si128(
-            _mm_srl_epi32(_mm_load_si128((const __m128i *)(levels + beam)), level_shift),
-            level_mask);
-        const __m128i *own_words = (const __m128i *)(words + beam);
-        row = store_kept(scan, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(signal),
-                         _mm_add_epi64(_mm_loadu_si128(own_words), offsets),
-                         _mm_add_epi64(_mm_loadu_si128(own_words + 1), offsets));
+    Column own;
+    own.distance_byte = group->word_bytes[fields[DISTANCE].word];
+    own.level_word = (int)fields[INTENSITY].word;
+    own.level_byte = group->word_bytes[fields[INTENSITY].word];
+    own.reflectivity_byte = group->word_bytes[fields[REFLECTIVITY].word];
+    own.is_big = (int)fields[DISTANCE].is_big;
+    own.mask = _mm_set1_epi32((int32_t)fields[DISTANCE].mask);
+    own.level_mask = _mm_set1_epi32((int32_t)fields[INTENSITY].mask);
+    own.reflectivity_mask = _mm_set1_epi32((int32_t)fields[REFLECTIVITY].mask);
+    own.shift = _mm_cvtsi32_si128((int32_t)fields[DISTANCE].shift);
+    own.level_shift = _mm_cvtsi32_si128((int32_t)fields[INTENSITY].shift);
+    own.reflectivity_shift = _mm_cvtsi32_si128((int32_t)fields[REFLECTIVITY].shift);
+    own.silent = _mm_set1_epi32((int32_t)group->silent);
+    own.factor = _mm_set1_ps(group->scale[0]);
+    own.divisor = _mm_set1_ps(group->scale[1]);
+    own.offsets = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
+    own.words = group->labels + known * width;
+    own.direction = group->direction + member * 9 * width;
+    own.reach = group->reach ? group->reach + member * width : 0;
+    own.is_limited = group->limits_m != 0;
+    own.low_m = _mm_set1_ps(own.is_limited ? group->limits_m[2 * member] : 0);
+    own.high_m = _mm_set1_ps(own.is_limited ? group->limits_m[2 * member + 1] : 0);
+    own.has_boxes = scan->box_count > 0;
+    own.has_extras = scan->range_m || scan->reflectivity;
+    own.point = scan->point;
+    own.label = scan->label;
+    own.width = width;
+    own.is_filtered = own.is_limited || own.has_boxes;
+    const int is_plain = !own.is_filtered && !own.has_extras;
+    int64_t *counts = group->counts + member * COUNTS;
+    if (group->kind == TABLED) {
+        const int64_t at = table_row(group, member, encoder);
+        own.cosine = _mm_set1_ps(group->cosine[at]);
+        own.sine = _mm_set1_ps(group->sine[at]);
+        for (int axis = 0; axis < 3; axis++)
+            own.origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
+        if (is_plain && group->step == 4)
+            return decode_runs(scan, group, &own, TABLED, 4, 1, record, row, counts);
+        if (is_plain && group->step == 12)
+            return decode_runs(scan, group, &own, TABLED, 12, 1, record, row, counts);
+        return decode_runs(scan, group, &own, TABLED, group->step, 0, record, row, counts);
     }
-    return row;
+    own.cosine = _mm_set1_ps(group->cosine[column]);
+    own.sine = _mm_set1_ps(group->sine[column]);
+    own.origins = group->origin + member * 9 * width;
+    own.used = group->used[member];
+    const float speed = speed_of(encoder);
+    own.speed = _mm_set1_ps(speed);
+    own.firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
+    if (is_plain && group->step == 3)
+        return decode_runs(scan, group, &own, TURNING, 3, 1, record, row, counts);
+    return decode_runs(scan, group, &own, TURNING, group->step, 0, record, row, counts);
 }
 #endif
 
@@ -515,10 +714,14 @@ static int64_t emit_organized(const Scan *scan, const Group *group, int64_t numb
 
 static const uint8_t *record_of(const Scan *scan, const Group *group, int64_t column)
 {
-    const Ring *ring = group->rings + scan->member_of[scan->sensor[column]];
+    Ring *ring = group->rings + scan->member_of[scan->sensor[column]];
     const int64_t index = scan->ring_index[column];
-    const int64_t row = index / ring->per_row;
-    return ring->first + row % ring->rows * ring->row_bytes
+    const int64_t row = ring->per_row == 1 ? index : index / ring->per_row;
+    if (row < ring->base || row >= ring->base + ring->rows) {
+        const int64_t rest = (row - ring->base) % ring->rows;
+        ring->base = row - (rest < 0 ? rest + ring->rows : rest);
+    }
+    return ring->first + (row - ring->base) * ring->row_bytes
         + (index - row * ring->per_row) * ring->column_bytes;
 }
 
@@ -568,20 +771,10 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     table = table < 0 ? 0 : table >= group->tables ? group->tables - 1 : table;
     const int64_t known = member * group->tables + table;
     const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
-    const int64_t *words = group->labels + known * group->returns * group->width;
-    const int is_plain = !group->order && !group->limits_m && !scan->box_count && !scan->row_slots;
-    int64_t *counts = group->counts + member * COUNTS;
-    counts[COLUMNS]++;
+    group->counts[member * COUNTS + COLUMNS]++;
 #if defined(__SSE2__)
-    /* A distance above 0 is a range above 0, unless it is scaled to less than a float. */
-    if (is_plain && group->kind == TABLED && group->slots % 4 == 0 && !scan->range_m
-        && !scan->reflectivity) {
-        const int64_t next =
-            decode_fused(scan, group, member, encoder, record, words, offset_ns, row, planes);
-        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
-            counts[step] += next - row;
-        return next;
-    }
+    if (group->fits_fours && !scan->row_slots)
+        return decode_fused(scan, group, member, column, known, record, row);
 #endif
     for (int64_t which = 0; which < group->returns; which++)
         read_return(group, record, which, planes);
@@ -589,17 +782,6 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
         project_tabled(group, member, encoder, planes);
     else
         project_turning(group, member, encoder, known, column, planes);
-    if (is_plain) {
-        const int64_t next = emit_plain(scan, group, words, offset_ns, row, planes);
-        for (int64_t step = FOUND; step <= OUTSIDE_BOXES; step++)
-            counts[step] += next - row;
-        if (scan->range_m || scan->reflectivity) {
-            for (int64_t beam = 0; beam < group->width; beam++)
-                planes->keep[beam] = planes->range_m[beam] > 0.0f;
-            emit_extras(scan, group, 0, row, planes);
-        }
-        return next;
-    }
     mark(scan, group, member, planes);
     label(group, known, offset_ns, planes);
     if (scan->row_slots)

@@ -10,19 +10,23 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 1
+_ABI = 2
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
-_COLUMNS = (_WORD, *[_ADDRESS] * 3)
-# Arguments of the functions that return a number.
+_BYTE = ctypes.c_char
+# Arguments of the functions; they return a number, except some.
 _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_abi": (),
     "mlbatch_decode": (_ADDRESS,),
     "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
-    "mlbatch_statistics": (*_COLUMNS, _WORD, _WORD, _ADDRESS, _ADDRESS, _ADDRESS),
+    "mlbatch_merge": (_WORD, _ADDRESS, _WORD, *[_ADDRESS] * 5),
+    "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
+    "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
+    "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
 }
+_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather")
 
 
 class Ring(ctypes.Structure):
@@ -34,6 +38,7 @@ class Ring(ctypes.Structure):
         ("per_row", _WORD),
         ("row_bytes", _WORD),
         ("column_bytes", _WORD),
+        ("base", _WORD),
     ]
 
 
@@ -85,6 +90,7 @@ class Group(ctypes.Structure):
         ("slot", _ADDRESS),
         ("typed", _WORD),
         ("sends_twice", _WORD),
+        ("fits_fours", _WORD),
         ("drops_repeated", _WORD),
         ("limits_m", _ADDRESS),
         ("counts", _ADDRESS),
@@ -124,10 +130,25 @@ class Scan(ctypes.Structure):
     ]
 
 
+class Part(ctypes.Structure):
+    """Columns of a sensor that wait for their window."""
+
+    _fields_: ClassVar = [
+        ("sensor", _WORD),
+        ("columns", _WORD),
+        ("stamp_ns", _ADDRESS),
+        ("ring_index", _ADDRESS),
+        ("encoder", _ADDRESS),
+    ]
+
+
 def address(array: npt.NDArray[Any]) -> int:
     """Return the address of a C-contiguous array; the caller keeps the array."""
     if not array.flags.c_contiguous:
         raise ValueError("expected a C-contiguous array")
+    if array.size and array.flags.writeable:
+        # A fifth of the time of the other way, and a window needs many addresses.
+        return ctypes.addressof(_BYTE.from_buffer(array.data))
     return int(array.ctypes.data)
 
 
@@ -141,9 +162,7 @@ def library() -> Any:
     for name, arguments in _FUNCTIONS.items():
         function = getattr(loaded, name)
         function.argtypes = arguments
-        function.restype = _WORD
-    loaded.mlbatch_copy.argtypes = (_WORD, *[_ADDRESS] * 5)
-    loaded.mlbatch_copy.restype = None
+        function.restype = None if name in _WITHOUT_RESULT else _WORD
     if loaded.mlbatch_abi() != _ABI:
         raise OSError(f"{path.name} of another version")
     return loaded

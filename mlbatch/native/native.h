@@ -15,7 +15,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 1
+#define MLBATCH_ABI 2
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -35,6 +35,7 @@ typedef struct {
     int64_t per_row;
     int64_t row_bytes;
     int64_t column_bytes;
+    int64_t base; /* number of a row that was at `first` */
 } Ring;
 
 /* An integer in a word of a pixel: `(word >> shift) & mask`, its two bytes swapped if is_big. */
@@ -72,7 +73,7 @@ typedef struct {
     int64_t dark_count;
     const int64_t *dark; /* (dark_count,): channels without returns */
     int64_t has_reflectivity;
-    const Ring *rings; /* (members,) */
+    Ring *rings; /* (members,) */
     /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
        TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
@@ -96,6 +97,8 @@ typedef struct {
     const int64_t *slot;   /* (E,): slot in an organized row */
     int64_t typed;
     int64_t sends_twice;
+    /* One return in wire order, runs of fours in the order of the channels, none of them dark. */
+    int64_t fits_fours;
     int64_t drops_repeated;
     const float *limits_m; /* (members, 2) or NULL */
     int64_t *counts;       /* (members, COUNTS), added to */
@@ -135,12 +138,25 @@ typedef struct {
     uint32_t *column;
 } Scan;
 
+/* Columns of a sensor that wait for their window: `types.Columns`. */
+typedef struct {
+    int64_t sensor;
+    int64_t columns;
+    const int64_t *stamp_ns; /* (columns,) */
+    const int64_t *ring_index;
+    const int64_t *encoder;
+} Part;
+
 EXPORT int64_t mlbatch_abi(void);
 EXPORT int64_t mlbatch_decode(const Scan *scan);
 EXPORT int64_t mlbatch_angles(int64_t count, const int64_t *words, float *cosine, float *sine);
-EXPORT int64_t mlbatch_statistics(int64_t columns, const int64_t *stamp_ns, const int64_t *sensor,
-                                  const int64_t *encoder, int64_t sensors, int64_t sectors,
-                                  const int64_t *positions, int64_t *entered, int64_t *figures);
+EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
+                             int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
+                             int64_t *ring_index, int64_t *encoder);
+EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
+                               const int64_t *sensor, const int64_t *encoder, int64_t sensors,
+                               const int64_t *positions, int64_t sectors, int64_t *entered,
+                               int64_t *figures);
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);
@@ -150,5 +166,8 @@ EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t 
                                int64_t *others, int64_t *found);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
                          const int64_t *bytes, uint8_t *target, const int64_t *target_at);
+EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
+                           int64_t range_count, const int64_t *ranges, int64_t row_bytes,
+                           uint8_t *out);
 
 #endif

@@ -7,12 +7,11 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
-
-import numpy as np
+from typing import NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
+from mlbatch.batching.merge import column_merge
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
@@ -74,8 +73,7 @@ class Stages:
             yield item
 
 
-@dataclass(frozen=True, slots=True)
-class SkippedWindow:
+class SkippedWindow(NamedTuple):
     """A window with columns that gives no scan (`--drop-incomplete`)."""
 
     end_ns: int
@@ -97,12 +95,14 @@ class Conversion:
         rig = self.session.setup.rig
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
+        paces = [sensor.pace() for sensor in self.sensors]
         self.batcher = Batcher(
             self.grid,
             [sensor.intake() for sensor in self.sensors],
             Policy(job.max_wait_ns, job.keep_partial, job.start, job.end),
             self.session.clocks.guards,
-            [sensor.pace() for sensor in self.sensors],
+            paces,
+            column_merge(self.session.engine, [pace.positions for pace in paces]),
         )
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.refuse_unknown(self.session.recordings)
@@ -126,10 +126,11 @@ class Conversion:
         smallest first, and cut at the bounds of an absolute grid.
         """
         self.passthrough.subscribe(self.session.recordings)
+        oldest_ring_indexes = self._oldest_ring_indexes()
         with contextlib.closing(self.session.packets()) as packets:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
-                ingested = self.session.ingest.columns(batch, self._oldest_ring_indexes())
+                ingested = self.session.ingest.columns(batch, oldest_ring_indexes)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -138,6 +139,8 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes)
                 if self.batcher.past_end:
                     break
+                oldest_ring_indexes = self._oldest_ring_indexes()
+                self.session.keep_from(oldest_ring_indexes)
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
@@ -189,9 +192,8 @@ class Conversion:
         # No comparison with an unknown fill is true.
         if not share or not bool((window.fill < share).any()):
             return False
-        counts = np.bincount(window.sensor, minlength=len(self.sensors)).tolist()
-        for sensor, count in zip(self.sensors, counts, strict=True):
-            sensor.ledger.columns.drop("incomplete", count)
+        for sensor, own in zip(self.sensors, window.figures, strict=True):
+            sensor.ledger.columns.drop("incomplete", own.columns)
         self.dropped_incomplete += 1
         return True
 
@@ -298,9 +300,10 @@ class Conversion:
 
     def _scan_offset_ns(self) -> int:
         """Scan clock minus receive time, by the first packet of the first sensor that has one."""
-        for sensor, first in zip(self.sensors, self.batcher.firsts, strict=True):
-            if first is not None:
-                return 0 if sensor.clock.by_host else first[0] - first[1]
+        for sensor in self.sensors:
+            offset_ns = self.batcher.host_offset_ns(sensor.index)
+            if offset_ns is not None:
+                return 0 if sensor.clock.by_host else offset_ns
         return 0
 
     def close(self) -> None:

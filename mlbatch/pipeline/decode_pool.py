@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
-from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source
 from mlbatch.report.ledger import PointCounts
-from mlbatch.types import Scan
+from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
 
@@ -51,8 +51,7 @@ class DecodeTask:
         return int(ring_index.min()) if len(ring_index) else None
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded:
+class Decoded(NamedTuple):
     """A scan, and the counts of its points, one list a sensor."""
 
     scan: Scan
@@ -143,21 +142,24 @@ class DecodePool:
             window.end_ns,
             window.complete,
             window.ready_host_ns,
+            window.figures,
             window.edge_gap_ns,
             window.fill,
             window.is_partial,
         )
-        columns = WindowColumns(window.stamp_ns, window.sensor, window.ring_index, window.encoder)
+        columns = window.columns
         if not self._split:
             yield self._task(columns, label, None, earlier)
             return
-        for number in np.unique(window.sensor).tolist():
-            own = window.sensor == number
-            first = np.zeros(int(np.count_nonzero(own)), np.int64)
-            part = WindowColumns(
-                columns.stamp_ns[own], first, columns.ring_index[own], columns.encoder[own]
-            )
-            yield self._task(part, label, number, earlier)
+        for number, figures in enumerate(window.figures):
+            if not figures.columns:
+                continue
+            part = columns.take(np.flatnonzero(columns.sensor == number))
+            # In the decoder of one sensor.
+            part.sensor[:] = 0
+            alone: list[ColumnFigures] = [NO_COLUMNS] * len(window.figures)
+            alone[number] = figures
+            yield self._task(part, replace(label, figures=alone), number, earlier)
 
     def _task(
         self,

@@ -177,7 +177,9 @@ class Ingest:
         """Copy packets that may be of a sensor to its ring; give those that are, and are valid."""
         lidar = sensor.lidar
         counts = sensor.ledger.packets
-        packets, ring_index = sensor.ring.store(batch.data, batch.start[index], oldest_ring_index)
+        packets, ring_index = sensor.ring.store(
+            batch.data, batch.start[index], oldest_ring_index, batch.place
+        )
         good = lidar.sent_by_me(packets) & ~owned[index]
         counts.read += int(np.count_nonzero(good))
         owned[index] |= good
@@ -200,6 +202,7 @@ class Ingest:
             key=lidar.sequence(packets),
             headers=headers,
             ring_index=ring_index,
+            column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
         )
 
     def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:

@@ -147,6 +147,8 @@ class ImuQueue:
 
     def drain_until(self, end_ns: int | None, limits_ns: TimeLimits) -> list[ImuSamples]:
         """Samples before `end_ns` (None: all) and inside the limits, by timestamp."""
+        if not self._waiting:
+            return []
         low_ns, high_ns = limits_ns
         taken = []
         later = []

@@ -13,8 +13,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,7 @@ INTERVAL_S = 0.5
 # -- an earlier run ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class EarlierRun:
+class EarlierRun(NamedTuple):
     """Remains of an earlier run to the same output."""
 
     state: State | None  # None if there is nothing to resume

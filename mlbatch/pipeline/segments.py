@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,8 +13,7 @@ from mlbatch.discovery.probe import is_metadata
 from mlbatch.types import Message, PacketBatch, Recording, WrappedRecording
 
 
-@dataclass(frozen=True, slots=True)
-class TimeSegment:
+class TimeSegment(NamedTuple):
     """Receive times in [begin_ns, end_ns); None: no limit."""
 
     begin_ns: int | None = None

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.arrays import F64Array
 from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
+from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.projector import Source
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
+from mlbatch.native.arena import PacketArena
 from mlbatch.report.ledger import SensorLedger
 from mlbatch.rig.rig import RigSensor
 
@@ -46,8 +48,7 @@ class SensorClock:
         return timescale(host_ns if self.by_host else stamp_ns, host_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """Which points of a sensor are written; ranges in m."""
 
     min_range_m: float
@@ -65,7 +66,7 @@ class Sensor:
     limits: Limits
     ring_base: int  # first ring number of its channels
     columns_per_s: float | None  # nominal rate, None if unknown
-    ring: PacketRing  # raw packets until their window closes
+    ring: PacketRing | ArenaRing  # raw packets until their window closes
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property
@@ -129,6 +130,11 @@ class Sensor:
         return replace(self, ring=new_ring(self.lidar), ledger=SensorLedger())
 
 
-def new_ring(lidar: Lidar) -> PacketRing:
-    """An empty ring for the packets of a lidar."""
-    return PacketRing(lidar.packet_size, lidar.records)
+def new_ring(lidar: Lidar, arena: PacketArena | None = None) -> PacketRing | ArenaRing:
+    """An empty ring for the packets of a lidar; arena: into which the recording is read, or None.
+
+    What numpy decodes is copied, since it gathers records, which are then close to each other.
+    """
+    if arena is None or lidar.pixels is None:
+        return PacketRing(lidar.packet_size, lidar.records)
+    return ArenaRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)

@@ -16,6 +16,7 @@ from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.native import choose_engine
+from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
@@ -55,6 +56,8 @@ class Session:
             recording.use_engine(self.engine)
         if job.segment != TimeSegment():
             opened = [ClippedRecording(recording, job.segment) for recording in opened]
+        # The compiled engine decodes packets where they were read.
+        self._arena = PacketArena() if self.engine == "native" else None
         self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
         self.sensors: list[Sensor] = []
@@ -100,7 +103,7 @@ class Session:
             limits=limits(job, rig),
             ring_base=ring_base,
             columns_per_s=sampler.columns_per_s(found),
-            ring=new_ring(lidar),
+            ring=new_ring(lidar, self._arena),
         )
 
     def _replay(self) -> FaultReplay | None:
@@ -117,6 +120,12 @@ class Session:
 
     # -- reading ------------------------------------------------------------------------------
 
+    def keep_from(self, oldest_ring_indexes: Sequence[int | None]) -> None:
+        """Free the packets before those that are still needed; by sensor, None: it needs none."""
+        if self._arena is not None:
+            needed = [index for index in oldest_ring_indexes if index is not None]
+            self._arena.keep_from(min(needed, default=None))
+
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets in receive order, with injected faults."""
         # Also after an error, files are closed here, by the thread that opened them.
@@ -126,6 +135,8 @@ class Session:
             from mlbatch.pipeline.overlap import RunOverlap
 
             self._overlap = RunOverlap(self.recordings, self.setup)
+        elif self._arena is not None and self.replay is None:
+            self.recordings[0].use_arena(self._arena)
         seen = None if self._overlap is None else self._overlap.add
         with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:
             batches: Iterator[PacketBatch] = merged

@@ -55,8 +55,7 @@ class State:
     checksum: str = ""  # of the last of them
 
 
-@dataclass(frozen=True, slots=True)
-class FoundState:
+class FoundState(NamedTuple):
     """Content of a state file; damage: one line on records that do not count, or ""."""
 
     state: State | None = None

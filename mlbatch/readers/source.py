@@ -21,6 +21,7 @@ import numpy as np
 
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
+from mlbatch.native.arena import PacketArena
 from mlbatch.readers.byte_records import SLACK
 
 BUFFER_BYTES = 4 << 20
@@ -156,8 +157,19 @@ class Window:
     behind `end`: `refill` then skips the bytes between.
     """
 
-    def __init__(self, source: Source, size: int = BUFFER_BYTES, front: int = 0) -> None:
-        self.data: U8Array = np.zeros(front + size + SLACK, np.uint8)
+    def __init__(
+        self,
+        source: Source,
+        size: int = BUFFER_BYTES,
+        front: int = 0,
+        arena: PacketArena | None = None,
+    ) -> None:
+        """arena: where each refill gets a new region; None: one buffer is used again."""
+        self._arena = arena
+        # In the arena, of `data[0]`.
+        self.arena_place: int | None = None
+        self.data: U8Array = np.zeros(0, np.uint8)
+        self._allocate(front + size + SLACK)
         self.begin = front
         self.end = front
         self._front = front
@@ -194,13 +206,21 @@ class Window:
         size = len(self.data) - front - SLACK
         if kept >= size or need > size:
             # A new array, since packets of the old one may still be in use.
-            self.data = np.zeros(front + max(2 * kept, need) + SLACK, np.uint8)
+            self._allocate(front + max(2 * kept, need) + SLACK)
+        elif self._arena is not None:
+            self._allocate(len(self.data))
         self.data[front : front + kept] = unread
         self.begin = front
         self.end = front + kept
         count = self._source.fill(self.data.data[self.end : len(self.data) - SLACK])
         self.end += count
         return count > 0
+
+    def _allocate(self, count: int) -> None:
+        if self._arena is None:
+            self.data = np.zeros(count, np.uint8)
+        else:
+            self.data, self.arena_place = self._arena.reserve_for_reading(count)
 
 
 class Decompressor:

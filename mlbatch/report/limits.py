@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
 
@@ -19,8 +18,7 @@ _LIMIT = re.compile(r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", re.AS
 _EXAMPLE = "write loss>0.1%,underfilled>0"
 
 
-@dataclass(frozen=True, slots=True)
-class Limit:
+class Limit(NamedTuple):
     """A limit of one quantity: a number, or a share in percent."""
 
     text: str
@@ -125,8 +123,7 @@ def _number(section: Report, key: str) -> int:
     return value if isinstance(value, int) else 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Quantity:
+class _Quantity(NamedTuple):
     """A quantity of a report.
 
     unit: for people; amounts: name of the sensor ("": the run) and amount; is_share: whether the

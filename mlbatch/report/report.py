@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import mlbatch
 from mlbatch.arrays import F64Array
@@ -31,8 +31,7 @@ Section: TypeAlias = dict[str, Json]
 SCHEMA = "mlbatch.report/1"
 
 
-@dataclass(frozen=True, slots=True)
-class InputReport:
+class InputReport(NamedTuple):
     """One recording."""
 
     path: str
@@ -40,8 +39,7 @@ class InputReport:
     container: str
 
 
-@dataclass(frozen=True, slots=True)
-class Unassigned:
+class Unassigned(NamedTuple):
     """A stream of no sensor."""
 
     stream: str
@@ -49,8 +47,7 @@ class Unassigned:
     what: str  # description of its packets
 
 
-@dataclass(frozen=True, slots=True)
-class ClockReport:
+class ClockReport(NamedTuple):
     """A sensor's clock against the common one and that of the capture host."""
 
     source: str
@@ -60,8 +57,7 @@ class ClockReport:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class SensorReport:
+class SensorReport(NamedTuple):
     """One sensor."""
 
     name: str
@@ -77,8 +73,7 @@ class SensorReport:
     calibration: str  # file name without folder
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
+class Timing(NamedTuple):
     """Costs of a run."""
 
     wall_s: float
@@ -98,8 +93,7 @@ class Timing:
         return self.recorded_s / self.wall_s if self.wall_s > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class ForwardedMessages:
+class ForwardedMessages(NamedTuple):
     """Recorded messages of a forwarded topic: read = written + sum(dropped)."""
 
     topic: str
@@ -108,16 +102,14 @@ class ForwardedMessages:
     dropped: dict[str, int]
 
 
-@dataclass(frozen=True, slots=True)
-class FaultReport:
+class FaultReport(NamedTuple):
     """An injected fault, and the packets it affected."""
 
     fault: str
     packets: int
 
 
-@dataclass(frozen=True, slots=True)
-class Warned:
+class Warned(NamedTuple):
     """A warning."""
 
     code: str
@@ -154,7 +146,7 @@ def build_report(run: RunReport) -> Section:
         "schema": SCHEMA,
         "version": mlbatch.__version__,
         **({"command": run.command} if run.command else {}),
-        "inputs": [asdict(item) for item in run.inputs],
+        "inputs": [item._asdict() for item in run.inputs],
         "timescale": run.timescale,
         "grid": {
             "rate_hz": run.rate_hz,
@@ -169,13 +161,13 @@ def build_report(run: RunReport) -> Section:
             "datagrams": run.capture.datagrams,
             "skipped": ordered(run.capture.skipped, CAPTURE_REASONS),
         },
-        "unassigned": [asdict(item) for item in run.unassigned],
+        "unassigned": [item._asdict() for item in run.unassigned],
         "sensors": [_sensor(sensor) for sensor in run.sensors],
-        "messages": [asdict(item) for item in run.messages],
-        **({"faults": [asdict(item) for item in run.faults]} if run.faults else {}),
-        "scans": asdict(run.scans),
+        "messages": [item._asdict() for item in run.messages],
+        **({"faults": [item._asdict() for item in run.faults]} if run.faults else {}),
+        "scans": _scans(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
-        "warnings": [asdict(item) for item in run.warnings],
+        "warnings": [item._asdict() for item in run.warnings],
     }
 
 
@@ -255,8 +247,13 @@ def summary_lines(run: RunReport) -> list[str]:
     return lines + [f"warning {item.code}: {item.message}" for item in run.warnings]
 
 
+def _scans(scans: ScanStatistics) -> Section:
+    spreads = {"span_ms": scans.span_ms._asdict(), "period_ms": scans.period_ms._asdict()}
+    return {**scans._asdict(), **spreads}
+
+
 def _timing(timing: Timing) -> Section:
-    costs: Section = asdict(timing)
+    costs: Section = timing._asdict()
     # The rates come last, after realtime_factor.
     tail = {key: costs.pop(key) for key in ("points_per_s", "peak_rss_mb", "engine")}
     return {**costs, "realtime_factor": timing.realtime_factor, **tail}
@@ -291,7 +288,7 @@ def _sensor(sensor: SensorReport) -> Section:
         },
         "fill": sensor.fill,
         "points": asdict(sensor.ledger.points),
-        "clock": asdict(sensor.clock),
+        "clock": sensor.clock._asdict(),
         "extrinsics": {
             "source": sensor.extrinsics_source,
             "body_from_sensor": sensor.body_from_sensor.tolist(),

@@ -9,6 +9,8 @@ import tempfile
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +27,7 @@ UNDERFILLED = 0.5
 _SPOOL_BYTES = 2**20
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
+class Spread(NamedTuple):
     """Distribution of a time over scans, ms; None without a value."""
 
     p50: float | None = None
@@ -34,8 +35,7 @@ class Spread:
     max: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ScanStatistics:
+class ScanStatistics(NamedTuple):
     """The scans of a run; span: last minus first column timestamp; period: between scan starts."""
 
     written: int
@@ -84,7 +84,11 @@ class ScanTable:
         gaps = (f"max_gap_ns_{name}" for name in names)
         words = ("coverage", "overlap", "missing", "fill")
         shares = (f"{word}_{name}" for word in words for name in names)
-        self._append([*start, *counts, *gaps, *shares, "ready_host_ns"])
+        header = io.StringIO()
+        # Names may need quotes; the cells of rows are numbers.
+        writer = csv.writer(header, lineterminator="\n")
+        writer.writerow([*start, *counts, *gaps, *shares, "ready_host_ns"])
+        self._append(header.getvalue())
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
     def add(self, scan: Scan) -> None:
@@ -146,7 +150,8 @@ class ScanTable:
         if row is None:
             return
         self._open = None
-        self._append([*row.cells(), *self._missing(row), *_fill_cells(row), row.ready_host_ns])
+        cells = [*row.cells(), *self._missing(row), *map(_fill_cell, row.fill), row.ready_host_ns]
+        self._append(",".join(map(str, cells)) + "\n")
         self._written += 1
         self._incomplete += not row.complete
         self._points += row.points
@@ -177,11 +182,9 @@ class ScanTable:
             for rate, count in zip(self._columns_per_s, row.columns, strict=True)
         ]
 
-    def _append(self, cells: Sequence[int | str]) -> None:
-        line = io.StringIO()
-        csv.writer(line, lineterminator="\n").writerow(cells)
+    def _append(self, line: str) -> None:
         try:
-            self._file.write(line.getvalue().encode())
+            self._file.write(line.encode())
         except OSError as err:
             raise ExportError(
                 f"{tempfile.gettempdir()}: expected space for the rows of scans.csv, found "
@@ -284,13 +287,20 @@ class _Row:
         start = (*self.key, self.start_ns, self.end_ns, *stamps)
         complete = str(self.complete).lower()
         counts = (self.points, total, *self.columns, complete)
-        shares = (f"{share:.3f}" for share in (*self.coverage, *self.overlap))
+        shares = map(_share_cell, (*self.coverage, *self.overlap))
         return [*start, *counts, *self.max_gap_ns, *shares]
 
 
-def _fill_cells(row: _Row) -> list[str]:
+# Few of the values differ, and to format them costs more than to look them up.
+@lru_cache(maxsize=1024)
+def _share_cell(share: float) -> str:
+    return f"{share:.3f}"
+
+
+@lru_cache(maxsize=1024)
+def _fill_cell(fill: float) -> str:
     # The shortest text of a float32.
-    return [UNKNOWN if math.isnan(fill) else str(np.float32(fill)) for fill in row.fill]
+    return UNKNOWN if math.isnan(fill) else str(np.float32(fill))
 
 
 def _counted(counts: dict[str, int]) -> dict[str, int]:

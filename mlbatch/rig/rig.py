@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -50,8 +50,7 @@ class StreamSelector:
         return ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
 
 
-@dataclass(frozen=True, slots=True)
-class UnknownExtrinsics:
+class UnknownExtrinsics(NamedTuple):
     """`extrinsics: unknown`; place: file, line and key path of it."""
 
     place: str = ""

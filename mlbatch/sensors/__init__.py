@@ -1,15 +1,17 @@
 """Lidar vendors as plug-ins: models, calibration files, names of unknown streams.
 
 Each folder of this package is a vendor; its module `sensor` is the plug-in (`Plugin`), found by its
-place. Vendors are asked in alphabetical order, and a vendor is imported only when it is asked.
-Other distributions add vendors by entry points of the group `mlbatch.sensors`; they are asked last.
+place. Vendors are asked in alphabetical order. The folder itself says cheaply which packets and
+files cannot be the vendor's (`Vendor`), so that `sensor` is imported only where it is needed. Other
+distributions add vendors by entry points of the group `mlbatch.sensors`; they are asked last.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, cast
@@ -25,6 +27,7 @@ __all__ = [
     "DECODE_OPTIONS",
     "MAX_CALIBRATION_BYTES",
     "Plugin",
+    "Vendor",
     "built_in",
     "content_keys",
     "describe",
@@ -32,10 +35,24 @@ __all__ = [
     "parse_calibration",
     "plugins",
     "read_calibration",
+    "senders",
+    "vendor_of",
 ]
 
 # Calibration files are far smaller; a larger file is a recording or something else.
 MAX_CALIBRATION_BYTES = 16_000_000
+
+
+class Vendor(Protocol):
+    """What the folder of a vendor offers: necessary conditions, tested without `sensor`."""
+
+    def may_send(self, size: int, packets: U8Array) -> bool:
+        """Return False for payloads (k, >= size) that `describe` and `match_score` do not know."""
+        ...
+
+    def may_calibrate(self, content: bytes) -> bool:
+        """Return False for files that are none of this vendor's calibrations, not even damaged."""
+        ...
 
 
 class Plugin(Protocol):
@@ -57,15 +74,19 @@ class Plugin(Protocol):
 
 def plugins() -> tuple[Plugin, ...]:
     """All plug-ins, sorted by name; those of other distributions last."""
-    return tuple(_load_lazily())
+    return tuple(_load_lazily(_names()))
 
 
-def _load_lazily() -> Iterator[Plugin]:
-    """All plug-ins in their order, each imported when the iterator reaches it."""
-    for name in _names():
-        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
+def _load_lazily(built_in: Iterable[str]) -> Iterator[Plugin]:
+    """These built-in plug-ins and all others, each imported when the iterator reaches it."""
+    yield from _load(built_in)
     for name in entry_points.names(entry_points.SENSORS, _names()):
         yield cast(Plugin, entry_points.load(entry_points.SENSORS, name))
+
+
+def _load(built_in: Iterable[str]) -> Iterator[Plugin]:
+    for name in built_in:
+        yield cast(Plugin, importlib.import_module(f"{__name__}.{name}.sensor"))
 
 
 @lru_cache(maxsize=1)
@@ -73,14 +94,41 @@ def _names() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__) if module.ispkg))
 
 
-def models() -> tuple[SensorModel, ...]:
-    """All supported models."""
-    return tuple(model for plugin in plugins() for model in plugin.MODELS)
+def _vendor(name: str) -> Vendor:
+    return cast(Vendor, importlib.import_module(f"{__name__}.{name}"))
 
 
-def built_in() -> tuple[Calibration, ...]:
-    """Calibrations of all vendors that need no file."""
-    return tuple(calibration for plugin in plugins() for calibration in plugin.BUILT_IN)
+def senders(size: int, packets: U8Array) -> list[str]:
+    """Names of the built-in vendors that may have sent payloads (k, >= size), in their order."""
+    return [name for name in _names() if _vendor(name).may_send(size, packets)]
+
+
+def vendor_of(model: str) -> tuple[str, ...]:
+    """Name of the built-in vendor that has a model of this name; () if none has.
+
+    Vendors that are loaded are searched first; the result is the same, since names differ.
+    """
+    by_loading = sorted(_names(), key=lambda name: f"{__name__}.{name}.sensor" not in sys.modules)
+    for name in by_loading:
+        (plugin,) = _load([name])
+        if any(row.name == model for row in plugin.MODELS):
+            return (name,)
+    return ()
+
+
+def models(vendors: Collection[str] | None = None) -> tuple[SensorModel, ...]:
+    """Supported models, of these built-in vendors (None: all) and of other distributions."""
+    return tuple(model for plugin in _load_lazily(_chosen(vendors)) for model in plugin.MODELS)
+
+
+def built_in(vendors: Collection[str] | None = None) -> tuple[Calibration, ...]:
+    """Calibrations without a file, of these built-in vendors and of other distributions."""
+    plugins = _load_lazily(_chosen(vendors))
+    return tuple(calibration for plugin in plugins for calibration in plugin.BUILT_IN)
+
+
+def _chosen(vendors: Collection[str] | None) -> list[str]:
+    return [name for name in _names() if vendors is None or name in vendors]
 
 
 def read_calibration(path: Path) -> Calibration | None:
@@ -100,11 +148,12 @@ def read_calibration(path: Path) -> Calibration | None:
 
 def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
     """Parse a calibration from a file or a topic (`origin`); None if it is none."""
-    found = (plugin.read_calibration(origin, content) for plugin in _load_lazily())
+    vendors = [name for name in _names() if _vendor(name).may_calibrate(content)]
+    found = (plugin.read_calibration(origin, content) for plugin in _load_lazily(vendors))
     return next((calibration for calibration in found if calibration is not None), None)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
     """Name payloads (k, size) of an unknown stream; None if no vendor knows them."""
-    found = (plugin.describe(size, sample) for plugin in _load_lazily())
+    found = (plugin.describe(size, sample) for plugin in _load_lazily(senders(size, sample)))
     return next((text for text in found if text is not None), None)

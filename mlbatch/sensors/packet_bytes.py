@@ -43,6 +43,11 @@ def has_bytes(packets: U8Array, magic: bytes, at: int = 0) -> BoolArray:
     return np.asarray(same.all(axis=1))
 
 
+def any_has_bytes(sample: U8Array, magic: bytes, at: int = 0) -> bool:
+    """Whether one of the payloads (k, size), or a single one, has these bytes at byte `at`."""
+    return bool(has_bytes(np.atleast_2d(sample), magic, at).any())
+
+
 def majority(packets: U8Array, good: BoolArray) -> U8Array | None:
     """The good payloads if they are more than half: a damaged packet must not hide a stream."""
     return packets[good] if 2 * int(good.sum()) > len(packets) else None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
 from mlbatch.writers.atomic import (
@@ -144,8 +144,7 @@ def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) 
     return plugin(name).open_writer(target, info, options)
 
 
-@dataclass(frozen=True, slots=True)
-class ReportPaths:
+class ReportPaths(NamedTuple):
     """Paths of the report and the table of scans of an output."""
 
     report: Path

@@ -14,8 +14,8 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from mlbatch.errors import ExportError
 from mlbatch.writers.durable import sync_entries, sync_to_disk
@@ -57,8 +57,7 @@ def export_errors(path: Path) -> Iterator[None]:
         raise ExportError(f"{path}: expected to write it, found {reason!r}; {advice}") from err
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
+class Output(NamedTuple):
     """A file or folder under construction."""
 
     target: Path  # final path

@@ -33,7 +33,6 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 
 import mlbatch
 from mlbatch.errors import ExportError, UsageError
@@ -46,6 +45,8 @@ from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32
 # Compresses so many bytes, given in parts, to one frame.
 Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]
 
+# Defined here, since `mcap.writer` reads the metadata of distributions when it is imported.
+MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 4 * 2**20
 # A message of this size ends its chunk; smaller ones are collected.
 LARGE_BYTES = 2**20
@@ -141,7 +142,7 @@ class McapContainer:
         self._kept_count = len(self._kept_lengths)
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._file.put(MCAP0_MAGIC)
+        self._file.put(MAGIC)
         self._file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
 
     # -- messages -----------------------------------------------------------------------------
@@ -298,7 +299,7 @@ class McapContainer:
 
     def _read_kept_lengths(self) -> Iterable[int]:
         """Yield the lengths of the chunks in the kept part of a continued file."""
-        position = len(MCAP0_MAGIC)
+        position = len(MAGIC)
         end = self._file.kept_bytes
         while position < end:
             head = self._file.look_at(position, _RECORD.size)
@@ -380,7 +381,7 @@ class McapContainer:
         head = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, offsets_start)
         crc = crc32(summary + offsets + head, 0)
         footer = encoded(Footer(start, offsets_start, crc))
-        self._file.put(summary, offsets, footer, MCAP0_MAGIC)
+        self._file.put(summary, offsets, footer, MAGIC)
 
     def _summary_groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:
         """Return the records of the summary by kind."""

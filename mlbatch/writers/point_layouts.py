@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias, cast
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +29,7 @@ PAIR = "<u2"  # return_type, lidar_id
 _PARTS = {REALS: (0, 4, 8, 12), LABEL: (0, 4, 6, 7)}
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
+class Points(NamedTuple):
     """The point arrays of a scan in the order of the file: (p,), or (slots, n) when organized.
 
     reals, labels: the same values as wide words `REALS` and `LABEL`; None if the arrays are not
@@ -159,8 +158,7 @@ class Field:
     values: Callable[[Points], Values]  # returns any type that converts to `dtype`
 
 
-@dataclass(frozen=True, slots=True)
-class WideWord:
+class WideWord(NamedTuple):
     """Several fields that are copied as one."""
 
     dtype: str
@@ -205,8 +203,7 @@ _WIDE_WORDS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
+class Layout(NamedTuple):
     """Fields of a point record; bytes between fields are zero."""
 
     name: str

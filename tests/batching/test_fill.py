@@ -8,6 +8,7 @@ import pytest
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.fill import FillMeter, Pace
 from mlbatch.batching.gaps import EdgeGaps
+from mlbatch.types import NO_COLUMNS, ColumnFigures, WindowColumns
 
 NS_PER_S = 10**9
 # 1000 columns a revolution of 0.1 s.
@@ -28,8 +29,9 @@ def _fill(meter: FillMeter, number: I64Array, length_ns: int = WINDOW_NS, word: 
     """Fill of a window with these columns of the only sensor; word: rotor words, else positions."""
     position = number % PER_TURN
     encoder = position * (2**32 // PER_TURN) if word else position
-    sensor = np.zeros(len(number), np.int64)
-    return float(meter.measure(length_ns, number * COLUMN_NS, sensor, encoder)[0])
+    columns = WindowColumns(number * COLUMN_NS, np.zeros(len(number), np.int64), number, encoder)
+    figures = [NO_COLUMNS._replace(columns=len(number))]
+    return float(meter.measure(length_ns, figures, columns)[0])
 
 
 def _meter(lit_share: float | None, positions: int | None = PER_TURN) -> FillMeter:
@@ -96,10 +98,13 @@ def test_a_sensor_never_seen_is_expected() -> None:
 
 def test_gaps_count_from_the_last_column_to_the_end_of_the_window() -> None:
     gaps = EdgeGaps(2)
-    sensor = np.array([0, 1, 0])
     # Of each sensor: from the start to the first column, from the last one to the end.
-    assert gaps.measure(100, 200, np.array([110, 130, 195]), sensor) == (10, 70)
+    assert gaps.measure(100, 200, [_from_to(110, 195), _from_to(130, 130)]) == (10, 70)
     # Sensor 1 is silent: from 130 to the end.
-    assert gaps.measure(200, 300, np.array([205]), np.array([0])) == (95, 170)
+    assert gaps.measure(200, 300, [_from_to(205, 205), NO_COLUMNS]) == (95, 170)
     # A window without any column is not given; 130 to 450, 205 to 401.
-    assert gaps.measure(400, 500, np.array([401, 450, 499]), np.array([0, 1, 0])) == (196, 320)
+    assert gaps.measure(400, 500, [_from_to(401, 499), _from_to(450, 450)]) == (196, 320)
+
+
+def _from_to(first_ns: int, last_ns: int) -> ColumnFigures:
+    return NO_COLUMNS._replace(columns=2, first_ns=first_ns, last_ns=last_ns)

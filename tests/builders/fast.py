@@ -92,7 +92,9 @@ def _window(window: FastWindow, intakes: Sequence[_Watched]) -> Window:
     rank = [{place: n for n, place in enumerate(intake.accepted)} for intake in intakes]
     columns = [
         (sensor, rank[sensor][place - place % _WIDEST], place % _WIDEST)
-        for sensor, place in zip(window.sensor.tolist(), window.ring_index.tolist(), strict=True)
+        for sensor, place in zip(
+            window.columns.sensor.tolist(), window.columns.ring_index.tolist(), strict=True
+        )
     ]
     return Window(
         window.index,
@@ -106,5 +108,5 @@ def _window(window: FastWindow, intakes: Sequence[_Watched]) -> Window:
 
 
 def _written(windows: Sequence[FastWindow], sensors: int) -> list[int]:
-    counts = [np.bincount(window.sensor, minlength=sensors) for window in windows]
+    counts = [np.bincount(window.columns.sensor, minlength=sensors) for window in windows]
     return [int(sum(count[s] for count in counts)) for s in range(sensors)]

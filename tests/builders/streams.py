@@ -6,17 +6,24 @@ import numpy as np
 
 from mlbatch.arrays import U8Array
 from mlbatch.lidar.interface import NeighbourStream
-from mlbatch.sensors import plugins
 from mlbatch.types import Stream
+from tests.builders.vendors import vendors
 
 LACKING = ": no decoder in this version"
 
 
 def named(packets: U8Array) -> str | None:
-    """What the vendors but Ouster, which names packets by their sizes, call payloads (k, size)."""
-    vendors = (plugin for plugin in plugins() if plugin.VENDOR != "Ouster")
-    names = (vendor.describe(packets.shape[1], packets) for vendor in vendors)
-    return next((name for name in names if name is not None), None)
+    """What the vendors but Ouster, which names packets by their sizes, call payloads (k, size).
+
+    A vendor that names them must not exclude them.
+    """
+    size = packets.shape[1]
+    for _, folder, plugin in vendors():
+        name = None if plugin.VENDOR == "Ouster" else plugin.describe(size, packets)
+        if name is not None:
+            assert folder.may_send(size, packets), name
+            return name
+    return None
 
 
 def beside(stream: Stream, payload: bytes) -> NeighbourStream:

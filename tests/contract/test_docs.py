@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import re
-import shlex
+import runpy
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,47 +12,27 @@ import pytest
 
 from mlbatch import writers
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.page.findings import REMEDIES
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers
 from mlbatch.report import ledger
 from mlbatch.report.report import build_report
-from mlbatch.rig.rig import read_rig
 from mlbatch.sensors import models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.consumers.environments import ENVIRONMENTS
+from tests.contract.blocks import PAGES
 from tests.contract.test_help import OPTIONS
 from tests.contract.tree import PACKAGE, ROOT, run_mlbatch, run_python
 
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "fixtures" / "README.md")
+LINKED = (*PAGES, *sorted((ROOT / "docs" / "sources").glob("*.md")))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+MODELS = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
 FIXTURE = "fixtures/two_lidars/two_lidars.pcap"
 RIG = "fixtures/two_lidars/rig.yaml"
 MAKE_TABLE = "runpy.run_path('docs/sensors_table.py', run_name='__main__')"
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LINK = re.compile(r"\]\(([^)#:]+)\)")
-# The only line of a run that differs from machine to machine.
-TIMES = re.compile(r"recorded in .*")
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A line of a console block, and what it printed there."""
-
-    words: tuple[str, ...]
-    output: str
-
-
-def _blocks(language: str) -> list[str]:
-    return [text for found, text in BLOCK.findall(README) if found == language]
-
-
-def _commands() -> Iterator[Command]:
-    for block in _blocks("console"):
-        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
-            line, _, output = part.partition("\n")
-            yield Command(tuple(shlex.split(line, comments=True)), output)
+LINK = re.compile(r"\]\(([^)#:\s]*)(?:#([^)]*))?\)")
 
 
 def _page(name: str) -> str:
@@ -78,73 +55,26 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_examples_print_what_the_readme_says(place: Path) -> None:
-    shown = [command for command in _commands() if "convert" in command.words and command.output]
-    assert len(shown) >= 2
-    for command in shown:
-        done = run_mlbatch(list(command.words[1:]), place)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert TIMES.sub("", done.stdout) == TIMES.sub("", command.output)
-
-
-def test_every_command_of_the_readme_exists() -> None:
-    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    for command in _commands():
-        program, *arguments = command.words
-        if program == "make":
-            assert set(arguments) <= targets
-        elif program == "mlbatch":
-            options = {word for word in arguments[1:] if word.startswith("-")}
-            assert options <= {"-o", *OPTIONS[arguments[0]]}, command.words
-        else:
-            assert program in ("python3", ".venv/bin/pip"), command.words
-
-
-def test_python_examples_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(place)
-    blocks = _blocks("python")
-    assert blocks
-    for block in blocks:
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(compile(block, "README.md", "exec"), {})
-        assert printed.getvalue()
-
-
-def test_the_rig_of_the_readme_is_one(tmp_path: Path) -> None:
-    (block,) = _blocks("yaml")
-    for name in ("left.json", "right.json"):
-        (tmp_path / name).symlink_to(ROOT / "fixtures" / "two_lidars" / name)
-    (tmp_path / "rig.yaml").write_text(block, encoding="utf-8")
-    shown = read_rig(tmp_path / "rig.yaml")
-    real = read_rig(ROOT / RIG)
-    for left, right in zip(shown.sensors, real.sensors, strict=True):
-        assert (left.name, left.stream) == (right.name, right.stream)
-        assert isinstance(left.extrinsics, np.ndarray)
-        assert isinstance(right.extrinsics, np.ndarray)
-        np.testing.assert_array_equal(left.extrinsics, right.extrinsics)
-
-
 def test_the_table_of_sensors_is_up_to_date(tmp_path: Path) -> None:
     """It is made of the models, never written by hand."""
-    copy = tmp_path / "README.md"
-    copy.write_text(README, encoding="utf-8")
+    copy = tmp_path / "models.md"
+    copy.write_text(MODELS, encoding="utf-8")
     run_python(f"import runpy, sys; sys.argv[1:] = [{str(copy)!r}]\n{MAKE_TABLE}")
-    assert copy.read_text(encoding="utf-8") == README, "run python docs/sensors_table.py"
+    assert copy.read_text(encoding="utf-8") == MODELS, "run python docs/sensors_table.py"
 
 
 def test_the_table_of_sensors_names_every_model() -> None:
-    table = README.partition("<!-- sensors:")[2].partition("<!-- end of sensors")[0]
+    table = MODELS.partition("<!-- sensors:")[2].partition("<!-- end of sensors")[0]
     for model in models():
         row = next(row for row in _rows(table) if model.name in re.split(r", | \(", row[1]))
         assert (row[0], row[-1]) == (model.vendor, model.verified)
-        assert f"| {model.verified} | " in README, "say what the word means"
+        assert f"| {model.verified} | " in MODELS, "say what the word means"
 
 
 @pytest.mark.parametrize("name", CLOUD_LAYOUTS)
 def test_layouts_are_described(name: str) -> None:
     layout = CLOUD_LAYOUTS[name]
-    short = next(row for row in _rows(README) if row[0] == name)
+    short = next(row for row in _rows(_page("howto/point-layouts.md")) if row[0] == name)
     assert re.sub(r" \([^)]*\)", "", short[1]) == ", ".join(f.name for f in layout.fields)
     assert short[2] == str(layout.step)
     fields = [f"{f.name} {np.dtype(f.dtype).name} {f.offset}" for f in layout.fields]
@@ -212,17 +142,63 @@ def _keys(value: object) -> Iterator[str]:
             yield from _keys(inner)
 
 
-def test_every_warning_is_described() -> None:
+def _warning_codes() -> set[str]:
+    """Codes of warnings that the source has as a text."""
     source = "".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
     codes = set(re.findall(r'\bNote\(\s*"(\w+)"', source))
     assert codes
-    assert codes <= _first_cells(_page("report.md"))
+    return codes
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_warning_is_described() -> None:
+    assert _warning_codes() <= _first_cells(_page("report.md"))
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in LINK.findall(page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.name}: {target}"
+    """To a file of the repository, and to a heading or anchor of it."""
+    for target, anchor in LINK.findall(_prose(page)):
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in _anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+def _prose(page: Path) -> str:
+    """The text of a page without blocks of code."""
+    return re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def _anchors(page: Path) -> set[str]:
+    """Anchors of a page: of its headings as Git hosts name them, and its own."""
+    text = _prose(page)
+    slugs = [
+        re.sub(r"[^\w\- ]", "", re.sub(r"`|\[([^]]*)\]\([^)]*\)", r"\1", title).lower())
+        for title in re.findall(r"^#+ (.+?) *$", text, re.MULTILINE)
+    ]
+    return {slug.replace(" ", "-") for slug in slugs} | set(re.findall(r'<a id="([^"]+)"', text))
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    made = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["made_pages"]()
+    nav = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(nav) == sorted([*pages, *made])
+
+
+def test_every_warning_has_a_section_with_its_remedy() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["warnings_page"]()
+    sections = re.findall(r"^## (\w+)$", page, re.MULTILINE)
+    assert _warning_codes() <= set(sections) == set(REMEDIES)
+    assert page.count("**What to do:**") == len(sections)
+
+
+def test_the_page_of_options_has_every_option() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["options_page"]()
+    for name, options in OPTIONS.items():
+        section = page.partition(f"## mlbatch {name}\n")[2].partition("\n## ")[0]
+        names = " ".join(row[0] for row in _rows(section))
+        assert set(re.findall(r"(?<![\w-])--[\w-]+", names)) >= set(options), name
 
 
 def test_every_module_is_on_the_map() -> None:

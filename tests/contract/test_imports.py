@@ -20,7 +20,8 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("decode", "batching"),
     ("report", "rig", "clocks"),
     ("lidar", "frames", "ros"),
-    ("types", "native"),
+    ("types",),
+    ("native",),
     ("arrays", "units", "entry_points"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", ""),

@@ -9,7 +9,7 @@ import pytest
 
 from tests.contract.tree import PACKAGE, ROOT
 
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.[ch]")])
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 # A private idiom that was removed, with what to write instead.

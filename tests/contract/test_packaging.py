@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import TypeAlias, cast
 
+import yaml
+
 import mlbatch
 from tests.contract.tree import PACKAGE, ROOT, modules
 
@@ -100,3 +102,26 @@ def test_licence_and_readme_are_there() -> None:
     assert "MIT License" in Path(ROOT / "LICENSE").read_text(encoding="utf-8")
     assert _settings("project")["license"] == {"file": "LICENSE"}
     assert (ROOT / str(_settings("project")["readme"])).is_file()
+
+
+def test_metadata_names_no_person_and_no_address() -> None:
+    project = _settings("project")
+    assert str(project["authors"]) == "[{'name': 'The mlbatch authors'}]"
+    assert "urls" not in project
+    assert f"Programming Language :: Python :: {sys.version_info[0]}" in project["classifiers"]
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == mlbatch.__version__
+    paper = citation["preferred-citation"]
+    names = ", ".join(author["family-names"] for author in paper["authors"])
+    batching = " ".join((ROOT / "docs" / "batching.md").read_text(encoding="utf-8").split())
+    assert f'{names} ({paper["year"]}), "{paper["title"]}"' in batching
+    assert "doi" not in paper
+
+
+def test_the_changelog_has_this_version() -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"## {mlbatch.__version__}\n" in changes
+    assert "## Unreleased\n" in changes

@@ -1,12 +1,8 @@
-"""The blocks of docs/python.md run, one after another, as someone would type them."""
+"""docs/python.md and docs/plugins.md name what the interface has (test_blocks.py runs them)."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import io
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,24 +12,6 @@ from tests.contract.tree import ROOT
 
 PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
 PLUGINS = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-# A second word is the package that a block needs.
-BLOCK = re.compile(r"^```python ?(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-BLOCKS = [(match[1], match[2]) for match in BLOCK.finditer(PAGE)]
-
-
-def test_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "fixtures").symlink_to(ROOT / "fixtures")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    assert len(BLOCKS) >= 7
-    for package, text in BLOCKS:
-        code = compile(text, "docs/python.md", "exec")
-        if package and importlib.util.find_spec(package) is None:
-            continue
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(code, names)
-        assert printed.getvalue()
 
 
 @pytest.mark.parametrize("name", sorted(set(mlbatch.__all__) - {"MlbatchError", "Run", "Scan"}))

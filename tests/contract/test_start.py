@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.builders.sessions import SMALL, Unit, write_session
-from tests.contract.tree import modules, run_python
+from tests.contract.tree import ROOT, modules, run_python
+from tests.golden.test_every_model import CASES, SOURCE, job_of
 
 
 def test_the_command_line_spares_the_collector() -> None:
@@ -35,9 +36,11 @@ def test_the_library_leaves_the_collector_alone() -> None:
     assert printed.strip() == "True"
 
 
-# Vendors that are asked after Ouster, containers and messages that are not there, outputs and
+# Other vendors, containers and messages that are not there, outputs and
 # commands that were not requested.
 NEEDLESS = (
+    *("mlbatch.sensors.hesai.sensor", "mlbatch.sensors.hesai.identify"),
+    *("mlbatch.sensors.livox.sensor", "mlbatch.sensors.livox.identify"),
     *("mlbatch.sensors.pointcloud.sensor", "mlbatch.sensors.robosense.sensor"),
     *("mlbatch.sensors.velodyne.sensor", "mlbatch.sensors.robosense.identify"),
     *("mlbatch.sensors.velodyne.identify", "mlbatch.readers.formats.mcap"),
@@ -49,7 +52,7 @@ NEEDLESS = (
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.bench", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
-    *("numpy.ma", "rosbags", "rich"),
+    *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
 )
 
 
@@ -80,3 +83,84 @@ def test_a_capture_loads_only_what_it_needs(tmp_path: Path) -> None:
     )
     assert printed.strip() == "0 []"
     assert output.is_file()
+
+
+# -- vendors --------------------------------------------------------------------------------------
+
+
+def _vendors_loaded(arguments: list[str]) -> set[str]:
+    """Vendors whose plug-ins a command loads."""
+    printed = run_python(
+        "import atexit, sys\n"
+        "names = [f'mlbatch.sensors.{name}.sensor' for name in "
+        "('hesai', 'livox', 'ouster', 'pointcloud', 'robosense', 'velodyne')]\n"
+        "from mlbatch.cli import main\n"
+        "atexit.register(lambda: print('loaded', *[n for n in names if n in sys.modules]))\n"
+        f"sys.argv[1:] = {arguments!r}\n"
+        "main()\n"
+    )
+    names = printed.splitlines()[-1].split()[1:]
+    return {name.split(".")[2] for name in names}
+
+
+@pytest.mark.parametrize("has_rig", [False, True])
+@pytest.mark.parametrize("vendor", ["hesai", "robosense", "velodyne"])
+def test_a_capture_of_one_vendor_loads_no_other(vendor: str, has_rig: bool, tmp_path: Path) -> None:
+    make, words = next(case for case in CASES if case[0].__name__ == f"{vendor}_sent")
+    sent = make(*words)
+    job = job_of(sent, tmp_path)
+    arguments = ["convert", str(job.recordings[0]), "--dry-run", "--quiet", "--keep-partial"]
+    if has_rig:
+        rig = tmp_path / "rig.yaml"
+        named = "" if vendor == "hesai" else f", model: {sent.model}"
+        file = f", metadata: {sent.file}" if sent.file else ""
+        rig.write_text(
+            f"sensors: [{{name: one{named}{file}, stream: {{source_ip: {SOURCE}, port: 2368}}, "
+            "extrinsics: {translation_m: [0, 0, 0], rotation_rpy_deg: [0, 0, 0]}}]\n"
+        )
+        arguments += ["--rig", str(rig)]
+    else:
+        arguments += ["--identity-extrinsics"]
+        arguments += ["--metadata", str(tmp_path / sent.file)] if sent.file else []
+    assert _vendors_loaded(arguments) == {vendor}
+
+
+def test_a_capture_of_ouster_and_other_programs_loads_no_other_vendor() -> None:
+    """The fixture has IMU packets and multicast DNS as well."""
+    folder = ROOT / "fixtures" / "two_lidars"
+    capture = str(folder / "two_lidars.pcap")
+    arguments = ["convert", capture, "--rig", str(folder / "rig.yaml"), "--dry-run", "--quiet"]
+    assert _vendors_loaded(arguments) == {"ouster"}
+    assert _vendors_loaded(["inspect", capture]) == {"ouster"}
+
+
+def test_a_capture_of_four_vendors_loads_all_of_them() -> None:
+    """The list above is that of plug-ins that would be loaded."""
+    folder = ROOT / "fixtures" / "four_makers"
+    (capture,) = folder.glob("*.pcap")
+    loaded = _vendors_loaded(["inspect", str(capture)])
+    assert {"hesai", "ouster", "robosense", "velodyne"} <= loaded
+
+
+# -- help -----------------------------------------------------------------------------------------
+
+# What only a run needs.
+OF_A_RUN = (
+    *("numpy", "yaml", "mcap", "rosbags", "zstandard", "lz4", "ctypes", "importlib.metadata"),
+    *("mlbatch.types", "mlbatch.rig", "mlbatch.sensors", "mlbatch.readers", "mlbatch.writers"),
+    *("mlbatch.pipeline", "mlbatch.discovery", "mlbatch.report", "mlbatch.cli.run"),
+)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["convert", "--help"], ["--version"]])
+def test_help_loads_nothing_of_a_run(arguments: list[str]) -> None:
+    printed = run_python(
+        "import atexit, sys\n"
+        "import typer\n"
+        f"names = [name for name in {OF_A_RUN!r} if name not in sys.modules]\n"
+        "from mlbatch.cli import main\n"
+        "atexit.register(lambda: print('loaded', *[n for n in names if n in sys.modules]))\n"
+        f"sys.argv[1:] = {arguments!r}\n"
+        "main()\n"
+    )
+    assert printed.splitlines()[-1] == "loaded"

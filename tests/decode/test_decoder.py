@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
+from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.projector import tile_columns
@@ -100,8 +101,11 @@ def _scan(
     mids = np.array([mid for _, mid in columns], np.int64)
     place = np.array([stored[s].ring_index[mid] for s, mid in columns], np.int64)
     stamps = START_NS + np.arange(len(columns), dtype=np.int64) * 100_000
-    label = ScanHeader(3, 0, START_NS, START_NS + 10**8, True, 17)
-    return decoder.scan(WindowColumns(stamps, sensor, place, mids), label)
+    due = WindowColumns(stamps, sensor, place, mids)
+    angles = [one.source.lidar.beams.angle_rad for one in stored]
+    merge = ColumnMerge([None if angle is None else len(angle) for angle in angles])
+    (figures,) = merge.figures(due, [len(due)])
+    return decoder.scan(due, ScanHeader(3, 0, START_NS, START_NS + 10**8, True, 17, figures))
 
 
 def _xyz(scan: Scan) -> list[list[float]]:

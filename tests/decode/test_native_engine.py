@@ -113,6 +113,7 @@ class Guarded(ScanBuffer):
             end = (GUARD_ROWS + len(array)) * row
             self._guards += [whole[:begin], whole[end:]]
             setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
+        self.view_labels()
 
     @property
     def is_intact(self) -> bool:
@@ -227,7 +228,7 @@ def test_records_stay_while_the_loops_run() -> None:
     lidar = ouster("RNG15_RFL8_NIR8", 16)
     rng = np.random.default_rng(0)
     ring, places = filled(lidar, rng)
-    before = weakref.ref(ring.pieces)
+    before = weakref.ref(ring.view[0])
     info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, POSES[0])
     run = RunInfo((info,), "base_link", "10", "utc", 1, "dense")
     sources = [Source(lidar, ring, POSES[0], 0)]
@@ -242,7 +243,7 @@ def test_records_stay_while_the_loops_run() -> None:
         def mlbatch_decode(self, scan: object) -> int:
             start = np.arange(1000) * lidar.packet_size
             ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
-            grown.append(before() is not None and before() is not ring.pieces)
+            grown.append(before() is not None and before() is not ring.view[0])
             return int(decode_columns(scan))
 
     cast(Any, decoder)._engine._library = Late()

@@ -233,3 +233,70 @@ def test_nothing_is_looked_up_where_a_built_in_plugin_fits(other: Path) -> None:
 
     assert readers.open_recording(capture, StreamTable()).container == "pcap"
     assert writers.choose_format(Path("scans.mcap"), None) == "mcap"
+
+
+# -- the quick search -----------------------------------------------------------------------------
+
+
+class _Lookups:
+    """Counts uses of `importlib.metadata`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.groups: list[str] = []
+        monkeypatch.setattr(importlib.metadata, "entry_points", self._entry_points)
+
+    def _entry_points(self, group: str) -> list[importlib.metadata.EntryPoint]:
+        self.groups.append(group)
+        return []
+
+
+def test_metadata_are_not_read_without_plugins(
+    other: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _distribution(other, "unrelated", "mlbatch.sensors_of_others", "x = y")
+    monkeypatch.setattr(sys, "path", [str(other), "", str(other / "missing")])
+    lookups = _Lookups(monkeypatch)
+    assert entry_points.names(entry_points.SENSORS) == ()
+    assert lookups.groups == []
+
+
+def test_metadata_are_read_where_one_distribution_has_plugins(
+    other: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = other / "own.egg-info"
+    about.mkdir()
+    (about / "entry_points.txt").write_text("[mlbatch.sensors]\nx = y\n")
+    monkeypatch.setattr(sys, "path", [str(other)])
+    lookups = _Lookups(monkeypatch)
+    entry_points.names(entry_points.READERS)
+    assert lookups.groups == []
+    entry_points.names(entry_points.SENSORS)
+    assert lookups.groups == [entry_points.SENSORS]
+
+
+@pytest.mark.parametrize("name", ["packages.zip", "thing-1.egg"])
+def test_metadata_are_read_where_archives_are_on_the_path(
+    name: str, other: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (other / name).write_bytes(b"PK")
+    monkeypatch.setattr(sys, "path", [str(other / name)])
+    lookups = _Lookups(monkeypatch)
+    entry_points.names(entry_points.WRITERS)
+    assert lookups.groups == [entry_points.WRITERS]
+
+
+def test_metadata_are_read_where_another_finder_has_distributions(
+    other: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Finder:
+        def find_spec(self, *_: object) -> None:
+            return None
+
+        def find_distributions(self, *_: object) -> list[object]:
+            return []
+
+    monkeypatch.setattr(sys, "path", [str(other)])
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder()])
+    lookups = _Lookups(monkeypatch)
+    entry_points.names(entry_points.WRITERS)
+    assert lookups.groups == [entry_points.WRITERS]

@@ -15,6 +15,7 @@ from mlbatch.errors import MlbatchError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import FAULTS, Calibration, Lidar
 from mlbatch.types import ColumnHeaders, PacketBatch, Pixels, Stream, StreamTable
+from tests.builders.vendors import wrongly_excluded
 from tests.fuzz.framing import Part
 from tests.fuzz.harness import BrokenLaw
 
@@ -64,6 +65,8 @@ def decode_samples(
         text = sensors.describe(evidence.size, evidence.sample)
         if text is not None and (not text.isprintable() or len(text) > 500):
             raise BrokenLaw(f"packets are described as {text!r}")
+        if excluded := wrongly_excluded(evidence):
+            raise BrokenLaw(f"packets that {excluded} know, though `may_send` is False")
         if is_rigged:
             fits, _ = best_fits(evidence, every, options, model)
             for fit in fits[:2]:

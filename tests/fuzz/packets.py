@@ -29,10 +29,11 @@ from tests.builders.livox import (
 from tests.builders.others import livox1_packets
 from tests.builders.velodyne_tables import calibration_yaml
 from tests.builders.velodyne_xml import entries, xml_of
+from tests.builders.vendors import wrongly_excluded_file
 from tests.contract.tree import ROOT
 from tests.fuzz.decoding import check_lidar, decode_samples, sampled, try_all
 from tests.fuzz.framing import Part, joined, mutated_parts, parts_of
-from tests.fuzz.harness import Target
+from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
 from tests.golden.test_every_model import CASES
 
@@ -165,6 +166,8 @@ def _evidence() -> Sequence[Evidence]:
 
 def _calibrate(suffix: str, data: bytes, folder: Path) -> None:
     """Read a file; where it is one, decode sound packets with it."""
+    if excluded := wrongly_excluded_file(Path(f"unit{suffix}"), data):
+        raise BrokenLaw(f"a file that {excluded} know, though `may_calibrate` is False")
     calibration = sensors.parse_calibration(Path(f"unit{suffix}"), data)
     if calibration is None:
         return
@@ -186,7 +189,8 @@ def seeds_of(vendor: str) -> Seeds:
     return _streams()[vendor]
 
 
-def _files_of(suffix: str) -> Seeds:
+def files_of(suffix: str) -> Seeds:
+    """Calibration files with a suffix."""
     return _files()[suffix]
 
 
@@ -199,7 +203,7 @@ TARGETS: Sequence[Target] = (
     *(
         Target(
             f"calibration {suffix}",
-            partial(_files_of, suffix),
+            partial(files_of, suffix),
             partial(_calibrate, suffix),
             mutated if suffix == ".dat" else mutated_text,
             4 if suffix == ".yaml" else 20,

@@ -42,7 +42,7 @@ def test_the_output_is_that_of_the_command(tmp_path: Path) -> None:
 def test_the_report_of_a_run(tmp_path: Path) -> None:
     run = mlbatch.convert(CAPTURE, tmp_path / "scans", rig=RIG)
     left = run.report.sensors["left"]
-    # README: 271 packets, 3584 columns written and 752 dropped, 90790 points.
+    # docs/tutorials/first-merge.md: 271 packets, 3584 columns and 752 dropped, 90790 points.
     assert (left.packets, left.lost, left.rejected) == (271, 0, {})
     assert (left.columns, sum(left.dropped.values()), left.points) == (3584, 752, 90790)
     assert run.report.scans.written == 7

@@ -9,7 +9,7 @@ copies the payload for every header of a chain of any length.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 _HEADER = struct.Struct(">IHBB16s16s")
 _FRAGMENT = struct.Struct(">BBHI")
@@ -23,8 +23,7 @@ _PLAIN_HEADERS = frozenset((0, 43, 60, 135, 139, 140))
 _MOST_HEADERS = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """A UDP payload or a fragment: `size` bytes from `start`; source and destination: 16 bytes.
 
     port: destination port of a whole datagram; ident: number of the set of a fragment, or None.

@@ -6,7 +6,7 @@ families of NULL and LOOP: 2 everywhere, IPv6 differs with the system (10, 24, 2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,7 @@ _BY_VERSION = _table(1 << 8, {v << 4 | low: v for v in (IPV4, IPV6) for low in r
 _ADDRESS_FAMILY = _table(1 << 8, {2: IPV4, 10: IPV6, 24: IPV6, 28: IPV6, 30: IPV6})
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
+class Link(NamedTuple):
     """A link header of `header` bytes; ethertype_at: place of the ethertype, if it has one.
 
     has_family: the header is an address family of four bytes, in either byte order.

@@ -16,6 +16,7 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.errors import RecordingError
+from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture import link_types
@@ -25,7 +26,7 @@ from mlbatch.readers.source import BUFFER_BYTES, Source, Window
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, StreamTable
 
 # Room for fragments of earlier buffers in addition to those of this one.
-_ARENA_EXTRA_BYTES = 1 << 20
+_FRONT_EXTRA_BYTES = 1 << 20
 # The largest snapshot length of libpcap; a longer frame is a damaged record header.
 MAX_FRAME_BYTES = 1 << 18
 # Read at the end of a file: more than the packets of some lidars in 100 ms.
@@ -72,6 +73,8 @@ class CaptureRecording(Recording):
     buffer_bytes: int = BUFFER_BYTES
     together: bool = True
     engine: str = "numpy"
+    # Of the next pass; None: each buffer is used again.
+    arena: PacketArena | None = None
     # Start of the first record in the last bytes of a file (True: all its records), and bytes of
     # the file before records.
     first_record: Callable[[U8Array, bool], int | None] | None = None
@@ -105,12 +108,18 @@ class CaptureRecording(Recording):
         """Read by `numpy` or `native` from the next pass on."""
         self.engine = engine
 
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Read the next pass into an arena."""
+        self.arena = arena
+        return True
+
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, in file order; each call is a new pass."""
         self.counts = CaptureCounts()
         self.notes = []
         self.position_bytes = 0
         current = _Pass(self)
+        self.arena = None
         try:
             with Source(self.path) as source:
                 yield from current.batches(source)
@@ -129,19 +138,22 @@ class _Pass:
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
         self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
-        self.arena_bytes = recording.buffer_bytes + _ARENA_EXTRA_BYTES
+        self.front_bytes = recording.buffer_bytes + _FRONT_EXTRA_BYTES
+        self.arena = recording.arena
         self.unknown_link: int | None = None
         self.has_known_link = False
 
     def batches(self, source: Source) -> Iterator[PacketBatch]:
         """All packets of the file."""
-        window = Window(source, self.recording.buffer_bytes, front=self.arena_bytes)
+        size = self.recording.buffer_bytes
+        window = Window(source, size, front=self.front_bytes, arena=self.arena)
         window.refill()
         while True:
             self.recording.position_bytes = source.position_bytes
             walk = self.walker.walk(window.data, window.begin, window.end)
-            for frames in self._portions(walk.frames):
-                batch = self._batch(window.data, frames)
+            for frames, is_last in self._portions(walk.frames):
+                # With a need the rest comes in another region.
+                batch = self._batch(window, frames, is_last=is_last and walk.need > 0)
                 if len(batch):
                     yield batch
             window.begin = walk.next
@@ -154,20 +166,28 @@ class _Pass:
                 self._end(window, walk, source)
                 return
 
-    def _portions(self, frames: Frames) -> Iterator[Frames]:
-        """Frames in portions whose datagrams fit into the arena, whatever their fragments."""
-        fewest = self.arena_bytes // MAX_DATAGRAM_BYTES
+    def _portions(self, frames: Frames) -> Iterator[tuple[Frames, bool]]:
+        """Frames in portions whose datagrams fit into the front, whatever their fragments.
+
+        The second is True for the last portion.
+        """
+        fewest = self.front_bytes // MAX_DATAGRAM_BYTES
         end_bytes = np.cumsum(frames.captured)
         at = 0
         while at < len(frames):
             before = int(end_bytes[at - 1]) if at else 0
-            room = self.arena_bytes - self.reassembler.sets.held_bytes + before
+            room = self.front_bytes - self.reassembler.sets.held_bytes + before
             stop = max(int(np.searchsorted(end_bytes, room, side="right")), at + fewest)
-            yield frames.take(slice(at, stop))
+            yield frames.take(slice(at, stop)), stop >= len(frames)
             at = stop
 
-    def _batch(self, data: U8Array, frames: Frames) -> PacketBatch:
-        """The packets that these frames contain or complete; all other frames are counted."""
+    def _batch(self, window: Window, frames: Frames, *, is_last: bool) -> PacketBatch:
+        """The packets that these frames contain or complete; all other frames are counted.
+
+        is_last: no other batch is assembled in the same bytes.
+        """
+        data = window.data
+        place = window.arena_place
         self._note_links(frames.link)
         found = dissect(data, frames, self.addresses, self.loops)
         counts = self.recording.counts
@@ -179,10 +199,11 @@ class _Pass:
             receive_ns = frames.host_ns[found.fragments.frame]
             assembled = self.reassembler.push(data, found.fragments, receive_ns)
             datagrams = in_order(datagrams, assembled)
+            place = place if is_last else None
         counts.datagrams += len(datagrams.frame)
         stream = self.numbers.numbers(datagrams.source, datagrams.port)
         host_ns = frames.host_ns[datagrams.frame]
-        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns)
+        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns, place=place)
 
     def _note_links(self, link: I64Array) -> None:
         if not self.has_known_link:

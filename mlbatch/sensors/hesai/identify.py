@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import BoolArray, U8Array
+from mlbatch.sensors.hesai import PREFIX_SIZE
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.layout import (
     AMBIENT,
     ONLY_RETURN,
-    PREFIX_SIZE,
     RETURN_MODES,
     SEQUENCE,
     Layout,

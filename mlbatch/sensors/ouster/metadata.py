@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
@@ -49,8 +49,7 @@ _RIGID_TOLERANCE = 1e-3
 _REMEDY = "save the metadata from the sensor again"
 
 
-@dataclass(frozen=True, slots=True)
-class Document:
+class Document(NamedTuple):
     """A metadata file as one mapping from field name to JSON value."""
 
     path: Path

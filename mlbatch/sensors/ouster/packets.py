@@ -57,6 +57,15 @@ def first_measurement_ids(packets: U8Array, layout: PacketLayout) -> I64Array:
     return unsigned(packets, (layout.record_start + _ID_OFFSET, _ID_BYTES))
 
 
+def column_starts(layout: PacketLayout) -> I64Array:
+    """(C,) first bytes of the columns."""
+    return layout.record_start + np.arange(layout.columns) * layout.record_size
+
+
+def _ranges(starts: I64Array, size: int) -> I64Array:
+    return np.stack([starts, np.full(len(starts), size)], axis=1)
+
+
 def column_bytes(packets: U8Array, layout: PacketLayout) -> U8Array:
     """All columns of all packets: (P, C, record size), a view."""
     size = layout.record_size
@@ -77,6 +86,16 @@ class LegacyHeaders:
         mid = columns["measurement_id"].astype(np.int64)
         valid = self._measured(packets) & (mid < self.columns_per_frame)
         return ColumnHeaders(columns["stamp_ns"].astype(np.int64), mid, valid)
+
+    def read_bytes(self) -> I64Array:
+        """(k, 2) first byte and number of bytes of all that is read here."""
+        ends = column_starts(self.layout) + self.layout.record_size - LEGACY_STATUS.itemsize
+        return np.concatenate(
+            [
+                _ranges(column_starts(self.layout), LEGACY_COLUMN.itemsize),
+                _ranges(ends, LEGACY_STATUS.itemsize),
+            ]
+        )
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) True: packets carry no serial number."""
@@ -136,6 +155,13 @@ class PacketHeaders:
         mid = columns["measurement_id"].astype(np.int64)
         valid = ((columns["status"] & 1) != 0) & (mid < self.columns_per_frame)
         return ColumnHeaders(columns["stamp_ns"].astype(np.int64), mid, valid)
+
+    def read_bytes(self) -> I64Array:
+        """(k, 2) first byte and number of bytes of all that is read here."""
+        if self.check_crc and self.header == STANDARD:
+            return np.array([[0, self.layout.packet_size]])
+        header = np.array([[0, self.layout.record_start]])
+        return np.concatenate([header, _ranges(column_starts(self.layout), COLUMN.itemsize)])
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether the serial number is the sensor's; 0 on either side matches all."""

@@ -8,8 +8,7 @@ masked, header included, since short rows cost more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +23,7 @@ _WORD_BITS = 32
 _WORD_BYTES = 4
 
 
-@dataclass(frozen=True, slots=True)
-class _BitField:
+class _BitField(NamedTuple):
     """A field as (word >> shift) & mask; None for a step that is not needed."""
 
     word: int
@@ -33,16 +31,14 @@ class _BitField:
     mask: np.uint32 | None
 
 
-@dataclass(frozen=True, slots=True)
-class _ByteField:
+class _ByteField(NamedTuple):
     """A field of whole bytes, read in place."""
 
     first: int
     dtype: np.dtype[np.unsignedinteger[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class _Return:
+class _Return(NamedTuple):
     """Fields of one return; per_metre: raw range units in a metre."""
 
     range: _BitField

@@ -8,7 +8,7 @@ byte.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,7 @@ COLUMN = np.dtype([("stamp_ns", "<i8"), ("measurement_id", "<u2"), ("status", "<
 ENCODER_TICKS = 90112
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(NamedTuple):
     """A field of a pixel: `width` bits from `first_bit` on, times 2**shift."""
 
     first_bit: int
@@ -45,8 +44,7 @@ class Field:
     shift: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class HeaderLayout:
+class HeaderLayout(NamedTuple):
     """Fields of a packet header as (first byte, bytes)."""
 
     packet_type: tuple[int, int]
@@ -63,8 +61,7 @@ HEADERS: Mapping[str, HeaderLayout] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
+class Profile(NamedTuple):
     """A lidar profile: pixel fields by name; RANGE in mm, 0 for no return."""
 
     name: str
@@ -82,8 +79,7 @@ class Profile:
         return FUSA if self.name.startswith("FUSA") else STANDARD
 
 
-@dataclass(frozen=True, slots=True)
-class PacketLayout:
+class PacketLayout(NamedTuple):
     """Sizes of a lidar packet."""
 
     profile: Profile

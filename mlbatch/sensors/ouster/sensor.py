@@ -183,6 +183,7 @@ class OusterLidar:
         self.init_id = described.init_id
         self._metadata = described
         self._headers = _headers(described, check_crc)
+        self.header_bytes = self._headers.read_bytes()
         self._pixels = PixelReader(layout)
         self.pixels = pixel_table(layout)
         self._rank, in_window = _packet_ranks(described)

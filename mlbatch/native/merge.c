@@ -1,0 +1,125 @@
+/* Columns of all sensors in one order, and their figures: `batching/merge.py`. */
+#include <string.h>
+
+#include "native.h"
+
+enum { MOST_SENSORS = 256 };
+/* Figures of a sensor in a window: columns, largest gap, sectors entered, sectors entered again,
+   first and last stamp; then the sector of the last column. */
+enum { NUMBER, GAP, ONCE, AGAIN, FIRST, LAST, SECTOR, FIGURES };
+
+/* Whether the columns of the parts of one sensor are in the order of their stamps. */
+static int is_sorted(const Part *parts, int64_t begin, int64_t end)
+{
+    int64_t last = INT64_MIN;
+    for (const Part *part = parts + begin; part < parts + end; part++)
+        for (int64_t column = 0; column < part->columns; column++) {
+            if (part->stamp_ns[column] < last)
+                return 0;
+            last = part->stamp_ns[column];
+        }
+    return 1;
+}
+
+/* Merge the columns before `until_ns` by stamp, then by sensor, then in their order. Parts come by
+   sensor; taken (parts,): columns taken of each. Return the number of columns, -1 if those of a
+   sensor are not in order. */
+EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
+                             int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
+                             int64_t *ring_index, int64_t *encoder)
+{
+    /* Of each sensor: its next part and the end of its parts. */
+    int64_t next[MOST_SENSORS], end[MOST_SENSORS], sensors = 0, count = 0;
+    for (int64_t part = 0; part < part_count; part++) {
+        taken[part] = 0;
+        if (part == 0 || parts[part].sensor != parts[part - 1].sensor)
+            next[sensors++] = part;
+        end[sensors - 1] = part + 1;
+    }
+    for (int64_t one = 0; one < sensors; one++)
+        if (!is_sorted(parts, next[one], end[one]))
+            return -1;
+    for (;;) {
+        /* The sensor with the smallest stamp, and the stamp at which another one comes first. */
+        int64_t best = -1, smallest = until_ns, limit = until_ns;
+        for (int64_t one = 0; one < sensors; one++) {
+            while (next[one] < end[one] && taken[next[one]] == parts[next[one]].columns)
+                next[one]++;
+            if (next[one] == end[one])
+                continue;
+            const int64_t stamp = parts[next[one]].stamp_ns[taken[next[one]]];
+            if (stamp < smallest) {
+                /* The one before has a lower number, so that it comes first again when equal. */
+                limit = smallest;
+                smallest = stamp;
+                best = one;
+            } else if (best >= 0 && stamp < limit) {
+                limit = stamp + 1;
+            }
+        }
+        if (best < 0)
+            return count;
+        const Part *part = parts + next[best];
+        int64_t at = taken[next[best]];
+        do {
+            stamp_ns[count] = part->stamp_ns[at];
+            sensor[count] = part->sensor;
+            ring_index[count] = part->ring_index[at];
+            encoder[count] = part->encoder[at];
+            count++;
+            at++;
+        } while (at < part->columns && part->stamp_ns[at] < limit);
+        taken[next[best]] = at;
+    }
+}
+
+/* Rotor positions are a share of `positions`; 0: rotor words, 2**32 ticks a revolution. */
+static int64_t sector_of(int64_t encoder, int64_t positions, int64_t sectors)
+{
+    if (positions)
+        return encoder * sectors / positions;
+    return (encoder & INT64_C(0xFFFFFFFF)) * sectors >> 32;
+}
+
+/* Figures (windows, sensors, FIGURES) of the columns of some windows; ends (windows,): column
+   after the last of each; positions (sensors,): see `sector_of`; entered (sensors, sectors):
+   scratch. Return 1 if a position is outside of the revolution, so that numpy computes them. */
+EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
+                               const int64_t *sensor, const int64_t *encoder, int64_t sensors,
+                               const int64_t *positions, int64_t sectors, int64_t *entered,
+                               int64_t *figures)
+{
+    memset(figures, 0, (size_t)(windows * sensors * FIGURES) * sizeof *figures);
+    int64_t column = 0;
+    for (int64_t window = 0; window < windows; window++, figures += sensors * FIGURES) {
+        memset(entered, 0, (size_t)(sensors * sectors) * sizeof *entered);
+        for (; column < ends[window]; column++) {
+            const int64_t number = sensor[column];
+            if (encoder[column] < 0 && positions[number])
+                return 1;
+            const int64_t sector = sector_of(encoder[column], positions[number], sectors);
+            if (sector < 0 || sector >= sectors)
+                return 1;
+            int64_t *own = figures + number * FIGURES;
+            if (own[NUMBER] == 0) {
+                own[FIRST] = stamp_ns[column];
+                entered[number * sectors + sector]++;
+            } else {
+                entered[number * sectors + sector] += sector != own[SECTOR];
+                const int64_t gap = stamp_ns[column] - own[LAST];
+                if (gap > own[GAP])
+                    own[GAP] = gap;
+            }
+            own[NUMBER]++;
+            own[LAST] = stamp_ns[column];
+            own[SECTOR] = sector;
+        }
+        for (int64_t number = 0; number < sensors; number++)
+            for (int64_t sector = 0; sector < sectors; sector++) {
+                const int64_t times = entered[number * sectors + sector];
+                figures[number * FIGURES + ONCE] += times > 0;
+                figures[number * FIGURES + AGAIN] += times > 1;
+            }
+    }
+    return 0;
+}

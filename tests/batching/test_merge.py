@@ -1,0 +1,118 @@
+"""Columns of all sensors in one order, and their figures: the loops against numpy, and by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.arrays import I64Array
+from mlbatch.batching.merge import ColumnMerge, column_merge
+from mlbatch.types import NO_COLUMNS, ColumnFigures, Columns, WindowColumns
+from tests.builders.engines import ENGINES, needs_native
+
+POSITIONS = (1024, None, 512)
+BASE_NS = 1_700_000_000_000_000_000
+
+
+def _merge(engine: str) -> ColumnMerge:
+    return column_merge(engine, POSITIONS)
+
+
+def _part(stamps: list[int], first: int) -> Columns:
+    stamp_ns = np.array(stamps, np.int64)
+    number = np.arange(first, first + len(stamps))
+    return Columns(stamp_ns, number, number * 7 % 512)
+
+
+def _waiting(sensors: list[list[list[int]]]) -> list[list[Columns]]:
+    """Columns of sensors, in parts; their ring indexes are their order of delivery."""
+    waiting = []
+    for parts in sensors:
+        firsts = np.cumsum([0, *(len(part) for part in parts)]).tolist()
+        waiting.append([_part(part, first) for part, first in zip(parts, firsts, strict=False)])
+    return waiting
+
+
+STAMPS = st.lists(st.integers(0, 30), max_size=8)
+PARTS = st.lists(STAMPS, max_size=4)
+
+
+@needs_native
+@pytest.mark.parametrize("engine", ENGINES)
+@given(
+    sensors=st.lists(PARTS, min_size=3, max_size=3),
+    in_order=st.booleans(),
+    until=st.integers(0, 31),
+)
+def test_columns_come_by_stamp_sensor_and_delivery(
+    engine: str, sensors: list[list[list[int]]], in_order: bool, until: int
+) -> None:
+    if in_order:
+        for parts in sensors:
+            ordered = sorted(stamp for part in parts for stamp in part)
+            for part in parts:
+                part[:] = [ordered.pop(0) for _ in part]
+    waiting = _waiting(sensors)
+    merged = _merge(engine).take_until(waiting, until)
+    everything = [
+        (stamp, number, place)
+        for number, parts in enumerate(sensors)
+        for place, stamp in enumerate(stamp for part in parts for stamp in part)
+    ]
+    due = sorted(one for one in everything if one[0] < until)
+    found = zip(
+        merged.stamp_ns.tolist(), merged.sensor.tolist(), merged.ring_index.tolist(), strict=True
+    )
+    assert list(found) == due
+    assert merged.encoder.tolist() == [place * 7 % 512 for _, _, place in due]
+    for number, own in enumerate(waiting):
+        left = [place for stamp, sensor, place in everything if sensor == number and stamp >= until]
+        assert [place for one in own for place in one.ring_index.tolist()] == left
+
+
+def _random(seed: int, count: int, most: int) -> WindowColumns:
+    """Rotor positions at random, with rotor words of any speed and table."""
+    rng = np.random.default_rng(seed)
+    sensor = rng.integers(0, len(POSITIONS), count)
+    stamp_ns = BASE_NS + np.sort(rng.integers(0, 100_000_000, count))
+    position = rng.integers(0, 7) + np.arange(count) // rng.integers(1, 9) % most
+    word = rng.integers(-(1 << 63), (1 << 63) - 1, count)
+    encoder: I64Array = np.where(sensor == 1, word, position)
+    return WindowColumns(stamp_ns, sensor, np.arange(count), encoder)
+
+
+@needs_native
+@pytest.mark.parametrize("count", [0, 1, 2, 17, 5000])
+@pytest.mark.parametrize("seed", range(4))
+def test_figures_equal_those_of_numpy(seed: int, count: int) -> None:
+    columns = _random(seed, count, 500)
+    ends = sorted({count // 5, count // 3, count} - {0})
+    assert _merge("native").figures(columns, ends) == _merge("numpy").figures(columns, ends)
+
+
+@needs_native
+def test_numpy_measures_positions_beyond_the_revolution() -> None:
+    columns = _random(1, 5000, 2000)
+    assert (columns.encoder[columns.sensor == 2] >= 512).any()
+    assert _merge("native").figures(columns, [5000]) == _merge("numpy").figures(columns, [5000])
+
+
+@needs_native
+@pytest.mark.parametrize("engine", ENGINES)
+def test_figures_by_hand(engine: str) -> None:
+    # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
+    stamp_ns = np.array([0, 10, 40, 45, 50, 51, 60, 75])
+    encoder = np.array([0, 2, 3, 1, 1 << 31, 359, 100, 100])
+    sensor = np.array([0, 0, 0, 0, 1, 0, 0, 0])
+    columns = WindowColumns(stamp_ns, sensor, stamp_ns, encoder)
+    merge = column_merge(engine, (360, None, 8))
+    assert merge.figures(columns, [6, 8]) == [
+        [
+            ColumnFigures(5, 30, 3 / 120, 1 / 120, 0, 51),
+            ColumnFigures(1, 0, 1 / 120, 0.0, 50, 50),
+            NO_COLUMNS,
+        ],
+        [ColumnFigures(2, 15, 1 / 120, 0.0, 60, 75), NO_COLUMNS, NO_COLUMNS],
+    ]

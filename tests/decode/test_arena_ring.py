@@ -1,0 +1,133 @@
+"""Records at their places in the arena: what was stored is what is gathered, however it moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.decode.arena_ring import ArenaRing
+from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.lidar.interface import Records
+from mlbatch.native.arena import PacketArena
+from tests.builders.engines import needs_native
+
+pytestmark = needs_native
+
+SIZE = 40
+# Four columns of 9 bytes from byte 4, two in a row.
+RECORDS = Records(start=4, stride=18, size=9, per_row=2, step=9)
+COLUMNS = 4
+HEADERS = np.array([[0, 4], [38, 2]])
+
+
+def _packets(seed: int, count: int) -> U8Array:
+    return np.random.default_rng(seed).integers(1, 256, (count, SIZE), np.uint8)
+
+
+def _columns(packets: U8Array) -> U8Array:
+    """Records (P * 4, 9) of packets, by hand."""
+    parts = [packets[:, 4 + 9 * column : 13 + 9 * column] for column in range(COLUMNS)]
+    return np.stack(parts, axis=1).reshape(-1, 9)
+
+
+def _gathered(ring: ArenaRing, first: I64Array) -> U8Array:
+    index = (first[:, None] + ring.column_offsets(COLUMNS)).reshape(-1)
+    out = np.zeros((len(index), 9), np.uint8)
+    ring.gather(index, out)
+    return out
+
+
+def _read(arena: PacketArena, packets: U8Array, gap: int) -> tuple[U8Array, I64Array, int]:
+    """Packets in a region of an arena, `gap` bytes apart, as a reader leaves them."""
+    step = SIZE + gap
+    region, place = arena.reserve_for_reading(len(packets) * step + 10)
+    start = 5 + np.arange(len(packets)) * step
+    for at, packet in zip(start.tolist(), packets, strict=True):
+        region[at : at + SIZE] = packet
+    return region, start, place
+
+
+@given(
+    sizes=st.lists(st.integers(1, 30), min_size=1, max_size=12),
+    behind=st.integers(0, 4),
+    is_read=st.lists(st.booleans(), min_size=12, max_size=12),
+)
+def test_records_stay_until_they_are_not_needed(
+    sizes: list[int], behind: int, is_read: list[bool]
+) -> None:
+    """behind: batches whose records are still needed when the next is read."""
+    arena = PacketArena()
+    ring = ArenaRing(SIZE, RECORDS, HEADERS, arena)
+    kept: list[tuple[I64Array, U8Array]] = []
+    for number, count in enumerate(sizes):
+        packets = _packets(number, count)
+        oldest = min((int(first.min()) for first, _ in kept), default=None)
+        arena.keep_from(oldest)
+        if is_read[number]:
+            region, start, place = _read(arena, packets, number % 3)
+            headers, first = ring.store(region, start, oldest, place)
+        else:
+            # The reader's own memory.
+            start = np.arange(count) * SIZE
+            headers, first = ring.store(packets.reshape(-1).copy(), start, oldest)
+        assert np.array_equal(headers[:, :4], packets[:, :4])
+        assert np.array_equal(headers[:, 38:], packets[:, 38:])
+        kept.append((first, _columns(packets)))
+        for one, expected in kept:
+            assert np.array_equal(_gathered(ring, one), expected)
+        kept = kept[len(kept) - behind :] if behind else []
+
+
+def test_memory_is_used_again() -> None:
+    arena = PacketArena()
+    ring = ArenaRing(SIZE, RECORDS, HEADERS, arena)
+    sizes = []
+    for number in range(100):
+        region, start, place = _read(arena, _packets(number, 20), 2)
+        _, first = ring.store(region, start, None, place)
+        arena.keep_from(int(first[-1]))
+        sizes.append(ring.nbytes)
+    assert len(set(sizes[3:])) == 1
+    assert arena.capacity <= 4 * (20 * (SIZE + 2) + 10)
+
+
+def test_packets_of_one_batch_do_not_replace_each_other() -> None:
+    """Nothing waits when the first sensor's packets are copied; the second's come to others."""
+    arena = PacketArena()
+    rings = [ArenaRing(SIZE, RECORDS, HEADERS, arena) for _ in range(3)]
+    for number in range(20):
+        arena.keep_from(None)
+        stored = []
+        for one, ring in enumerate(rings):
+            packets = _packets(3 * number + one, 10)
+            _, first = ring.store(packets.reshape(-1).copy(), np.arange(10) * SIZE, None)
+            stored.append((ring, first, _columns(packets)))
+        for ring, first, expected in stored:
+            assert np.array_equal(_gathered(ring, first), expected)
+
+
+def test_sums_are_those_of_copied_packets() -> None:
+    arena = PacketArena()
+    one = ArenaRing(SIZE, RECORDS, HEADERS, arena)
+    other = PacketRing(SIZE, RECORDS)
+    one.keep_sums()
+    other.keep_sums()
+    for number in range(20):
+        packets = _packets(number, 7)
+        region, start, place = _read(arena, packets, 3)
+        arena.keep_from(None)
+        _, first = one.store(region, start, None, place if number % 2 else None)
+        _, known = other.store(packets.reshape(-1).copy(), np.arange(7) * SIZE, None)
+        for packet in range(7):
+            assert one.sum_until(int(first[packet])) == other.sum_until(int(known[packet]))
+            last = int(first[packet] + one.column_offsets(COLUMNS)[-1])
+            assert one.sum_until(last) == one.sum_until(int(first[packet]))
+
+
+def test_packets_beyond_their_array_are_an_error() -> None:
+    ring = ArenaRing(SIZE, RECORDS, HEADERS, PacketArena())
+    with pytest.raises(IndexError):
+        ring.store(np.zeros(100, np.uint8), np.array([61]), None)
