@@ -107,7 +107,9 @@ class CommentedReader:
                 raise DamageError("times of points", "none")
             return points.time_ns, 0
         bad: BoolArray = np.logical_not(np.isfinite(time_s))
-        self.log.none("times", where, bad.reshape(-1), "a finite number", time_s.reshape(-1).item)
+        if bad.any():
+            found = time_s.reshape(-1).item
+            self.log.none("times", where, bad.reshape(-1), "a finite number", found)
         # Before the conversion, which warns of signalling NaN.
         exact_s: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
         if time_s.dtype.itemsize > np.dtype("f4").itemsize:
