@@ -8,6 +8,7 @@
 #   make lint    the first three of them
 #   make docs    the documentation as a site, build/site/index.html
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
+#   make test-consumers   programs of others read our outputs, each in an environment of its own
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make fuzz-sanitized   its targets of compiled loops, with sanitizers in the C code
 #   make clean   remove what the others made
@@ -17,6 +18,7 @@ PYTHON ?= python3
 LOWEST_PYTHON ?= $(PYTHON)
 VENV := .venv
 LOWEST := .venv-lowest
+CONSUMERS := .venv-consumers
 BIN := $(VENV)/bin
 RIG := fixtures/two_lidars
 # Of the compiled engine, which an installation builds.
@@ -24,7 +26,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick test-lowest lint docs bench fuzz fuzz-sanitized clean
+.PHONY: help demo test coverage test-quick test-lowest test-consumers lint docs bench fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -47,6 +49,10 @@ test-quick: $(VENV)/dev.stamp
 
 test-lowest: $(LOWEST)/dev.stamp
 	$(LOWEST)/bin/python -m pytest -n 2 -m 'not slow and not long'
+
+# PCL and CloudCompare: apt-get install pcl-tools cloudcompare; the reader of JavaScript: node, npm.
+test-consumers: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest tests/consumers/check_consumers.py -v -rs
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
@@ -78,7 +84,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
 
 # The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:

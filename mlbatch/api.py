@@ -141,6 +141,7 @@ def convert(
     format: str | None = None,
     point_layout: str = "standard",
     compression: str = "none",
+    ply_style: str = "standard",
     overwrite: bool = False,
     fsync: bool = True,
     report: AnyPath | None = None,
@@ -181,6 +182,7 @@ def convert(
         format=format,
         point_layout=point_layout,
         compression=compression,
+        ply_style=ply_style,
         overwrite=overwrite,
         fsync=fsync,
         report=path_of("report", report),
@@ -190,7 +192,7 @@ def convert(
 
 
 def read(output: AnyPath) -> Iterator[Scan]:
-    """Yield the scans of an output of `convert`: npz, PLY, MCAP, ROS 1 or ROS 2 bag.
+    """Yield the scans of an output of `convert`, in any format.
 
     Arrays that the format does not store are empty, and named in `Scan.absent`. Raises
     RecordingError where the output is damaged.

@@ -12,6 +12,7 @@ from mlbatch.cli.words import decode_words, format_words, one_of, point_layout_w
 
 LAYOUTS = ("dense", "organized")
 SORTS = ("columns", "points")
+PLY_STYLES = ("standard", "cloudcompare", "float")
 COMPRESSIONS = ("none", "lz4", "zstd")
 CLOCKS = ("sensor", "host")
 ALIGN_TO = ("host", "first")
@@ -43,7 +44,8 @@ def convert(
         one_of(
             format_words,
             *("--format", "-f"),
-            help="mcap, npz, ply, rosbag1, rosbag2.  [default: by OUTPUT; a folder: npz]",
+            help="mcap, npz, ply, pcd, las, laz, kitti, nuscenes, rosbag1, rosbag2.  "
+            "[default: by OUTPUT; a folder: npz]",
             metavar="FORMAT",
         ),
     ] = None,
@@ -64,7 +66,7 @@ def convert(
         one_of(
             point_layout_words,
             "--point-layout",
-            help="Fields of a PointCloud2 point (preset).",
+            help="Fields of a PointCloud2 point (preset). FAST-LIO2: 128 rings at most.",
             metavar="NAME",
         ),
     ] = "standard",
@@ -77,6 +79,15 @@ def convert(
             metavar="NAME",
         ),
     ] = "none",
+    ply_style: Annotated[
+        str,
+        one_of(
+            PLY_STYLES,
+            "--ply-style",
+            help="PLY properties: standard, cloudcompare, float (small_gicp).",
+            metavar="NAME",
+        ),
+    ] = "standard",
     slices: Annotated[
         int, typer.Option(help="Sub-scans a window, published one by one.", metavar="N")
     ] = 1,
@@ -312,6 +323,7 @@ def convert(
             format=format_,
             point_layout=point_layout,
             compression=compression,
+            ply_style=ply_style,
             dry_run=dry_run,
             report=None if options.is_stdout(report) else report,
             prints_report=options.is_stdout(report),

@@ -30,7 +30,17 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         *("keep_repeated", "pass_"),
     ),
     "Output": (
-        *("output", "format_", "layout", "sort", "point_layout", "compression", "report", "html"),
+        *(
+            "output",
+            "format_",
+            "layout",
+            "sort",
+            "point_layout",
+            "ply_style",
+            "compression",
+            "report",
+            "html",
+        ),
         *("figures", "as_json", "write_rig", "overwrite", "no_fsync"),
     ),
     "Clocks": ("clock", "align_clocks", "align_to", "on_jump"),

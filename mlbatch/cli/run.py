@@ -37,7 +37,7 @@ from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,
-    check_compression,
+    check_options,
     check_target,
     choose_format,
     extras,
@@ -56,6 +56,7 @@ class Target:
     format: str | None
     point_layout: str
     compression: str
+    ply_style: str
     dry_run: bool
     report: Path | None
     prints_report: bool  # to standard output, without a summary
@@ -104,9 +105,10 @@ def _run_one(job: Job, target: Target) -> list[str]:
         target.overwrite,
         job.split,
         compression=target.compression,
+        ply_style=target.ply_style,
         fsync=target.fsync,
     )
-    check_compression(name, options)
+    check_options(name, options)
     job = replace(job, extras=extras(name, options))
     report_path = target.report
     open_output: OpenWriter | None = None

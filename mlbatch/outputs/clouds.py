@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import ScanRow
 from mlbatch.types import RunInfo
@@ -74,14 +74,24 @@ class CloudPlace:
 
 def scan_of_cloud(place: CloudPlace, rows: Rows, complete: bool) -> Scan:
     """A scan of records (p,), or (n, slots) when organized; fields as in the point layouts."""
+    xyz = np.stack([rows[axis] for axis in "xyz"], axis=-1)
+    return scan_of_fields(
+        place, xyz, {name: rows[name] for name in rows.dtype.names or ()}, complete
+    )
+
+
+def scan_of_fields(
+    place: CloudPlace, xyz: F32Array, fields: Mapping[str, Values], complete: bool
+) -> Scan:
+    """A scan of arrays by the names of the point layouts; xyz: (p, 3) or (n, slots, 3)."""
     found: dict[str, Values] = {}
-    for name in rows.dtype.names or ():
+    for name, values in fields.items():
         if name in _FIELDS:
             array, kind, convert = _FIELDS[name]
-            found[array] = np.ascontiguousarray(convert(rows[name], place.start_ns), kind)
+            found[array] = np.ascontiguousarray(convert(values, place.start_ns), kind)
     if place.only is not None:
         # All points are of this sensor, whether the layout has a field for it or not.
-        found["lidar_id"] = np.full(rows.shape, place.only, np.uint8)
+        found["lidar_id"] = np.full(xyz.shape[:-1], place.only, np.uint8)
     kinds = {array: kind for array, kind, _ in _FIELDS.values()}
     empty = {array: np.zeros(0, kind) for array, kind in kinds.items() if array not in found}
     arrays = found | empty
@@ -94,7 +104,7 @@ def scan_of_cloud(place: CloudPlace, rows: Rows, complete: bool) -> Scan:
         end_ns=place.end_ns,
         complete=complete,
         ready_host_ns=row.ready_host_ns,
-        xyz=np.stack([rows[axis] for axis in "xyz"], axis=-1),
+        xyz=np.ascontiguousarray(xyz),
         intensity=arrays["intensity"],
         reflectivity=found.get("reflectivity"),
         range_m=found.get("range_m"),

@@ -6,9 +6,8 @@ is an error here.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
@@ -16,28 +15,32 @@ from zipfile import BadZipFile
 import numpy as np
 
 from mlbatch.errors import RecordingError
-from mlbatch.outputs.clouds import CloudPlace, Rows, scan_of_cloud
+from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
 from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of
 from mlbatch.outputs.scan import Scan
+from mlbatch.outputs.table import ScanRow, TableOfRun
 from mlbatch.types import RunInfo
+from mlbatch.verify.commented import CommentedReader
+from mlbatch.verify.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
 from mlbatch.verify.folders import ScanFile, entries, scan_files
+from mlbatch.verify.las import LasReader
+from mlbatch.verify.pcd import PcdReader
+from mlbatch.verify.ply import PlyReader
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 from mlbatch.writers.atomic import PARTIAL_SUFFIX
-from mlbatch.writers.point_layouts import PLY_LAYOUT
 
 _METADATA = "metadata.yaml"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG V2.0\n"
 _CLOUD = "sensor_msgs/PointCloud2"
 _SCHEMA = "mlbatch.scan/1"
-_PLY_INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)
-_PLY_END = b"end_header\n"
+_WITHOUT_HEADER = (NUSCENES_SUFFIX, KITTI_SUFFIX)
 
 
 def read(path: Path) -> Iterator[Scan]:
     """Yield the scans of an output in its order, with `--split` those of each sensor.
 
-    path: a .mcap or .bag file, a folder (npz, PLY, ROS 2 bag), or one npz or PLY file. Raises
+    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan. Raises
     RecordingError where the output is damaged, unfinished or of another program.
     """
     if path.name.endswith(PARTIAL_SUFFIX):
@@ -66,16 +69,17 @@ def _scans(path: Path) -> Iterator[Scan]:
         return _scans_of_mcap(path, path.name)
     if head.startswith(_BAG_MAGIC):
         return _scans_of_bag(path)
-    if path.suffix in _FILE_READERS:
+    suffix = next((one for one in _FILE_READERS if path.name.endswith(one)), None)
+    if suffix is not None:
         folder = path.parent
         log = CheckLog()
-        named = [file for file in scan_files(log, folder, path.suffix) if file.path == path]
+        named = [file for file in scan_files(log, folder, suffix) if file.path == path]
         # The files of a sensor are in a folder of their own.
         if not RunFiles.of(folder).report and RunFiles.of(folder.parent).report:
             folder = folder.parent
-            named = [file for file in scan_files(log, folder, path.suffix) if file.path == path]
+            named = [file for file in scan_files(log, folder, suffix) if file.path == path]
         if named:
-            return _scans_of_files(folder, path.suffix, named)
+            return _scans_of_files(folder, suffix, named)
     raise RecordingError(
         f"{path}: expected an output of `mlbatch convert`, found another file; name the .mcap or "
         ".bag file, or the folder"
@@ -215,6 +219,10 @@ class _FileRun:
     files: RunFiles
     info: RunInfo | None = None
     about: RunOfOutput | None = None
+    # Starts of scans without one, by folder and file.
+    starts: dict[Path, dict[Path, int]] = field(default_factory=dict)
+    _table: TableOfRun | None = None
+    _has_table: bool = False
 
     def shared(self, about: RunOfOutput, frame_id: str, layout: str) -> RunInfo:
         """What all scans share, made once."""
@@ -223,11 +231,17 @@ class _FileRun:
             self.info = about.info(frame_id, layout)
         return self.info
 
+    def row(self, scan: Scan, only: int | None) -> ScanRow | None:
+        """The row of a scan in scans.csv; None if there is none."""
+        if self.about is not None and not self._has_table:
+            self._table = self.about.table()
+            self._has_table = True
+        return row_of(self._table, scan.index, scan.slice, only)
+
 
 def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterator[Scan]:
     reader = _FILE_READERS[suffix]
     run = _FileRun(RunFiles.of(folder))
-    table = None
     for file in files:
         try:
             scan, index = reader(file, run)
@@ -235,12 +249,15 @@ def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterato
             raise RecordingError(
                 f"{file.path}: {err}; see `mlbatch verify`, and convert again"
             ) from err
-        if table is None and run.about is not None:
-            table = run.about.table()
-        only = None if file.sensor is None else index
         scan.sensor = file.sensor or ""
-        row = row_of(table, scan.index, scan.slice, only)
+        row = run.row(scan, None if file.sensor is None else index)
+        if row is None and file.suffix in _WITHOUT_HEADER:
+            raise RecordingError(
+                f"{file.path}: expected a row of scan {scan.index} slice {scan.slice} in "
+                "scans.csv, found none; put scans.csv back, or convert again"
+            )
         if row is not None:
+            scan.complete = row.complete if file.suffix in _WITHOUT_HEADER else scan.complete
             scan.columns_per_sensor = row.columns
             scan.max_gap_ns = row.max_gap_ns
             scan.coverage = row.coverage
@@ -313,52 +330,77 @@ def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
     return scan, _sensor_index(file, names)
 
 
-def _ply_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
-    data = file.read()
-    end = data.find(_PLY_END) + len(_PLY_END)
-    text = data[:end].decode("utf-8", "replace")
-    comments: dict[str, str] = {}
-    for line in text.splitlines():
-        words = line.split(" ", 2)
-        if words[0] == "comment" and len(words) == 3:
-            comments[words[1]] = words[2]
-    properties = re.findall(r"^property \w+ (\w+)$", text, re.MULTILINE)
-    vertices = re.search(r"^element vertex (\d{1,19})$", text, re.MULTILINE)
-    expected = [field.name for field in PLY_LAYOUT.fields]
-    if vertices is None or properties != expected or "mlbatch" not in comments:
-        raise DamageError("the header of a PLY file of mlbatch", repr(text[:60]))
-    layout = PLY_LAYOUT.dtype
-    if len(data) - end != int(vertices[1]) * layout.itemsize:
-        stored = f"{vertices[1]} vertices of {layout.itemsize} bytes"
-        raise DamageError(stored, f"{len(data) - end} bytes after the header")
-    rows: Rows = np.frombuffer(data, layout, offset=end)
-    try:
-        found = _PLY_INDEX.fullmatch(comments["index"])
-        if found is None:
-            raise ValueError(comments["index"])
-        index, part, slices = map(int, found.groups())
-        names = tuple(comments["lidar_id"].partition("from 0: ")[2].split(" "))
-        about = RunOfOutput(
-            str(file.path),
-            names,
-            comments["rate_hz"],
-            slices,
-            comments["timescale"],
-            None,
-            comments.get("sort", "columns"),
-            run.files,
-        )
-        info = run.shared(about, comments["frame_id"], "dense")
-        start_ns = int(comments["start_ns"])
-        end_ns = int(comments["end_ns"])
-        complete = {"true": True, "false": False}[comments["complete"]]
-    except (KeyError, ValueError) as err:
-        raise DamageError("the comments of docs/formats.md", str(err)) from err
-    place = CloudPlace(info, index, part, start_ns, end_ns, None)
-    return scan_of_cloud(place, rows, complete), _sensor_index(file, names)
+def _commented_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
+    """A scan of a format that has its metadata in comments: PLY, PCD, LAS."""
+    log = CheckLog()
+    reader = _COMMENTED[file.suffix](log)
+    comments, points = reader.parse(file.read())
+    _refuse_damage(log, file.path)
+    metadata = comments.metadata()
+    index, part, slices = comments.place()
+    names = metadata.sensors
+    if names is None or metadata.rate is None or metadata.timescale is None:
+        raise DamageError("the comments of docs/formats.md", "no rate, timescale or sensors")
+    about = RunOfOutput(
+        str(file.path),
+        names,
+        metadata.rate,
+        slices,
+        metadata.timescale,
+        None,
+        metadata.sort or "columns",
+        run.files,
+    )
+    layout = "organized" if points.organized else "dense"
+    info = run.shared(about, metadata.frame_id or "", layout)
+    start_ns = comments.number("start_ns")
+    only = _sensor_index(file, names)
+    end_ns = comments.number("end_ns")
+    place = CloudPlace(info, index, part, start_ns, end_ns, None, only)
+    fields = {
+        "intensity": points.intensity,
+        "reflectivity": points.reflectivity,
+        "time": points.time_s,
+        "t": points.time_ns,
+        "ring": points.ring,
+        "return_type": points.return_type,
+        "lidar_id": points.lidar_id,
+    }
+    stored = {name: values for name, values in fields.items() if values is not None}
+    scan = scan_of_fields(place, points.xyz, stored, comments.is_complete())
+    return scan, only
 
 
+def _rows_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
+    """A scan of kitti or nuscenes: all but the points is in report and scans.csv."""
+    found = read_rows(file)
+    about = run.about or run.files.about()
+    info = run.shared(about, "", "dense")
+    start_ns = start_of(file, run.starts)
+    index, part, end_ns = about.places().place(start_ns)
+    only = _sensor_index(file, about.sensors)
+    place = CloudPlace(info, index, part, start_ns, end_ns, None, only)
+    fields: dict[str, Values] = {"intensity": found.rows[:, 3]}
+    if found.times is not None:
+        fields |= {
+            "ring": found.rows[:, 4],
+            "time": found.times[:, 0],
+            "lidar_id": found.times[:, 1],
+        }
+    # `complete` is in scans.csv.
+    return scan_of_fields(place, found.rows[:, :3], fields, False), only
+
+
+_COMMENTED: dict[str, Callable[[CheckLog], CommentedReader]] = {
+    ".ply": PlyReader,
+    ".pcd": PcdReader,
+    ".las": LasReader,
+    ".laz": LasReader,
+}
+# By the suffix of the first file of a scan; that of kitti is the end of that of nuscenes.
 _FILE_READERS: dict[str, Callable[[ScanFile, _FileRun], tuple[Scan, int | None]]] = {
     ".npz": _npz_scan,
-    ".ply": _ply_scan,
+    **dict.fromkeys(_COMMENTED, _commented_scan),
+    NUSCENES_SUFFIX: _rows_scan,
+    KITTI_SUFFIX: _rows_scan,
 }

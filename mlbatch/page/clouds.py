@@ -11,9 +11,9 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
-from mlbatch.verify import npz, ply
 from mlbatch.verify.containers import BoundedFile, Message, library_errors
 from mlbatch.verify.encoding import MessageCursor
+from mlbatch.verify.file_formats import FILE_FORMATS
 from mlbatch.verify.folders import entries, scan_files
 from mlbatch.verify.messages import CLOUD, read_cloud, stored_scan
 from mlbatch.verify.scan import StoredScan
@@ -135,11 +135,11 @@ def _scans(output: Path, places: list[Place], sensors: tuple[str, ...]) -> Itera
 def _of_files(folder: Path, places: list[Place]) -> Iterator[StoredScan]:
     log = CheckLog()
     keys = {(place.index, place.slice) for place in places}
-    for suffix in (npz.SUFFIX, ply.SUFFIX):
-        files = scan_files(log, folder, suffix)
+    for form in FILE_FORMATS:
+        files = scan_files(log, folder, form.suffix)
         if not files:
             continue
-        reader = npz.NpzReader(log) if suffix == npz.SUFFIX else ply.PlyReader(log)
+        reader = form.reader(log)
         reader.begin(files[0])
         yield from reader.scans([one for one in files if (one.index, one.slice or 0) in keys])
         return

@@ -123,7 +123,8 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
         columns[:, i] = _whole(cells[f"columns_{name}"])
         gap_ms[:, i] = _numbers(cells[f"max_gap_ns_{name}"]) / NS_PER_MS
         missing = cells.get(f"missing_{name}", ("",) * rows)
-        if all(missing):
+        # Unknown: NaN, or empty in outputs of earlier versions.
+        if all(cell not in ("", "NaN") for cell in missing):
             expected[:, i] = columns[:, i] + _whole(missing)
         else:
             present = columns[columns[:, i] > 0, i]

@@ -60,6 +60,8 @@ def job_identity(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
     found = {"mlbatch": mlbatch.__version__, "numpy": np.__version__, "format": name}
     found["point layout"] = options.point_layout
     found["compression"] = options.compression
+    if name == "ply":
+        found["ply style"] = options.ply_style
     for key, value in _options(job):
         found[key.replace("_", " ")] = _text(value)
     return found

@@ -26,7 +26,7 @@ from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,
-    check_compression,
+    check_options,
     check_target,
     choose_format,
     extras,
@@ -117,6 +117,7 @@ class OutputOptions:
     format: str | None = None
     point_layout: str = "standard"
     compression: str = "none"
+    ply_style: str = "standard"
     overwrite: bool = False
     fsync: bool = True  # wait until the output is on the disk
     report: Path | None = None
@@ -135,9 +136,10 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         options.overwrite,
         job.split,
         compression=options.compression,
+        ply_style=options.ply_style,
         fsync=options.fsync,
     )
-    check_compression(name, writer_options)
+    check_options(name, writer_options)
     job = replace(job, extras=extras(name, writer_options), jobs=options.jobs)
     if output is None:
         preflight.check_report(job, options.report, None, name)

@@ -19,6 +19,8 @@ from mlbatch.errors import ExportError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
+# A number in every reader of CSV: a column of empty cells would be one of texts.
+UNKNOWN = "NaN"
 # A scan with less of any sensor's columns is underfilled.
 UNDERFILLED = 0.5
 # scans.csv is kept in memory up to this size, then in a temporary file.
@@ -173,10 +175,10 @@ class ScanTable:
         self._underfilled += is_underfilled
 
     def _missing(self, row: _Row) -> list[int | str]:
-        """Missing columns of each sensor in a window, by its nominal rate; "" if unknown."""
+        """Missing columns of each sensor in a window, by its nominal rate; `UNKNOWN` if unknown."""
         seconds = (row.end_ns - row.start_ns) / NS_PER_S
         return [
-            "" if rate is None else max(0, round(rate * seconds) - count)
+            UNKNOWN if rate is None else max(0, round(rate * seconds) - count)
             for rate, count in zip(self._columns_per_s, row.columns, strict=True)
         ]
 
@@ -298,7 +300,7 @@ def _share_cell(share: float) -> str:
 @lru_cache(maxsize=1024)
 def _fill_cell(fill: float) -> str:
     # The shortest text of a float32.
-    return "" if math.isnan(fill) else str(np.float32(fill))
+    return UNKNOWN if math.isnan(fill) else str(np.float32(fill))
 
 
 def _counted(counts: dict[str, int]) -> dict[str, int]:

@@ -106,6 +106,7 @@ CONVERT: tuple[Key[Values], ...] = (
     _choice_key("layout", "valid points only, or slots x columns", "dense", "organized"),
     _choice_key("sort", "order of the points of a scan", "columns", "points"),
     _text_key("point_layout", "fields of a PointCloud2 point (preset)"),
+    _text_key("ply_style", "properties of PLY files"),
     _text_key("compression", "of MCAP chunks"),
     Key(
         *("slices", _whole(1, _MOST_SLICES), (), whole_form(1, _MOST_SLICES)),

@@ -84,6 +84,9 @@ class Examination:
                 log.fail("grid", f"{scan.where} {name}", "a time", at_ns)
                 return
         place = self._grid_checks.check(scan)
+        if place is None and scan.index is not None:
+            # Without a rate, by its name.
+            place = scan.index, scan.slice or 0
         end_ns = self._end_ns(scan)
         fits = check_columns(log, scan, end_ns, self._sensors)
         points = valid_points(log, scan)

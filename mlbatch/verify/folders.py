@@ -11,7 +11,8 @@ from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
 # Files with other suffixes are ignored.
-_OUTPUTS = (".npz", ".ply", ".partial", ".mcap", ".bag")
+_FIRST, _SECOND = ".pcd.bin", ".time.bin"
+_OUTPUTS = (".npz", ".ply", ".pcd", ".las", ".laz", ".bin", ".partial", ".mcap", ".bag")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,8 @@ class ScanFile:
     index: int
     # None where windows are not sliced.
     slice: int | None
+    # Of the format, with its first dot.
+    suffix: str
 
     def read(self) -> bytes:
         """The bytes of the file."""
@@ -38,7 +41,7 @@ class ScanFile:
         name = "head" if index < 0 else f"{index:06d}"
         if slices > 1:
             name += f"-{part}"
-        log.equal("names", self.where, name + self.path.suffix, self.path.name)
+        log.equal("names", self.where, name + self.suffix, self.path.name)
 
     def sensor_index(self, log: CheckLog, sensors: tuple[str, ...]) -> int | None:
         """Index of the sensor of the folder; None without `--split`."""
@@ -82,8 +85,12 @@ def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> I
         if path.suffix not in _OUTPUTS or path.is_dir():
             continue
         log.ok("names")
-        name = _NAME.fullmatch(path.stem)
-        if name is None or path.suffix != suffix:
+        # A second file of a scan, which its reader looks for.
+        if path.name.endswith(_SECOND) and suffix == _FIRST:
+            continue
+        stem = path.name.removesuffix(suffix)
+        name = _NAME.fullmatch(stem)
+        if name is None or stem == path.name:
             expected = f"an index of six digits or head, perhaps with a slice, and {suffix}"
             log.fail("names", where, expected, path.name)
             continue
@@ -91,4 +98,4 @@ def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> I
         index = -1 if head else int(number)
         if not head and number != f"{index:06d}":
             log.fail("names", where, f"{index:06d}", number)
-        yield ScanFile(path, where, sensor, index, None if part is None else int(part))
+        yield ScanFile(path, where, sensor, index, None if part is None else int(part), suffix)

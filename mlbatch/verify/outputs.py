@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from mlbatch.verify import messages, npz, ply
+from mlbatch.verify import messages, npz
 from mlbatch.verify.examination import Examination, Progress
+from mlbatch.verify.file_formats import FileFormat, format_of
+from mlbatch.verify.float_rows import RowReader
 from mlbatch.verify.folders import entries, scan_files
 from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
 from mlbatch.verify.report_checks import (
@@ -27,7 +30,7 @@ _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG V2.0\n"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
-_FOREIGN = "expected an output of mlbatch (a folder of npz or PLY files, an MCAP file, a bag)"
+_FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a bag)"
 _NAME_ONE = "name the output of `mlbatch convert`"
 
 
@@ -85,35 +88,21 @@ def _check_of_folder(path: Path) -> Callable[[Output], Verdict]:
         return _check_rosbag2
     folders = [entry for entry in inside if entry.is_dir() and not entry.name.startswith(".")]
     names = [*inside, *(inner for folder in folders for inner in entries(folder))]
-    for suffix, check in ((npz.SUFFIX, _check_npz), (ply.SUFFIX, _check_ply)):
-        if any(entry.suffix == suffix for entry in names):
-            return check
+    found = format_of(names)
+    if found is not None:
+        return partial(_check_files, found)
     kind = "an empty folder" if not inside else "a folder without scans"
     raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
 
 
-def _check_npz(output: Output) -> Verdict:
-    reader = npz.NpzReader(output.log)
-    limits = npz.LIMITS | {"geometry": _RANGES}
-    return _check_files(output, "npz", npz.SUFFIX, reader, limits)
-
-
-def _check_ply(output: Output) -> Verdict:
-    return _check_files(output, "ply", ply.SUFFIX, ply.PlyReader(output.log), ply.LIMITS)
-
-
-def _check_files(
-    output: Output,
-    name: str,
-    suffix: str,
-    reader: npz.NpzReader | ply.PlyReader,
-    limits: dict[str, str],
-) -> Verdict:
+def _check_files(form: FileFormat, output: Output) -> Verdict:
     log = output.log
+    reader = form.reader(log)
+    limits = dict(form.limits)
     files = ReportFiles.read(log, output.places)
     if not output.places.table.exists():
         log.fail("table", TABLE, "the table of scans", "none")
-    scans = scan_files(log, output.path, suffix)
+    scans = scan_files(log, output.path, form.suffix)
     if not scans:
         raise VerifyError(f"{output.path}: expected files of scans, found strange names only")
     try:
@@ -123,13 +112,17 @@ def _check_files(
             f"{scans[0].path}: {err}; restore the first scan, or convert again"
         ) from err
     metadata = files.metadata(log, own)
+    if isinstance(reader, RowReader):
+        reader.know(metadata)
+        if metadata.rate is None:
+            limits |= dict.fromkeys(("grid", "index"), f"rows have no rate; {_NO_REPORT}")
     examination = Examination(log, str(output.path), metadata, files, output.progress)
     for scan in reader.scans(scans):
         examination.scan(scan)
     examination.finish(split=scans[0].sensor is not None)
-    if isinstance(reader, npz.NpzReader) and reader.organized:
-        limits = limits | npz.ORGANIZED_LIMITS
-    return output.verdict(name, examination, limits, files)
+    if reader.organized:
+        limits |= npz.ORGANIZED_LIMITS
+    return output.verdict(form.name, examination, limits, files)
 
 
 def _check_rosbag2(output: Output) -> Verdict:

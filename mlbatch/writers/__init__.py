@@ -23,6 +23,7 @@ from mlbatch.writers.atomic import (
 )
 from mlbatch.writers.base import (
     NO_COMPRESSION,
+    PLY_STYLES,
     Checkpoint,
     ScanJob,
     ScanWriter,
@@ -34,6 +35,7 @@ from mlbatch.writers.formats import (
     built_in_names,
     format_module,
     format_names,
+    format_of_files,
     is_format,
     other_names,
 )
@@ -52,6 +54,7 @@ __all__ = [
     "check_compression",
     "check_free_space",
     "check_name",
+    "check_options",
     "check_target",
     "choose_format",
     "discard",
@@ -72,23 +75,13 @@ __all__ = [
 ]
 
 DEFAULT_FORMAT = "npz"
-# Formats that are announced, so that errors can say that this version has none of them.
-LATER_FORMATS = ("pcd", "las", "kitti")
-LATER_SUFFIXES = {
-    ".pcd": "pcd",
-    ".las": "las",
-    ".laz": "las",
-    ".bin": "kitti",
-}
 
 
 def plugin(name: str) -> WriterModule:
     """Return the module of a format, UsageError for an unknown one."""
     if not is_format(name):
-        later = " (not in this version)" if name in LATER_FORMATS else ""
         raise UsageError(
-            f"--format: expected one of {', '.join(format_names())}, found {name!r}{later}; "
-            "choose one"
+            f"--format: expected one of {', '.join(format_names())}, found {name!r}; choose one"
         )
     return format_module(name)
 
@@ -96,8 +89,9 @@ def plugin(name: str) -> WriterModule:
 def choose_format(target: Path, asked: str | None) -> str:
     """Return the format of the output `target`; asked: value of `--format`, None if not given."""
     suffix = target.suffix.lower()
-    _refuse_file_name(target, suffix)
     found = _format_of_suffix(suffix)
+    if found is None:
+        _refuse_file_name(target, suffix)
     if asked is None:
         return found or DEFAULT_FORMAT
     if found is not None and plugin(asked).SUFFIX is None:
@@ -130,9 +124,9 @@ def _has_suffix(name: str, suffix: str) -> bool:
 
 
 def _refuse_file_name(target: Path, suffix: str) -> None:
-    """Refuse names of files for outputs that are folders or not in this version."""
-    name = suffix.removeprefix(".")
-    if is_format(name) and plugin(name).SUFFIX is None:
+    """Refuse names of files for outputs that are folders."""
+    name = format_of_files(suffix.removeprefix("."))
+    if name is not None:
         raise UsageError(
             f"-o {target}: expected a folder, since {name} output is one file per scan, found a "
             f"file name; give -o {target.with_suffix('')} --format {name}"
@@ -142,16 +136,11 @@ def _refuse_file_name(target: Path, suffix: str) -> None:
             f"-o {target}: expected a folder, since rosbag2 output is a folder with an MCAP file, "
             f"found a file name; give -o {target.with_suffix('')} --format rosbag2"
         )
-    if suffix in LATER_SUFFIXES:
-        raise UsageError(
-            f"-o {target}: expected a .mcap file, a .bag file or a folder, found {suffix} "
-            f"({LATER_SUFFIXES[suffix]}, not in this version); choose another output"
-        )
 
 
 def open_writer(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the output `target` in a format."""
-    check_compression(name, options)
+    check_options(name, options)
     return plugin(name).open_writer(target, info, options)
 
 
@@ -175,6 +164,21 @@ def report_paths(target: Path, name: str) -> ReportPaths:
 def extras(name: str, options: WriterOptions) -> frozenset[str]:
     """Return the optional contents of an output, see `WriterModule.extras`."""
     return plugin(name).extras(options)
+
+
+def check_options(name: str, options: WriterOptions) -> None:
+    """Refuse options that the format does not have, or unknown values of them."""
+    check_compression(name, options)
+    style = options.ply_style
+    if style not in PLY_STYLES:
+        raise UsageError(
+            f"--ply-style: expected {', '.join(PLY_STYLES)}, found {style!r}; choose one"
+        )
+    if style != PLY_STYLES[0] and name != "ply":
+        raise UsageError(
+            f"--ply-style: expected {PLY_STYLES[0]} for {name}, found {style!r}; leave it out, or "
+            "give --format ply"
+        )
 
 
 def check_compression(name: str, options: WriterOptions) -> None:

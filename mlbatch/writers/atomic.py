@@ -19,15 +19,18 @@ from typing import NamedTuple
 
 from mlbatch.errors import ExportError
 from mlbatch.writers.durable import sync_entries, sync_to_disk
-from mlbatch.writers.formats import format_module, is_format
+from mlbatch.writers.formats import format_of_files
 
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
-_SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.(\w+)")
-# The same for a ROS 2 bag. Other programs write such files too: scans.csv marks an own output.
-_OWN_BAG_FILE = re.compile(r".+_0\.mcap|metadata\.yaml")
+_SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.([\w.]+)")
+# Names that only mlbatch gives, or that its first versions wrote without a scans.csv.
+_UNMARKED = ("npz", "ply")
+# The same for a ROS 2 bag and for lists of times. Other programs write such files too, and scans
+# of other formats: scans.csv marks an own output.
+_SHARED_FILE = re.compile(r".+_0\.mcap|metadata\.yaml|times\.txt")
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
 _HEAD_BYTES = 64
@@ -113,14 +116,17 @@ class Output(NamedTuple):
 
 def is_taken(name: str) -> bool:
     """Return whether a run may write a file of this name into an output folder."""
-    return _is_own_file(name) or bool(_OWN_BAG_FILE.fullmatch(name))
+    return _is_own_file(name, marked=True)
 
 
-def _is_own_file(name: str) -> bool:
+def _is_own_file(name: str, *, marked: bool) -> bool:
+    """marked: there is a scans.csv in the output."""
+    if name in (SCANS_CSV, REPORT_JSON):
+        return True
     scan = _SCAN_FILE.fullmatch(name)
     if scan is None:
-        return name in (SCANS_CSV, REPORT_JSON)
-    return is_format(scan[3]) and format_module(scan[3]).SUFFIX is None
+        return marked and bool(_SHARED_FILE.fullmatch(name))
+    return (marked or scan[3] in _UNMARKED) and format_of_files(scan[3]) is not None
 
 
 def is_report(path: Path) -> bool:
@@ -240,13 +246,12 @@ def _check_replaceable(target: Path, overwrite: bool, folder: bool) -> None:
 
 def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
     """Yield entries of a folder that no run wrote; deep: enter folders of single sensors."""
-    has_scans = (folder / SCANS_CSV).is_file()
+    folders = (folder,) if deep else (folder, folder.parent)
+    marked = any((one / SCANS_CSV).is_file() for one in folders)
     for entry in folder.iterdir():
-        if has_scans and _OWN_BAG_FILE.fullmatch(entry.name):
-            continue
         if deep and entry.is_dir() and not entry.is_symlink():
             yield from _strangers(entry, deep=False)
-        elif not (_is_own_file(entry.name) or is_report(entry)):
+        elif not (_is_own_file(entry.name, marked=marked) or is_report(entry)):
             yield entry
 
 

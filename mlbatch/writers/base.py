@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 DEFAULT_POINT_LAYOUT = "standard"
 NO_COMPRESSION = "none"
+PLY_STYLES = ("standard", "cloudcompare", "float")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class WriterOptions:
     # a new `.partial`.
     kept_bytes: int | None = None
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
+    ply_style: str = PLY_STYLES[0]  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
 
 
@@ -113,6 +115,8 @@ class WriterModule(Protocol):
     FORMAT: str  # name of the module
     SUFFIX: str | None  # of the output file; None: the output is a folder
     COMPRESSES: bool  # whether `--compression` applies
+    # Optional, only for folders: FILE_SUFFIXES, a tuple with the suffixes of the files of a scan,
+    # without the first dot. Without it the suffix is FORMAT.
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
         """Return the optional contents that the output includes.

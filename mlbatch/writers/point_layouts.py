@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -430,3 +430,13 @@ CLOUD_LAYOUTS = {
     )
 }
 PLY_LAYOUT = Layout("ply", 30, _PLY)
+# CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
+_SCALARS = tuple(replace(field, name=f"scalar_{field.name}") for field in _PLY[3:])
+# small_gicp reads four floats a vertex, whatever the header says.
+_FLOATS = (*_XYZ, _time(12))
+# By the styles of `--ply-style`.
+PLY_LAYOUTS = {
+    "standard": PLY_LAYOUT,
+    "cloudcompare": Layout("ply-cloudcompare", 30, (*_XYZ, *_SCALARS)),
+    "float": Layout("ply-float", 16, _FLOATS),
+}

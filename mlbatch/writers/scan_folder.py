@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -27,6 +28,22 @@ def scan_name(index: int, slice_: int, slices: int) -> str:
     return stem if slices == 1 else f"{stem}-{slice_}"
 
 
+def check_dense(name: str, info: RunInfo) -> None:
+    """Refuse organized scans; name: of a format without them."""
+    if info.layout == "organized":
+        raise UsageError(
+            f"--layout organized: expected dense for {name}, found organized; write npz or mcap"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A file of a scan; `key` sorts as the names of files: the head is last."""
+
+    key: tuple[bool, int, int]  # is the head, index, slice
+    start_ns: int
+
+
 class FolderWriter:
     """Writes each scan to a file of its own."""
 
@@ -37,8 +54,17 @@ class FolderWriter:
         options: WriterOptions,
         name: str,
         encoder: Callable[[], Encoder],
+        *,
+        suffix: str = "",
+        others: Mapping[str, Callable[[], Encoder]] | None = None,
+        lists: Mapping[str, Callable[[Sequence[Entry]], str]] | None = None,
     ) -> None:
-        """name: of the format, the suffix of its files; encoder: creates one for a thread."""
+        """name: of the format; encoder: creates one for a thread.
+
+        suffix: of the file of a scan, without a dot; "": the name. others: encoders of further
+        files of a scan, by suffix. lists: further files of a folder, by name; their text is made
+        of its scans in the order of their names.
+        """
         if options.point_layout != DEFAULT_POINT_LAYOUT:
             raise UsageError(
                 f"--point-layout: expected {DEFAULT_POINT_LAYOUT} for {name}, found "
@@ -48,9 +74,10 @@ class FolderWriter:
         self._output = prepare(
             target, options.overwrite, folder=True, keep=keep, fsync=options.fsync
         )
-        self._name = name
-        self._encoder = encoder
-        self._idle: list[Encoder] = []
+        self._encoders = {suffix or name: encoder, **(others or {})}
+        self._idle: dict[str, list[Encoder]] = {suffix: [] for suffix in self._encoders}
+        self._lists = dict(lists or {})
+        self._entries: dict[int | None, list[Entry]] = {}
         self._committed = 0
         self._behind = WriteBehind()
         self._folders: dict[int | None, Path] = {None: self._output.partial}
@@ -59,11 +86,11 @@ class FolderWriter:
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan to a file of its own."""
-        return _SaveJob(self, scan, self._path(scan, sensor))
+        return _SaveJob(self, scan, self._paths(scan, sensor))
 
     def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that keeps the file of a scan."""
-        return _KeepJob(self, self._path(scan, sensor))
+        return _KeepJob(self, self._paths(scan, sensor))
 
     def flush(self) -> ScanJob:
         """Return a job without work: only scans are written."""
@@ -80,7 +107,13 @@ class FolderWriter:
         """Ignore messages."""
 
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
-        """Add scans.csv and move the folder to its final path."""
+        """Add lists and scans.csv, and move the folder to its final path."""
+        for sensor, entries in self._entries.items():
+            entries.sort(key=lambda entry: entry.key)
+            for name, text in self._lists.items():
+                path = self._folders[sensor] / name
+                with export_errors(path):
+                    path.write_text(text(entries), encoding="utf-8", newline="\n")
         path = self._output.partial / SCANS_CSV
         with export_errors(path):
             path.write_text(summary.scans_csv, encoding="utf-8", newline="\n")
@@ -92,25 +125,33 @@ class FolderWriter:
     def abandon(self) -> None:
         """Do nothing: no file is open between jobs."""
 
-    def save(self, scan: Scan, path: Path) -> int:
-        """Write the file of a scan; returns its size in bytes. Any thread."""
-        encoder = borrow(self._idle, self._encoder)
-        with export_errors(path), path.open("wb", buffering=0) as file:
-            write_all(file, encoder.encode(scan))
-            size = file.tell()
-            drop_from_cache(file.fileno(), 0, size)
-        self._idle.append(encoder)
-        return size
+    def save(self, scan: Scan, paths: Mapping[str, Path]) -> dict[Path, int]:
+        """Write the files of a scan; returns their sizes in bytes. Any thread."""
+        sizes = {}
+        for suffix, path in paths.items():
+            idle = self._idle[suffix]
+            encoder = borrow(idle, self._encoders[suffix])
+            with export_errors(path), path.open("wb", buffering=0) as file:
+                write_all(file, encoder.encode(scan))
+                sizes[path] = file.tell()
+                drop_from_cache(file.fileno(), 0, sizes[path])
+            idle.append(encoder)
+        return sizes
 
-    def count(self, path: Path, size: int) -> None:
-        """Count the file of a scan as complete; size: bytes to drop from the cache. In order."""
+    def count(self, sizes: Mapping[Path, int]) -> None:
+        """Count the files of a scan as complete; sizes: bytes to drop from the cache. In order."""
         self._committed += 1
-        if size:
+        for path, size in sizes.items():
             self._behind.add(path, size)
 
-    def _path(self, scan: Scan, sensor: int | None) -> Path:
+    def _paths(self, scan: Scan, sensor: int | None) -> dict[str, Path]:
+        """Return the files of a scan by suffix, and note it for the lists."""
+        if self._lists:
+            key = (scan.index < 0, scan.index, scan.slice)
+            self._entries.setdefault(sensor, []).append(Entry(key, scan.start_ns))
         stem = scan_name(scan.index, scan.slice, scan.slices)
-        return self._folders[sensor] / f"{stem}.{self._name}"
+        folder = self._folders[sensor]
+        return {suffix: folder / f"{stem}.{suffix}" for suffix in self._encoders}
 
     def _sensor_folders(self, info: RunInfo) -> dict[int | None, Path]:
         folders: dict[int | None, Path] = {}
@@ -123,32 +164,33 @@ class FolderWriter:
 
 
 class _SaveJob(ScanJob):
-    """Writes the file of one scan; files are independent, so any thread may do all of it."""
+    """Writes the files of one scan; scans are independent, so any thread may do all of it."""
 
-    def __init__(self, writer: FolderWriter, scan: Scan, path: Path) -> None:
+    def __init__(self, writer: FolderWriter, scan: Scan, paths: Mapping[str, Path]) -> None:
         self._writer = writer
         self._scan = scan
-        self._path = path
-        self._size = 0
+        self._paths = paths
+        self._sizes: dict[Path, int] = {}
 
     def pack(self) -> None:
-        self._size = self._writer.save(self._scan, self._path)
+        self._sizes = self._writer.save(self._scan, self._paths)
 
     def commit(self) -> None:
-        self._writer.count(self._path, self._size)
+        self._writer.count(self._sizes)
 
 
 class _KeepJob(ScanJob):
-    """Keeps the file of one scan that the interrupted run has written."""
+    """Keeps the files of one scan that the interrupted run has written."""
 
-    def __init__(self, writer: FolderWriter, path: Path) -> None:
+    def __init__(self, writer: FolderWriter, paths: Mapping[str, Path]) -> None:
         self._writer = writer
-        self._path = path
+        self._paths = paths
 
     def commit(self) -> None:
-        if not self._path.is_file():
-            raise ExportError(
-                f"{self._path}: expected a scan of the interrupted run, found no file; leave out "
-                "--resume to start over"
-            )
-        self._writer.count(self._path, 0)
+        for path in self._paths.values():
+            if not path.is_file():
+                raise ExportError(
+                    f"{path}: expected a scan of the interrupted run, found no file; leave out "
+                    "--resume to start over"
+                )
+        self._writer.count({})

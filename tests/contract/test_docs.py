@@ -21,6 +21,7 @@ from mlbatch.report.report import build_report
 from mlbatch.sensors import models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
+from tests.consumers.environments import ENVIRONMENTS
 from tests.contract.blocks import PAGES
 from tests.contract.test_help import OPTIONS
 from tests.contract.tree import PACKAGE, ROOT, run_mlbatch, run_python
@@ -88,6 +89,16 @@ def test_formats_are_described() -> None:
 def test_every_container_is_named() -> None:
     for reader in readers():
         assert reader.CONTAINER in README
+
+
+def test_every_consumer_and_its_version_is_on_its_page() -> None:
+    page = _page("consumers.md")
+    for environment in ENVIRONMENTS.values():
+        for package in environment.packages:
+            name, _, version = package.replace("==", "@").rpartition("@")
+            # What a program needs and none of its own is left out.
+            if name and name not in ("@mcap/nodejs", "@foxglove/rosmsg"):
+                assert version in page, package
 
 
 def _first_cells(page: str) -> set[str]:

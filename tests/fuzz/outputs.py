@@ -27,6 +27,10 @@ _FORMS = {
     "mcap zstd": ("mcap", "zstd.mcap", "zstd:1"),
     "npz": ("npz", "n", "none"),
     "ply": ("ply", "p", "none"),
+    "pcd": ("pcd", "c", "none"),
+    "las": ("las", "l", "none"),
+    "kitti": ("kitti", "k", "none"),
+    "nuscenes": ("nuscenes", "s", "none"),
     "rosbag1": ("rosbag1", "o.bag", "none"),
     "rosbag2": ("rosbag2", "r", "none"),
 }

@@ -16,6 +16,7 @@ from mlbatch.errors import RecordingError, UsageError
 from mlbatch.outputs.clouds import CloudPlace, scan_of_cloud
 from mlbatch.outputs.scan import Scan
 from mlbatch.python.recording import Recording
+from mlbatch.writers.base import PLY_STYLES
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.scans import run_info
 from tests.contract.tree import ROOT
@@ -29,7 +30,15 @@ FORMATS = (
     ("bag", "rosbag2"),
     ("npz", "npz"),
     ("ply", "ply"),
+    ("pcd", "pcd"),
+    ("las", "las"),
+    ("laz", "laz"),
+    ("kitti", "kitti"),
+    ("nuscenes", "nuscenes"),
 )
+EXACT_TIMES = ("npz", "ply", "las", "laz")
+# Half a step of 0.1 mm, rounded to float32.
+LAS_ERROR_M = 0.51e-4
 ARRAYS = ("intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type", "lidar_id")
 FLOAT32_STEP_NS = 8  # of seconds below 0.125
 FLOAT64_STEP_NS = 300  # of seconds since 1970
@@ -40,7 +49,7 @@ def rec() -> Recording:
     return mlbatch.open(FIXTURE / "two_lidars.pcap", rig=FIXTURE / "rig.yaml")
 
 
-def _assert_same(read: Scan, wrote: Scan, step_ns: int) -> None:
+def _assert_same(read: Scan, wrote: Scan, step_ns: int, error_m: float = 0.0) -> None:
     """Equal in all that the output stores; times may be up to `step_ns` earlier."""
     for name in ("index", "slice", "start_ns", "end_ns", "complete", "columns_per_sensor"):
         assert getattr(read, name) == getattr(wrote, name), name
@@ -48,14 +57,16 @@ def _assert_same(read: Scan, wrote: Scan, step_ns: int) -> None:
     assert read.ready_host_ns == wrote.ready_host_ns
     np.testing.assert_array_equal(read.fill, wrote.fill)
     np.testing.assert_allclose(read.coverage, wrote.coverage, atol=5e-4)
-    assert (read.sensors, read.frame_id) == (wrote.sensors, wrote.frame_id)
+    assert read.sensors == wrote.sensors
+    # Empty where neither the format nor the report has it.
+    assert read.frame_id in ("", wrote.frame_id)
     assert (read.rate_hz, read.timescale) == (wrote.rate_hz, wrote.timescale)
     assert (read.slices, read.info.layout) == (wrote.slices, wrote.info.layout)
     assert read.sort == wrote.sort
     for one, other in zip(read.info.sensors, wrote.info.sensors, strict=True):
         assert (one.name, one.model) == (other.name, other.model)
         np.testing.assert_array_equal(one.body_from_sensor, other.body_from_sensor)
-    np.testing.assert_array_equal(read.xyz, wrote.xyz)
+    np.testing.assert_allclose(read.xyz, wrote.xyz, rtol=0, atol=error_m)
     for name in ARRAYS:
         found, expected = getattr(read, name), getattr(wrote, name)
         if name in read.absent:
@@ -71,6 +82,10 @@ def _assert_same(read: Scan, wrote: Scan, step_ns: int) -> None:
             np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
+def _error_m(kind: str | None) -> float:
+    return LAS_ERROR_M if kind in ("las", "laz") else 0.0
+
+
 @pytest.mark.parametrize(("name", "kind"), FORMATS)
 @pytest.mark.parametrize("rate", [10, "15", "10/3"])
 def test_scans_come_back(
@@ -81,9 +96,12 @@ def test_scans_come_back(
     assert wrote[0].index == -1
     read = list(mlbatch.read(tmp_path / name))
     assert len(read) == len(wrote) == run.report.scans.written > 0
-    step_ns = 0 if kind in ("npz", "ply") else 4 * FLOAT32_STEP_NS
+    step_ns = 0 if kind in EXACT_TIMES else 4 * FLOAT32_STEP_NS
+    # The head is the last file by name.
+    read.sort(key=lambda scan: scan.index)
     for one, other in zip(read, wrote, strict=True):
-        _assert_same(one, other, step_ns)
+        _assert_same(one, other, step_ns, _error_m(kind))
+        assert (one.frame_id == "") == (kind in ("kitti", "nuscenes"))
         if kind == "npz":
             assert one.absent == {"ring_base"}
             for key in ("column", "column_stamp_ns", "column_lidar_id"):
@@ -96,10 +114,11 @@ def test_scans_sorted_by_points_come_back(
 ) -> None:
     mlbatch.convert(rec, tmp_path / name, format=kind, sort="points")
     for one, other in zip(mlbatch.read(tmp_path / name), rec.scans(sort="points"), strict=True):
-        _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
+        step_ns = 0 if kind in EXACT_TIMES else FLOAT32_STEP_NS
+        _assert_same(one, other, step_ns, _error_m(kind))
 
 
-@pytest.mark.parametrize(("name", "kind"), FORMATS[:4])
+@pytest.mark.parametrize(("name", "kind"), [*FORMATS[:4], ("pcd", "pcd")])
 def test_organized_scans_come_back(
     name: str, kind: str | None, rec: Recording, tmp_path: Path
 ) -> None:
@@ -129,7 +148,16 @@ def test_slices_of_single_sensors_come_back(
         own = int(one.lidar_id[0])
         assert one.max_gap_ns[own] == other.max_gap_ns[own]
         other.max_gap_ns = one.max_gap_ns
-        _assert_same(one, other, 0 if kind in ("npz", "ply") else FLOAT32_STEP_NS)
+        step_ns = 0 if kind in EXACT_TIMES else FLOAT32_STEP_NS
+        _assert_same(one, other, step_ns, _error_m(kind))
+
+
+@pytest.mark.parametrize("style", PLY_STYLES)
+def test_every_ply_style_is_read(style: str, rec: Recording, tmp_path: Path) -> None:
+    mlbatch.convert(rec, tmp_path / "out", format="ply", ply_style=style)
+    for one, other in zip(mlbatch.read(tmp_path / "out"), rec.scans(), strict=True):
+        assert ("ring" in one.absent) == (style == "float")
+        _assert_same(one, other, FLOAT32_STEP_NS if style == "float" else 0)
 
 
 @pytest.mark.parametrize("layout", CLOUD_LAYOUTS)
@@ -165,9 +193,11 @@ def test_a_sensor_of_a_scan_that_was_read(rec: Recording, tmp_path: Path) -> Non
 
 
 def test_one_file_of_a_folder(rec: Recording, tmp_path: Path) -> None:
-    for kind in ("npz", "ply"):
+    suffixes = {"kitti": "bin", "nuscenes": "pcd.bin"}
+    for kind in ("npz", "ply", "pcd", "laz", "kitti", "nuscenes"):
         mlbatch.convert(rec, tmp_path / kind, format=kind, split=True)
-        (scan,) = mlbatch.read(str(tmp_path / kind / "right" / f"000002.{kind}"))
+        name = f"000002.{suffixes.get(kind, kind)}"
+        (scan,) = mlbatch.read(str(tmp_path / kind / "right" / name))
         assert (scan.index, set(scan.lidar_id.tolist())) == (2, {1})
         assert np.isfinite(scan.xyz_sensor).all()
 
@@ -205,6 +235,24 @@ def test_a_bag_without_its_report(rec: Recording, tmp_path: Path) -> None:
         list(mlbatch.read(bag))
 
 
+@pytest.mark.parametrize("kind", ["kitti", "nuscenes"])
+@pytest.mark.parametrize(
+    ("missing", "expected"),
+    [
+        ("report.json", "expected the report of the run"),
+        ("scans.csv", "expected a row of scan 0 slice 0 in scans.csv"),
+        ("times.txt", r"expected a readable times\.txt next to the scans"),
+    ],
+)
+def test_rows_without_their_side_files(
+    kind: str, missing: str, expected: str, rec: Recording, tmp_path: Path
+) -> None:
+    folder = _converted(rec, tmp_path, "out", kind)
+    (folder / missing).unlink()
+    with pytest.raises(RecordingError, match=expected):
+        list(mlbatch.read(folder))
+
+
 def test_npz_without_a_report_has_no_poses(rec: Recording, tmp_path: Path) -> None:
     folder = _converted(rec, tmp_path, "npz")
     (folder / "report.json").unlink()
@@ -213,13 +261,16 @@ def test_npz_without_a_report_has_no_poses(rec: Recording, tmp_path: Path) -> No
         _ = scan.xyz_sensor
 
 
-@pytest.mark.parametrize(("name", "kind"), [FORMATS[0], FORMATS[3], FORMATS[4]])
+@pytest.mark.parametrize(("name", "kind"), [FORMATS[0], *FORMATS[3:]])
 def test_damage_is_an_error(name: str, kind: str | None, rec: Recording, tmp_path: Path) -> None:
     output = _converted(rec, tmp_path, name, kind)
-    file = output if output.is_file() else output / f"000003.{kind}"
+    file = output
+    if output.is_dir():
+        (file,) = (one for one in output.glob("000003.*") if ".time" not in one.name)
     data = bytearray(file.read_bytes())
-    half = len(data) // 2
-    damaged = data[:half] if kind == "ply" else data[:half] + b"\xa5" * 64 + data[half + 64 :]
+    half = len(data) // 2 | 1
+    has_checksums = kind in (None, "npz")
+    damaged = data[:half] + b"\xa5" * 64 + data[half + 64 :] if has_checksums else data[:half]
     file.write_bytes(damaged)
     with pytest.raises(RecordingError, match=r"expected .*, found .*; .*convert again"):
         list(mlbatch.read(output))

@@ -154,7 +154,7 @@ def test_table_of_scans_by_hand() -> None:
     last = start + 75_000_000  # four columns, 25 ms apart
     times = [start, end, start, last]
     # Nothing is known of rotors here, nor of what the sensors should have sent; see `dense_scan`.
-    rest = [*["0.000"] * 4, "", "", 1.0, 0.75]
+    rest = [*["0.000"] * 4, "NaN", "NaN", 1.0, 0.75]
     assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, *rest, end + 7]))
     times = [start - PERIOD_NS, start, start - PERIOD_NS, start - PERIOD_NS]
     assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, *rest, start + 7]))

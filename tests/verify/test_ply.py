@@ -80,6 +80,35 @@ PLY: dict[str, Case] = {
 }
 
 
-@pytest.mark.parametrize(("kind", "case"), cases({"ply": PLY}))
+FLOATS = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
+
+
+def number(name: str, place: int, value: float) -> Edit:
+    """Put a value into a vertex of the style `float`."""
+
+    def change(data: bytearray) -> bytearray:
+        begin = data.index(b"end_header\n") + len(b"end_header\n")
+        np.frombuffer(data, FLOATS, offset=begin)[name][place] = value
+        return data
+
+    return raw(ONE, change)
+
+
+FLOAT: dict[str, Case] = {
+    "no number": (number("y", 8, np.inf), "finite", "000001.ply point 8"),
+    "time that is none": (number("time", 8, np.nan), "times", "000001.ply point 8"),
+    "time past the scan": (number("time", 8, 3e38), "times", "000001.ply point 8"),
+    "property": (text(ONE, "float time", "float tame"), "container", ONE),
+}
+CLOUDCOMPARE: dict[str, Case] = {
+    "cut off": PLY["cut off"],
+    "property": (text(ONE, "int scalar_ring", "int ring"), "container", ONE),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "case"),
+    cases({"ply": PLY, "ply-float": FLOAT, "ply-cloudcompare": CLOUDCOMPARE}),
+)
 def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
     check_case(kind, case, tmp_path)

@@ -41,6 +41,24 @@ def test_a_recorded_bag_is_never_replaced(tmp_path: Path) -> None:
     assert len(list((tmp_path / "drive").iterdir())) == 2
 
 
+@pytest.mark.parametrize(
+    "names",
+    [("000000.bin", "times.txt"), ("000000.pcd.bin",), ("000000.pcd",), ("left/000000.laz",)],
+)
+def test_scans_of_other_programs_are_never_replaced(names: tuple[str, ...], tmp_path: Path) -> None:
+    """Data sets have such files too: only with a scans.csv are they an own output."""
+    for name in names:
+        (tmp_path / "drive" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "drive" / name).write_text("mine")
+    with pytest.raises(ExportError, match="expected a folder with nothing but scans to overwrite"):
+        prepare(tmp_path / "drive", overwrite=True, folder=True)
+    (tmp_path / "drive" / "scans.csv").touch()
+    prepare(tmp_path / "drive", overwrite=True, folder=True)
+    (tmp_path / "drive" / "000000.bin.txt").touch()
+    with pytest.raises(ExportError, match=r"found 000000\.bin\.txt in it"):
+        prepare(tmp_path / "drive", overwrite=True, folder=True)
+
+
 def test_files_and_folders_do_not_replace_each_other(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()

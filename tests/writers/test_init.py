@@ -12,6 +12,7 @@ from mlbatch.errors import UsageError
 from mlbatch.writers import (
     WriterOptions,
     check_compression,
+    check_options,
     check_target,
     choose_format,
     extras,
@@ -25,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_formats_are_found_by_their_place() -> None:
     modules = (ROOT / "mlbatch" / "writers" / "formats").glob("[!_]*.py")
     assert format_names() == tuple(sorted(path.stem for path in modules))
-    assert set(format_names()) >= {"mcap", "npz", "ply", "rosbag1", "rosbag2"}
+    assert set(format_names()) >= {"mcap", "npz", "ply", "pcd", "las", "laz", "kitti"}
 
 
 def test_listing_formats_loads_no_heavy_package() -> None:
@@ -63,13 +64,15 @@ def test_suffix_and_option_choose(target: str, asked: str | None, expected: str)
         ("x.npz", "npz", "-o x --format npz"),
         ("x.ply", "mcap", "folder"),
         ("x.mcap", "npz", "leave out .mcap"),
-        ("x.pcd", None, "pcd, not in this version"),
+        ("x.pcd", None, "-o x --format pcd"),
+        ("x.LAZ", "laz", "-o x --format laz"),
+        ("x.bin", None, "-o x --format kitti"),
         ("x.db3", None, "-o x --format rosbag2"),
         ("x.bag", "rosbag2", "leave out .bag"),
         ("x.bag", "mcap", "the name of a .mcap file for --format mcap, found that of a rosbag1"),
         ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
-        ("x", "las", "'las' (not in this version)"),
-        ("x", "stl", "one of mcap, npz, ply"),
+        ("x", "bin", "found 'bin'; choose one"),
+        ("x", "stl", "one of kitti, las, laz, mcap, npz, nuscenes, pcd, ply"),
     ],
 )
 def test_refusals_name_a_remedy(target: str, asked: str | None, hint: str) -> None:
@@ -93,7 +96,7 @@ def test_contents_of_the_formats() -> None:
         assert extras(name, WriterOptions("ouster")) == {
             *("imu", "range_m", "reflectivity", *encodings)
         }
-    for name in ("npz", "ply"):
+    for name in ("npz", "ply", "pcd", "las", "laz", "kitti", "nuscenes"):
         assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
 
 
@@ -110,7 +113,36 @@ def test_formats_without_compression_refuse_it(name: str) -> None:
         check_compression(name, WriterOptions(compression="gzip"))
 
 
-def test_ply_is_never_organized(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="organized"):
-        check_target("ply", tmp_path / "x", WriterOptions(), "organized")
+@pytest.mark.parametrize("name", ["ply", "las", "laz", "kitti", "nuscenes"])
+def test_formats_that_are_never_organized(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=f"expected dense for {name}, found organized"):
+        check_target(name, tmp_path / "x", WriterOptions(), "organized")
+    assert not list(tmp_path.iterdir())
+
+
+def test_styles_are_those_of_ply() -> None:
+    check_options("ply", WriterOptions(ply_style="float"))
+    with pytest.raises(UsageError, match="expected standard, cloudcompare, float, found 'pdal'"):
+        check_options("ply", WriterOptions(ply_style="pdal"))
+    with pytest.raises(UsageError) as caught:
+        check_options("npz", WriterOptions(ply_style="float"))
+    assert str(caught.value) == (
+        "--ply-style: expected standard for npz, found 'float'; leave it out, or give --format ply"
+    )
+
+
+@pytest.mark.parametrize("name", ["las", "laz"])
+@pytest.mark.parametrize("missing", ["laspy", "lazrs"])
+def test_a_missing_package_is_one_line(
+    name: str, missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    if (name, missing) == ("las", "lazrs"):
+        # Only LAZ is compressed.
+        check_target(name, tmp_path / "x", WriterOptions(), "dense")
+        return
+    with pytest.raises(UsageError) as caught:
+        check_target(name, tmp_path / "x", WriterOptions(), "dense")
+    assert str(caught.value).startswith(f"--format {name}: expected the packages laspy and lazrs")
+    assert str(caught.value).endswith("; pip install 'mlbatch[las]'")
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,6 @@
 """Output formats, one module each; they are found by their place here, or by entry points.
 
-A format that writes one file per scan uses its own name as the suffix of these files.
+A format that writes files for each scan uses its own name as their suffix, or `FILE_SUFFIXES`.
 """
 
 from __future__ import annotations
@@ -36,6 +36,21 @@ def other_names() -> tuple[str, ...]:
 def is_format(name: str) -> bool:
     """Return whether there is a format of this name."""
     return name in built_in_names() or (name != "" and name in format_names())
+
+
+def format_of_files(suffix: str) -> str | None:
+    """Return the format whose scans are files with this suffix, without a dot; None: there is none.
+
+    Formats are imported until one has it.
+    """
+    if is_format(suffix):
+        return suffix if format_module(suffix).SUFFIX is None else None
+    return next((name for name in built_in_names() if suffix in _file_suffixes(name)), None)
+
+
+def _file_suffixes(name: str) -> tuple[str, ...]:
+    found: tuple[str, ...] = getattr(format_module(name), "FILE_SUFFIXES", ())
+    return found
 
 
 def format_module(name: str) -> WriterModule:

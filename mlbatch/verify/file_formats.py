@@ -1,0 +1,51 @@
+"""Formats with files for each scan: how they are recognised and read, and their limits.
+
+Libraries of a format are loaded only for outputs of that format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from mlbatch.verify import float_rows, las, npz, pcd, ply
+from mlbatch.verify.commented import CommentedReader
+from mlbatch.verify.float_rows import RowReader
+from mlbatch.verify.npz import NpzReader
+from mlbatch.verify.verdict import CheckLog
+
+FileReader: TypeAlias = NpzReader | CommentedReader | RowReader
+
+_RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
+
+
+@dataclass(frozen=True, slots=True)
+class FileFormat:
+    """A format; suffix: of the first file of a scan; limits: as in `Output.verdict`."""
+
+    name: str
+    suffix: str
+    reader: Callable[[CheckLog], FileReader]
+    limits: Mapping[str, str]
+
+
+# In the order in which suffixes are looked for: that of kitti is the end of that of nuscenes.
+FILE_FORMATS = (
+    FileFormat("npz", npz.SUFFIX, NpzReader, npz.LIMITS | {"geometry": _RANGES}),
+    FileFormat("ply", ply.SUFFIX, ply.PlyReader, ply.LIMITS),
+    FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, pcd.LIMITS),
+    FileFormat("las", las.LAS_SUFFIX, las.LasReader, las.LIMITS),
+    FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, las.LIMITS),
+    FileFormat("nuscenes", float_rows.NUSCENES_SUFFIX, RowReader, float_rows.NUSCENES_LIMITS),
+    FileFormat("kitti", float_rows.KITTI_SUFFIX, RowReader, float_rows.KITTI_LIMITS),
+)
+
+
+def format_of(paths: Collection[Path]) -> FileFormat | None:
+    """The format of files; None if there is none of a known one."""
+    return next(
+        (one for one in FILE_FORMATS if any(path.name.endswith(one.suffix) for path in paths)),
+        None,
+    )

@@ -1,0 +1,181 @@
+"""Folders of float32 rows: kitti and nuscenes. They have no header: the rest is in the report.
+
+The format: docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.verify.folders import ScanFile, scan_files
+from mlbatch.verify.report_checks import RunMetadata
+from mlbatch.verify.scan import StoredScan
+from mlbatch.verify.verdict import CheckLog, DamageError
+
+KITTI_SUFFIX = ".bin"
+NUSCENES_SUFFIX = ".pcd.bin"
+TIME_SUFFIX = ".time.bin"
+TIMES_TXT = "times.txt"
+_TIME = re.compile(r"(\d{1,10})\.(\d{9})", re.ASCII)
+_NS = 10**9
+_MOST_S = 4.0
+_BYTES = 4
+
+_COMMON = {
+    "columns": "first and last column of a scan, by scans.csv; rows have no column stamps",
+    "geometry": "rows have no ranges",
+    "stamps": "rows have no log times",
+    "duplicates": "rows have no columns",
+    "returns": "rows have no return types",
+    "metadata": "report only: rows have no header",
+    "tf_static": "rows have no transforms",
+    "imu": "rows have no IMU samples",
+    "messages": "rows have no messages",
+}
+KITTI_LIMITS = _COMMON | {
+    "order": "rows have no times",
+    "times": "rows have no times",
+    "sensors": "rows have no sensors",
+    "rings": "rows have no rings",
+}
+NUSCENES_LIMITS = _COMMON | {
+    "order": "points step back by less than a column's duration; rows have no columns",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FloatRows:
+    """Rows of a scan; times and sensors only where the format has them."""
+
+    rows: F32Array  # (p, 4), or (p, 5) with rings
+    times: F32Array | None = None  # (p, 2): s after the start, sensor
+
+
+def read_rows(file: ScanFile) -> FloatRows:
+    """The rows of a file, and of the second one of nuscenes; DamageError for another size."""
+    if file.suffix == KITTI_SUFFIX:
+        return FloatRows(_rows(file.read(), 4))
+    rows = _rows(file.read(), 5)
+    path = file.path.with_name(file.path.name.removesuffix(NUSCENES_SUFFIX) + TIME_SUFFIX)
+    try:
+        times = _rows(path.read_bytes(), 2)
+    except OSError as err:
+        raise DamageError(f"a readable file {path.name} next to it", str(err.strerror)) from err
+    if len(times) != len(rows):
+        raise DamageError(f"{len(rows)} rows in {path.name}", str(len(times)))
+    return FloatRows(rows, times)
+
+
+def _rows(data: bytes, columns: int) -> F32Array:
+    if len(data) % (columns * _BYTES):
+        raise DamageError(f"rows of {columns} float32", f"{len(data)} bytes")
+    rows: F32Array = np.frombuffer(data, "<f4").reshape(-1, columns)
+    return rows
+
+
+def read_times(folder: Path, files: list[ScanFile]) -> list[int]:
+    """Starts of the scans of a folder, ns, in the order of their names."""
+    path = folder / TIMES_TXT
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise DamageError(f"a readable {TIMES_TXT} next to the scans", str(err)) from err
+    if len(lines) != len(files):
+        raise DamageError(f"{len(files)} lines in {TIMES_TXT}", str(len(lines)))
+    starts = []
+    for number, line in enumerate(lines, 1):
+        found = _TIME.fullmatch(line)
+        if found is None:
+            raise DamageError(f"seconds with 9 decimals in {TIMES_TXT} line {number}", repr(line))
+        starts.append(int(found[1]) * _NS + int(found[2]))
+    return starts
+
+
+def start_of(file: ScanFile, known: dict[Path, dict[Path, int]]) -> int:
+    """The start of a scan in the times.txt of its folder, ns; known: starts by folder and file."""
+    folder = file.path.parent
+    if folder not in known:
+        inside = [
+            one for one in scan_files(CheckLog(), folder, file.suffix) if one.path.parent == folder
+        ]
+        inside.sort(key=lambda one: (one.index < 0, one.index, one.slice or 0))
+        starts = read_times(folder, inside)
+        known[folder] = {one.path: start for one, start in zip(inside, starts, strict=True)}
+    return known[folder][file.path]
+
+
+@dataclass(slots=True)
+class RowReader:
+    """Reads the files of one folder."""
+
+    log: CheckLog
+    sensors: tuple[str, ...] = ()
+    organized: bool = False
+    _slices: int = 1
+    _starts: dict[Path, dict[Path, int]] = field(default_factory=dict)
+
+    def begin(self, file: ScanFile) -> RunMetadata:
+        """Nothing: rows have no header."""
+        return RunMetadata()
+
+    def know(self, metadata: RunMetadata) -> None:
+        """Take over what the report has."""
+        self.sensors = metadata.sensors or ()
+        self._slices = metadata.slices or 1
+
+    def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
+        """Every readable scan; the others are violations."""
+        for file in files:
+            try:
+                scan = self._scan(file)
+            except DamageError as err:
+                self.log.fail("container", file.where, err.expected, err.found)
+                continue
+            self.log.ok("container")
+            yield scan
+
+    def _scan(self, file: ScanFile) -> StoredScan:
+        found = read_rows(file)
+        self.log.ok("layout")
+        part = file.slice or 0
+        file.check_name(self.log, file.index, part, self._slices)
+        scan = StoredScan(
+            where=file.where,
+            start_ns=start_of(file, self._starts),
+            index=file.index,
+            slice=part,
+            xyz=found.rows[:, :3],
+            organized=False,
+            sensor=file.sensor_index(self.log, self.sensors),
+            intensity=found.rows[:, 3],
+        )
+        if found.times is not None:
+            self._label(scan, found.rows[:, 4], found.times[:, 0], found.times[:, 1])
+        return scan
+
+    def _label(self, scan: StoredScan, ring: F32Array, time_s: F32Array, lidar: F32Array) -> None:
+        """Add what only nuscenes has."""
+        finite: BoolArray = np.isfinite(time_s)
+        bad: BoolArray = np.logical_not(finite)
+        self.log.none("times", scan.point, bad, "a finite number", time_s.item)
+        exact: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
+        step_s = float(np.spacing(np.float32(np.abs(exact).max(initial=0))))
+        # Rounded toward zero: never later than the true time.
+        scan.time_ns = np.floor(exact * _NS).astype(np.int64)
+        scan.time_step_ns = int(step_s * _NS) + 1
+        scan.ring = self._whole("rings", scan, ring, 65535)
+        scan.lidar_id = self._whole("sensors", scan, lidar, 255).astype(np.uint8)
+
+    def _whole(self, check: str, scan: StoredScan, values: F32Array, most: int) -> I64Array:
+        exact: F64Array = np.nan_to_num(values, nan=-1.0).astype(np.float64)
+        cut: I64Array = np.clip(np.rint(exact), 0, most).astype(np.int64)
+        bad: BoolArray = cut != exact
+        expected = f"a whole number from 0 to {most}"
+        self.log.none(check, scan.point, bad, expected, values.item)
+        return cut

@@ -1,0 +1,39 @@
+"""A folder of .bin files as in the KITTI odometry data set, with the times of the scans.
+
+Source: A. Geiger et al., "Vision meets robotics: the KITTI dataset", IJRR 2013 (rows of float32
+x, y, z, reflectance), and docs/sources/outputs.md section 6.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mlbatch.types import RunInfo
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.float_rows import TIMES_TXT, XYZI, RowEncoder, times_text
+from mlbatch.writers.scan_folder import FolderWriter, check_dense
+
+FORMAT = "kitti"
+SUFFIX: str | None = None
+COMPRESSES = False
+FILE_SUFFIXES = ("bin",)
+
+
+def extras(options: WriterOptions) -> frozenset[str]:
+    """Return nothing: the columns are fixed."""
+    return frozenset()
+
+
+def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start a folder of .bin files."""
+    check_dense(FORMAT, info)
+    (suffix,) = FILE_SUFFIXES
+    return FolderWriter(
+        target,
+        info,
+        options,
+        FORMAT,
+        lambda: RowEncoder(XYZI),
+        suffix=suffix,
+        lists={TIMES_TXT: times_text},
+    )

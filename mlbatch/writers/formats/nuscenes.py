@@ -1,0 +1,48 @@
+"""A folder of .pcd.bin files as in the nuScenes data set, with times and lidars of the points.
+
+Source: H. Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020, and
+docs/sources/outputs.md section 6. Its readers expect five float32 a point and no more: x, y, z,
+intensity, ring. Time and lidar of each point are in a second file, as nuScenes has labels of
+points (lidarseg) in files of their own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mlbatch.types import RunInfo
+from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.float_rows import (
+    TIME_AND_LIDAR,
+    TIMES_TXT,
+    XYZIR,
+    RowEncoder,
+    times_text,
+)
+from mlbatch.writers.scan_folder import FolderWriter, check_dense
+
+FORMAT = "nuscenes"
+SUFFIX: str | None = None
+COMPRESSES = False
+FILE_SUFFIXES = ("pcd.bin", "time.bin")
+
+
+def extras(options: WriterOptions) -> frozenset[str]:
+    """Return nothing: the columns are fixed."""
+    return frozenset()
+
+
+def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start a folder of .pcd.bin and .time.bin files."""
+    check_dense(FORMAT, info)
+    points, times = FILE_SUFFIXES
+    return FolderWriter(
+        target,
+        info,
+        options,
+        FORMAT,
+        lambda: RowEncoder(XYZIR),
+        suffix=points,
+        others={times: lambda: RowEncoder(TIME_AND_LIDAR)},
+        lists={TIMES_TXT: times_text},
+    )

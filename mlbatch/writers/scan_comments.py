@@ -1,0 +1,40 @@
+"""Metadata of a scan as lines of text, for formats whose headers have comments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+import mlbatch
+from mlbatch.errors import one_line
+from mlbatch.types import Scan
+
+# Fields in the units of all formats with seconds after the start of the scan.
+UNITS = "x y z m; time s after start_ns; intensity as sent by the sensor"
+
+
+def scan_comments(scan: Scan, units: str = UNITS) -> list[str]:
+    """Return the lines: a name and its value each; units: of the fields."""
+    info = scan.info
+    names = " ".join(sensor.name for sensor in info.sensors)
+    return [
+        f"mlbatch {mlbatch.__version__}",
+        f"start_ns {scan.start_ns}",
+        f"end_ns {scan.end_ns}",
+        f"index {scan.index} slice {scan.slice} of {scan.slices}",
+        f"complete {str(scan.complete).lower()}",
+        f"fill {' '.join(map(_share, scan.fill.tolist()))}",
+        f"sort {info.sort}",
+        f"timescale {info.timescale}",
+        f"rate_hz {info.rate_hz}",
+        # Frame names come from recordings and may contain line ends.
+        f"frame_id {one_line(info.frame_id)}",
+        f"units: {units}",
+        f"lidar_id from 0: {names}",
+    ]
+
+
+def _share(fill: float) -> str:
+    """Return a fill as text, as in scans.csv."""
+    return "unknown" if math.isnan(fill) else str(np.float32(fill))
