@@ -14,7 +14,7 @@ def simulate(
         typer.Argument(help="Scenario file (YAML), or room, street, forest-easy, forest-hard."),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Recording to write: .pcap, .mcap or .db3.")
+        Path, typer.Option("-o", "--output", help="Recording to write: .pcap, .mcap or .db3.")
     ],
     duration: Annotated[
         float | None, typer.Option(min=0.1, help="Seconds. [default: the scenario's]")

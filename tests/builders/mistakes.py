@@ -61,17 +61,11 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "-o out.npz: expected a folder, since npz output is one file per scan, found a file name; "
         "give -o out --format npz",
     ),
-    "later suffix": (
-        f"{FIX} -o out.las",
+    "format of others": (
+        f"{FIX} --format e57",
         2,
-        "-o out.las: expected a .mcap file, a .bag file or a folder, found .las (las, not in this "
-        "version); choose another output",
-    ),
-    "later format": (
-        f"{FIX} --format las",
-        2,
-        "--format: expected one of mcap, npz, ply, rosbag1, rosbag2, found 'las' (not in this "
-        "version); choose one",
+        "--format: expected one of kitti, las, laz, mcap, npz, nuscenes, pcd, ply, rosbag1, rosbag2, "
+        "found 'e57'; choose one",
     ),
     "folder format for a file": (
         f"{FIX} -o out.mcap --format ply",

@@ -36,6 +36,10 @@ def test_no_other_path_may_be_it(
     words = ["-"] if is_argument else [option, "-"]
     if not is_argument and command != "bench":
         words.append(str(CAPTURE))
+    if command == "diff":
+        words = ["-", str(CAPTURE)] if option == "a" else [str(CAPTURE), "-"]
+    if command == "batch":
+        words += ["-o", "out"]
     outcome = shell(command, *words)
     assert (outcome.code, outcome.out) == (2, "")
     name = option.upper() if is_argument else {"--output": "-o"}.get(option, option)

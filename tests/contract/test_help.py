@@ -136,8 +136,10 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
 }
 # Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
-_OWN = ("--output", "--rig", "--jobs", "--only", "--overwrite", "--resume", "--quiet", "--verbose")
+_OWN = ("--output", "--rig", "--jobs", "--overwrite", "--resume", "--quiet", "--verbose")
 _PASSED = set(OPTIONS["convert"]) - {*_OWN, "--report", "--html", "--dry-run"}
+# There `--only` names sessions.
+_PASSED -= {"--only", "--include-sensor"}
 OPTIONS["batch"] |= {name: OPTIONS["convert"][name] for name in sorted(_PASSED)}
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
