@@ -10,6 +10,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
@@ -243,6 +244,13 @@ class _Lookups:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.groups: list[str] = []
+        # Without finders that libraries of other tests added.
+        finders = [
+            finder
+            for finder in sys.meta_path
+            if finder is PathFinder or not hasattr(finder, "find_distributions")
+        ]
+        monkeypatch.setattr(sys, "meta_path", finders)
         monkeypatch.setattr(importlib.metadata, "entry_points", self._entry_points)
 
     def _entry_points(self, group: str) -> list[importlib.metadata.EntryPoint]:
