@@ -64,8 +64,8 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "format of others": (
         f"{FIX} --format e57",
         2,
-        "--format: expected one of kitti, las, laz, mcap, npz, nuscenes, pcd, ply, rosbag1, rosbag2, "
-        "found 'e57'; choose one",
+        "--format: expected one of kitti, las, laz, mcap, npz, nuscenes, pcd, ply, rosbag1, "
+        "rosbag2, found 'e57'; choose one",
     ),
     "folder format for a file": (
         f"{FIX} -o out.mcap --format ply",

@@ -244,13 +244,6 @@ class _Lookups:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.groups: list[str] = []
-        # Without finders that libraries of other tests added.
-        finders = [
-            finder
-            for finder in sys.meta_path
-            if finder is PathFinder or not hasattr(finder, "find_distributions")
-        ]
-        monkeypatch.setattr(sys, "meta_path", finders)
         monkeypatch.setattr(importlib.metadata, "entry_points", self._entry_points)
 
     def _entry_points(self, group: str) -> list[importlib.metadata.EntryPoint]:
@@ -258,9 +251,20 @@ class _Lookups:
         return []
 
 
+def _leave_out_finders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search without the finders that libraries of other tests may have added."""
+    finders = [
+        finder
+        for finder in sys.meta_path
+        if finder is PathFinder or not hasattr(finder, "find_distributions")
+    ]
+    monkeypatch.setattr(sys, "meta_path", finders)
+
+
 def test_metadata_are_not_read_without_plugins(
     other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    _leave_out_finders(monkeypatch)
     _distribution(other, "unrelated", "mlbatch.sensors_of_others", "x = y")
     monkeypatch.setattr(sys, "path", [str(other), "", str(other / "missing")])
     lookups = _Lookups(monkeypatch)
@@ -271,6 +275,7 @@ def test_metadata_are_not_read_without_plugins(
 def test_metadata_are_read_where_one_distribution_has_plugins(
     other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    _leave_out_finders(monkeypatch)
     about = other / "own.egg-info"
     about.mkdir()
     (about / "entry_points.txt").write_text("[mlbatch.sensors]\nx = y\n")
