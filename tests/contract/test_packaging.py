@@ -126,3 +126,12 @@ def test_the_changelog_has_this_version() -> None:
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"## {mlbatch.__version__}\n" in changes
     assert "## Unreleased\n" in changes
+
+
+def test_the_engine_is_built_from_all_its_sources() -> None:
+    """A missing one would fail quietly, since the extension is optional."""
+    (extension,) = cast(list[dict[str, list[str]]], _settings("tool", "setuptools")["ext-modules"])
+    native = PACKAGE / "native"
+    names = [path.relative_to(PACKAGE.parent).as_posix() for path in sorted(native.glob("*.c"))]
+    assert extension["sources"] == names
+    assert extension["depends"] == ["mlbatch/native/native.h"]

@@ -108,6 +108,12 @@ def test_a_library_of_another_version_is_not_used(
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_engine_is_built_where_a_compiler_is() -> None:
+    """Otherwise all tests of it would be skipped."""
+    assert library.trouble() == ""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_the_sources_have_no_warnings(tmp_path: Path) -> None:
     flags = ["-std=c11", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
     sources = [str(one) for one in sorted(SOURCES.glob("*.c"))]
