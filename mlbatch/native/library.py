@@ -157,7 +157,7 @@ def library() -> Any:
     """Return the loaded library; OSError if it is missing, or was built from other sources."""
     path = library_path()
     if path is None:
-        raise OSError("none, since no C compiler was found when it was installed")
+        raise OSError("none, since it was not compiled when mlbatch was installed")
     loaded = ctypes.CDLL(str(path))
     for name, arguments in _FUNCTIONS.items():
         function = getattr(loaded, name)

@@ -138,7 +138,14 @@ def _scans(report: Values, windows: Windows | None) -> Iterator[Finding]:
     incomplete = scans.count("incomplete")
     if windows is not None and windows.has_head:
         yield Finding(Level.NOTE, "Head and tail are incomplete, as requested by --keep-partial.")
-        incomplete -= 1 + int(not windows.complete[-1])
+        partial = 1 + int(not windows.complete[-1])
+        incomplete -= partial
+        if written <= partial:
+            yield Finding(
+                Level.WARNING,
+                "No window is whole: head and tail, which are partial, are all that was written.",
+                "record longer, or use shorter windows (--rate)",
+            )
     if incomplete > 0:
         yield Finding(
             Level.WARNING,

@@ -69,6 +69,21 @@ def test_head_and_tail_are_partial_by_request() -> None:
     assert "Head and tail are incomplete, as requested by --keep-partial." in texts
 
 
+@pytest.mark.parametrize("written", [1, 2])
+def test_head_and_tail_alone_are_no_good_run(written: int) -> None:
+    document = report(sensor("left"), sensor("right", 1))
+    document["scans"] |= {"written": written, "incomplete": written}
+    columns = [[100, 100], [50, 0]][:written]
+    missing = [[512 - count for count in own] for own in columns]
+    text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
+    found_texts = [
+        one.text
+        for one in findings(Values(document), read_windows(text, 1))
+        if one.level is Level.WARNING
+    ]
+    assert found_texts[0].startswith("No window is whole")
+
+
 def test_the_warning_of_a_loss_is_not_repeated() -> None:
     message = "left: 20 of 1000 packets lost (2 %)"
     warning = {"code": "loss", "sensor": "left", "message": message}
