@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,6 +111,16 @@ class Sampler:
         samples.packets += len(index)
         samples.last_host_ns = int(batch.host_ns[index[-1]])
         return is_new
+
+    def share_of(self, kinds: Collection[PacketKind]) -> float:
+        """Share of some kinds in the bytes so far; of streams not followed, with the mean size."""
+        sizes = {kind: one.packets * kind.size for kind, one in self.kinds.items()}
+        packets = sum(one.packets for one in self.kinds.values())
+        total = sum(sizes.values())
+        if not total:
+            return 0.0
+        unfollowed = self.crowd.packets * total / packets
+        return sum(size for kind, size in sizes.items() if kind in kinds) / (total + unfollowed)
 
     def evidence(self, kind: PacketKind) -> Evidence:
         """Samples of a kind and of its neighbours, as vendors recognise them."""

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 CLOUDS = "clouds"
 
 
+# Share of the bytes of a recording.
+_MOST = 0.5
+
+
 class Session:
     """The recordings of a job and the sensors found in them.
 
@@ -57,10 +61,13 @@ class Session:
             recording.use_engine(self.engine)
         if job.segment != TimeSegment():
             opened = [ClippedRecording(recording, job.segment) for recording in opened]
-        # The compiled engine decodes packets where they were read.
-        self._arena = PacketArena() if self.engine == "native" else None
         self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
+        # The compiled engine decodes packets where they were read, unless most bytes there are
+        # of others, which would be kept as long.
+        kinds = {kind for found in self.setup.sensors for kind in found.kinds}
+        is_mostly_lidar = self.setup.sampler.share_of(kinds) >= _MOST
+        self._arena = PacketArena() if self.engine == "native" and is_mostly_lidar else None
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
             self.sensors.append(self._sensor(found))
