@@ -82,15 +82,17 @@ def options_page() -> str:
         parts.append(f"\n## mlbatch {name}\n\n{about}\n\n`{usage}`\n")
         for title, rows in help_rows.groups.items():
             parts.append(f"\n| {title.lower()} | meaning |\n|---|---|\n")
-            parts += [
-                f"| `{_cell(names)}` | {_cell(text).replace('<', '&lt;')} |\n"
-                for names, text in rows
-            ]
+            parts += [f"| `{_cell(names)}` | {_plain(_cell(text))} |\n" for names, text in rows]
     return "".join(parts)
 
 
 def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
+
+
+def _plain(text: str) -> str:
+    """Text in which neither < nor [ has a meaning: ranges of numbers are not links."""
+    return text.replace("<", "&lt;").replace("[", "&#91;")
 
 
 def warnings_page() -> str:
