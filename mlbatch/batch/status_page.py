@@ -10,8 +10,7 @@ from urllib.parse import quote
 import mlbatch
 from mlbatch.batch.record import SessionRecord
 from mlbatch.batch.status import UNFINISHED, BatchStatus, SessionStatus
-from mlbatch.errors import ExportError
-from mlbatch.page import MARK, check_page
+from mlbatch.page import MARK, check_page, write_text_page
 
 _ORDER = {"failed": 0, UNFINISHED: 1, "done": 2}
 # Levels of loss in %, as in docs/page.md.
@@ -29,16 +28,7 @@ td strong.problem { color: var(--problem); }
 def write_status_page(path: Path, status: BatchStatus) -> None:
     """Write the page; an earlier page is replaced, any other file never."""
     check_page(path, overwrite=True)
-    data = _page(path, status).encode("utf-8", "backslashreplace")
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as err:
-        partial.unlink(missing_ok=True)
-        raise ExportError(
-            f"{path}: expected to write the page, found {err.strerror!r}; choose another place"
-        ) from err
+    write_text_page(path, _page(path, status))
 
 
 def _page(path: Path, status: BatchStatus) -> str:

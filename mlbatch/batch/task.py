@@ -270,7 +270,7 @@ def _remove(path: Path) -> None:
 
 
 def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
-    """Run the process until it ends by itself; exit code and number of attempts."""
+    """Run the process until it ends; exit code and number of attempts."""
     attempt = 0
     code = 0
     while attempt <= task.retries:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array
 from mlbatch.verify.comments import ScanComments
-from mlbatch.verify.folders import ScanFile
+from mlbatch.verify.folders import ScanFile, readable
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError
@@ -61,14 +61,7 @@ class CommentedReader:
 
     def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
         """Every readable scan; the others are violations."""
-        for file in files:
-            try:
-                scan = self._scan(file)
-            except DamageError as err:
-                self.log.fail("container", file.where, err.expected, err.found)
-                continue
-            self.log.ok("container")
-            yield scan
+        return readable(self.log, files, self._scan)
 
     def _scan(self, file: ScanFile) -> StoredScan:
         log = self.log

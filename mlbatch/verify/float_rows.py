@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
-from mlbatch.verify.folders import ScanFile, scan_files
+from mlbatch.verify.folders import ScanFile, readable, scan_files
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError
@@ -131,14 +131,7 @@ class RowReader:
 
     def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
         """Every readable scan; the others are violations."""
-        for file in files:
-            try:
-                scan = self._scan(file)
-            except DamageError as err:
-                self.log.fail("container", file.where, err.expected, err.found)
-                continue
-            self.log.ok("container")
-            yield scan
+        return readable(self.log, files, self._scan)
 
     def _scan(self, file: ScanFile) -> StoredScan:
         found = read_rows(file)

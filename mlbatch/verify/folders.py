@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
@@ -51,6 +52,24 @@ class ScanFile:
             return sensors.index(self.sensor)
         log.fail("names", self.where, f"the folder of one of {', '.join(sensors)}", self.sensor)
         return None
+
+
+def readable(
+    log: CheckLog, files: Iterable[ScanFile], read: Callable[[ScanFile], StoredScan | None]
+) -> Iterator[StoredScan]:
+    """Yield the scan of every file that can be read; the others are violations.
+
+    read: None where a scan is not in its layout.
+    """
+    for file in files:
+        try:
+            scan = read(file)
+        except DamageError as err:
+            log.fail("container", file.where, err.expected, err.found)
+            continue
+        log.ok("container")
+        if scan is not None:
+            yield scan
 
 
 def entries(folder: Path) -> list[Path]:

@@ -19,7 +19,7 @@ from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.verify.containers import check_unpacked_size, library_errors
-from mlbatch.verify.folders import ScanFile
+from mlbatch.verify.folders import ScanFile, readable
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError
@@ -112,15 +112,7 @@ class NpzReader:
 
     def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
         """Every readable scan; the others are violations."""
-        for file in files:
-            try:
-                scan = self._scan(file)
-            except DamageError as err:
-                self.log.fail("container", file.where, err.expected, err.found)
-                continue
-            self.log.ok("container")
-            if scan is not None:
-                yield scan
+        return readable(self.log, files, self._scan)
 
     def _scan(self, file: ScanFile) -> StoredScan | None:
         data = _members(file)
