@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -65,15 +66,16 @@ def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
     return cast(Lidar, found.lidar({}, None))
 
 
+def lidar_of(make: Callable[..., models.Sent], words: tuple[str, ...], folder: Path) -> Lidar:
+    """The lidar that a conversion finds in the packets of a case."""
+    (sensor,) = Conversion(models.job_of(make(*words), folder)).sensors
+    return sensor.lidar
+
+
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
     """Lidars of other vendors."""
-    found = []
-    for make, words in OTHERS:
-        job = models.job_of(make(*words), tmp_path_factory.mktemp("lidar"))
-        (sensor,) = Conversion(job).sensors
-        found.append(sensor.lidar)
-    return found
+    return [lidar_of(make, words, tmp_path_factory.mktemp("lidar")) for make, words in OTHERS]
 
 
 @dataclass(frozen=True, slots=True)

@@ -117,7 +117,7 @@ def _read(path: Path, engine: str) -> list[object]:
 
 
 @lru_cache(maxsize=1)
-def _records() -> tuple[tuple[int, bytes], ...]:
+def capture_records() -> tuple[tuple[int, bytes], ...]:
     every = frames(300_000_000)
     foreign = [record for record in every if len(record[1]) < 200][:8]
     payload = bytes(range(200))
@@ -132,9 +132,9 @@ def _records() -> tuple[tuple[int, bytes], ...]:
 
 
 def _pcaps() -> Seeds:
-    small = [record for record in _records() if len(record[1]) < 400]
+    small = [record for record in capture_records() if len(record[1]) < 400]
     return (
-        pcap_bytes(_records()),
+        pcap_bytes(capture_records()),
         pcap_bytes(small),
         pcap_bytes(small, ns=False),
         pcap_bytes(small, big_endian=True),
@@ -143,7 +143,7 @@ def _pcaps() -> Seeds:
 
 
 def _pcapngs() -> Seeds:
-    blocks = [Packet(frame, host_ns) for host_ns, frame in _records()[:_RECORDS]]
+    blocks = [Packet(frame, host_ns) for host_ns, frame in capture_records()[:_RECORDS]]
     small = [block for block in blocks if len(block.frame) < 400][:12]
     mixed: list[Packet | Other | Interface] = [*small[:3], Other(4, bytes(32)), *small[3:]]
     return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tests.fuzz import messages, outputs, packets, readers, sessions, texts
+from tests.fuzz import compiled, messages, outputs, packets, readers, sessions, texts
 from tests.fuzz.harness import Target
 
 TARGETS: Sequence[Target] = (
@@ -14,4 +14,5 @@ TARGETS: Sequence[Target] = (
     *texts.TARGETS,
     *outputs.TARGETS,
     *sessions.TARGETS,
+    *compiled.TARGETS,
 )

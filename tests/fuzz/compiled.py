@@ -1,0 +1,254 @@
+"""Targets: compiled loops called directly, on mutated bytes; numpy must find the same.
+
+Quick enough for a million inputs with the sanitizers (`make fuzz-sanitized`).
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import tempfile
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.batching.merge import ColumnMerge, column_merge
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source
+from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.interface import Lidar
+from mlbatch.native.capture import CaptureLoops, Found
+from mlbatch.native.library import trouble
+from mlbatch.readers.byte_records import SLACK
+from mlbatch.readers.capture.frames import Addresses, Dissection, Frames, dissect
+from mlbatch.types import EXTRAS, Columns, RunInfo, SensorInfo, WindowColumns
+from tests.builders.engines import BOXES_M, Pair
+from tests.decode.test_native_engine import (
+    END_NS,
+    NAMES,
+    OTHERS,
+    POSES,
+    START_NS,
+    lidar_of,
+    ouster,
+    packets_of,
+    words_of,
+)
+from tests.fuzz.harness import BrokenLaw, Target
+from tests.fuzz.mutation import Seeds, mutated
+from tests.fuzz.readers import capture_records
+
+_ETHERNET = 1
+_PACKETS = 3
+_COLUMNS = 40
+_HEAD = struct.Struct("<I")
+_SIZE = struct.Struct("<H")
+_MOST_BYTES = 2000
+
+# -- pixels ---------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _lidars() -> Sequence[Lidar]:
+    with tempfile.TemporaryDirectory() as name:
+        others = [lidar_of(make, words, Path(name)) for make, words in OTHERS]
+    return (*(ouster(name, 16) for name in NAMES), *others)
+
+
+@lru_cache(maxsize=1)
+def _pixel_seeds() -> Seeds:
+    """Of each lidar three packets behind a number, which chooses the rest of a case."""
+    rng = np.random.default_rng(5)
+    return tuple(
+        _HEAD.pack(number) + packets_of(lidar, rng, _PACKETS).tobytes()
+        for number, lidar in enumerate(_lidars())
+        for _ in range(3)
+    )
+
+
+@lru_cache(maxsize=256)
+def _pair(
+    number: int, layout: str, *, is_cut: bool, keeps_repeated: bool
+) -> tuple[Pair, PacketRing]:
+    """Decoders of both engines for one lidar."""
+    lidar = _lidars()[number]
+    pose = POSES[number % len(POSES)]
+    ring = PacketRing(lidar.packet_size, lidar.records)
+    low_m, high_m = (1.0, 60.0) if is_cut else (0.0, float("inf"))
+    sources = [Source(lidar, ring, pose, 0, low_m, high_m, keeps_repeated)]
+    info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, pose)
+    run = RunInfo((info,), "base_link", "10", "utc", 1, layout)
+    boxes_m = np.array(BOXES_M if is_cut else ()).reshape(-1, 6)
+    engines = ("numpy", "native")
+    return Pair(*(Decoder(run, sources, boxes_m, EXTRAS, engine=name) for name in engines)), ring
+
+
+def _decode(data: bytes, folder: Path) -> None:
+    """Columns of packets of any bytes, in any order and at any position of the rotor."""
+    data = data.ljust(_HEAD.size, b"\0")
+    (number,) = _HEAD.unpack_from(data)
+    lidar = _lidars()[number % len(_lidars())]
+    rng = np.random.default_rng(number)
+    layout = str(rng.choice(("dense", "organized")))
+    is_cut, keeps_repeated = rng.random(2) < 0.5
+    pair, ring = _pair(
+        number % len(_lidars()), layout, is_cut=bool(is_cut), keeps_repeated=bool(keeps_repeated)
+    )
+    size = lidar.packet_size * _PACKETS
+    packets = np.frombuffer(data[_HEAD.size :].ljust(size, b"\0")[:size], np.uint8)
+    _, places = ring.store(packets, np.arange(_PACKETS) * lidar.packet_size, None)
+    every = (places[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
+    place = rng.choice(every, _COLUMNS)
+    word = words_of(lidar, rng, _COLUMNS)
+    stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
+    columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word)
+    pair.check(columns, ScanHeader(0, 0, START_NS, END_NS, True, 0))
+
+
+# -- frames ---------------------------------------------------------------------------------------
+
+
+def _framed(frames: Sequence[bytes]) -> bytes:
+    return b"".join(_SIZE.pack(len(one)) + one for one in frames)
+
+
+def _frames_of(data: bytes) -> list[bytes]:
+    found, at = [], 0
+    while at + _SIZE.size <= len(data):
+        at += _SIZE.size
+        found.append(data[at : at + _SIZE.unpack_from(data, at - _SIZE.size)[0]])
+        at += len(found[-1])
+    return found
+
+
+def _frame_seeds() -> Seeds:
+    """Frames of datagrams, whole, in fragments and of other kinds, each behind its size."""
+    rng = random.Random(5)
+    every = [frame for _, frame in capture_records()]
+    return tuple(_framed(rng.choices(every, k=6)) for _ in range(20))
+
+
+def _mutated_frames(rng: random.Random, seeds: Seeds) -> bytes:
+    """Change some frames, all alike or each in its way."""
+    frames = _frames_of(rng.choice(seeds))
+    for at in rng.sample(range(len(frames)), rng.choice((1, 1, 2, 6))):
+        frames[at] = mutated(rng, (frames[at],))[:_MOST_BYTES]
+    return _framed(frames)
+
+
+class _Exact(CaptureLoops):
+    """Loops over an array that ends with its last frame, so that sanitizers see what is beyond."""
+
+    def __init__(self, data: U8Array) -> None:
+        super().__init__()
+        self._data = data
+
+    def dissect(
+        self, data: U8Array, start: I64Array, captured: I64Array, original: I64Array
+    ) -> Found:
+        return super().dissect(self._data, start, captured, original)
+
+
+def _dissect(data: bytes, folder: Path) -> None:
+    """What is in frames; compiled loops read nothing beyond the last one."""
+    sizes = [len(one) for one in _frames_of(data)]
+    captured = np.array(sizes, np.int64)
+    start = captured.cumsum() - captured + _SIZE.size * np.arange(1, len(sizes) + 1)
+    exact = np.frombuffer(data, np.uint8).copy()
+    # What numpy reads beyond the last frame, as in a reader's buffer.
+    padded = np.concatenate([exact, np.zeros(SLACK, np.uint8)])
+    original = captured + (captured % 7 == 3)
+    link = np.full(len(sizes), _ETHERNET, np.int64)
+    frames = Frames(start, captured, original, link, np.zeros(len(sizes), np.int64))
+    one = _content(len(data), dissect(padded, frames, Addresses()))
+    other = _content(len(data), dissect(padded, frames, Addresses(), _Exact(exact)))
+    if one != other:
+        raise BrokenLaw("compiled loops find other datagrams than numpy")
+
+
+def _content(size: int, found: Dissection) -> object:
+    datagrams, parts = found.datagrams, found.fragments
+    arrays = (
+        *(datagrams.frame, datagrams.start, datagrams.size, datagrams.source, datagrams.port),
+        *(parts.frame, parts.source, parts.destination, parts.ident, parts.offset, parts.more),
+        *(parts.start, parts.size),
+    )
+    inside = datagrams.start + datagrams.size <= size
+    return [one.tolist() for one in arrays], found.skipped, bool(inside.all())
+
+
+# -- columns --------------------------------------------------------------------------------------
+
+_SENSORS = 3
+_ROW = struct.Struct("<BbH")
+_POSITIONS = (512, None, 8)
+
+
+def _stamp_seeds() -> Seeds:
+    """Rows of a sensor, a step in time and a position."""
+    rng = random.Random(5)
+    return tuple(
+        b"".join(
+            _ROW.pack(rng.randrange(_SENSORS), rng.choice((0, 1, 1, 3)), rng.randrange(512))
+            for _ in range(120)
+        )
+        for _ in range(10)
+    )
+
+
+def _merge(data: bytes, folder: Path) -> None:
+    """Columns of sensors in parts, with steps back in time, taken in three portions."""
+    rows = [_ROW.unpack_from(data, at) for at in range(0, len(data) - 3, _ROW.size)]
+    sensor = np.array([row[0] % _SENSORS for row in rows], np.int64)
+    step = np.array([row[1] for row in rows], np.int64)
+    ticks = np.array([row[2] for row in rows], np.int64)
+    words = rotor_words(np.float64(1 / 512) * ticks, np.float64(1) * (ticks % 41) - 20.0)
+    word = np.choose(sensor, (ticks % 512, words, ticks % 8))
+    stamp_ns = START_NS + step.cumsum()
+    until = [int(stamp_ns[len(rows) * third // 3]) if rows else 0 for third in (1, 2)]
+    portions = (*until, END_NS)
+    taken = [
+        _taken(column_merge(name, _POSITIONS), sensor, stamp_ns, word, portions)
+        for name in ("numpy", "native")
+    ]
+    if taken[0] != taken[1]:
+        raise BrokenLaw("compiled loops merge otherwise than numpy")
+
+
+def _taken(
+    merge: ColumnMerge,
+    sensor: I64Array,
+    stamp_ns: I64Array,
+    word: I64Array,
+    portions: Sequence[int],
+) -> object:
+    waiting: list[list[Columns]] = [[] for _ in range(_SENSORS)]
+    for number, own in enumerate(waiting):
+        is_own = sensor == number
+        stamps, words = stamp_ns[is_own], word[is_own]
+        half = len(stamps) // 2
+        for part in (slice(None, half), slice(half, None)):
+            if len(stamps[part]):
+                own.append(Columns(stamps[part], np.arange(len(stamps))[part], words[part]))
+    found = []
+    for until in portions:
+        merged = merge.take_until(waiting, until)
+        third = len(merged.stamp_ns) // 3
+        figures = merge.figures(merged, [third, len(merged.stamp_ns)])
+        arrays = (merged.stamp_ns, merged.sensor, merged.ring_index, merged.encoder)
+        found.append(([one.tolist() for one in arrays], figures))
+    return found
+
+
+TARGETS: Sequence[Target] = (
+    ()
+    if trouble()
+    else (
+        Target("pixels, compiled", _pixel_seeds, _decode, mutated, 20),
+        Target("frames, compiled", _frame_seeds, _dissect, _mutated_frames, 10),
+        Target("columns, compiled", _stamp_seeds, _merge, mutated, 10),
+    )
+)
