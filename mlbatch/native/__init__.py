@@ -15,7 +15,10 @@ from mlbatch.errors import UsageError
 ENGINES = ("auto", "numpy", "native")
 # Names of earlier versions.
 ALIASES = {"numba": "native"}
-BUILD_ADVICE = "reinstall mlbatch where a C compiler is (Debian: apt-get install gcc)"
+BUILD_ADVICE = (
+    "reinstall mlbatch where a C compiler is (Debian: apt-get install gcc; without administrator "
+    "rights see docs/howto/compiler.md)"
+)
 _STEM = "_native"
 
 
