@@ -123,10 +123,12 @@ def _rig(rig: str) -> str:
 
     path = Path(rig)
     try:
-        named = [sensor.metadata for sensor in read_rig(path).sensors]
+        sensors = read_rig(path).sensors
     except MlbatchError:
-        named = []
-    files = [path, *(one for one in named if one is not None)]
+        sensors = ()
+    calibrations = [sensor.metadata for sensor in sensors if sensor.metadata is not None]
+    extrinsics = [file for sensor in sensors for file in sensor.extrinsics_files]
+    files = [path, *calibrations, *dict.fromkeys(extrinsics)]
     return " ".join(_digest(file) for file in files)
 
 

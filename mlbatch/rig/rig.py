@@ -62,8 +62,9 @@ class RigSensor:
     """One sensor of the rig; None: taken from the recording.
 
     extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
-    unknown; clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added
-    to the timestamps; decode: options as for `--decode`; points: how its clouds are read.
+    unknown; extrinsics_files: files that it was read from; clock: sensor or host; epoch: of the
+    sensor's clock, utc, tai or gps; offset_ns: added to the timestamps; decode: options as for
+    `--decode`; points: how its clouds are read.
     """
 
     name: str
@@ -71,6 +72,7 @@ class RigSensor:
     stream: StreamSelector | None = None
     metadata: Path | None = None
     extrinsics: F64Array | str | UnknownExtrinsics | None = None
+    extrinsics_files: tuple[Path, ...] = ()
     clock: str | None = None
     epoch: str | None = None
     offset_ns: int = 0

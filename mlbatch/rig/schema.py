@@ -49,6 +49,7 @@ from mlbatch.rig.yaml_tree import Node
 from mlbatch.units import NS_PER_S, parse_rate
 
 if TYPE_CHECKING:
+    from mlbatch.rig.extrinsics_files import ExtrinsicsFiles
     from mlbatch.ros.point_times import PointRule
 
 # `lidar_id` is a uint8.
@@ -154,14 +155,63 @@ def _clock(node: Node) -> Mapping[str, Node]:
     return node.fields(names(_CLOCK_KEYS))
 
 
-def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics:
-    """Return (4, 4) body_from_sensor, m, the name of a frame of the recording, or unknown."""
+def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics | ExtrinsicsFiles:
+    """Return (4, 4) body_from_sensor, m, a frame of the recording, unknown, or files with it."""
     if node.kind == "scalar" and node.text == UNKNOWN:
         return UnknownExtrinsics(node.place)
     fields = _some_fields(node, names(_EXTRINSICS_KEYS))
-    frame = _FRAME_OF_RECORDING.of(fields)
+    if "file" in fields:
+        return _extrinsics_files(node, fields)
+    frame = _FRAME_OF_EXTRINSICS.of(fields)
     if frame:
         return frame
+    return _pose(fields)
+
+
+def _extrinsics_files(node: Node, fields: Mapping[str, Node]) -> ExtrinsicsFiles:
+    # Few rigs have it.
+    from mlbatch.rig.extrinsics_files import ExtrinsicsFiles
+
+    keys = _MATRIX_KEYS.of(fields)
+    direction = _DIRECTION.of(fields)
+    if direction and not keys:
+        raise fields["direction"].error(
+            "direction with key",
+            "no key",
+            "name the matrix as key; files with named frames state their direction",
+        )
+    return ExtrinsicsFiles(
+        node,
+        _FILES.of(fields),
+        _FRAME_OF_EXTRINSICS.of(fields),
+        _PARENT.of(fields),
+        keys,
+        direction,
+        _SENSOR_IN_FRAME.of(fields),
+    )
+
+
+def _files(node: Node) -> tuple[Path, ...]:
+    """Return existing files, of a name or a list of names."""
+    if node.kind != "list":
+        return (_existing_file(node),)
+    if not node.items:
+        raise node.error("one or more files", node.shown, "give a file")
+    return tuple(map(_existing_file, node.items))
+
+
+def _matrix_keys(node: Node) -> tuple[str, ...]:
+    """Return keys of matrices, of a name or a list of names."""
+    items = node.items if node.kind == "list" and node.items else (node,)
+    return tuple(item.word("the key of a matrix in the file", _WORD) for item in items)
+
+
+def _sensor_in_frame(node: Node) -> F64Array:
+    return _pose(_some_fields(node, names(_POSE_KEYS)))
+
+
+def _pose(fields: Mapping[str, Node]) -> F64Array:
+    """Return the (4, 4) transform, m, that translation and rotation or a matrix give."""
     origin = _TRANSLATION.of(fields)
     if "rotation_xyzw" in fields:
         xyzw = fields["rotation_xyzw"].numbers(4)
@@ -203,12 +253,13 @@ def _box(node: Node) -> list[float]:
     return values
 
 
-def _sensors(node: Node) -> tuple[RigSensor, ...]:
+def _sensors(node: Node) -> tuple[Node, ...]:
+    """Return the entries; they are read with the body frame."""
     items = node.elements("sensors")
     if not 1 <= len(items) <= MAX_SENSORS:
         remedy = "list each sensor with `- name:`"
         raise node.error(f"1 to {MAX_SENSORS} sensors", node.shown, remedy)
-    return tuple(_sensor(item) for item in items)
+    return items
 
 
 # The keys of each mapping.
@@ -236,8 +287,6 @@ _LIDAR_ID: Key[int | None] = Key(
     "number of one of several lidars whose clouds share a topic",
 )
 _STREAM_KEYS = (_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
-# Of streams, with the key that they need.
-_NEEDS = {"frame_id": "topic", "lidar_id": "topic"}
 
 _POINT_TIME = Key("time", _word("the name of a field"), "", WORD, "field with the time of a point")
 _POINT_UNIT = Key(
@@ -300,21 +349,74 @@ _MATRIX: Key[F64Array | None] = Key(
     {"type": "array", "items": numbers_form(4), "minItems": 3, "maxItems": 4},
     "body_from_sensor, 4 x 4 or 3 x 4, m",
 )
-_FRAME_OF_RECORDING = Key(
-    "frame", _word("a frame of the recording"), "", WORD, "a frame of the recording's transforms"
+_FRAME_OF_EXTRINSICS = Key(
+    "frame",
+    _word("the name of a frame"),
+    "",
+    WORD,
+    "frame of the sensor in the file, or in the recording's transforms",
 )
-_EXTRINSICS_KEYS = (_TRANSLATION, _ROTATION_RPY, _ROTATION_XYZW, _MATRIX, _FRAME_OF_RECORDING)
+_POSE_KEYS = (_TRANSLATION, _ROTATION_RPY, _ROTATION_XYZW)
+_SOME_WORDS: Form = {"anyOf": [WORD, {"type": "array", "items": WORD, "minItems": 1}]}
+_FILES: Key[tuple[Path, ...]] = Key(
+    "file",
+    _files,
+    (),
+    {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}]},
+    "file or files with the extrinsics, relative to this file",
+)
+_PARENT = Key(
+    "parent", _word("the name of a frame"), "", WORD, "frame of the file that is the body frame"
+)
+_MATRIX_KEYS: Key[tuple[str, ...]] = Key(
+    "key", _matrix_keys, (), _SOME_WORDS, "key of a matrix in the file; several are multiplied"
+)
+_DIRECTION = Key(
+    "direction",
+    _choice("body_from_sensor", "sensor_from_body"),
+    "",
+    choice_form("body_from_sensor", "sensor_from_body"),
+    "what the matrix maps",
+)
+# Keys of streams and extrinsics that need another one.
+_NEEDS = {
+    "frame_id": "topic",
+    "lidar_id": "topic",
+    "parent": "file",
+    "key": "direction",
+    "direction": "file",
+    "sensor_in_frame": "file",
+}
 # Keys of streams and extrinsics that exclude others.
 _EXCLUDES = {
     "rotation_xyzw": ("rotation_rpy_deg",),
     "matrix": ("translation_m", "rotation_rpy_deg", "rotation_xyzw"),
     "frame": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
     "topic": ("source_ip", "port"),
+    "file": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
+    "key": ("frame", "parent"),
 }
+_SENSOR_IN_FRAME: Key[F64Array | None] = Key(
+    "sensor_in_frame",
+    _sensor_in_frame,
+    None,
+    mapping_form(_POSE_KEYS, excludes=_EXCLUDES, may_be_empty=False),
+    "pose of the sensor in the frame of the file",
+)
+_EXTRINSICS_KEYS = (
+    *_POSE_KEYS,
+    _MATRIX,
+    _FRAME_OF_EXTRINSICS,
+    _FILES,
+    _PARENT,
+    _MATRIX_KEYS,
+    _DIRECTION,
+    _SENSOR_IN_FRAME,
+)
 _EXTRINSICS_FORM: Form = {
     "anyOf": [
         {"const": UNKNOWN},
-        mapping_form(_EXTRINSICS_KEYS, excludes=_EXCLUDES, may_be_empty=False),
+        mapping_form(_EXTRINSICS_KEYS, excludes=_EXCLUDES, needs=_NEEDS, may_be_empty=False),
     ]
 }
 
@@ -337,7 +439,7 @@ _STREAM: Key[StreamSelector | None] = Key(
 _METADATA: Key[Path | None] = Key(
     "metadata", _existing_file, None, TEXT, "metadata or calibration, relative to this file"
 )
-_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | None] = Key(
+_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | ExtrinsicsFiles | None] = Key(
     "extrinsics", _extrinsics, None, _EXTRINSICS_FORM, "body_from_sensor; default: the recording's"
 )
 _CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {}, mapping_form(_CLOCK_KEYS), "its clock")
@@ -383,7 +485,7 @@ _RATE: Key[Fraction | None] = Key(
     {"anyOf": [{**NUMBER, "exclusiveMinimum": 0}, text_form(r"[0-9./]+")]},
     "scans a second: 10, 29.97, 10/3",
 )
-_SENSORS: Key[tuple[RigSensor, ...]] = Key(
+_SENSORS: Key[tuple[Node, ...]] = Key(
     "sensors",
     _sensors,
     (),
@@ -425,10 +527,11 @@ def rig_schema() -> dict[str, object]:
 def rig_from(root: Node) -> Rig:
     """Return the rig that a tree describes; RigError for the first mistake."""
     fields = root.fields(names(_RIG_KEYS), required=_REQUIRED)
+    body_frame = _BODY_FRAME.of(fields)
     rig = Rig(
-        body_frame=_BODY_FRAME.of(fields),
+        body_frame=body_frame,
         rate=_RATE.of(fields),
-        sensors=_SENSORS.of(fields),
+        sensors=tuple(_sensor(item, body_frame) for item in _SENSORS.of(fields)),
         exclude_boxes_m=_BOXES.of(fields),
         options=_CONVERT.of(fields),
     )
@@ -436,15 +539,19 @@ def rig_from(root: Node) -> Rig:
     return rig
 
 
-def _sensor(node: Node) -> RigSensor:
+def _sensor(node: Node, body_frame: str) -> RigSensor:
     fields = node.fields(names(_SENSOR_KEYS), required=("name",))
     clock = _CLOCK.of(fields)
+    stream = _STREAM.of(fields)
+    given = _EXTRINSICS.of(fields)
+    extrinsics, files = _of_files(given, body_frame, "" if stream is None else stream.serial)
     sensor = RigSensor(
         name=_SENSOR_NAME.of(fields),
         model=_MODEL.of(fields),
-        stream=_STREAM.of(fields),
+        stream=stream,
         metadata=_METADATA.of(fields),
-        extrinsics=_EXTRINSICS.of(fields),
+        extrinsics=extrinsics,
+        extrinsics_files=files,
         clock=_CLOCK_SOURCE.of(clock),
         epoch=_CLOCK_EPOCH.of(clock),
         offset_ns=_CLOCK_OFFSET.of(clock),
@@ -465,6 +572,22 @@ def _sensor(node: Node) -> RigSensor:
         remedy = "give the larger range as maximum"
         raise value.error(f"more than {low_m:g} m", value.shown, remedy)
     return sensor
+
+
+def _of_files(
+    given: F64Array | str | UnknownExtrinsics | ExtrinsicsFiles | None,
+    body_frame: str,
+    serial: str,
+) -> tuple[F64Array | str | UnknownExtrinsics | None, tuple[Path, ...]]:
+    """Return extrinsics, read from files where the rig names some; and these files."""
+    if given is None or isinstance(given, (str, np.ndarray, UnknownExtrinsics)):
+        return given, ()
+    matrix = given.pose(body_frame, serial)
+    for value in matrix[:3, 3].tolist():
+        if not abs(value) <= MAX_TRANSLATION_M:
+            expected = f"at most {MAX_TRANSLATION_M:g} m from the body origin"
+            raise given.node.error(expected, f"{value:g} m", "correct the file")
+    return matrix, given.files
 
 
 def _check_distinct(node: Node, rig: Rig) -> None:

@@ -25,6 +25,7 @@ MAX_DEPTH = 16
 _MAX_DIGITS = 100
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _KEY = re.compile(r"\w{1,40}", re.ASCII)
+_OPENCV_HEAD = re.compile(r"\A%(?=YAML:\d)")
 # Spellings of YAML 1.1.
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _NULLS = ("", "~", "null", "Null", "NULL")
@@ -35,7 +36,8 @@ class Node:
     """A value of the file: a scalar (`text`), a list (`items`) or a mapping (`entries`).
 
     path: keys from the root, as `sensors[1].name`; line: counts from 1; kind: scalar, list or
-    mapping; plain: a scalar without quotes.
+    mapping, or repeated: a key of a foreign file that occurs twice, text: where; plain: a scalar
+    without quotes.
     """
 
     file: Path
@@ -69,6 +71,8 @@ class Node:
             return "a mapping"
         if self.is_null():
             return "nothing"
+        if self.kind == "repeated":
+            return f"the key twice ({self.text})"
         return short(self.text) if self.plain else f"the text {short(self.text)}"
 
     def is_null(self) -> bool:
@@ -89,6 +93,15 @@ class Node:
             if key not in self.entries:
                 raise self.error(f"the key {key}", "none", "add it")
         return self.entries
+
+    def entry(self, key: str) -> Node:
+        """Return the value of a key that a mapping must have; other keys do not matter."""
+        if key not in self.entries:
+            found = self.shown
+            if self.kind == "mapping":
+                found = f"keys {', '.join(self.entries) or 'none'}"
+            raise self.error(f"the key {key}", found, "correct the file")
+        return self.entries[key]
 
     def elements(self, what: str) -> tuple[Node, ...]:
         """Return the values of a list."""
@@ -148,9 +161,18 @@ class Node:
 
 def read_yaml(file: Path) -> Node:
     """Read a YAML file; RigError unless it is one document of plain values."""
-    text = _text(file)
+    return _read(file, _text(file), _Loader)
+
+
+def read_foreign(file: Path) -> Node:
+    """Read YAML of OpenCV, or JSON: its tags and head are accepted, repeated keys are marked."""
+    # Not a directive of YAML, which has a blank there.
+    return _read(file, _OPENCV_HEAD.sub("#", _text(file), count=1), _ForeignLoader)
+
+
+def _read(file: Path, text: str, kind: type[_Loader]) -> Node:
     try:
-        loader = _Loader(file, text)
+        loader = kind(file, text)
         # An empty file has no node.
         root = loader.get_node() if loader.check_node() else None
         if loader.check_node():
@@ -168,11 +190,13 @@ def read_yaml(file: Path) -> Node:
         raise _error(file, line, "", f"expected YAML, found {found}; remove it") from err
     if root is None:
         return Node(file, "", 1, "scalar", plain=True)
-    return _tree(file, root, "", _line(root))
+    return _tree(file, root, "", _line(root), marks_repeated=kind is _ForeignLoader)
 
 
 class _Loader(yaml.SafeLoader):
     """Composes plain values; refuses anchors, aliases, tags, and more values than the limits."""
+
+    TAGS: tuple[str, ...] = ()
 
     def __init__(self, file: Path, text: str) -> None:
         super().__init__(text)
@@ -197,7 +221,7 @@ class _Loader(yaml.SafeLoader):
         message = ""
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             message = "expected plain values, found an anchor or alias; write the value out"
-        elif (tag := getattr(event, "tag", None)) is not None:
+        elif (tag := getattr(event, "tag", None)) is not None and tag not in self.TAGS:
             message = f"expected plain values, found the tag {short(tag)}; remove it"
         elif is_key and not isinstance(event, yaml.ScalarEvent):
             message = "expected a word as key, found brackets; put the brackets after the colon"
@@ -214,6 +238,12 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
+class _ForeignLoader(_Loader):
+    """Accepts the tag of OpenCV's matrices; nothing is constructed from it."""
+
+    TAGS = ("tag:yaml.org,2002:opencv-matrix",)
+
+
 def _below(path: str, index: object) -> str:
     """Return the path of an element; index: as of `_Loader.compose_node`."""
     if isinstance(index, yaml.ScalarNode):
@@ -223,13 +253,15 @@ def _below(path: str, index: object) -> str:
     return path if index is None else f"{path}[{index}]"
 
 
-def _tree(file: Path, node: yaml.Node, path: str, line: int) -> Node:
+def _tree(
+    file: Path, node: yaml.Node, path: str, line: int, *, marks_repeated: bool = False
+) -> Node:
     """Convert a composed value; line: that of its key in a mapping, as a block begins below."""
     if isinstance(node, yaml.ScalarNode):
         return Node(file, path, line, "scalar", text=str(node.value), plain=node.style is None)
     if isinstance(node, yaml.SequenceNode):
         items = [
-            _tree(file, item, _below(path, index), _line(item))
+            _tree(file, item, _below(path, index), _line(item), marks_repeated=marks_repeated)
             for index, item in enumerate(node.value)
         ]
         return Node(file, path, line, "list", items=tuple(items))
@@ -238,10 +270,14 @@ def _tree(file: Path, node: yaml.Node, path: str, line: int) -> Node:
         name = str(key.value)
         own_path = _below(path, key)
         if name in entries:
-            found = f"it again (first on line {entries[name].line})"
+            first = f"first on line {entries[name].line}"
+            if marks_repeated:
+                entries[name] = Node(file, own_path, _line(key), "repeated", text=first)
+                continue
+            found = f"it again ({first})"
             message = f"expected each key once, found {found}; remove one of the two"
             raise _error(file, _line(key), own_path, message)
-        entries[name] = _tree(file, value, own_path, _line(key))
+        entries[name] = _tree(file, value, own_path, _line(key), marks_repeated=marks_repeated)
     return Node(file, path, line, "mapping", entries=entries)
 
 

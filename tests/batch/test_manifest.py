@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from mlbatch.batch.identity import session_key
 from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
 from mlbatch.batch.session import OWN, Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
@@ -158,3 +159,20 @@ OTHER_FILES = ("scans.txt", "my scans.mcap", "scans.mcap.bak", "report.pdf", "ri
 def test_only_files_of_runs_are_removed() -> None:
     assert all(OWN.fullmatch(name) for name in OWN_FILES)
     assert not any(OWN.fullmatch(name) for name in OTHER_FILES)
+
+
+def test_a_session_changes_with_the_extrinsics_files_of_its_rig(tmp_path: Path) -> None:
+    recording = tmp_path / "data" / "a.pcap"
+    recording.parent.mkdir()
+    recording.write_bytes(b"x")
+    file = tmp_path / "kit.yaml"
+    text = "base_link: {lidar: {x: 1, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}\n"
+    file.write_text(text)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("sensors: [{name: a, extrinsics: {file: kit.yaml}}]\n")
+    session = Session("a", (str(recording),), str(rig))
+    before = session_key(session, tmp_path)
+    assert session_key(session, tmp_path) == before
+    file.write_text(text.replace("x: 1", "x: 2"))
+    after = session_key(session, tmp_path)
+    assert {key for key in before if before[key] != after[key]} == {"rig"}

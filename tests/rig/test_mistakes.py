@@ -61,7 +61,10 @@ SENSOR_KEYS = (
     "decode, points"
 )
 STREAM_KEYS = "source_ip, port, topic, serial, frame_id, lidar_id"
-X_KEYS = "translation_m, rotation_rpy_deg, rotation_xyzw, matrix, frame"
+X_KEYS = (
+    "translation_m, rotation_rpy_deg, rotation_xyzw, matrix, frame, file, parent, key, direction, "
+    "sensor_in_frame"
+)
 NUMBER = "expected a finite number"
 PLAIN_NUMBER = "write a decimal number, without quotes or unit"
 NAME = "a name of letters, digits and _ that does not start with a digit"

@@ -1,0 +1,314 @@
+"""Extrinsics in files of other programs: poses by hand calculation, errors in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mlbatch.arrays import F64Array
+from mlbatch.errors import RigError
+from mlbatch.rig.rig import read_rig
+
+# Halves of a right angle.
+H = 0.7071067811865476
+HALF_PI = "1.5707963267948966"
+
+# As in the calibration folder of Ford AV: one transform a file.
+STAMPED = f"""\
+header:
+  seq: 0
+  stamp: {{secs: 0, nsecs: 0}}
+  frame_id: body
+child_frame_id: lidar_red
+transform:
+  translation: {{x: 1.0, y: 2.0, z: 3.0}}
+  rotation: {{x: 0.0, y: 0.0, z: {H}, w: {H}}}
+"""
+KIT = f"""\
+base_link:
+  sensor_kit_base_link: {{x: 0.9, y: 0.0, z: 2.0, roll: 0.0, pitch: 0.0, yaw: {HALF_PI}}}
+"""
+SENSORS = f"""\
+sensor_kit_base_link:
+  camera0/camera_link: {{x: 0.1, y: 0.5, z: -0.2, roll: -0.025, pitch: 0.315, yaw: 1.035}}
+  velodyne_top_base_link: {{x: 1.0, y: 0.0, z: 0.0, roll: 0.0, pitch: {HALF_PI}, yaw: 0.0}}
+"""
+OUSTER = json.dumps(
+    {
+        "transforms": [
+            {"destination_frame": "world", "source_frame": "992313000353",
+             "p_x": 0.5, "p_y": 0.0, "p_z": 1.5, "q_x": 1.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0},
+            {"destination_frame": "world", "source_frame": "122150000150",
+             "p_x": -2.0, "p_y": 0.0, "p_z": 0.0, "q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0},
+        ]
+    },
+    indent=2,
+)  # fmt: skip
+# With a head that is no YAML, a repeated key and a matrix cut off, as in published files.
+OPENCV = """\
+%YAML:1.0
+---
+# lidar in body coordinates
+body_T_lidar: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: d
+   data: [ 0., -1, 0, 0.25,
+           1,  0.,  0, -0.5,
+           0,  0,  1, -0.28,
+           0., 0., 0., 1 ]
+body_T_other: !!opencv-matrix
+   rows: 3
+   cols: 4
+   dt: f
+   data: [ 1, 0, 0, 2.0, 0, 1, 0, 0, 0, 0, 1, 0 ]
+turn: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [0, -1, 0, 1, 0, 0, 0, 0, 1]}
+shift: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [1, 2, 3]}
+twice: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [1, 2, 3]}
+twice: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [1, 2, 4]}
+short: !!opencv-matrix {rows: 4, cols: 4, dt: d, data: [1, 2, 3]}
+"""
+PLAIN = """\
+body:
+  os_sensor:
+    T: [[0, -1, 0, 0.25], [1, 0, 0, -0.5], [0, 0, 1, -0.28], [0, 0, 0, 1]]
+    flat: [0, -1, 0, 0.25, 1, 0, 0, -0.5, 0, 0, 1, -0.28]
+"""
+FILES = {
+    "red.yaml": STAMPED,
+    "kit.yaml": KIT,
+    "sensors.yaml": SENSORS,
+    "extrinsic_parameters.json": OUSTER,
+    "opencv.yaml": OPENCV,
+    "plain.yaml": PLAIN,
+    "list.yaml": "- " + STAMPED.rstrip().replace("\n", "\n  ") + "\n",
+    "message.yaml": "transforms:\n- " + STAMPED.rstrip().replace("\n", "\n  ") + "\n",
+    "slash.yaml": STAMPED.replace("body", "/body").replace("lidar_red", "/lidar_red"),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def _pose(folder: Path, extrinsics: str, head: str = "", sensor: str = "") -> F64Array:
+    rig = folder / "rig.yaml"
+    rig.write_text(f"{head}sensors:\n- name: a\n{sensor}  extrinsics: {extrinsics}\n")
+    (one,) = read_rig(rig).sensors
+    assert isinstance(one.extrinsics, np.ndarray)
+    return one.extrinsics
+
+
+def _rows(*rows: tuple[float, ...]) -> F64Array:
+    return np.array([*rows, (0, 0, 0, 1)], np.float64)
+
+
+# A quarter about z at (1, 2, 3): x of the sensor is y of the body.
+RED = _rows((0, -1, 0, 1), (1, 0, 0, 2), (0, 0, 1, 3))
+LIDAR = _rows((0, -1, 0, 0.25), (1, 0, 0, -0.5), (0, 0, 1, -0.28))
+
+
+@pytest.mark.parametrize("name", ["red.yaml", "list.yaml", "message.yaml", "slash.yaml"])
+def test_transform_stamped_maps_the_child_into_the_parent(folder: Path, name: str) -> None:
+    pose = _pose(folder, f"{{file: {name}}}", "body_frame: body\n")
+    np.testing.assert_allclose(pose, RED, atol=1e-15)
+    # A point 1 m in front of the sensor is at (1, 2 + 1, 3).
+    np.testing.assert_allclose(pose @ (1, 0, 0, 1), (1, 3, 3, 1), atol=1e-15)
+
+
+def test_the_frame_of_the_file_may_have_another_name_than_the_body(folder: Path) -> None:
+    pose = _pose(folder, "{file: red.yaml, parent: body}")
+    np.testing.assert_allclose(pose, RED, atol=1e-15)
+
+
+def test_the_inverse_is_used_where_the_body_is_the_child(folder: Path) -> None:
+    """From lidar_red to body: R' p - R' t, with R' a quarter back."""
+    pose = _pose(folder, "{file: red.yaml, parent: lidar_red, frame: body}")
+    np.testing.assert_allclose(pose, _rows((0, 1, 0, -2), (-1, 0, 0, 1), (0, 0, 1, -3)), atol=1e-15)
+
+
+def test_autoware_files_are_a_chain_in_radians(folder: Path) -> None:
+    """The kit is at (0.9, 0, 2) and a quarter about z; in it the lidar at (1, 0, 0), nose down.
+
+    The lidar's base is 1 m along x of the kit, which is y of the body: (0.9, 1, 2). Its z, along
+    which the points' frame is 0.0377 m higher, is x of the kit and y of the body: (0.9, 1.0377, 2).
+    Its x is down, its y is minus x of the body.
+    """
+    text = (
+        "{file: [kit.yaml, sensors.yaml], frame: velodyne_top_base_link, "
+        "sensor_in_frame: {translation_m: [0, 0, 0.0377]}}"
+    )
+    expected = _rows((0, -1, 0, 0.9), (0, 0, 1, 1.0377), (-1, 0, 0, 2))
+    np.testing.assert_allclose(_pose(folder, text), expected, atol=1e-15)
+
+
+def test_autoware_angles_turn_about_fixed_axes(folder: Path) -> None:
+    """Of x: roll leaves it, pitch of a quarter turns it down, and no yaw can change that."""
+    text = KIT.replace("roll: 0.0, pitch: 0.0", f"roll: {HALF_PI}, pitch: {HALF_PI}")
+    (folder / "kit.yaml").write_text(text)
+    pose = _pose(
+        folder,
+        "{file: kit.yaml, frame: sensor_kit_base_link, "
+        "sensor_in_frame: {rotation_rpy_deg: [0, 0, 0]}}",
+    )
+    np.testing.assert_allclose(pose[:3, 0], (0, 0, -1), atol=1e-15)
+    # y: to z by the roll, to x by the pitch, to y by the yaw.
+    np.testing.assert_allclose(pose[:3, 1], (0, 1, 0), atol=1e-15)
+
+
+def test_ouster_transforms_are_found_by_the_serial_number(folder: Path) -> None:
+    """Half a revolution about x: y and z change their signs."""
+    name = "extrinsic_parameters.json"
+    expected = _rows((1, 0, 0, 0.5), (0, -1, 0, 0), (0, 0, -1, 1.5))
+    by_serial = _pose(
+        folder, f"{{file: {name}, parent: world}}", sensor='  stream: {serial: "992313000353"}\n'
+    )
+    by_name = _pose(folder, f"{{file: {name}, parent: world, frame: 992313000353}}")
+    np.testing.assert_allclose(by_serial, expected, atol=1e-15)
+    np.testing.assert_allclose(by_name, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{file: opencv.yaml, key: body_T_lidar, direction: body_from_sensor}",
+        "{file: plain.yaml, key: body.os_sensor.T, direction: body_from_sensor}",
+        "{file: plain.yaml, key: body.os_sensor.flat, direction: body_from_sensor}",
+    ],
+)
+def test_a_matrix_is_used_as_it_is(folder: Path, text: str) -> None:
+    np.testing.assert_array_equal(_pose(folder, text), LIDAR)
+
+
+def test_a_matrix_from_body_to_sensor_is_inverted(folder: Path) -> None:
+    """R' is a quarter back; -R' t: of (0.25, -0.5, -0.28) it is (0.5, 0.25, 0.28)."""
+    pose = _pose(folder, "{file: opencv.yaml, key: body_T_lidar, direction: sensor_from_body}")
+    expected = _rows((0, 1, 0, 0.5), (-1, 0, 0, 0.25), (0, 0, 1, 0.28))
+    np.testing.assert_allclose(pose, expected, atol=1e-15)
+
+
+def test_matrices_are_multiplied_in_the_order_of_the_keys(folder: Path) -> None:
+    """2 m along x of the lidar are 2 m along y of the body: (0.25, 1.5, -0.28)."""
+    text = "{file: opencv.yaml, key: [body_T_lidar, body_T_other], direction: body_from_sensor}"
+    expected = _rows((0, -1, 0, 0.25), (1, 0, 0, 1.5), (0, 0, 1, -0.28))
+    np.testing.assert_allclose(_pose(folder, text), expected, atol=1e-15)
+
+
+def test_a_translation_and_a_rotation_are_p_equals_r_q_plus_t(folder: Path) -> None:
+    text = "{file: opencv.yaml, key: [shift, turn], direction: body_from_sensor}"
+    np.testing.assert_array_equal(_pose(folder, text), RED)
+
+
+X = "sensors[0].extrinsics"
+MISTAKES = [
+    ("{file: none.yaml}", ".file: expected an existing file, found none at"),
+    ("{file: []}", ".file: expected one or more files, found a list of 0; give a file"),
+    ("{file: red.yaml}", ": expected a frame of the file as body_frame, one of body, lidar_red ("),
+    ("{file: red.yaml, frame: lidar_blue, parent: body}",
+     "expected a frame of the file as frame, one of body, lidar_red ("),
+    ("{file: red.yaml, matrix: [[1]]}", "expected file without matrix, found matrix as well"),
+    ("{frame: a, key: T, direction: body_from_sensor}", "expected key without frame, found frame"),
+    ("{file: opencv.yaml, key: body_T_lidar}", "expected key with direction, found no direction"),
+    ("{file: opencv.yaml, direction: body_from_sensor}",
+     "expected direction with key, found no key"),
+    ("{direction: body_from_sensor, key: a}", "expected direction with file, found no file"),
+    ("{file: opencv.yaml, key: body_T_lidr, direction: body_from_sensor}",
+     ": expected the key body_T_lidr in one file ("),
+    ("{file: opencv.yaml, key: twice, direction: body_from_sensor}",
+     "twice: expected a matrix of 4 x 4, 3 x 4, 3 x 3, 3 x 1, found the key twice (first on line "
+     "19)"),
+    ("{file: opencv.yaml, key: short, direction: body_from_sensor}",
+     "opencv.yaml:21: short.data: expected 16 numbers, found a list of 3; give all 16 and no more"),
+    ("{file: opencv.yaml, key: [turn, shift], direction: body_from_sensor}",
+     "shift: expected a translation (3 x 1) before its rotation (3 x 3) in `key`, found it after"),
+    ("{file: opencv.yaml, key: body_T_lidar, direction: sideways}",
+     ".direction: expected body_from_sensor or sensor_from_body, found 'sideways'"),
+    ("{file: opencv.yaml}",
+     ": expected TransformStamped (header.frame_id, child_frame_id, transform), "
+     "Ouster (transforms with source_frame, destination_frame, p_x), "
+     "Autoware (parent: {child: {x, y, z, roll, pitch, yaw}}), found keys body_T_lidar, "),
+    ("{file: [kit.yaml, sensors.yaml]}",
+     ": expected the key frame, since the file has 3 of them ("),
+    ("{file: sensors.yaml, frame: velodyne_top_base_link, parent: sensor_kit_base_link}",
+     ": expected sensor_in_frame, as velodyne_top_base_link is the mounting face of the housing "
+     "and not the frame of the points ("),
+    ("{file: [kit.yaml, red.yaml], frame: lidar_red}",
+     ": expected frames that connect base_link with lidar_red ("),
+    ("{file: extrinsic_parameters.json, parent: world}",
+     ": expected the key frame, since the file has 2 of them ("),
+    ("{file: extrinsic_parameters.json, frame: 992313000353}",
+     ": expected a frame of the file as body_frame, one of 122150000150, 992313000353, world ("),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "expected"), MISTAKES, ids=[text for text, _ in MISTAKES])
+def test_errors_of_rigs(folder: Path, text: str, expected: str) -> None:
+    with pytest.raises(RigError) as caught:
+        _pose(folder, text)
+    message = str(caught.value)
+    assert message.startswith(f"{folder / 'rig.yaml'}:3: {X}") or "/opencv.yaml:" in message
+    assert expected in message
+    assert "\n" not in message
+
+
+BROKEN = [
+    ("red.yaml", "w: 0.70", "w: 0.30",
+     "8: transform.rotation: expected a quaternion of norm 1 within 0.001, found norm 0.7"),
+    ("red.yaml", "translation: {x: 1.0, y", "translation: {y",
+     "7: transform.translation: expected the key x, found keys y, z; correct the file"),
+    ("red.yaml", "child_frame_id: lidar_red", "child_frame_id: ~",
+     "5: child_frame_id: expected the name of a frame, found nothing; correct it"),
+    ("red.yaml", "x: 1.0", "x: .nan", "7: transform.translation.x: expected a finite number"),
+    ("kit.yaml", ", yaw: " + HALF_PI, "",
+     "2: base_link.sensor_kit_base_link: expected the key yaw, found keys x, y, z, roll, pitch; "),
+    ("kit.yaml", HALF_PI, "90.0",
+     "2: base_link.sensor_kit_base_link.yaw: expected radians, within 2 pi, found '90.0'; convert"),
+    ("kit.yaml", "base_link:\n", "base_link: &a\n",
+     "1: base_link: expected plain values, found an anchor or alias; write the value out"),
+    ("kit.yaml", "0.9", "!!python/object/apply:os.system [ls]",
+     "found the tag 'tag:yaml.org,2002:python/object/apply:os...'; remove it"),
+    ("opencv.yaml", "[ 0., -1, 0, 0.25", "[ 0., -1, 0.5, 0.25",
+     "4: body_T_lidar: expected orthonormal axes within 0.001, found axes off by 0.5"),
+    ("opencv.yaml", "[ 0., -1, 0, 0.25", "[ 0., 1, 0, 0.25",
+     "4: body_T_lidar: expected a rotation (determinant 1), found a mirror image (determinant -1)"),
+    ("opencv.yaml", "cols: 4\n   dt: d\n   data: [ 0.,", "cols: 5\n   dt: d\n   data: [ 0.,",
+     "6: body_T_lidar.cols: expected a whole number from 1 to 4, found '5'; "),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "old", "new", "expected"), BROKEN, ids=[b[3] for b in BROKEN])
+def test_errors_of_files(folder: Path, name: str, old: str, new: str, expected: str) -> None:
+    text = FILES[name]
+    assert old in text
+    (folder / name).write_text(text.replace(old, new, 1))
+    given = {
+        "red.yaml": "{file: red.yaml, parent: body}",
+        "kit.yaml": "{file: kit.yaml, frame: sensor_kit_base_link}",
+        "opencv.yaml": "{file: opencv.yaml, key: body_T_lidar, direction: body_from_sensor}",
+    }[name]
+    with pytest.raises(RigError) as caught:
+        _pose(folder, given)
+    message = str(caught.value)
+    assert f"{folder / name}:" in message
+    assert expected in message
+    assert "\n" not in message
+
+
+def test_two_transforms_of_one_frame_that_differ_are_refused(folder: Path) -> None:
+    (folder / "other.yaml").write_text(STAMPED.replace("x: 1.0", "x: 1.001"))
+    with pytest.raises(RigError, match="expected one transform body -> lidar_red, found two that"):
+        _pose(folder, "{file: [red.yaml, other.yaml], parent: body}")
+
+
+def test_a_body_far_away_is_refused(folder: Path) -> None:
+    (folder / "red.yaml").write_text(STAMPED.replace("x: 1.0", "x: 334455.0"))
+    with pytest.raises(
+        RigError, match="expected at most 10000 m from the body origin, found 33445"
+    ):
+        _pose(folder, "{file: red.yaml, parent: body}")
