@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Literal
 
 from mlbatch.discovery.inspect import Inspection
 from mlbatch.discovery.inspect import inspect as inspect_recordings
@@ -145,7 +146,7 @@ def convert(
     overwrite: bool = False,
     fsync: bool = True,
     report: AnyPath | None = None,
-    jobs: int = 1,
+    jobs: int | Literal["auto"] = "auto",
 ) -> Run:
     """Write the scans of a recording as `mlbatch convert` does; its options are the arguments.
 

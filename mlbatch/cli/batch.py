@@ -40,7 +40,13 @@ def batch(
         str | None, typer.Option(help="Rig file (YAML) of all sessions. [default: manifest's]")
     ] = None,
     workers: Annotated[int, typer.Option(help="Sessions converted at the same time.")] = 1,
-    jobs: Annotated[int, typer.Option(help="Scans made at the same time, by each session.")] = 1,
+    jobs: Annotated[
+        str | None,
+        typer.Option(
+            help="Scans made at the same time, by each session. [default: auto; 1 with workers]",
+            metavar="N|auto",
+        ),
+    ] = None,
     retries: Annotated[
         int, typer.Option(help="Further attempts of a session that crashed or was killed.")
     ] = 1,
@@ -82,7 +88,8 @@ def batch(
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.pipeline.interrupts import interruptible
 
-    _check_counts(workers=workers, jobs=jobs, retries=retries)
+    _check_counts(workers=workers, retries=retries)
+    jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
     given = Common(rig, tuple(_given(context, options, jobs)))
     sessions = chosen(sessions_of(sources, given, _kinds()), only or (), numbers)
@@ -144,7 +151,18 @@ def _kinds() -> dict[str, str]:
     return found | {"only": "list", "jobs": "value"}
 
 
-def _given(context: typer.Context, options: dict[str, Any], jobs: int) -> Iterator[Option]:
+def _jobs(asked: str | None, workers: int) -> str | None:
+    """Jobs of each session; None: as `convert` decides, or its rig."""
+    from mlbatch.writers import parse_jobs
+
+    if asked is None:
+        # Several sessions use all cores already.
+        return None if workers == 1 else "1"
+    parse_jobs("--jobs", asked)
+    return asked
+
+
+def _given(context: typer.Context, options: dict[str, Any], jobs: str | None) -> Iterator[Option]:
     """The options of `convert` on this command line."""
     from mlbatch.batch.session import Option
 
@@ -159,8 +177,8 @@ def _given(context: typer.Context, options: dict[str, Any], jobs: int) -> Iterat
         else:
             several = value if isinstance(value, (list, tuple)) else [value]
             yield Option(long_name, tuple(map(str, several)))
-    if jobs != 1:
-        yield Option("--jobs", (str(jobs),))
+    if jobs is not None:
+        yield Option("--jobs", (jobs,))
 
 
 def _check_counts(**counts: int) -> None:

@@ -223,11 +223,14 @@ def convert(
         ),
     ] = None,
     jobs: Annotated[
-        int,
+        str,
         typer.Option(
-            *("--jobs", "-j"), help="Scans made at the same time, a thread each.", metavar="N"
+            *("--jobs", "-j"),
+            help="Scans made at the same time, a thread each; auto: cores, up to 4, if writing is "
+            "slow.",
+            metavar="N|auto",
         ),
-    ] = 1,
+    ] = "auto",
     engine: Annotated[
         str,
         one_of(ENGINES, "--engine", help="Decoder: auto, numpy, or native (compiled)."),
@@ -269,6 +272,7 @@ def convert(
     from mlbatch.pipeline.job import Job, check_sort
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
+    from mlbatch.writers import parse_jobs
 
     options.choices(
         layout=(layout, LAYOUTS),
@@ -313,7 +317,6 @@ def convert(
         fault_seed=options.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
-        jobs=options.jobs(jobs),
         engine=engine,
     )
     run(
@@ -325,6 +328,7 @@ def convert(
             compression=compression,
             ply_style=ply_style,
             dry_run=dry_run,
+            jobs=parse_jobs("--jobs", jobs),
             report=None if options.is_stdout(report) else report,
             prints_report=options.is_stdout(report),
             html=html,

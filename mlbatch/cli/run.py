@@ -41,6 +41,7 @@ from mlbatch.writers import (
     check_target,
     choose_format,
     extras,
+    jobs_for,
     open_writer,
     report_paths,
     sync_entries,
@@ -58,6 +59,7 @@ class Target:
     compression: str
     ply_style: str
     dry_run: bool
+    jobs: int | None  # None: auto
     report: Path | None
     prints_report: bool  # to standard output, without a summary
     html: Path | None  # page of the run
@@ -109,7 +111,8 @@ def _run_one(job: Job, target: Target) -> list[str]:
         fsync=target.fsync,
     )
     check_options(name, options)
-    job = replace(job, extras=extras(name, options))
+    jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
+    job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report
     open_output: OpenWriter | None = None
     resume_log = None

@@ -6,8 +6,8 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
-from mlbatch.errors import UsageError
 from mlbatch.pipeline import preflight, resume
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
@@ -30,14 +30,13 @@ from mlbatch.writers import (
     check_target,
     choose_format,
     extras,
+    jobs_for,
     open_writer,
+    parse_jobs,
     report_paths,
     sync_entries,
     write_text,
 )
-
-# Every job needs memory for a few scans.
-_MAX_JOBS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,15 +120,12 @@ class OutputOptions:
     overwrite: bool = False
     fsync: bool = True  # wait until the output is on the disk
     report: Path | None = None
-    jobs: int = 1
+    jobs: int | Literal["auto"] = "auto"
 
 
 def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     """Convert to `output` (None: a dry run); the report is written as by the command."""
-    if not 1 <= options.jobs <= _MAX_JOBS:
-        raise UsageError(
-            f"jobs: expected 1 to {_MAX_JOBS}, found {options.jobs}; give the number of free cores"
-        )
+    asked = parse_jobs("jobs", str(options.jobs))
     name = choose_format(output or Path("scans.mcap"), options.format)
     writer_options = WriterOptions(
         options.point_layout,
@@ -140,7 +136,8 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         fsync=options.fsync,
     )
     check_options(name, writer_options)
-    job = replace(job, extras=extras(name, writer_options), jobs=options.jobs)
+    jobs = jobs_for(asked, name, writer_options) if output is not None else asked or 1
+    job = replace(job, extras=extras(name, writer_options), jobs=jobs)
     if output is None:
         preflight.check_report(job, options.report, None, name)
         _, content = convert(job, None)

@@ -78,6 +78,10 @@ def _whole(low: int, high: int) -> Callable[[Node], Values]:
     return lambda node: (str(node.whole(low, high)),)
 
 
+def _jobs(node: Node) -> Values:
+    return ("auto",) if node.text == "auto" else (str(node.whole(1, _MOST_JOBS)),)
+
+
 def _choice(*words: str) -> Callable[[Node], Values]:
     return lambda node: (node.choice(words),)
 
@@ -100,6 +104,7 @@ def _choice_key(name: str, about: str, *words: str) -> Key[Values]:
 
 
 _PERCENT: Form = {"type": "number", "minimum": 0, "maximum": _FULL_PERCENT}
+_JOBS: Form = {"anyOf": [choice_form("auto"), whole_form(1, _MOST_JOBS)]}
 
 CONVERT: tuple[Key[Values], ...] = (
     _text_key("format", "format of the output"),
@@ -132,7 +137,7 @@ CONVERT: tuple[Key[Values], ...] = (
     _texts_key("pass", "topics to copy"),
     _texts_key("fault", "faults to inject"),
     Key("fault_seed", _whole(0, 2**31), (), whole_form(0, 2**31), "seed of random faults"),
-    Key("jobs", _whole(1, _MOST_JOBS), (), whole_form(1, _MOST_JOBS), "scans made in parallel"),
+    Key("jobs", _jobs, (), _JOBS, "scans made in parallel, auto: by cores and format"),
     _choice_key("engine", "decoder", "auto", "numpy", "native"),
     _flag_key("strict", "the first rejected packet or warning is an error"),
     _texts_key("fail_on", "limits beyond which the exit code is 3"),

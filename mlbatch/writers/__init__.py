@@ -39,6 +39,7 @@ from mlbatch.writers.formats import (
     is_format,
     other_names,
 )
+from mlbatch.writers.threads import jobs_for, parse_jobs
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,8 +65,10 @@ __all__ = [
     "format_names",
     "is_report",
     "is_taken",
+    "jobs_for",
     "old_path",
     "open_writer",
+    "parse_jobs",
     "partial_path",
     "plugin",
     "report_paths",

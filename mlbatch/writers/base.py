@@ -115,6 +115,8 @@ class WriterModule(Protocol):
     FORMAT: str  # name of the module
     SUFFIX: str | None  # of the output file; None: the output is a folder
     COMPRESSES: bool  # whether `--compression` applies
+    # Optional: IS_SLOW, True if a scan takes longer to write than to decode, even without
+    # `--compression`, and several threads can write at the same time.
     # Optional, only for folders: FILE_SUFFIXES, a tuple with the suffixes of the files of a scan,
     # without the first dot. Without it the suffix is FORMAT.
 

@@ -16,6 +16,7 @@ from mlbatch.writers.scan_folder import FolderWriter, check_dense
 FORMAT = "las"
 SUFFIX: str | None = None
 COMPRESSES = False
+IS_SLOW = True
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
