@@ -299,6 +299,19 @@ class SensorInfo:
     sensor_from_imu: F64Array | None = field(default=None, compare=False)
 
 
+# Instants of a window: words of `--stamp` and `--deskew-to`.
+INSTANTS = ("start", "middle", "end")
+
+
+def instant_ns(word: str, start_ns: int, end_ns: int) -> int:
+    """Return an instant of a window [start_ns, end_ns) by a word of INSTANTS."""
+    return {"start": start_ns, "middle": (start_ns + end_ns) // 2, "end": end_ns}[word]
+
+
+# Options of `convert` that change what a scan is, or where its points are.
+VARIANTS = ("batching", "batching_times", "stamp", "deskew", "deskew_to")
+
+
 @dataclass(frozen=True, slots=True)
 class RunInfo:
     """Properties that all scans of a run share."""
@@ -312,6 +325,12 @@ class RunInfo:
     sort: str = "columns"  # order of the points of a dense scan: by their columns, or `points`
     # Static frames of the recording that forwarded messages may name: name, (4, 4) body_from_frame.
     frames: tuple[tuple[str, F64Array], ...] = ()
+    # Options of VARIANTS, where they differ from the default: name and value, as in outputs.
+    variants: tuple[tuple[str, str], ...] = ()
+
+    def variant(self, name: str, default: str) -> str:
+        """Value of one of `variants`."""
+        return dict(self.variants).get(name, default)
 
 
 # Optional arrays of a scan: those that the output cannot store are not made.

@@ -15,6 +15,9 @@ SORTS = ("columns", "points")
 PLY_STYLES = ("standard", "cloudcompare", "float")
 COMPRESSIONS = ("none", "lz4", "zstd")
 CLOCKS = ("sensor", "host")
+BATCHINGS = ("window", "latest", "approximate", "collate")
+BATCHING_TIMES = ("common", "own")
+INSTANTS = ("start", "middle", "end")
 ALIGN_TO = ("host", "first")
 ON_JUMP = ("error", "split")
 ENGINES = ("auto", "numpy", "native")
@@ -79,6 +82,15 @@ def convert(
             metavar="NAME",
         ),
     ] = "none",
+    stamp: Annotated[
+        str,
+        one_of(
+            INSTANTS,
+            "--stamp",
+            help="Instant of the window that messages are stamped with; times of points count "
+            "from its start.",
+        ),
+    ] = "start",
     ply_style: Annotated[
         str,
         one_of(
@@ -88,6 +100,25 @@ def convert(
             metavar="NAME",
         ),
     ] = "standard",
+    batching: Annotated[
+        str,
+        one_of(
+            BATCHINGS,
+            "--batching",
+            help="window; or frame-level fusion of sweeps, as drivers and message filters give: "
+            "latest, approximate, collate.",
+            metavar="POLICY",
+        ),
+    ] = "window",
+    batching_times: Annotated[
+        str,
+        one_of(
+            BATCHING_TIMES,
+            "--batching-times",
+            help="Times of points in fused sweeps: from the start of the set (common), or of "
+            "their own sweep, as drivers give them (own).",
+        ),
+    ] = "common",
     slices: Annotated[
         int, typer.Option(help="Sub-scans a window, published one by one.", metavar="N")
     ] = 1,
@@ -269,13 +300,14 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.pipeline.job import Job, check_sort
+    from mlbatch.pipeline.job import Job, check_batching, check_sort
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
     from mlbatch.writers import parse_jobs
 
     options.choices(
         layout=(layout, LAYOUTS),
+        stamp=(stamp, INSTANTS),
         clock=(clock, CLOCKS),
         align_to=(align_to, ALIGN_TO),
         on_jump=(on_jump, ON_JUMP),
@@ -298,6 +330,9 @@ def convert(
             decode=options.decode_options(decode or ()),
         ),
         rate=None if rate is None else options.rate(rate),
+        stamp=stamp,
+        batching=batching,
+        batching_times=batching_times,
         slices=slices,
         layout=layout,
         sort=check_sort("--sort", sort, layout),
@@ -320,7 +355,7 @@ def convert(
         engine=engine,
     )
     run(
-        job,
+        check_batching(job),
         Target(
             output=output,
             format=format_,

@@ -22,6 +22,7 @@ Rows = list[tuple[str, str]]
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "Input": (*("recordings", "rig", "metadata", "decode", "identity_extrinsics", "whole"),),
     "Batching": (
+        *("batching", "batching_times"),
         *("rate", "slices", "split", "max_wait", "keep_partial", "drop_incomplete"),
         *("tolerance", "timeout"),
     ),
@@ -36,6 +37,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
             "layout",
             "sort",
             "point_layout",
+            "stamp",
             "ply_style",
             "compression",
             "report",

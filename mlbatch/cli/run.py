@@ -39,6 +39,7 @@ from mlbatch.writers import (
     WriterOptions,
     check_options,
     check_target,
+    check_variants,
     choose_format,
     extras,
     jobs_for,
@@ -111,6 +112,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         fsync=target.fsync,
     )
     check_options(name, options)
+    check_variants(name, job.variants)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
     job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report

@@ -1,4 +1,4 @@
 """Windows against frame-level fusion of sweeps, on the same recording.
 
-sweeps.py cuts sweeps and joins them to sets, statistics.py measures sets, compare.py runs both.
+statistics.py measures sets of sweeps (batching/sweeps.py), compare.py runs both.
 """

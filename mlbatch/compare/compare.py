@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from mlbatch.batching.batcher import SLACK_NS
-from mlbatch.batching.windows import Window
-from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
-from mlbatch.compare.sweeps import (
+from mlbatch.batching.sweeps import (
+    DEFAULT_TIMEOUT_NS,
+    DEFAULT_TOLERANCE_NS,
     CollectedSweeps,
     JoinPolicy,
     NearestSweeps,
@@ -24,21 +24,19 @@ from mlbatch.compare.sweeps import (
     SweepSet,
     publication_order,
 )
+from mlbatch.batching.windows import Window
+from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
 from mlbatch.page.policies import PolicyFigures
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.conversion import Conversion, Progress, sweep_cutter
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 SCHEMA = "mlbatch.compare/1"
 WINDOWS = "windows (mlbatch)"
-# Half a revolution at 10 Hz.
-DEFAULT_TOLERANCE_NS = 50 * NS_PER_MS
-# One revolution at 10 Hz.
-DEFAULT_TIMEOUT_NS = 100 * NS_PER_MS
 Value: TypeAlias = str | int | float | Sequence["Value"] | Mapping[str, "Value"] | None
 
 
@@ -192,7 +190,7 @@ def compare(
         NearestSweeps(count, settings.tolerance_ns),
         CollectedSweeps(count, settings.timeout_ns),
     )
-    joiner = Joiner([_cutter(sensor) for sensor in run.sensors], policies, period_ns)
+    joiner = Joiner([sweep_cutter(sensor) for sensor in run.sensors], policies, period_ns)
     windows = SetStatistics(WINDOWS, count, period_ns)
     columns, length_ns = _run(run, joiner, windows, progress)
     return Comparison(
@@ -250,11 +248,6 @@ def _sweeps_of(window: Window, sensors: int) -> SweepSet:
             part = Sweep(index, first_ns, int(stamp_ns[-1]), window.end_ns, len(stamp_ns))
         parts.append(part)
     return tuple(parts)
-
-
-def _cutter(sensor: Sensor) -> SweepCutter:
-    angles = sensor.lidar.beams.angle_rad
-    return SweepCutter(sensor.index, None if angles is None else len(angles))
 
 
 def _sensor_sweeps(sensor: Sensor, lengths_ns: array[int]) -> SensorSweeps:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.compare.sweeps import Sweep, SweepSet
+from mlbatch.batching.sweeps import Sweep, SweepSet
 from mlbatch.units import NS_PER_MS
 
 # A sweep is stale in a set whose newest column is more than this many periods newer than its own.

@@ -42,6 +42,8 @@ class ScanHeader:
     edge_gap_ns: tuple[int, ...] = ()  # by sensor, widest gap at either bound
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     is_partial: bool = False
+    # Times of points count from the first column of their sensor, not from `start_ns`.
+    own_times: bool = False
 
 
 class _EngineChoice(NamedTuple):
@@ -147,7 +149,8 @@ class Decoder:
         self._buffer = self._other_buffers.popleft()
         self._reserve(len(columns))
         before = self._written()
-        points = self._engine.decode(columns, header.start_ns, 0, self._buffer)
+        timed = _by_own_times(columns, header) if header.own_times else columns
+        points = self._engine.decode(timed, header.start_ns, 0, self._buffer)
         if self._info.sort == "points":
             self._sort(points)
         return self._scan(columns, header, points, before)
@@ -232,6 +235,13 @@ class Decoder:
         if self._only is not None:
             return np.full(len(columns), self._only, np.uint8)
         return columns.sensor.astype(np.uint8)
+
+
+def _by_own_times(columns: WindowColumns, header: ScanHeader) -> WindowColumns:
+    """Return the columns with stamps as if all sensors had begun at the start of the scan."""
+    first_ns = np.array([one.first_ns for one in header.figures])
+    stamp_ns = columns.stamp_ns - (first_ns - header.start_ns)[columns.sensor]
+    return replace(columns, stamp_ns=stamp_ns)
 
 
 def _groups(sources: Sequence[Source], joins_rotors: bool) -> list[list[int]]:

@@ -104,15 +104,6 @@ def column_motion(track: PoseTrack, stamp_ns: I64Array, to_ns: int) -> ColumnMot
     return ColumnMotion(rotation, translation, no_pose)
 
 
-# Words of `--deskew-to`.
-INSTANTS = ("start", "middle", "end")
-
-
-def instant_ns(word: str, start_ns: int, end_ns: int) -> int:
-    """Return an instant of a window [start_ns, end_ns) by a word of INSTANTS."""
-    return {"start": start_ns, "middle": (start_ns + end_ns) // 2, "end": end_ns}[word]
-
-
 def constant_twist(
     stamp_ns: int, velocity: F64Array, angular_velocity: F64Array, lasts_ns: int
 ) -> PoseTrack:

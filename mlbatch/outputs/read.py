@@ -16,7 +16,7 @@ import numpy as np
 
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
-from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of
+from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of, variants_of
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import ScanRow, TableOfRun
 from mlbatch.types import RunInfo
@@ -144,6 +144,7 @@ def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
             int(grid["t_init_ns"]),
             grid.get("sort", "columns"),
             RunFiles(str(path), report, table.decode("utf-8", "replace")),
+            variants_of(grid),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as err:
         raise RecordingError(
@@ -178,6 +179,8 @@ class _Clouds:
         self._places = about.places()
         self._table = about.table()
         self._infos: dict[tuple[str, str], RunInfo] = {}
+        # Clouds so far.
+        self._read = 0
 
     def scan(self, topic: str, data: bytes | memoryview, encoding: str) -> Iterator[Scan]:
         """The scan of a message; none for a forwarded topic."""
@@ -197,16 +200,30 @@ class _Clouds:
         key = (cloud.frame_id, layout)
         if key not in self._infos:
             self._infos[key] = self._about.info(*key)
-        index, part, end_ns = self._places.place(cloud.stamp_ns)
+        if "batching" in dict(self._about.variants):
+            index, part, start_ns, end_ns = self._set()
+        else:
+            start_ns = self._places.start_of_message(cloud.stamp_ns)
+            index, part, end_ns = self._places.place(start_ns)
         row = row_of(self._table, index, part, own[topic])
         if row is None:
             raise RecordingError(
                 f"{self._about.where}: expected a row of scan {index} slice {part} in scans.csv, "
                 "found none; put scans.csv back, or convert again"
             )
-        place = CloudPlace(self._infos[key], index, part, cloud.stamp_ns, end_ns, row, own[topic])
+        place = CloudPlace(self._infos[key], index, part, start_ns, end_ns, row, own[topic])
         rows = cloud.records.T if layout == "organized" else cloud.records.reshape(-1)
         yield scan_of_cloud(place, rows, row.complete)
+
+    def _set(self) -> tuple[int, int, int, int]:
+        """Index, slice, start and end (ns) of the next set of sweeps: a line of scans.csv each."""
+        number = self._read
+        self._read += 1
+        rows = None if self._table is None else self._table.rows
+        if rows is None or number >= len(rows):
+            return number, 0, 0, 0
+        row = rows[number]
+        return int(row["index"]), 0, int(row["start_ns"]), int(row["end_ns"])
 
 
 # -- a file a scan --------------------------------------------------------------------------------
@@ -297,6 +314,7 @@ def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
             None,
             str(values.get("sort", "columns")),
             run.files,
+            variants_of(values),
         )
         layout = "dense" if values["xyz"].ndim == 2 else "organized"
         info = run.shared(about, str(values["frame_id"]), layout)
@@ -350,6 +368,7 @@ def _commented_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
         None,
         metadata.sort or "columns",
         run.files,
+        variants_of(comments.by_name),
     )
     layout = "organized" if points.organized else "dense"
     info = run.shared(about, metadata.frame_id or "", layout)

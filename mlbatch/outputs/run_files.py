@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.outputs.table import ScanRow, TableOfRun, read_table
-from mlbatch.types import RunInfo, SensorInfo
+from mlbatch.types import VARIANTS, RunInfo, SensorInfo
 from mlbatch.units import parse_rate
 from mlbatch.writers.atomic import REPORT_JSON, SCANS_CSV, side_path
 
@@ -60,6 +60,7 @@ class RunFiles:
                 grid["t_init_ns"],
                 str(grid.get("sort", _SORT)),
                 self,
+                variants_of(grid),
             )
         except (KeyError, TypeError, ValueError, RecursionError) as err:
             raise self._damaged(err) from err
@@ -88,6 +89,11 @@ class RunFiles:
         )
 
 
+def variants_of(values: Mapping[str, object]) -> tuple[tuple[str, str], ...]:
+    """The options of `RunInfo.variants` among the metadata of an output."""
+    return tuple((name, str(values[name])) for name in VARIANTS if name in values)
+
+
 @dataclass(frozen=True, slots=True)
 class RunOfOutput:
     """Constants of a run as its output has them."""
@@ -100,12 +106,20 @@ class RunOfOutput:
     t_init_ns: int | None
     sort: str
     files: RunFiles
+    variants: tuple[tuple[str, str], ...] = ()  # as of `RunInfo`
 
     def info(self, frame_id: str, layout: str) -> RunInfo:
         """What all scans share."""
         sensors = self.files.sensors(self.sensors)
         return RunInfo(
-            sensors, frame_id, self.rate_hz, self.timescale, self.slices, layout, self.sort
+            sensors,
+            frame_id,
+            self.rate_hz,
+            self.timescale,
+            self.slices,
+            layout,
+            self.sort,
+            variants=self.variants,
         )
 
     def places(self) -> Places:
@@ -114,7 +128,8 @@ class RunOfOutput:
             grid = Grid(parse_rate(self.rate_hz), self.slices)
         except UsageError as err:
             raise RecordingError(f"{self.where}: {err}; convert again") from err
-        return Places(grid, grid.index_of(self.t_init_ns or 0))
+        stamp = dict(self.variants).get("stamp", "start")
+        return Places(grid, grid.index_of(self.t_init_ns or 0), stamp)
 
     def table(self) -> TableOfRun | None:
         """scans.csv; None if there is none."""
@@ -130,6 +145,12 @@ class Places:
 
     grid: Grid
     first: int
+    stamp: str = "start"
+
+    def start_of_message(self, stamp_ns: int) -> int:
+        """Start of the window of a message."""
+        # The end of a window is the start of the next one.
+        return self.grid.floor_bound(stamp_ns - (self.stamp == "end"))
 
     def place(self, start_ns: int) -> tuple[int, int, int]:
         """Index, slice and end (ns) of the scan that starts at a time."""

@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
+from mlbatch.batching.fusion import OWN, SweepFusion
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.merge import column_merge
+from mlbatch.batching.sweeps import SweepCutter
 from mlbatch.batching.windows import Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
@@ -99,14 +101,20 @@ class Conversion:
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
         paces = [sensor.pace() for sensor in self.sensors]
+        merge = column_merge(self.session.engine, [pace.positions for pace in paces])
         self.batcher = Batcher(
             self.grid,
             [sensor.intake() for sensor in self.sensors],
-            Policy(job.max_wait_ns, job.keep_partial, job.start, job.end),
+            # Sweeps may begin or end in partial windows.
+            Policy(job.max_wait_ns, job.keep_partial or job.is_fused, job.start, job.end),
             self.session.clocks.guards,
             paces,
-            column_merge(self.session.engine, [pace.positions for pace in paces]),
+            merge,
         )
+        self.fusion: SweepFusion | None = None
+        if job.is_fused:
+            cutters = [sweep_cutter(sensor) for sensor in self.sensors]
+            self.fusion = SweepFusion(job.batching, cutters, merge)
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
@@ -160,12 +168,21 @@ class Conversion:
         Each task may be given to any decode worker, by any thread, while the next are made.
         """
         with contextlib.closing(self.windows(progress)) as windows:
-            for window in self.stages.each("merge_s", windows):
+            for window in self.stages.each("merge_s", self._batches(windows)):
                 pool = self._pool or self._begin()
                 if self._is_too_incomplete(window):
                     yield SkippedWindow(window.end_ns)
                 else:
                     yield from pool.tasks(window, self.earlier)
+
+    def _batches(self, windows: Iterator[Window]) -> Iterator[Window]:
+        """Yield what becomes a scan: the windows, or the sets of sweeps in them."""
+        if self.fusion is None:
+            yield from windows
+            return
+        for window in windows:
+            yield from self.fusion.push(window)
+        self.fusion.finish()
 
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with `--split`, the index of its sensor.
@@ -187,6 +204,8 @@ class Conversion:
         oldest = []
         for sensor in self.sensors:
             ring_indexes = [self.batcher.oldest_ring_index(sensor.index)]
+            if self.fusion is not None:
+                ring_indexes.append(self.fusion.oldest_ring_index(sensor.index))
             if self._pool is not None:
                 ring_indexes.append(self._pool.oldest_ring_index(sensor.index))
             known = (index for index in ring_indexes if index is not None)
@@ -234,6 +253,7 @@ class Conversion:
             workers=job.jobs,
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
+            own_times=job.batching_times == OWN,
         )
         return self._pool
 
@@ -340,6 +360,10 @@ class Conversion:
         ledger.columns.decoded = self.batcher.decoded[sensor.index]
         for reason, count in self.batcher.dropped[sensor.index].items():
             ledger.columns.drop(reason, count)
+        if self.fusion is not None:
+            for reason, count in self.fusion.dropped[sensor.index].items():
+                ledger.columns.drop(reason, count)
+            ledger.columns.reused = self.fusion.reused[sensor.index]
         ledger.points = self.points(sensor.index)
 
     def _refuse_rejected(self) -> None:
@@ -362,3 +386,9 @@ class Conversion:
     def notes(self) -> Sequence[Note]:
         """Warnings so far."""
         return self.session.notes
+
+
+def sweep_cutter(sensor: Sensor) -> SweepCutter:
+    """Return what cuts the columns of a sensor into sweeps."""
+    angles = sensor.lidar.beams.angle_rad
+    return SweepCutter(sensor.index, None if angles is None else len(angles))

@@ -115,13 +115,16 @@ class DecodePool:
         workers: int,
         split: bool,
         counts_clipped: bool = False,
+        own_times: bool = False,
     ) -> None:
         """workers: one a thread; each has lidars of its own if there are several.
 
+        own_times: times of points count from the first column of their sensor.
         Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
         self._rings = [source.ring for source in sources]
         self._split = split
+        self._own_times = own_times
         self._open: list[DecodeTask] = []
         self.workers = [
             DecodeWorker(
@@ -146,6 +149,7 @@ class DecodePool:
             window.edge_gap_ns,
             window.fill,
             window.is_partial,
+            own_times=self._own_times,
         )
         columns = window.columns
         if not self._split:

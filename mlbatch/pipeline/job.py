@@ -9,6 +9,7 @@ from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
+from mlbatch.batching.fusion import BATCHINGS, COMMON, TIMES, WINDOW
 from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
@@ -56,8 +57,27 @@ class Job:
     segment: TimeSegment = field(default_factory=TimeSegment)  # of the session, by receive time
     passed: tuple[str, ...] = ()  # patterns of topics to forward
     extras: frozenset[str] = EXTRAS  # optional contents that the output can store
+    stamp: str = "start"  # or middle, end: instant of a window that its message is stamped with
+    batching: str = WINDOW  # or a policy of frame-level fusion
+    batching_times: str = COMMON  # or own
     jobs: int = 1  # scans made at the same time
     engine: str = "auto"  # one of `native.ENGINES`
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether scans are sets of sweeps instead of windows."""
+        return self.batching != WINDOW
+
+    @property
+    def variants(self) -> tuple[tuple[str, str], ...]:
+        """See `RunInfo`."""
+        values = (
+            ("batching", self.batching, WINDOW),
+            # Also the default: with it nothing is left to guess.
+            ("batching_times", self.batching_times if self.is_fused else "", ""),
+            ("stamp", self.stamp, "start"),
+        )
+        return tuple((name, value) for name, value, default in values if value != default)
 
 
 def wait_ns(option: str, seconds: float, given: object) -> int | None:
@@ -88,6 +108,38 @@ def check_sort(option: str, sort: str, layout: str) -> str:
             "places of their columns; leave one of them out"
         )
     return sort
+
+
+def check_batching(job: Job) -> Job:
+    """Return the job; UsageError for options that have no meaning for sets of sweeps."""
+    for option, word, words in (
+        ("--batching", job.batching, BATCHINGS),
+        ("--batching-times", job.batching_times, TIMES),
+    ):
+        if word not in words:
+            raise UsageError(
+                f"{option}: expected {', '.join(words)}, found {word!r}; choose one of them"
+            )
+    if not job.is_fused:
+        if job.batching_times != COMMON:
+            raise UsageError(
+                f"--batching-times: expected {COMMON} for windows, found {job.batching_times}; "
+                "give --batching latest, or leave it out"
+            )
+        return job
+    given = {
+        "--slices": job.slices > 1,
+        "--split": job.split,
+        "--keep-partial": job.keep_partial,
+        "--drop-incomplete": job.drop_incomplete > 0,
+    }
+    for option, is_given in given.items():
+        if is_given:
+            raise UsageError(
+                f"{option}: expected windows, found --batching {job.batching}, whose scans are "
+                "sets of sweeps; leave one of them out"
+            )
+    return job
 
 
 def check_ranges_m(low_option: str, low: float, high_option: str, high: float) -> None:

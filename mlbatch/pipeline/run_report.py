@@ -54,11 +54,16 @@ def run_report(run: Conversion) -> RunReport:
         t_init_ns=run.batcher.t_init_ns,
         slices=run.job.slices,
         sort=run.job.sort,
+        variants=run.job.variants,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
         if table is None
-        else table.statistics(run.batcher.empty, run.dropped_incomplete),
+        else table.statistics(
+            # Sets of sweeps are on no grid, where windows may be empty.
+            0 if run.job.is_fused else run.batcher.empty,
+            run.dropped_incomplete,
+        ),
         unassigned=_unassigned(run),
         timing=_timing(run),
         messages=tuple(
@@ -287,6 +292,11 @@ def why_no_scan(run: Conversion) -> str:
         return (
             f"{where}: no scan: expected --start in the recording, "
             f"{text_of_range(first_ns, last_ns)}, found {text_of_time(start_ns)}; choose another"
+        )
+    if run.job.is_fused:
+        return (
+            f"{where}: no scan: expected a whole sweep of each sensor for --batching "
+            f"{run.job.batching}, found {'; '.join(spans)}; choose a longer recording"
         )
     period_ms = float(NS_PER_S / run.grid.rate / NS_PER_MS)
     advice = (

@@ -240,6 +240,7 @@ class Session:
             job.layout,
             job.sort,
             frames,
+            job.variants,
         )
 
     # -- checks and warnings ------------------------------------------------------------------

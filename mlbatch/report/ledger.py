@@ -12,7 +12,8 @@ from mlbatch.types import CaptureCounts
 # `fragment`: a frame whose content is in the datagram that its last fragment completed.
 CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
-# `incomplete`: of windows left out by --drop-incomplete.
+# `incomplete`: of windows left out by --drop-incomplete. Of frame-level fusion: `part_sweep`: of
+# sweeps of which the recording has a part only; `no_set`: of sweeps that no set contains.
 COLUMN_REASONS = (
     "before_start",
     "late",
@@ -21,6 +22,8 @@ COLUMN_REASONS = (
     "invalid",
     "outside_time",
     "incomplete",
+    "part_sweep",
+    "no_set",
 )
 # `no_place`: the output format cannot store them.
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")
@@ -47,10 +50,11 @@ class PacketCounts:
 
 @dataclass(slots=True)
 class DecodedCounts:
-    """Columns or IMU samples of a sensor: decoded = written + sum(dropped)."""
+    """Columns or IMU samples of a sensor: decoded + reused = written + sum(dropped)."""
 
     decoded: int = 0
     written: int = 0
+    reused: int = 0  # columns written again, in a further set of frame-level fusion
     dropped: dict[str, int] = field(default_factory=dict)
 
     def drop(self, reason: str, count: int = 1) -> None:
@@ -105,7 +109,11 @@ class SensorLedger:
         samples = self.imu_samples
         return [
             *_balance("packets", packets.read, (packets.accepted, *packets.rejected.values())),
-            *_balance("columns", columns.decoded, (columns.written, *columns.dropped.values())),
+            *_balance(
+                "columns",
+                columns.decoded + columns.reused,
+                (columns.written, *columns.dropped.values()),
+            ),
             *_balance("points", points.slots, tuple(points.outcomes)),
             *_balance("IMU samples", samples.decoded, (samples.written, *samples.dropped.values())),
             *_unknown("packets", packets.rejected, PACKET_REASONS),

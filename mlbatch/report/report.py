@@ -137,6 +137,7 @@ class RunReport:
     faults: tuple[FaultReport, ...] = ()
     repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
     first_scan: str = ""  # start of the first scan, as text
+    variants: tuple[tuple[str, str], ...] = ()  # as `RunInfo.variants`
     command: str = ""  # command line; "" for runs by the Python interface
 
 
@@ -155,6 +156,7 @@ def build_report(run: RunReport) -> Section:
             "t_init_ns": run.t_init_ns,
             "slices": run.slices,
             "sort": run.sort,
+            **dict(run.variants),
         },
         "capture": {
             "frames": run.capture.frames,
@@ -232,10 +234,18 @@ def summary_lines(run: RunReport) -> list[str]:
     scans = run.scans
     left_out = scans.dropped_incomplete
     dropped = f", {left_out} left out by --drop-incomplete" if left_out else ""
-    lines.append(
-        f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
-        f"{scans.empty} empty windows{dropped}), {scans.points} points, clock {run.timescale}"
-    )
+    variants = dict(run.variants)
+    if "batching" in variants:
+        lines.append(
+            f"{scans.written} sets of sweeps ({scans.incomplete} incomplete), frame-level fusion "
+            f"{variants['batching']}, {variants['batching_times']} times, {scans.points} points, "
+            f"clock {run.timescale}"
+        )
+    else:
+        lines.append(
+            f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
+            f"{scans.empty} empty windows{dropped}), {scans.points} points, clock {run.timescale}"
+        )
     if run.first_scan:
         lines.append(f"first scan at {run.first_scan}")
     for name, count in scans.underfilled_by_sensor.items():
@@ -289,6 +299,7 @@ def _sensor(sensor: SensorReport) -> Section:
         "columns": {
             "decoded": columns.decoded,
             "written": columns.written,
+            **({"reused": columns.reused} if columns.reused else {}),
             "dropped": ordered(columns.dropped, COLUMN_REASONS),
         },
         "fill": sensor.fill,

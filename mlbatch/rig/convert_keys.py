@@ -113,6 +113,15 @@ CONVERT: tuple[Key[Values], ...] = (
     _text_key("point_layout", "fields of a PointCloud2 point (preset)"),
     _text_key("ply_style", "properties of PLY files"),
     _text_key("compression", "of MCAP chunks"),
+    _choice_key(
+        *("stamp", "instant of the window that messages are stamped with"),
+        *("start", "middle", "end"),
+    ),
+    _choice_key(
+        *("batching", "windows, or a policy of frame-level fusion"),
+        *("window", "latest", "approximate", "collate"),
+    ),
+    _choice_key("batching_times", "times of points in fused sweeps", "common", "own"),
     Key(
         *("slices", _whole(1, _MOST_SLICES), (), whole_form(1, _MOST_SLICES)),
         about="sub-scans a window",

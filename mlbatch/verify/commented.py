@@ -54,7 +54,7 @@ class CommentedReader:
     def begin(self, file: ScanFile) -> RunMetadata:
         """Metadata of the run in the first scan."""
         comments, points = self.parse(file.read())
-        self._metadata = comments.metadata()
+        self._metadata = comments.metadata(self.log, file.where)
         self.sensors = self._metadata.sensors or ()
         self.organized = points.organized
         return self._metadata
@@ -67,7 +67,7 @@ class CommentedReader:
         log = self.log
         comments, points = self.parse(file.read())
         log.ok("layout")
-        self._metadata.joined(log, file.where, comments.metadata())
+        self._metadata.joined(log, file.where, comments.metadata(log, file.where))
         where = f"{file.where} {'slot' if points.organized else 'point'}"
         time_ns, step_ns = self._times(where, points)
         index, part, slices = comments.place()

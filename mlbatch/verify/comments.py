@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import F32Array
-from mlbatch.verify.report_checks import RunMetadata
-from mlbatch.verify.verdict import DamageError
+from mlbatch.verify.report_checks import RunMetadata, with_variants
+from mlbatch.verify.verdict import CheckLog, DamageError
 
 # Numbers of up to 19 digits: Python refuses very long ones.
 _INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)
@@ -64,11 +64,11 @@ class ScanComments:
         except ValueError:
             raise DamageError("comment fill with a number for each sensor", text) from None
 
-    def metadata(self) -> RunMetadata:
-        """Metadata of the run."""
+    def metadata(self, log: CheckLog | None = None, where: str = "") -> RunMetadata:
+        """Metadata of the run; log: for words that are unknown."""
         _, _, slices = self.place()
         _, _, names = self.by_name.get("lidar_id", "").partition("from 0: ")
-        return RunMetadata(
+        found = RunMetadata(
             rate=self.by_name.get("rate_hz"),
             slices=slices,
             sensors=tuple(names.split(" ")) if names else None,
@@ -76,3 +76,4 @@ class ScanComments:
             frame_id=self.by_name.get("frame_id"),
             sort=self.by_name.get("sort"),
         )
+        return with_variants(log or CheckLog(), where, found, self.by_name)

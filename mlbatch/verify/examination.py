@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 from mlbatch.verify.report_checks import (
     ReportFiles,
@@ -36,6 +37,14 @@ _MOST_SENSORS = 256
 _MOST_NS = 2**62
 
 
+class MessageWindow(NamedTuple):
+    """Window of a message; place: index of the scan; None: not known by the message alone."""
+
+    start_ns: int
+    end_ns: int | None = None
+    place: int | None = None
+
+
 class Examination:
     """Takes the scans of an output one after the other; arrays are only used during the call."""
 
@@ -52,9 +61,14 @@ class Examination:
         self._all = 0 if files.table is None else len(files.table.index)
         self.log = log
         self._files = files
+        # Why checks are impossible for scans of these options.
+        self.limits = metadata.limits
         self._grid = metadata.grid(where)
         self._grid_checks = GridChecks(log, self._grid, metadata.t_init_ns, where)
         self._by_time = metadata.sort == "points"
+        self._is_fused = metadata.batching is not None
+        self._stamp = metadata.stamp or "start"
+        self._own_times = metadata.batching_times == "own"
         if metadata.sort not in (None, "columns", "points"):
             log.fail("metadata", f"{where} sort", "columns or points", metadata.sort)
         self._sensors = _MOST_SENSORS if metadata.sensors is None else len(metadata.sensors)
@@ -67,7 +81,8 @@ class Examination:
         self.totals = OutputTotals(log, self._sensors, table)
         self._duplicates = DuplicateColumns(log)
         poses = None if files.report is None else poses_of(files.report)
-        fits = poses is not None and len(poses) == self._sensors
+        # Moved points are not at their ranges from the sensor.
+        fits = poses is not None and len(poses) == self._sensors and metadata.deskew is None
         self._geometry = GeometryChecks(log, poses if fits else None)
 
     def scan(self, scan: StoredScan) -> None:
@@ -79,6 +94,7 @@ class Examination:
     def _check(self, scan: StoredScan) -> None:
         log = self.log
         scan.by_time = self._by_time
+        scan.own_times = self._own_times
         for name, at_ns in (("start_ns", scan.start_ns), ("end_ns", scan.end_ns)):
             if at_ns is not None and abs(at_ns) >= _MOST_NS:
                 log.fail("grid", f"{scan.where} {name}", "a time", at_ns)
@@ -109,6 +125,28 @@ class Examination:
         check_times(log, scan, points, end_ns - scan.start_ns)
         self.totals.add(scan, points, place)
 
+    def window_of_message(self, stamp_ns: int, number: int, where: str) -> MessageWindow:
+        """Window of the message of a scan by its stamp; number: of the message in its topic."""
+        table = self._files.table
+        if self._is_fused:
+            row = None if table is None else table.row(number, 0)
+            if table is None or row is None:
+                # A scan without a line of the table is a violation there.
+                return MessageWindow(stamp_ns, place=number)
+            window = MessageWindow(int(table.start_ns[row]), int(table.end_ns[row]), number)
+        elif self._stamp == "start" or self._grid is None:
+            return MessageWindow(stamp_ns)
+        else:
+            # The end of a window is the start of the next one.
+            q = self._grid.number(stamp_ns - (self._stamp == "end"))
+            window = MessageWindow(self._grid.bound(q), self._grid.bound(q + 1))
+        end_ns = window.start_ns if window.end_ns is None else window.end_ns
+        middle_ns = window.start_ns + (end_ns - window.start_ns) // 2
+        instants = {"start": window.start_ns, "middle": middle_ns, "end": end_ns}
+        expected = instants[self._stamp]
+        self.log.equal("stamps", f"{where} header stamp ({self._stamp})", expected, stamp_ns)
+        return window
+
     def _end_ns(self, scan: StoredScan) -> int:
         if scan.end_ns is not None:
             return scan.end_ns
@@ -125,10 +163,15 @@ class Examination:
         report = self._files.report
         if table is not None:
             check_table(self.log, table, self._grid, self._grid_checks.first)
-            self.totals.check_table()
+            if self._is_fused:
+                # Sets are numbered; where they begin is known from their columns alone.
+                expected = list(range(len(table)))
+                self.log.equal("index", f"{table.where} index", expected, table.index.tolist())
+            self.totals.check_table(apart=self._is_fused)
         if report is not None:
             check_ledgers(report)
-            check_period(report)
+            if not self._is_fused:
+                check_period(report)
             check_report(report, self.totals, table, self._grid)
 
     def _check_rings(self) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -336,7 +336,14 @@ class TopicChecks:
         if self.metadata.frame_id is not None:
             log.equal("metadata", f"{where} frame_id", self.metadata.frame_id, cloud.frame_id)
         self._named.setdefault(message.topic, set()).add(cloud.frame_id)
-        self.examination.scan(stored_scan(cloud, where, sensor))
+        number = self.counts[message.topic] - 1
+        window = self.examination.window_of_message(cloud.stamp_ns, number, where)
+        scan = stored_scan(replace(cloud, stamp_ns=window.start_ns), where, sensor)
+        scan.end_ns = window.end_ns
+        if window.place is not None:
+            scan.index = window.place
+            scan.slice = 0
+        self.examination.scan(scan)
 
     def _check_imu(self, message: Message, frame_id: str | None) -> None:
         """Check an IMU message; frame_id: None for a recorded one."""

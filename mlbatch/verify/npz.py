@@ -20,7 +20,7 @@ from numpy.lib.format import read_array_header_1_0, read_magic
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.verify.containers import check_unpacked_size, library_errors
 from mlbatch.verify.folders import ScanFile, readable
-from mlbatch.verify.report_checks import RunMetadata
+from mlbatch.verify.report_checks import VARIANTS, RunMetadata, with_variants
 from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError
 
@@ -50,7 +50,7 @@ _NUMBERS = {
 _BY_SENSOR = {"fill": "<f4"}
 _TEXTS = ("sensors", "frame_id", "rate_hz", "timescale", "sort", "schema")
 # The same in every scan of a run.
-_CONSTANT = ("slices", *_TEXTS)
+_CONSTANT = ("slices", *_TEXTS, *VARIANTS)
 
 LIMITS = {
     "tf_static": "npz has no transforms",
@@ -86,12 +86,16 @@ class NpzReader:
         xyz = data.get("xyz")
         self.organized = xyz is not None and _array("xyz", xyz).ndim == 3
         values = self._values
-        texts = {key: str(values[key]) for key in _TEXTS if key in values and key != "sensors"}
+        texts = {
+            key: str(values[key])
+            for key in (*_TEXTS, *VARIANTS)
+            if key in values and key != "sensors"
+        }
         self.log.equal("layout", f"{file.where} schema", SCHEMA, texts.get("schema"))
         if "sensors" in values:
             self.sensors = tuple(map(str, values["sensors"].tolist()))
         slices = values.get("slices")
-        return RunMetadata(
+        found = RunMetadata(
             rate=texts.get("rate_hz"),
             slices=None if slices is None else int(cast(I64Array, slices)),
             sensors=self.sensors or None,
@@ -99,11 +103,12 @@ class NpzReader:
             frame_id=texts.get("frame_id"),
             sort=texts.get("sort"),
         )
+        return with_variants(self.log, file.where, found, texts)
 
     def _fits(self, file: ScanFile, key: str, values: Values) -> bool:
         """Whether a constant has its type; a number of another type is a violation in each scan."""
         kind = values.dtype.str
-        if key not in _TEXTS:
+        if key in _NUMBERS:
             return (kind, values.ndim) == (_NUMBERS[key], 0)
         expected = "texts" if key == "sensors" else "a text"
         fits = kind.startswith("<U") and values.ndim == (key == "sensors")

@@ -48,6 +48,7 @@ class Output:
     ) -> Verdict:
         """The result after all checks; limits: why checks are not or only partly possible."""
         totals = examination.totals
+        limits = limits | examination.limits
         if files.report is None:
             limits = dict.fromkeys(("ledger", "report", "t_init"), _NO_REPORT) | limits
         if not totals.scans and not self.log.violations:

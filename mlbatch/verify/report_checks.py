@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from pathlib import Path
@@ -64,6 +65,25 @@ class RunMetadata:
     frame_id: str | None = None
     # Order of points: columns or points.
     sort: str | None = None
+    # Options that change what a scan is; None: the default.
+    batching: str | None = None
+    batching_times: str | None = None
+    stamp: str | None = None
+    deskew: str | None = None
+    deskew_to: str | None = None
+
+    @property
+    def limits(self) -> dict[str, str]:
+        """Checks that such options make impossible, and why."""
+        limits: dict[str, str] = {}
+        if self.batching is not None:
+            reason = f"sets of sweeps (--batching {self.batching}) are on no grid"
+            limits |= dict.fromkeys(("grid", "t_init"), reason)
+        if self.batching_times == "own":
+            limits["order"] = "columns only: times of points count from the start of each sweep"
+        if self.deskew is not None:
+            limits["geometry"] = "points were moved (--deskew): ranges are as measured"
+        return limits
 
     def joined(self, log: CheckLog, where: str, other: RunMetadata) -> RunMetadata:
         """Both together; contradictions are violations at `where`."""
@@ -78,8 +98,8 @@ class RunMetadata:
         return found
 
     def grid(self, where: str) -> Grid | None:
-        """The grid; None without a rate."""
-        if self.rate is None:
+        """The grid; None without a rate, and of sets of sweeps."""
+        if self.rate is None or self.batching is not None:
             return None
         slices = 1 if self.slices is None else self.slices
         try:
@@ -90,6 +110,34 @@ class RunMetadata:
             expected = f"1 to {_MOST_SLICES} slices a window"
             raise VerifyError(f"{where}: expected {expected}, found {slices}; convert again")
         return Grid(rate, slices)
+
+
+VARIANTS = ("batching", "batching_times", "stamp", "deskew", "deskew_to")
+_VARIANT_WORDS = {
+    "batching": ("latest", "approximate", "collate"),
+    "batching_times": ("common", "own"),
+    "stamp": ("middle", "end"),
+    "deskew_to": ("start", "middle", "end"),
+}
+
+
+def with_variants(
+    log: CheckLog, where: str, own: RunMetadata, said: Mapping[str, str]
+) -> RunMetadata:
+    """Metadata with the options in `said` that change what a scan is."""
+    known = {name: said[name] for name in VARIANTS if name in said}
+    for name, words in _VARIANT_WORDS.items():
+        if name in known and known[name] not in words:
+            log.fail("metadata", f"{where} {name}", f"one of {', '.join(words)}", known[name])
+            del known[name]
+    return replace(
+        own,
+        batching=known.get("batching"),
+        batching_times=known.get("batching_times"),
+        stamp=known.get("stamp"),
+        deskew=known.get("deskew"),
+        deskew_to=known.get("deskew_to"),
+    )
 
 
 def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMetadata:
@@ -112,7 +160,7 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
     if not isinstance(names, list):
         log.fail("metadata", f"{where} sensors", "a list", grid.get("sensors"))
         names = None
-    return RunMetadata(
+    found = RunMetadata(
         rate=grid.get("rate_hz"),
         slices=numbers["slices"],
         t_init_ns=numbers["t_init_ns"],
@@ -121,6 +169,7 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
         frame_id=grid.get("frame_id"),
         sort=grid.get("sort"),
     )
+    return with_variants(log, where, found, grid)
 
 
 # -- the report as a document ---------------------------------------------------------------------
@@ -197,7 +246,8 @@ class Document:
     def metadata(self) -> RunMetadata:
         """Metadata of the run in the report."""
         names = [self.text("sensors", i, "name") for i in range(self.length("sensors"))]
-        return RunMetadata(
+        said = {name: self.at("grid", name) for name in VARIANTS}
+        found = RunMetadata(
             rate=self.text("grid", "rate_hz"),
             slices=self.number("grid", "slices"),
             t_init_ns=self.number("grid", "t_init_ns"),
@@ -205,6 +255,8 @@ class Document:
             timescale=self.text("timescale"),
             sort=self.text("grid", "sort"),
         )
+        texts = {name: value for name, value in said.items() if isinstance(value, str)}
+        return with_variants(self.log, self.where, found, texts)
 
     def check_number(self, expected: int, *path: str | int) -> None:
         """Check a number of the report against the output."""
@@ -362,7 +414,8 @@ def check_ledgers(report: Document) -> None:
         log.equal("ledger", report.name("sensors", i, "lidar_id"), i, number)
         for section, total, good, others in _LEDGERS:
             path: Keys = ("sensors", i, section)
-            _check_sum(report, (*path, total), (*path, good), report.counts(*path, others))
+            more = report.number(*path, "reused") if report.at(*path, "reused") else 0
+            _check_sum(report, (*path, total), (*path, good), report.counts(*path, others), more)
         path = ("sensors", i, "points")
         outcomes = {name: report.number(*path, name) for name in _OUTCOMES[1:]}
         if None not in outcomes.values():
@@ -390,13 +443,17 @@ def _clipped(report: Document, points: Keys) -> int:
     return 0 if report.at(*path) is None else report.number(*path) or 0
 
 
-def _check_sum(report: Document, total: Keys, good: Keys, others: dict[str, int]) -> None:
-    """Check that a total is its good outcome and the others together."""
+def _check_sum(
+    report: Document, total: Keys, good: Keys, others: dict[str, int], more: int | None = 0
+) -> None:
+    """Check that a total is its good outcome and the others together; more: counted again."""
     said = report.number(*total)
     first = report.number(*good)
     if said is None or first is None:
         return
     parts = [first, *others.values()]
+    if more:
+        parts.append(-more)
     report.log.ok("ledger")
     if said != sum(parts):
         text = " + ".join(map(str, parts))

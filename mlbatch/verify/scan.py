@@ -54,6 +54,8 @@ class StoredScan:
     fill: F32Array | None = None
     # Points by time instead of by column.
     by_time: bool = False
+    # Times of points count from the first column of their sensor.
+    own_times: bool = False
 
     @property
     def point(self) -> str:

@@ -308,7 +308,7 @@ def check_times(log: CheckLog, scan: StoredScan, points: Points, span_ns: int) -
         _check_offsets(log, scan, points, time_ns)
     elif points.row is not None:
         _check_rows(log, scan, points.row, time_ns)
-    elif not scan.organized:
+    elif not scan.organized and (scan.by_time or not scan.own_times):
         _check_steps_back(log, scan, scan.point, time_ns)
 
 
@@ -331,7 +331,7 @@ def _check_offsets(log: CheckLog, scan: StoredScan, points: Points, time_ns: I64
     column = points.row if scan.column is None else scan.column
     if column is None or scan.column_stamp_ns is None or not fits_columns(scan):
         return
-    offset_ns = time_ns - (scan.column_stamp_ns - scan.start_ns)[column]
+    offset_ns = time_ns - (scan.column_stamp_ns - _time_origins(scan))[column]
     log.none(
         "times",
         scan.point,
@@ -341,6 +341,17 @@ def _check_offsets(log: CheckLog, scan: StoredScan, points: Points, time_ns: I64
     )
     if scan.column is not None:
         _check_point_order(log, scan, scan.column.astype(np.int64), time_ns)
+
+
+def _time_origins(scan: StoredScan) -> int | I64Array:
+    """Where times of points count from: the start, or (n,) the first column of each sensor."""
+    stamps = scan.column_stamp_ns
+    owner = scan.column_lidar_id
+    if not scan.own_times or stamps is None or owner is None:
+        return scan.start_ns
+    first: I64Array = np.full(256, np.iinfo(np.int64).max)
+    np.minimum.at(first, owner, stamps)
+    return first[owner]
 
 
 def _check_point_order(
@@ -387,7 +398,8 @@ def _check_rows(log: CheckLog, scan: StoredScan, row: I64Array, time_ns: I64Arra
         f"points within {COLUMN_NS} ns",
         lambda at: f"{int(spread[at])} ns",
     )
-    _check_steps_back(log, scan, f"{scan.where} column with points", first[last >= 0])
+    if not scan.own_times:
+        _check_steps_back(log, scan, f"{scan.where} column with points", first[last >= 0])
 
 
 def check_labels(log: CheckLog, scan: StoredScan, points: Points, sensors: int) -> bool:

@@ -454,8 +454,8 @@ class OutputTotals:
         own[only] = len(scan.xyz)
         return own
 
-    def check_table(self) -> None:
-        """Check scans.csv against the sums."""
+    def check_table(self, *, apart: bool = False) -> None:
+        """Check scans.csv against the sums; apart: no scan continues the one before."""
         table = self._table
         rows = self._rows
         if table is None or rows is None or not self.scans:
@@ -469,24 +469,24 @@ class OutputTotals:
             for sensor, name in enumerate(table.sensors):
                 columns = table.columns_of[:, sensor]
                 checks.equal(f"{_COLUMNS}{name}", columns, rows.columns_of[:, sensor])
-                self._check_gaps(checks, rows, sensor)
+                self._check_gaps(checks, rows, sensor, apart)
         elif self.knows_columns:
             checks.equal("columns", table.columns, rows.columns)
         if self.knows_complete:
             bad = table.complete == rows.incomplete
             checks.none("table", "complete", bad, "the value in the scan", table.complete)
         if table.fill is not None:
-            apart = np.abs(rows.fill - table.fill) > _FILL_ERROR
-            apart |= np.isnan(rows.fill) != np.isnan(table.fill)
+            differs = np.abs(rows.fill - table.fill) > _FILL_ERROR
+            differs |= np.isnan(rows.fill) != np.isnan(table.fill)
             for sensor, name in enumerate(table.sensors):
-                bad = (apart & rows.has_fill)[:, sensor]
+                bad = (differs & rows.has_fill)[:, sensor]
                 at = int(bad.argmax()) if bad.any() else 0
                 expected = f"{rows.fill[at, sensor]:.6g} of the scan"
                 checks.none("table", f"{_FILL}{name}", bad, expected, table.fill[:, sensor])
         if self.knows_times:
             self._check_times(checks, rows)
 
-    def _check_gaps(self, checks: _RowChecks, rows: _RowTotals, sensor: int) -> None:
+    def _check_gaps(self, checks: _RowChecks, rows: _RowTotals, sensor: int, apart: bool) -> None:
         """Widest gaps of a sensor: from its last column before a window to the window's end.
 
         Between lines that do not follow each other there may be columns that were not written.
@@ -498,7 +498,8 @@ class OutputTotals:
         # The last line before with columns of the sensor.
         newest = np.maximum.accumulate(np.where(has_columns, line, -1))
         before = np.concatenate([[-1], newest[:-1]])
-        part = np.concatenate([[0], np.cumsum(table.start_ns[1:] != table.end_ns[:-1])])
+        begins = np.ones(count - 1, bool) if apart else table.start_ns[1:] != table.end_ns[:-1]
+        part = np.concatenate([[0], np.cumsum(begins)])
         is_known = (before >= 0) & (part[before] == part)
         before_ns = np.where(is_known, rows.last_of_ns[before, sensor], table.start_ns)
         first_ns = np.where(has_columns, rows.first_of_ns[:, sensor], table.end_ns)

@@ -20,7 +20,7 @@ CHECKS = {
     "grid": "windows and slices begin and end on the grid: no gap, no overlap, no drift",
     "index": "index and slice are those of the window, and increase",
     "t_init": "scan 0 begins at t_init, a bound of the grid",
-    "stamps": "log time, publish time and header stamp are the start of the window",
+    "stamps": "log time, publish time and header stamp are the start of the window, or as --stamp",
     "columns": "the stamp of a column is inside its window",
     "order": "stamps never decrease; points are in the order of their columns",
     "times": "no point is before its column, or after the end of its column",

@@ -42,6 +42,7 @@ from mlbatch.writers.formats import (
 from mlbatch.writers.threads import jobs_for, parse_jobs
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from mlbatch.types import RunInfo
@@ -57,6 +58,7 @@ __all__ = [
     "check_name",
     "check_options",
     "check_target",
+    "check_variants",
     "choose_format",
     "discard",
     "discard_old",
@@ -78,6 +80,8 @@ __all__ = [
 ]
 
 DEFAULT_FORMAT = "npz"
+# Formats without a header.
+ROWS = ("kitti", "nuscenes")
 
 
 def plugin(name: str) -> WriterModule:
@@ -181,6 +185,22 @@ def check_options(name: str, options: WriterOptions) -> None:
         raise UsageError(
             f"--ply-style: expected {PLY_STYLES[0]} for {name}, found {style!r}; leave it out, or "
             "give --format ply"
+        )
+
+
+def check_variants(name: str, variants: Sequence[tuple[str, str]]) -> None:
+    """Refuse options that the format cannot store; variants: as of `RunInfo`."""
+    given = dict(variants)
+    is_file = plugin(name).SUFFIX is not None
+    if "stamp" in given and not is_file and name != "rosbag2":
+        raise UsageError(
+            f"--stamp: expected start for {name}, whose scans have their start and end, found "
+            f"{given['stamp']!r}; leave it out, or write messages (mcap, rosbag1, rosbag2)"
+        )
+    if "batching" in given and name in ROWS:
+        raise UsageError(
+            f"--batching: expected window for {name}, whose scans have no start and end, found "
+            f"{given['batching']!r}; write another format"
         )
 
 

@@ -19,7 +19,16 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.ros.definitions import FIELD_CODES
 from mlbatch.ros.encoding import Wire
-from mlbatch.types import IMU, ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.types import (
+    IMU,
+    INSTANTS,
+    ImuSamples,
+    Message,
+    RunInfo,
+    Scan,
+    Summary,
+    instant_ns,
+)
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
 from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions
 from mlbatch.writers.output_file import borrow
@@ -208,16 +217,16 @@ class MessageWriter:
         cloud = borrow(self.idle, self._new_cloud)
         if is_kept:
             shape = (scan.points,) if dense else scan.time_ns.T.shape
-            return cloud, cloud.blank(shape, scan.start_ns)
-        return cloud, cloud.assemble(points_of(scan), scan.start_ns, dense)
+            return cloud, cloud.blank(shape, stamp_ns(scan))
+        return cloud, cloud.assemble(points_of(scan), stamp_ns(scan), dense)
 
     def send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
         """Add the message of a scan to its chunk. In order."""
         with export_errors(self._output.partial):
-            self._begin(scan.start_ns)
+            self._begin(stamp_ns(scan))
             self._chunk_of_scan.append(self._file.complete_chunks)
             topic = self._topics[sensor]
-            self._file.send(topic, "sensor_msgs/PointCloud2", scan.start_ns, message)
+            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message)
 
     # -- messages -----------------------------------------------------------------------------
 
@@ -274,7 +283,13 @@ class MessageWriter:
             "timescale": info.timescale,
             "frame_id": info.frame_id,
             "sort": info.sort,
+            **dict(info.variants),
         }
+
+
+def stamp_ns(scan: Scan) -> int:
+    """Return the time of the message of a scan: an instant of its window, by `--stamp`."""
+    return instant_ns(scan.info.variant("stamp", INSTANTS[0]), scan.start_ns, scan.end_ns)
 
 
 class _ChunkJob(ScanJob):

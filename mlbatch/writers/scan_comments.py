@@ -26,6 +26,7 @@ def scan_comments(scan: Scan, units: str = UNITS) -> list[str]:
         f"complete {str(scan.complete).lower()}",
         f"fill {' '.join(map(_share, scan.fill.tolist()))}",
         f"sort {info.sort}",
+        *(f"{name} {value}" for name, value in info.variants),
         f"timescale {info.timescale}",
         f"rate_hz {info.rate_hz}",
         # Frame names come from recordings and may contain line ends.

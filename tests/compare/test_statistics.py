@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from mlbatch.batching.sweeps import Sweep
 from mlbatch.compare.statistics import SetStatistics
-from mlbatch.compare.sweeps import Sweep
 from mlbatch.units import NS_PER_MS
 
 

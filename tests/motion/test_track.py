@@ -13,8 +13,8 @@ from mlbatch.motion.track import (
     PoseTrack,
     column_motion,
     constant_twist,
-    instant_ns,
 )
+from mlbatch.types import instant_ns
 
 S = 1_000_000_000
 

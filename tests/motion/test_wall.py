@@ -14,9 +14,10 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.imu import integrated
-from mlbatch.motion.track import PoseTrack, column_motion, instant_ns
+from mlbatch.motion.track import PoseTrack, column_motion
 from mlbatch.motion.tum import read_tum
 from mlbatch.outputs.scan import Scan
+from mlbatch.types import instant_ns
 from tests.builders.simulated import Recorded, record, scenario_text
 
 WALL = 200

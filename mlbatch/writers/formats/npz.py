@@ -75,6 +75,7 @@ class NpzEncoder:
             "timescale": np.array(info.timescale, dtype=np.str_),
             "sort": np.array(info.sort, dtype=np.str_),
             "schema": np.array(SCHEMA, dtype=np.str_),
+            **{name: np.array(value, dtype=np.str_) for name, value in info.variants},
         }
 
     def encode(self, scan: Scan) -> list[Bytes]:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.compare.sweeps import (
+from mlbatch.batching.sweeps import (
     CollectedSweeps,
     JoinPolicy,
     NearestSweeps,

@@ -22,6 +22,10 @@ from mlbatch.units import NS_PER_MS
 LONGEST_SWEEP_NS = 250 * NS_PER_MS
 # Length of the sweeps of sensors without a rotor.
 PART_NS = 100 * NS_PER_MS
+# Approximate time: half a revolution at 10 Hz.
+DEFAULT_TOLERANCE_NS = 50 * NS_PER_MS
+# Timeout collate: one revolution at 10 Hz.
+DEFAULT_TIMEOUT_NS = 100 * NS_PER_MS
 # A rotor position that falls by more than this fraction of a revolution begins a new sweep: more
 # than the jitter of angles, less than the narrowest azimuth window of a sensor.
 _MIN_FALL = 0.01
@@ -91,6 +95,11 @@ class SweepCutter:
         self._open = _extended(sweep, stamp_ns[begin:], int(stamp_ns[-1]))
         self._angle = float(angle[-1])
         return ended
+
+    @property
+    def open_columns(self) -> int | None:
+        """Columns of the sweep that has not ended; None before the first cut."""
+        return self._open.columns if self._is_whole and self._open is not None else None
 
     def _revolutions(self, encoder: I64Array) -> F64Array:
         """Rotor positions in revolutions."""

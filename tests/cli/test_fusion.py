@@ -1,0 +1,201 @@
+"""`--batching` and `--stamp`: frame-level fusion as output, and the stamps of messages."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+import mlbatch
+from mlbatch.compare.compare import compare
+from mlbatch.pipeline.job import Job
+from tests.builders.phases import CASES, write_case
+from tests.builders.sessions import FIXTURE, Shell, arrays, names, report_of
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+WORDS = f"convert {CAPTURE} --rig {RIG} -q"
+POLICIES = {
+    "latest": "latest sweeps",
+    "approximate": "approximate time",
+    "collate": "timeout collate",
+}
+NS = 10**9
+
+
+# -- frame-level fusion ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("case", ["10 Hz, 37 ms apart", "10 Hz with 20 Hz"])
+def test_sets_are_those_of_compare(shell: Shell, policy: str, case: str) -> None:
+    """`compare` measures the sets that `convert` writes."""
+    capture = write_case(Path("case"), CASES[case])
+    words = f"convert {capture} --identity-extrinsics -q --report report.json"
+    assert shell(f"{words} --batching {policy} -o sets").code == 0
+    own = next(one for one in compare(Job((capture,))).reports if one.policy == POLICIES[policy])
+    found = [arrays(f"sets/{name}") for name in names("sets")]
+    assert len(found) == own.sets
+    spans_ms = [np.ptp(one["column_stamp_ns"]) / 1e6 for one in found]
+    assert max(spans_ms) == pytest.approx(own.span_ms.max)
+    assert min(spans_ms) == pytest.approx(own.span_ms.min)
+    used: list[tuple[int, int]] = []
+    for one in found:
+        used += zip(one["column_lidar_id"].tolist(), one["column_stamp_ns"].tolist(), strict=True)
+    assert len(used) - len(set(used)) == own.used_twice
+
+
+def test_own_times_count_from_the_first_column_of_a_sensor(shell: Shell) -> None:
+    """As drivers give them; all else is as with common times."""
+    for times in ("common", "own"):
+        line = f"{WORDS} --batching latest --batching-times {times} -o {times}"
+        assert shell(line).code == 0
+    late = 0
+    for name in names("common"):
+        common = arrays(f"common/{name}")
+        own = arrays(f"own/{name}")
+        for key in ("xyz", "ring", "column_stamp_ns", "start_ns", "end_ns", "column"):
+            np.testing.assert_array_equal(common[key], own[key], err_msg=key)
+        for sensor in range(2):
+            columns = common["column_stamp_ns"][common["column_lidar_id"] == sensor]
+            begins_ns = int(columns.min()) - int(common["start_ns"])
+            points = common["lidar_id"] == sensor
+            np.testing.assert_array_equal(
+                own["time_ns"][points].astype(np.int64),
+                common["time_ns"][points].astype(np.int64) - begins_ns,
+            )
+            late += begins_ns
+        assert int(common["start_ns"]) == int(common["column_stamp_ns"].min())
+    assert late > 0
+
+
+@pytest.mark.parametrize("times", ["common", "own"])
+@pytest.mark.parametrize(
+    "output",
+    [
+        *("out.mcap", "out.bag", "out --format rosbag2 --point-layout hesai", "out --format npz"),
+        *("out --format ply", "out --format pcd", "out --format las", "out --layout organized"),
+        *("out.mcap --layout organized", "out --sort points", "out.mcap --stamp end --sort points"),
+        "out.mcap --point-layout autoware",
+    ],
+)
+def test_sets_can_be_checked_and_read(shell: Shell, output: str, times: str) -> None:
+    line = f"{WORDS} --batching latest --batching-times {times} -o {output} --fault drop:left:10%"
+    assert shell(line).code == 0
+    path = output.split()[0]
+    verified = shell(f"verify {path} --json")
+    assert verified.code == 0, verified.out
+    checks = {one["name"]: one for one in json.loads(verified.out)["checks"]}
+    for name in ("grid", "t_init"):
+        assert checks[name]["outcome"] == "not checkable"
+        assert "on no grid" in checks[name]["limit"]
+    scans = list(mlbatch.read(path))
+    assert [scan.index for scan in scans] == list(range(len(scans)))
+    assert len(scans) > 3
+    for before, scan in pairwise(scans):
+        assert before.end_ns < scan.end_ns
+        assert scan.end_ns > scan.start_ns
+
+
+def test_the_report_says_that_it_is_frame_level_fusion(shell: Shell) -> None:
+    done = shell(f"convert {CAPTURE} --rig {RIG} --batching collate -o out.mcap --html page.html")
+    assert done.code == 0
+    assert "sets of sweeps (0 incomplete), frame-level fusion collate, common times" in done.out
+    report = report_of("out.mcap.report.json")
+    assert report["grid"]["batching"] == "collate"
+    assert report["grid"]["batching_times"] == "common"
+    for sensor in report["sensors"]:
+        columns = sensor["columns"]
+        assert set(columns["dropped"]) <= {"part_sweep", "no_set", "before_start"}
+        again = columns.get("reused", 0)
+        assert columns["decoded"] + again == columns["written"] + sum(columns["dropped"].values())
+    with Path("out.mcap").open("rb") as file:
+        grid = next(one for one in make_reader(file).iter_metadata() if one.name == "mlbatch.grid")
+    assert grid.metadata["batching"] == "collate"
+
+
+def test_reused_columns_are_counted(shell: Shell) -> None:
+    """Sweeps of 5 Hz are used by about two sweeps of 10 Hz."""
+    capture = write_case(Path("case"), CASES["10.00 Hz with 9.95 Hz"])
+    line = f"convert {capture} --identity-extrinsics --batching latest -o out -q --only os-1001"
+    # The slower one repeats a sweep once in 20 s, seen from the faster one.
+    line = line.removesuffix(" --only os-1001")
+    assert shell(line).code == 0
+    left, right = report_of("out/report.json")["sensors"]
+    assert left["columns"].get("reused", 0) == 0
+    assert right["columns"]["reused"] > 0
+    assert right["columns"]["reused"] % 512 == 0
+    assert shell("verify out").code == 0
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+@pytest.mark.parametrize("engine", ["numpy", "native"])
+def test_bytes_do_not_depend_on_engine_and_jobs(shell: Shell, engine: str, jobs: int) -> None:
+    words = f"{WORDS} --batching latest --batching-times own"
+    assert shell(f"{words} -o one.mcap --engine numpy").code == 0
+    assert shell(f"{words} -o two.mcap --engine {engine} --jobs {jobs}").code == 0
+    assert Path("one.mcap").read_bytes() == Path("two.mcap").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--batching latest --slices 5", "--slices: expected windows, found --batching latest"),
+        ("--batching latest --split", "--split: expected windows, found --batching latest"),
+        ("--batching best", "--batching: expected window, latest, approximate, collate"),
+        ("--batching latest --batching-times mine", "--batching-times: expected common, own"),
+        ("--batching-times own", "--batching-times: expected common for windows, found own"),
+        ("--batching latest --format kitti", "--batching: expected window for kitti"),
+        ("--stamp end", "--stamp: expected start for npz"),
+        ("--stamp first", "--stamp: expected start or middle or end"),
+    ],
+)
+def test_options_without_a_meaning(shell: Shell, words: str, message: str) -> None:
+    done = shell(f"{WORDS} -o out {words}")
+    assert done.code == 2
+    assert message in done.err
+    assert not Path("out").exists()
+
+
+# -- stamps ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stamp", "after_ns"), [("start", 0), ("middle", NS // 20), ("end", NS // 10)]
+)
+@pytest.mark.parametrize("output", ["out.mcap", "out.bag"])
+def test_stamps_of_messages(shell: Shell, output: str, stamp: str, after_ns: int) -> None:
+    """10 Hz: windows begin at whole tenths of a second; times still count from there."""
+    assert shell(f"{WORDS} -o usual.mcap").code == 0
+    assert shell(f"{WORDS} -o {output} --stamp {stamp} --overwrite").code == 0
+    verified = shell(f"verify {output}")
+    assert verified.code == 0, verified.out
+    for usual, scan in zip(mlbatch.read("usual.mcap"), mlbatch.read(output), strict=True):
+        assert (scan.index, scan.start_ns, scan.end_ns) == (
+            *(usual.index, usual.start_ns, usual.end_ns),
+        )
+        np.testing.assert_array_equal(scan.xyz, usual.xyz)
+        np.testing.assert_array_equal(scan.time_ns, usual.time_ns)
+    if output == "out.mcap":
+        with Path(output).open("rb") as file:
+            clouds = [message for _, _, message in make_reader(file).iter_messages(["/points"])]
+        for cloud in clouds:
+            second, rest = np.frombuffer(cloud.data[4:12], "<u4").tolist()
+            assert cloud.log_time == second * NS + rest
+            assert (cloud.log_time - after_ns) % (NS // 10) == 0
+
+
+def test_verify_finds_a_stamp_of_another_instant(shell: Shell) -> None:
+    """Middle of the window instead of its end: other bytes than the metadata say."""
+    assert shell(f"{WORDS} -o out.mcap --stamp middle").code == 0
+    data = Path("out.mcap").read_bytes()
+    assert data.count(b"stamp\x06\x00\x00\x00middle") == 1
+    report = Path("out.mcap.report.json")
+    report.write_text(report.read_text().replace('"stamp": "middle"', '"stamp": "end"'))
+    verified = shell("verify out.mcap")
+    assert verified.code == 1
+    assert "grid.stamp" in verified.out + verified.err
