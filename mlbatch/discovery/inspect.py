@@ -40,7 +40,7 @@ from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RigError
-from mlbatch.readers import merge, open_recording
+from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
@@ -306,7 +306,7 @@ def inspect(
     """
     table = StreamTable()
     discovery = discover(
-        [open_recording(path, table) for path in recordings],
+        open_recordings(recordings, table, rig),
         table,
         SensorSelection(rig=rig, metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,

@@ -22,7 +22,7 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
-from mlbatch.readers import merge, open_recording
+from mlbatch.readers import merge, open_recordings
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
@@ -55,7 +55,7 @@ class Session:
         self._received_ns: tuple[int, int] | None = None
         self._overlap: RunOverlap | None = None
         streams = StreamTable()
-        opened = [open_recording(path, streams) for path in job.recordings]
+        opened = open_recordings(job.recordings, streams, job.selection.rig)
         self.engine = choose_engine(job.engine)
         for recording in opened:
             recording.use_engine(self.engine)

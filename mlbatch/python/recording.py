@@ -29,7 +29,7 @@ from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import time_limit
 from mlbatch.python.options import Box, Moment, Rate, ScanOptions
-from mlbatch.readers import merge, open_recording
+from mlbatch.readers import merge, open_recordings
 from mlbatch.types import ImuSamples, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -106,7 +106,7 @@ class Recording:
 
     def _discover(self) -> Discovery:
         table = StreamTable()
-        opened = [open_recording(path, table) for path in self.job.recordings]
+        opened = open_recordings(self.job.recordings, table, self.job.selection.rig)
         engine = choose_engine(self.job.engine)
         for recording in opened:
             recording.use_engine(engine)

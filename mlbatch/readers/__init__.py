@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 from mlbatch import entry_points
 from mlbatch.errors import RecordingError
 from mlbatch.readers import formats
+from mlbatch.readers.datasets import found_in_file
 from mlbatch.readers.merge import merge
 from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable, Topic
@@ -30,6 +31,7 @@ __all__ = [
     "has_packets",
     "merge",
     "open_recording",
+    "open_recordings",
     "readers",
 ]
 
@@ -73,6 +75,22 @@ def open_recording(path: Path, streams: StreamTable) -> Recording:
     if path.is_dir():
         return _open_folder(path, streams)
     return _reader_of(path).open_packets(path, streams)
+
+
+def open_recordings(
+    paths: Sequence[Path], streams: StreamTable, rig: Path | None
+) -> list[Recording]:
+    """Open the recordings of a session; rig: a file that may describe folders of sweeps."""
+    if rig is not None and any(path.is_dir() for path in paths):
+        # Not loaded for captures.
+        from mlbatch.rig.rig import read_rig
+
+        sensors = [sensor for sensor in read_rig(rig).sensors if sensor.sweeps is not None]
+        if sensors:
+            from mlbatch.readers.sweeps import open_with_sweeps
+
+            return open_with_sweeps(paths, streams, sensors)
+    return [open_recording(path, streams) for path in paths]
 
 
 def has_packets(topic: Topic) -> bool:
@@ -121,6 +139,9 @@ def _reader_of(path: Path) -> Reader:
     for reader in _other_readers():
         if reader.recognises(head):
             return reader
+    known = found_in_file(path, head)
+    if known:
+        raise RecordingError(f"{path}: expected a recording, {known}")
     containers = ", ".join(reader.CONTAINER for reader in readers())
     raise RecordingError(
         f"{path}: expected a recording ({containers}; also gzip or zstd of them), found a file "

@@ -57,6 +57,18 @@ class UnknownExtrinsics(NamedTuple):
     place: str = ""
 
 
+class Sweeps(NamedTuple):
+    """Files of a sensor, one a sweep, in the folder that is given as recording.
+
+    glob: pattern in the folder, and topic of the sensor; fields: name and numpy type of each field
+    of a point, empty: PCD; place: file, line and key path of the pattern.
+    """
+
+    glob: str
+    fields: tuple[tuple[str, str], ...]
+    place: str = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
     """One sensor of the rig; None: taken from the recording.
@@ -64,7 +76,7 @@ class RigSensor:
     extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
     unknown; extrinsics_files: files that it was read from; clock: sensor or host; epoch: of the
     sensor's clock, utc, tai or gps; offset_ns: added to the timestamps; decode: options as for
-    `--decode`; points: how its clouds are read.
+    `--decode`; points: how its clouds are read; sweeps: its files, of a folder of sweeps.
     """
 
     name: str
@@ -81,6 +93,7 @@ class RigSensor:
     optional: bool = False
     decode: dict[str, str] = field(default_factory=dict)
     points: PointRule | None = None
+    sweeps: Sweeps | None = None
 
 
 def no_boxes() -> F64Array:

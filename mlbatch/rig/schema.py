@@ -42,6 +42,7 @@ from mlbatch.rig.rig import (
     Rig,
     RigSensor,
     StreamSelector,
+    Sweeps,
     UnknownExtrinsics,
     no_boxes,
 )
@@ -149,6 +150,48 @@ def _points(node: Node) -> PointRule:
         ring=_POINT_RING.of(fields),
         places={key: value.place for key, value in fields.items()},
     )
+
+
+def _sweeps(node: Node) -> Sweeps | None:
+    """Return the files of a folder of sweeps, None where `points` names none."""
+    fields = node.entries
+    if "glob" not in fields:
+        return None
+    return Sweeps(_GLOB.of(fields), _DTYPE.of(fields), fields["glob"].place)
+
+
+def _glob(node: Node) -> str:
+    text = node.word("a pattern of files, as Ouster/*.bin", _WORD)
+    if text.startswith("/") or ".." in text.split("/"):
+        remedy = "give the folder as recording, and the pattern relative to it"
+        raise node.error("a pattern within the folder of the recording", node.shown, remedy)
+    return text
+
+
+def _dtype(node: Node) -> tuple[tuple[str, str], ...]:
+    """Return name and type of each field of a point, in order, without gaps."""
+    if node.kind != "mapping" or not node.entries:
+        remedy = "write {x: f4, y: f4, z: f4, t: u4}, in the order of the file"
+        raise node.error("a mapping of fields to numpy types", node.shown, remedy)
+    return tuple((name, _field_type(value)) for name, value in node.entries.items())
+
+
+def _field_type(node: Node) -> str:
+    text = node.word("a numpy type", _WORD)
+    found = _PADDING.fullmatch(text)
+    if found is None:
+        # `float32` and `<f4` are names of f4.
+        try:
+            kind = np.dtype(text)
+        except TypeError:
+            kind = np.dtype(object)
+        word = f"{kind.kind}{kind.itemsize}"
+        if kind.byteorder != ">" and word in FIELD_TYPES:
+            return word
+        remedy = "write the file with these types, or V3 for 3 bytes without meaning"
+        expected = f"one of {', '.join(FIELD_TYPES)}, little endian"
+        raise node.error(expected, node.shown, remedy)
+    return f"V{int(found[1])}"
 
 
 def _clock(node: Node) -> Mapping[str, Node]:
@@ -304,7 +347,22 @@ _POINT_ORIGIN = Key(
     "the header's stamp is that of the first point, of the last one; or times count from 1970",
 )
 _POINT_RING = Key("ring", _word("the name of a field"), "", WORD, "field with the ring of a point")
-_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING)
+# Of a sensor_msgs/PointField.
+FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_PADDING = re.compile(r"V([1-9]\d{0,3})", re.ASCII)
+_GLOB = Key("glob", _glob, "", WORD, "files of sweeps in the folder of the recording")
+_DTYPE: Key[tuple[tuple[str, str], ...]] = Key(
+    "dtype",
+    _dtype,
+    (),
+    {
+        "type": "object",
+        "additionalProperties": text_form(r"[<|=]?\w+"),
+        "minProperties": 1,
+    },
+    "fields of a point in the files, and their numpy types, in order; PCD states its own",
+)
+_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING, _GLOB, _DTYPE)
 
 _CLOCK_SOURCE: Key[str | None] = Key(
     "source",
@@ -386,6 +444,7 @@ _NEEDS = {
     "key": "direction",
     "direction": "file",
     "sensor_in_frame": "file",
+    "dtype": "glob",
 }
 # Keys of streams and extrinsics that exclude others.
 _EXCLUDES = {
@@ -453,8 +512,8 @@ _POINTS: Key[PointRule | None] = Key(
     "points",
     _points,
     None,
-    mapping_form(_POINTS_KEYS, may_be_empty=False),
-    "how decoded clouds are read; only with a topic",
+    mapping_form(_POINTS_KEYS, needs=_NEEDS, may_be_empty=False),
+    "how decoded clouds are read; only with a topic, or files of sweeps",
 )
 _SENSOR_KEYS = (
     _SENSOR_NAME,
@@ -543,6 +602,12 @@ def _sensor(node: Node, body_frame: str) -> RigSensor:
     fields = node.fields(names(_SENSOR_KEYS), required=("name",))
     clock = _CLOCK.of(fields)
     stream = _STREAM.of(fields)
+    sweeps = _sweeps(fields["points"]) if "points" in fields else None
+    if sweeps is not None:
+        if "stream" in fields:
+            found = f"glob as well (line {fields['points'].entries['glob'].line})"
+            raise fields["stream"].error("a stream without glob", found, "keep one of the two")
+        stream = StreamSelector(topic=sweeps.glob)
     given = _EXTRINSICS.of(fields)
     extrinsics, files = _of_files(given, body_frame, "" if stream is None else stream.serial)
     sensor = RigSensor(
@@ -560,10 +625,14 @@ def _sensor(node: Node, body_frame: str) -> RigSensor:
         optional=_OPTIONAL.of(fields),
         decode=_DECODE.of(fields),
         points=_POINTS.of(fields),
+        sweeps=sweeps,
     )
     if sensor.points is not None and (sensor.stream is None or not sensor.stream.topic):
         points = fields["points"]
-        remedy = "give the topic of its clouds as stream: {topic: ...}, or remove points"
+        remedy = (
+            "give the topic of its clouds as stream: {topic: ...}, files of sweeps as glob, or "
+            "remove points"
+        )
         raise points.error("a sensor on a topic", "none", remedy)
     low_m = sensor.min_range_m or 0.0
     high_m = sensor.max_range_m
@@ -601,9 +670,9 @@ def _check_distinct(node: Node, rig: Rig) -> None:
             raise _repeated(name, "a name", seen[sensor.name], "rename one of the two sensors")
         seen[sensor.name] = name
         if sensor.stream is not None:
-            stream = item.entries["stream"]
+            stream = item.entries["stream" if sensor.sweeps is None else "points"]
             if sensor.stream in seen:
-                remedy = "give each sensor its own source_ip, port, topic or serial"
+                remedy = "give each sensor its own source_ip, port, topic, serial or glob"
                 raise _repeated(stream, "a stream", seen[sensor.stream], remedy)
             seen[sensor.stream] = stream
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
 from mlbatch.rig.convert_keys import RigOption
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, Sweeps, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
@@ -64,7 +64,7 @@ def _option_text(option: RigOption) -> str:
 def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
     yield f"name: {_text(sensor.name)}"
     yield f"model: {_text(sensor.model or 'auto')}"
-    if sensor.stream is not None:
+    if sensor.stream is not None and sensor.sweeps is None:
         yield f"stream: {_stream_text(sensor.stream)}"
     if sensor.metadata is not None:
         yield f"metadata: {_text(_path_from(folder, sensor.metadata))}"
@@ -85,7 +85,16 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
     if sensor.decode:
         yield "decode: " + _braces({_text(k): _text(v) for k, v in sensor.decode.items()})
     if sensor.points is not None:
-        yield "points: " + _braces({key: _text(v) for key, v in sensor.points.keys().items() if v})
+        points = {key: _text(value) for key, value in sensor.points.keys().items() if value}
+        if sensor.sweeps is not None:
+            points["glob"] = _text(sensor.sweeps.glob)
+            points["dtype"] = _dtype_text(sensor.sweeps)
+        yield "points: " + _braces(points)
+
+
+def _dtype_text(sweeps: Sweeps) -> str:
+    fields = {_text(name): _text(kind) for name, kind in sweeps.fields}
+    return _braces(fields) if fields else ""
 
 
 def _stream_text(stream: StreamSelector) -> str:

@@ -163,7 +163,7 @@ MISTAKES: list[tuple[str, str]] = [
      f"found 'base-link'; {FIX}"),
     # Clouds.
     (one("stream: {topic: /a}\n    points: {tme: t}"),
-     f"4: {S}.points.tme: expected a key of time, unit, from, ring, found 'tme'; "
+     f"4: {S}.points.tme: expected a key of time, unit, from, ring, glob, dtype, found 'tme'; "
      "the nearest known key is time"),
     (one("stream: {topic: /a}\n    points:\n      unit: min"),
      f"5: {S}.points.unit: expected s or ms or us or ns, found 'min'; use one of these words"),
@@ -171,11 +171,12 @@ MISTAKES: list[tuple[str, str]] = [
      f"4: {S}.points.from: expected start or end or absolute, found 'middle'; "
      "use one of these words"),
     (one("stream: {topic: /a}\n    points: {}"),
-     f"4: {S}.points: expected at least one of time, unit, from, ring, found none; "
+     f"4: {S}.points: expected at least one of time, unit, from, ring, glob, dtype, found none; "
      "add one of them"),
     (one("points: {unit: us}"),
      f"3: {S}.points: expected a sensor on a topic, found none; "
-     "give the topic of its clouds as stream: {topic: ...}, or remove points"),
+     "give the topic of its clouds as stream: {topic: ...}, files of sweeps as glob, or "
+     "remove points"),
     (one("stream: {port: 1, frame_id: a}"),
      f"3: {S}.stream.frame_id: expected frame_id with topic, found no topic; add the topic"),
     (one("stream: {topic: /a, lidar_id: -1}"),
@@ -204,7 +205,7 @@ MISTAKES: list[tuple[str, str]] = [
     (two("name: a, stream: {port: 7502}", "name: b, stream: {port: 7502.0}"),
      "3: sensors[1].stream: expected a stream of its own, "
      "found that of sensors[0].stream (line 2) again; "
-     "give each sensor its own source_ip, port, topic or serial"),
+     "give each sensor its own source_ip, port, topic, serial or glob"),
     # Extrinsics.
     (one("extrinsics: {}"), f"3: {X}: expected at least one of {X_KEYS}, found none; add one "
                             "of them"),

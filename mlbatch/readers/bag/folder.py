@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.errors import RecordingError, RigError
+from mlbatch.readers.datasets import found_in_folder
 
 _BAG_FILE = re.compile(r"\.(db3|mcap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
 _METADATA = "metadata.yaml"
@@ -36,6 +37,9 @@ def bag_folder(folder: Path) -> BagFolder:
             "check its access rights"
         ) from err
     if not files:
+        known = found_in_folder(folder)
+        if known:
+            raise RecordingError(f"{folder}: expected a recording, {known}")
         raise RecordingError(
             f"{folder}: expected a recording, found a folder without .db3 or .mcap files; "
             "name the files inside it"

@@ -1,0 +1,180 @@
+"""A folder of sweeps as a recording of PointCloud2 messages.
+
+Counts: a file that cannot be read is one frame, `truncated`; a file that can is counted as the
+cloud that it becomes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.errors import RecordingError
+from mlbatch.readers.sweeps.files import SweepError, read_sweep
+from mlbatch.rig.rig import RigSensor, Sweeps
+from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+CLOUD_TYPE = "sensor_msgs/PointCloud2"
+# Unit of a whole number by its digits: those of times from 2001 to 2286.
+_UNITS_NS = {10: NS_PER_S, 13: NS_PER_MS, 16: NS_PER_US, 19: 1}
+# Seconds with decimals are exact to the nanosecond.
+_SECONDS = re.compile(r"(\d{10})[._](\d{1,9})", re.ASCII)
+_WHOLE = re.compile(r"\d+", re.ASCII)
+_LATEST_NS = 2**31 * NS_PER_S
+# A batch ends with the file that exceeds this.
+_BATCH_BYTES = 8 << 20
+_MOST_NOTES = 100
+# Files that are checked before all others are read.
+_CHECKED = 8
+_NONE = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class _SweepFile:
+    """A file of a sensor; stamp_ns: of its name."""
+
+    stamp_ns: int
+    path: Path
+    topic: Topic
+    sweeps: Sweeps
+    size_bytes: int
+
+
+@dataclass(slots=True)
+class SweepRecording(Recording):
+    """The sweeps of all sensors of a rig in a folder, in the order of their times."""
+
+    files: tuple[_SweepFile, ...] = ()
+
+    @classmethod
+    def of_folder(cls, folder: Path, sensors: Sequence[RigSensor]) -> SweepRecording | None:
+        """The sweeps in a folder; None without any, RecordingError for names without a time."""
+        found: list[_SweepFile] = []
+        topics: list[Topic] = []
+        for sensor in sensors:
+            files = [] if sensor.sweeps is None else _files(folder, sensor.sweeps)
+            if files:
+                topics.append(files[0].topic)
+                found += files
+        if not found:
+            return None
+        found.sort(key=lambda file: file.stamp_ns)
+        return cls(
+            folder,
+            "sweeps",
+            sum(file.size_bytes for file in found),
+            topics=tuple(topics),
+            last_ns=found[-1].stamp_ns,
+            files=tuple(found),
+        )
+
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield the sweeps of kept topics as messages, in the order of their times."""
+        self.counts = CaptureCounts()
+        self.notes = []
+        self.position_bytes = 0
+        messages: list[Message] = []
+        size = 0
+        for file in self.files:
+            self.position_bytes += file.size_bytes
+            if file.topic.name not in self.keep:
+                continue
+            message = self._message(file)
+            if message is not None:
+                messages.append(message)
+                size += len(message.data)
+            if size >= _BATCH_BYTES:
+                yield _batch(messages)
+                messages = []
+                size = 0
+        if messages:
+            yield _batch(messages)
+
+    def _message(self, file: _SweepFile) -> Message | None:
+        """The message of a file; None where it cannot be read, which is counted and noted."""
+        try:
+            data = read_sweep(file.path, file.sweeps, file.stamp_ns)
+        except SweepError as err:
+            self.counts.frames += 1
+            self.counts.skip("truncated")
+            if len(self.notes) < _MOST_NOTES:
+                self.notes.append(str(err))
+            return None
+        return Message(file.topic, file.stamp_ns, data)
+
+
+def _batch(messages: list[Message]) -> PacketBatch:
+    return PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE, tuple(messages))
+
+
+def _files(folder: Path, sweeps: Sweeps) -> list[_SweepFile]:
+    """The files of a sensor in the order of their times; RecordingError where these are unclear."""
+    paths = sorted(path for path in folder.glob(sweeps.glob) if path.is_file())
+    topic = Topic(sweeps.glob, CLOUD_TYPE, "ros1")
+    found: dict[int, _SweepFile] = {}
+    unit_ns = 0
+    for path in paths:
+        stamp_ns, own_unit_ns = _stamp_ns(path, sweeps)
+        if unit_ns not in (0, own_unit_ns):
+            raise RecordingError(
+                f"{path}: expected a time with the digits of {paths[0].name}, found another "
+                f"unit; correct the pattern {sweeps.glob} ({sweeps.place})"
+            )
+        unit_ns = own_unit_ns
+        other = found.get(stamp_ns)
+        if other is not None:
+            raise RecordingError(
+                f"{path}: expected each time once, found that of {other.path} again; give each "
+                f"lidar a sensor with a pattern of its own ({sweeps.place})"
+            )
+        size = path.stat().st_size
+        found[stamp_ns] = _SweepFile(stamp_ns, path, topic, sweeps, size)
+    files = sorted(found.values(), key=lambda file: file.stamp_ns)
+    _check_first(files)
+    return files
+
+
+def _check_first(files: Sequence[_SweepFile]) -> None:
+    """Refuse a description that less than half of the first files fit."""
+    checked = files[:_CHECKED]
+    faults = [fault for file in checked if (fault := _fault(file))]
+    if len(faults) * 2 > len(checked):
+        raise RecordingError(
+            f"{faults[0]} ({len(faults)} of the first {len(checked)} files, "
+            f"{checked[0].sweeps.place})"
+        )
+
+
+def _fault(file: _SweepFile) -> str:
+    """Why a file cannot be read, or ""."""
+    try:
+        read_sweep(file.path, file.sweeps, file.stamp_ns)
+    except SweepError as err:
+        return str(err)
+    return ""
+
+
+def _stamp_ns(path: Path, sweeps: Sweeps) -> tuple[int, int]:
+    """The time in the name of a file, and the unit of its digits, ns."""
+    text = path.stem
+    seconds = _SECONDS.fullmatch(text)
+    if seconds:
+        whole, decimals = seconds.groups()
+        stamp_ns = int(whole) * NS_PER_S + int(decimals.ljust(9, "0"))
+        unit_ns = NS_PER_S
+    else:
+        is_whole = _WHOLE.fullmatch(text) is not None
+        unit_ns = _UNITS_NS.get(len(text), 0) if is_whole else 0
+        stamp_ns = int(text) * unit_ns if unit_ns else 0
+    if not 0 < stamp_ns < _LATEST_NS:
+        raise RecordingError(
+            f"{path}: expected the time of the sweep as its name (10 digits of s since 1970, 13 "
+            f"of ms, 16 of us, 19 of ns, or s with decimals), found {text!r}; rename the files by "
+            f"the dataset's list of times, or correct the pattern {sweeps.glob} ({sweeps.place})"
+        )
+    return stamp_ns, unit_ns

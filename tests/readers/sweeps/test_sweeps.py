@@ -1,0 +1,305 @@
+"""Folders with a file for each sweep: points at their own times, and mistakes in one line.
+
+Stamps are known by construction: column n of a sweep is measured n ms after the time in its name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mlbatch.readers.datasets import DATASET_FILES
+from mlbatch.rig.rig import read_rig
+from mlbatch.rig.write import write_rig
+from tests.builders.run import scan_files
+from tests.builders.sessions import Shell
+from tests.builders.sweeps import dtype_text, pcd, raw, write_sweeps
+
+MS = 1_000_000
+START_NS = 1_700_000_000_000_000_000
+SWEEPS = 4
+COLUMNS = 98
+RINGS = 4
+FIELDS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4", "ring": "u2"}
+POINTS = [
+    (5.0, float(ring), 2.0, 9.0, column * MS, ring)
+    for column in range(COLUMNS)
+    for ring in range(RINGS)
+]
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    monkeypatch.chdir(tmp_path)
+    return Shell(monkeypatch, capsys)
+
+
+def _starts() -> list[int]:
+    return [START_NS + number * 100 * MS for number in range(SWEEPS)]
+
+
+def _names(suffix: str = ".bin") -> dict[str, bytes]:
+    return {f"{start}{suffix}": raw(FIELDS, POINTS) for start in _starts()}
+
+
+def _rig(points: str) -> None:
+    text = (
+        f"sensors:\n- name: top\n  points: {points}\n  extrinsics: {{translation_m: [0, 0, 1]}}\n"
+    )
+    Path("rig.yaml").write_text(text)
+
+
+GLOB = f"{{glob: top/*.bin, dtype: {dtype_text(FIELDS)}, from: start}}"
+
+
+def _run(shell: Shell, points: str = GLOB) -> Any:
+    _rig(points)
+    return shell("convert drive --rig rig.yaml -o out --keep-partial --overwrite")
+
+
+def _columns(folder: str = "out") -> list[int]:
+    stamps: set[int] = set()
+    for path in scan_files(Path(folder)):
+        with np.load(path) as scan:
+            stamps |= set((scan["column_stamp_ns"] - START_NS).tolist())
+    return sorted(stamps)
+
+
+def _xyz(folder: str = "out") -> Any:
+    found = []
+    for path in scan_files(Path(folder)):
+        with np.load(path) as scan:
+            found.append(scan["xyz"])
+    return np.concatenate(found)
+
+
+EXPECTED = [number * 100 * MS + n * MS for number in range(SWEEPS) for n in range(COLUMNS)]
+
+
+def test_points_are_at_the_time_of_the_name_and_their_own(shell: Shell) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    outcome = _run(shell)
+    assert outcome.code == 0, outcome.err
+    assert _columns() == EXPECTED
+    xyz = _xyz()
+    assert len(xyz) == SWEEPS * COLUMNS * RINGS
+    # 1 m higher by the extrinsics.
+    np.testing.assert_array_equal(np.unique(xyz[:, 2]), [3.0])
+    np.testing.assert_array_equal(np.unique(xyz[:, 1]), [0.0, 1.0, 2.0, 3.0])
+    report = json.loads(Path("out/report.json").read_text())
+    assert report["sensors"][0]["points"]["written"] == SWEEPS * COLUMNS * RINGS
+    assert [one["code"] for one in report["warnings"]] == ["clouds"]
+    assert shell("verify out").code == 0
+
+
+@pytest.mark.parametrize("data", ["binary", "ascii"])
+def test_pcd_gives_the_same_scans(shell: Shell, data: str) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    assert _run(shell).code == 0
+    expected = _xyz()
+    for path in Path("drive/top").iterdir():
+        path.unlink()
+    write_sweeps(
+        Path("drive/top"), {f"{start}.pcd": pcd(FIELDS, POINTS, data) for start in _starts()}
+    )
+    outcome = _run(shell, "{glob: top/*.pcd, from: start}")
+    assert outcome.code == 0, outcome.err
+    assert _columns() == EXPECTED
+    np.testing.assert_array_equal(_xyz(), expected)
+
+
+def test_two_lidars_in_folders_of_their_own(shell: Shell) -> None:
+    write_sweeps(Path("drive/a"), _names())
+    write_sweeps(Path("drive/b"), {f"{s + 50 * MS}.bin": raw(FIELDS, POINTS) for s in _starts()})
+    text = f"dtype: {dtype_text(FIELDS)}, from: start"
+    Path("rig.yaml").write_text(
+        f"sensors:\n- {{name: a, points: {{glob: a/*.bin, {text}}}, extrinsics: "
+        f"{{translation_m: [0, 0, 1]}}}}\n- {{name: b, points: {{glob: b/*.bin, {text}}}, "
+        "extrinsics: {translation_m: [0, 0, 2]}}\n"
+    )
+    outcome = shell("convert drive --rig rig.yaml -o out --keep-partial")
+    assert outcome.code == 0, outcome.err
+    assert _columns() == sorted({*EXPECTED, *(stamp + 50 * MS for stamp in EXPECTED)})
+    assert len(_xyz()) == 2 * SWEEPS * COLUMNS * RINGS
+    assert "top" not in shell("inspect drive --rig rig.yaml").out
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("{0}", 1), ("{0}", 1000), ("{0}", MS), ("{1}.{2:09d}", 1), ("{1}_{2:09d}", 1)],
+)
+def test_the_unit_of_a_name_is_that_of_its_digits(shell: Shell, name: str, unit: int) -> None:
+    names = [
+        name.format(start // unit, start // 10**9, start % 10**9) + ".bin" for start in _starts()
+    ]
+    write_sweeps(Path("drive/top"), dict.fromkeys(names, raw(FIELDS, POINTS)))
+    assert _run(shell).code == 0
+    assert _columns() == EXPECTED
+
+
+def test_padding_is_skipped(shell: Shell) -> None:
+    fields = {"x": "f4", "pad": "u1", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4"}
+    points = [(x, 255, y, z, i, t) for x, y, z, i, t, _ in POINTS]
+    sweeps = {f"{start}.bin": raw(fields, points) for start in _starts()}
+    write_sweeps(Path("drive/top"), sweeps)
+    text = dtype_text({**fields, "pad": "V1"})
+    outcome = _run(shell, f"{{glob: top/*.bin, dtype: {text}, from: start}}")
+    assert outcome.code == 0, outcome.err
+    assert _columns() == EXPECTED
+
+
+def test_a_file_cut_off_is_counted_and_named(shell: Shell) -> None:
+    sweeps = _names()
+    last = sorted(sweeps)[-1]
+    sweeps[last] = sweeps[last][:-1]
+    write_sweeps(Path("drive/top"), sweeps)
+    outcome = _run(shell)
+    assert outcome.code == 0, outcome.err
+    assert _columns() == EXPECTED[:-COLUMNS]
+    report = json.loads(Path("out/report.json").read_text())
+    assert report["capture"]["skipped"] == {"truncated": 1}
+    # A frame for each column of the other files, and one for the file itself.
+    assert report["capture"]["frames"] == (SWEEPS - 1) * COLUMNS + 1
+    size = len(sweeps[last])
+    assert f"{last}: expected a multiple of 22 bytes" in outcome.err
+    assert f"found {size}; correct `dtype`, or copy the file again" in outcome.err
+
+
+def test_a_rig_with_sweeps_is_written_as_it_was_read(tmp_path: Path) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text(f"sensors: [{{name: top, points: {GLOB}}}]\n")
+    rig = read_rig(file)
+    file.write_text(write_rig(rig, tmp_path))
+    again = read_rig(file).sensors[0]
+    assert again.sweeps is not None
+    assert again.sweeps[:2] == rig.sensors[0].sweeps[:2]  # type: ignore[index]
+    assert (again.points, again.stream) == (rig.sensors[0].points, rig.sensors[0].stream)
+
+
+# -- mistakes -------------------------------------------------------------------------------------
+
+TIMELESS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
+NAME = f"{START_NS}.bin"
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "points", "expected"),
+    [
+        ({"000001.bin": raw(FIELDS, POINTS)}, GLOB,
+         "000001.bin: expected the time of the sweep as its name (10 digits of s since 1970, 13 of "
+         "ms, 16 of us, 19 of ns, or s with decimals), found '000001'; rename the files"),
+        ({NAME: raw(FIELDS, POINTS), "1700000000.bin": raw(FIELDS, POINTS)}, GLOB,
+         "expected a time with the digits of 1700000000.bin, found another unit; correct"),
+        ({NAME: raw(FIELDS, POINTS)[:-3]}, GLOB,
+         f"{NAME}: expected a multiple of 22 bytes, the size of a point of the dtype, found 8621; "
+         "correct `dtype`, or copy the file again (1 of the first 1 files, rig.yaml:3: "
+         "sensors[0].points.glob)"),
+        ({NAME: b""}, GLOB, f"{NAME}: expected points, found 0 bytes; remove it or copy it again"),
+        ({NAME: pcd(FIELDS, POINTS)}, GLOB,
+         f"{NAME}: expected points of the dtype, found a PCD file; remove `dtype`"),
+        ({NAME: raw(FIELDS, POINTS)}, "{glob: top/*.bin}",
+         f"{NAME}: expected a PCD file, found one that begins with 00 00 a0 40 00 00 00 00; give"),
+        ({NAME: pcd(FIELDS, POINTS).replace(b"DATA binary", b"DATA binary_compressed")},
+         "{glob: top/*.bin}",
+         "expected DATA binary or ascii, found 'binary_compressed'; convert it with PCL"),
+        ({NAME: pcd(FIELDS, POINTS)[:-1]}, "{glob: top/*.bin}",
+         f"{NAME}: expected 392 points of 22 bytes, found 8623 bytes of data; copy the file again"),
+        ({NAME: pcd(FIELDS, POINTS).replace(b"SIZE 4 4", b"SIZE 4")}, "{glob: top/*.bin}",
+         "expected a SIZE, TYPE and COUNT for each of 6 FIELDS, found 5, 6 and 6; the file is dam"),
+        ({NAME: pcd(FIELDS, POINTS).replace(b"POINTS 392", b"POINTS 391")}, "{glob: top/*.bin}",
+         "expected POINTS = WIDTH x HEIGHT, found 391 and 392 x 1; the file is damaged"),
+        ({NAME: pcd(FIELDS, POINTS, "ascii")[:-12]}, "{glob: top/*.bin}", "; the file is damaged"),
+        ({NAME: raw(FIELDS, POINTS)}, GLOB.replace("top/", "none/"),
+         "rig.yaml:3: sensors[0].points.glob: expected files that match none/*.bin in drive, found "
+         "none; give the folder that the pattern begins in, correct the pattern, or set"),
+        # Points without a time: Complex Urban, KITTI, Lyft, nuPlan.
+        ({NAME: raw(TIMELESS, [point[:4] for point in POINTS])},
+         f"{{glob: top/*.bin, dtype: {dtype_text(TIMELESS)}}}",
+         "top/*.bin: expected the time of each point in a field t, time, timestamp, time_stamp, "
+         "timestamps, offset_time or ts, found x, y, z, intensity; name it in the rig"),
+        # One time for all points, as where a table was filled up.
+        ({f"{start}.bin": raw(FIELDS, [(*p[:4], 0, p[5]) for p in POINTS]) for start in _starts()},
+         GLOB, "field t (uint32): expected times of points that span about the spacing of the "
+         "messages (100.000 ms), found 0 for every point"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line(
+    shell: Shell, sweeps: Mapping[str, bytes], points: str, expected: str
+) -> None:
+    write_sweeps(Path("drive/top"), sweeps)
+    outcome = _run(shell, points)
+    assert outcome.code != 0
+    error = outcome.err.strip().splitlines()[-1]
+    assert error.startswith("mlbatch: error: ")
+    assert expected in error
+    assert not Path("out").exists()
+
+
+def test_fields_in_another_order_are_refused_by_their_times(shell: Shell) -> None:
+    """The size of a point is the same; the times of points are then no sweep."""
+    write_sweeps(Path("drive/top"), _names())
+    text = dtype_text({"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "u2", "t": "u4"})
+    outcome = _run(shell, f"{{glob: top/*.bin, dtype: {text}, from: start}}")
+    assert outcome.code != 0
+    assert not Path("out").exists()
+
+
+def test_two_folders_of_one_pattern_are_refused(shell: Shell) -> None:
+    write_sweeps(Path("drive/a"), _names())
+    write_sweeps(Path("drive/b"), _names())
+    outcome = _run(shell, GLOB.replace("top/*.bin", "'*/*.bin'"))
+    assert outcome.code != 0
+    assert "expected each time once, found that of drive/a/" in outcome.err
+    assert "give each lidar a sensor with a pattern of its own" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("points", "expected"),
+    [
+        ("{glob: /data/*.bin}", "expected a pattern within the folder of the recording"),
+        ("{glob: ../a/*.bin}", "expected a pattern within the folder of the recording"),
+        ("{dtype: {x: f4}}", "expected dtype with glob, found no glob; add the glob"),
+        ("{glob: a, dtype: {x: u8}}", "expected one of i1, u1, i2, u2, i4, u4, f4, f8, little"),
+        ("{glob: a, dtype: {x: '>f4'}}", "little endian, found the text '>f4'"),
+        ("{glob: a, dtype: {x: fast}}", "little endian, found 'fast'"),
+        ("{glob: a, dtype: {x: V0}}", "little endian, found 'V0'"),
+        ("{glob: a, dtype: [x, y]}", "expected a mapping of fields to numpy types, found a list"),
+        ("{glob: a, dtype: {}}", "expected a mapping of fields to numpy types, found a mapping"),
+    ],
+)
+def test_mistakes_of_rigs(shell: Shell, points: str, expected: str) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    outcome = _run(shell, points)
+    assert outcome.code != 0
+    assert outcome.err.startswith("mlbatch: error: rig.yaml:3: sensors[0].points")
+    assert expected in outcome.err
+
+
+def test_a_stream_and_a_glob_exclude_each_other(shell: Shell) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    Path("rig.yaml").write_text(
+        f"sensors:\n- name: top\n  stream: {{topic: /a}}\n  points: {GLOB}\n"
+    )
+    outcome = shell("convert drive --rig rig.yaml -o out")
+    assert "stream: expected a stream without glob, found glob as well (line 4)" in outcome.err
+
+
+@pytest.mark.parametrize("kind", DATASET_FILES, ids=lambda kind: str(kind.suffixes[0]))
+def test_files_of_datasets_are_refused_with_the_reason(shell: Shell, kind: Any) -> None:
+    name = f"drive/sensors/lidar/315967376959822000{kind.suffixes[0]}"
+    Path(name).parent.mkdir(parents=True)
+    Path(name).write_bytes(kind.magic + bytes(100))
+    for path in (name, "drive"):
+        outcome = shell(f"convert {path} -o out")
+        assert outcome.code == 1
+        assert f"{path}: expected a recording, found " in outcome.err
+        assert kind.remedy in outcome.err
+        assert outcome.err.count("\n") == 1
+    assert not Path("out").exists()
