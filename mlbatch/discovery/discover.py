@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch import sensors
 from mlbatch.arrays import BoolArray, F64Array, U8Array
-from mlbatch.clocks.compare import refuse_incomparable
+from mlbatch.clocks.compare import COMPARABLE_NS, refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
 from mlbatch.discovery.interleaved import shared_address
@@ -38,13 +38,13 @@ from mlbatch.discovery.probe import (
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
-from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.errors import ClockError, RecordingError, RigError, UsageError
 from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.sensors.advice import with_advice
 from mlbatch.types import Recording, Stream, StreamTable
-from mlbatch.units import NS_PER_S
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.readers.bag.cloud_topics import CloudTopics
@@ -195,7 +195,7 @@ def discover(
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
     if to_convert:
         _refuse_shared_addresses(sampler, chosen)
-        _refuse_incomparable_clocks(sampler, chosen, selection)
+        _refuse_incomparable_clocks(sampler, chosen, selection, clouds)
     extrinsics = place(
         chosen,
         collector.extrinsics,
@@ -674,7 +674,10 @@ def _refuse_shared_addresses(sampler: Sampler, chosen: Sequence[DetectedSensor])
 
 
 def _refuse_incomparable_clocks(
-    sampler: Sampler, chosen: Sequence[DetectedSensor], selection: SensorSelection
+    sampler: Sampler,
+    chosen: Sequence[DetectedSensor],
+    selection: SensorSelection,
+    clouds: CloudTopics | None,
 ) -> None:
     """Raise ClockError for clocks that cannot be merged, before extrinsics are asked for."""
     if selection.aligned:
@@ -686,8 +689,50 @@ def _refuse_incomparable_clocks(
         if offset_ns is not None:
             offset_ns += sensor.offset_ns
         offsets_ns.append((sensor.name, offset_ns))
-        refuse_incomparable(
-            offsets_ns,
-            len(offsets_ns) - 1,
-            has_receive_times=all(map(sampler.has_receive_times, chosen)),
-        )
+        try:
+            refuse_incomparable(
+                offsets_ns,
+                len(offsets_ns) - 1,
+                has_receive_times=all(map(sampler.has_receive_times, chosen)),
+            )
+        except ClockError as err:
+            raise ClockError(f"{err}{_coarse_offsets(sampler, chosen, clouds)}") from err
+
+
+def _coarse_offsets(
+    sampler: Sampler, chosen: Sequence[DetectedSensor], clouds: CloudTopics | None
+) -> str:
+    """Text for a rig with the offsets of clouds, by the log times of their messages; or ""."""
+    if clouds is None:
+        return ""
+    ahead_ns = {sensor.name: _ahead_ns(sampler, sensor, clouds) for sensor in chosen}
+    known = {name: ns for name, ns in ahead_ns.items() if ns is not None}
+    unknown = [name for name in ahead_ns if name not in known]
+    if unknown:
+        return f"; the log times of {', '.join(unknown)} do not show the offset"
+    reference = min(known, key=lambda name: abs(known[name]))
+    lines = []
+    for sensor in chosen:
+        offset_ns = sensor.offset_ns + known[reference] - known[sensor.name]
+        if abs(known[reference] - known[sensor.name]) > COMPARABLE_NS:
+            seconds = round(offset_ns / NS_PER_MS) / (NS_PER_S // NS_PER_MS)
+            lines.append(f"{sensor.name} clock: {{offset_s: {seconds:.3f}}}")
+    return (
+        f": {', '.join(lines)} (by log times of messages: coarse, to some 0.01 s, as the delays "
+        "of the drivers differ)"
+        if lines
+        else ""
+    )
+
+
+def _ahead_ns(sampler: Sampler, sensor: DetectedSensor, clouds: CloudTopics) -> int | None:
+    """Newest points of a sensor minus the receive times, with the offset of the rig."""
+    if sampler.has_receive_times(sensor):
+        found = sampler.clock_offset_ns(sensor)
+    else:
+        streams = [sampler.table.streams[number] for number in sensor.streams]
+        all_ns = [
+            clouds.ahead_ns.get((stream.topic, clouds.frames.get(stream, ""))) for stream in streams
+        ]
+        found = max((ns for ns in all_ns if ns is not None), default=None)
+    return None if found is None else found + sensor.offset_ns

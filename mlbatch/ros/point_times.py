@@ -310,6 +310,34 @@ def checked_rule(
     return rule, notes
 
 
+def ahead_ns(samples: Sequence[CloudSample], rule: PointRule) -> int | None:
+    """How far the last points of a topic are ahead of the log times of their messages, at most.
+
+    None where that is unknown: log times that are copies of the header's, or unreadable times.
+    """
+    known = [one for one in samples if one.points]
+    if not known or all(one.host_ns == one.stamp_ns for one in known):
+        return None
+    lasts = [(_last_stamp_ns(one, rule), one.host_ns) for one in known]
+    return max((last - host_ns for last, host_ns in lasts if last is not None), default=None)
+
+
+def _last_stamp_ns(sample: CloudSample, rule: PointRule) -> int | None:
+    """The stamp of the last point of a message."""
+    if rule.unit_ns:
+        reading: Reading | None = _by_unit(sample.high, rule.unit_ns)
+    else:
+        reading = convention(sample.kind, sample.high)
+    if reading is None:
+        return None
+    if rule.origin == ABSOLUTE or (not rule.origin and reading.is_absolute):
+        return round(sample.high * reading.unit_ns)
+    if rule.origin == END and sample.high > 0:
+        return sample.zero.base_ns
+    low = sample.low if rule.origin == START and sample.low < 0 else 0.0
+    return sample.zero.base_ns + round((sample.high - low) * reading.unit_ns)
+
+
 def _inferred(
     name: str,
     span: float,

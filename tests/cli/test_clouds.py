@@ -578,6 +578,52 @@ def test_a_frame_that_no_transform_has_is_named(shell: Shell) -> None:
     )
 
 
+def test_offsets_of_mixed_clocks_are_written_out(shell: Shell) -> None:
+    """One lidar counts from power-on, one is right; the delays of their drivers differ by 20 ms.
+
+    The first is 1,699,999,500 s behind, and logged 20 ms later than the second, which is nearest to
+    the log times: its offset appears 20 ms too large.
+    """
+    behind = -1_699_999_500 * 1000 * MS
+    us = 1000
+    velodyne = _clouds(VELODYNE, [n - 0.097 for n in SECONDS], header=LAST + 10 * us)
+    messages = [
+        *_bag(_clouds(OUSTER, NS, header=behind), "/os/points", delay=SWEEP + 20 * MS),
+        *_bag(velodyne, "/velodyne_points"),
+    ]
+    rig = "sensors:\n" + "".join(
+        f"  - {{name: {name}, stream: {{topic: {topic}}}{clock}}}\n"
+        for name, topic, clock in (
+            ("os", "/os/points", "%s"),
+            ("velo", "/velodyne_points", ""),
+        )
+    )
+    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % "")
+    assert outcome.code == 1
+    line = "os clock: {offset_s: 1699999500.020}"
+    assert f"in the rig: {line} (by log times of messages: coarse" in outcome.err
+    assert outcome.err.count("offset_s:") == 1
+    paste = ", clock: {offset_s: 1699999500.020}"
+    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % paste)
+    assert outcome.code == 0, outcome.err
+    # Columns of the first lidar are 20 ms late, those of the second where they were measured.
+    # float32 seconds are within 10 ns.
+    found = {round(stamp / us) * us for stamp in _stamps(Path("out"))}
+    assert found == {*_expected(20 * MS), *_expected(10 * us)}
+
+
+def test_log_times_that_are_copies_show_no_offset(shell: Shell) -> None:
+    behind = -1_699_999_500 * 1000 * MS
+    messages = [
+        *_bag(_clouds(OUSTER, NS, header=behind), "/one/points"),
+        *_bag(_clouds(OUSTER, NS), "/two/points", delay=0),
+    ]
+    outcome = _run(shell, messages, "--identity-extrinsics")
+    assert outcome.code == 1
+    assert "; the log times of two do not show the offset" in outcome.err
+    assert "offset_s:" not in outcome.err
+
+
 def test_clock_errors_name_what_works(shell: Shell, tmp_path: Path) -> None:
     late = 37 * 1000 * MS
     messages = [
@@ -590,6 +636,8 @@ def test_clock_errors_name_what_works(shell: Shell, tmp_path: Path) -> None:
     assert "--clock host" not in outcome.err
     assert "--align-clocks" not in outcome.err
     assert "give clock.offset_s or clock.epoch in the rig" in outcome.err
+    # Both messages are logged 3 ms after their last points, which are measured at 97 ms.
+    assert "in the rig: two clock: {offset_s: -37.000} (by log times" in outcome.err
     rig = (
         "sensors:\n  - {name: one, stream: {topic: /one/points}}\n"
         "  - {name: two, stream: {topic: /two/points}, clock: {offset_s: -37}}\n"

@@ -15,7 +15,7 @@ from mlbatch.readers.merge import merge
 from mlbatch.rig.rig import RigSensor
 from mlbatch.ros.encoding import ENCODINGS
 from mlbatch.ros.point_packets import CloudError, Layout
-from mlbatch.ros.point_times import CONVENTION, CloudSample, PointRule, checked_rule
+from mlbatch.ros.point_times import CONVENTION, CloudSample, PointRule, ahead_ns, checked_rule
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, FieldError, read_cloud, sample_cloud
 from mlbatch.types import Message, Recording, Stream, Topic
 from mlbatch.units import NS_PER_S
@@ -62,7 +62,8 @@ class CloudTopics:
     """The clouds of a session, shared by its recordings, since a topic may be spread over several.
 
     rules: by topic and frame_id; lidars: by topic; layouts: of the packets of each stream; frames:
-    frame_id of each stream; refused: why topics cannot be used; warnings: topic and text.
+    frame_id of each stream; refused: why topics cannot be used; ahead_ns: by topic
+    and frame_id, the last points minus the log times; warnings: topic and text.
     """
 
     topics: tuple[Topic, ...]
@@ -72,6 +73,7 @@ class CloudTopics:
     layouts: dict[Stream, Layout] = field(default_factory=dict)
     frames: dict[Stream, str] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
+    ahead_ns: dict[tuple[str, str], int | None] = field(default_factory=dict)
     warnings: list[tuple[str, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -153,6 +155,7 @@ class CloudTopics:
             for (frame, _), samples in examined.samples.items():
                 rule, texts = checked_rule(samples, self._given(name, frame), name)
                 self.rules.setdefault((name, frame), rule)
+                self.ahead_ns.setdefault((name, frame), ahead_ns(samples, rule))
                 notes |= dict.fromkeys(texts)
             for message in examined.clouds.values():
                 read_cloud(message, lambda frame: self.rule(name, frame))
