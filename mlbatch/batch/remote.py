@@ -27,6 +27,8 @@ _WEB = ("http", "https")
 # Bytes of a request; one that fails is repeated, not the whole file.
 _BLOCK_BYTES = 8 << 20
 # Waits between attempts, s: a network that is cut for a minute is no failure.
+# Machines of the providers ask these for credentials, if the environment has none.
+_CREDENTIAL_HOSTS = ("169.254.169.254", "metadata.google.internal")
 _WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 _TIMEOUT = "60s"
 
@@ -89,6 +91,12 @@ def _repeated(url: str, call: Callable[[], T]) -> T:
         except Exception as err:
             if isinstance(err, MlbatchError):
                 raise
+            if any(host in str(err) for host in _CREDENTIAL_HOSTS):
+                raise RecordingError(
+                    f"{url}: expected credentials, found none in the environment; set them "
+                    "(AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, GOOGLE_SERVICE_ACCOUNT, "
+                    "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY)"
+                ) from err
             is_final = isinstance(err, FileNotFoundError) or type(err).__name__ in (
                 *("NotFoundError", "PermissionDeniedError", "UnauthenticatedError"),
                 *("InvalidPathError", "NotSupportedError", "NotImplementedError"),

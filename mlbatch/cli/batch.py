@@ -37,12 +37,14 @@ def batch(
         str, typer.Option("-o", "--output", help="Folder (or s3:// URL); a folder a session in it.")
     ],
     rig: Annotated[
-        str | None, typer.Option(help="Rig file (YAML) of all sessions. [default: manifest's]")
+        str | None,
+        typer.Option("--rig", "-r", help="Rig file (YAML) of all sessions. [default: manifest's]"),
     ] = None,
     workers: Annotated[int, typer.Option(help="Sessions converted at the same time.")] = 1,
     jobs: Annotated[
         str | None,
         typer.Option(
+            *("--jobs", "-j"),
             help="Scans made at the same time, by each session. [default: auto; 1 with workers]",
             metavar="N|auto",
         ),
@@ -84,14 +86,19 @@ def batch(
     from mlbatch.batch.driver import Batch
     from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
     from mlbatch.batch.plan import plan_of
+    from mlbatch.batch.session import is_url
     from mlbatch.batch.store import tasks_of
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.pipeline.interrupts import interruptible
+    from mlbatch.rig.rig import read_rig
 
     _check_counts(workers=workers, retries=retries)
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
     given = Common(rig, tuple(_given(context, options, jobs)))
+    if rig is not None and not is_url(rig):
+        # A mistake in it would fail every session.
+        read_rig(Path(rig))
     sessions = chosen(sessions_of(sources, given, _kinds()), only or (), numbers)
     copies = Cache.of(cache, cache_gb)
     with interruptible():

@@ -233,6 +233,16 @@ def test_fail_fast_begins_no_other_session(tmp_path: Path) -> None:
     assert ended.last == "3 sessions: 0 done, 0 skipped, 1 failed, 2 not begun (--fail-fast)"
 
 
+def test_a_mistake_in_the_rig_of_all_begins_no_session(good: Dataset, tmp_path: Path) -> None:
+    ended = run(good, tmp_path / "out", "-r", "missing.yaml")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err == (
+        "mlbatch: error: missing.yaml: expected a readable file, found no such file or directory; "
+        "check the path\n"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_limit_is_a_failure_with_an_output(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", ["a1"])
     out = tmp_path / "out"

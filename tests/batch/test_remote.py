@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from mlbatch.batch import remote
+from mlbatch.errors import RecordingError
 from tests.batch.network import Network, s3_server
 from tests.batch.sessions import Dataset, Ended, run, scans, write_dataset
 from tests.builders.run import ROOT
@@ -194,3 +196,14 @@ def test_mistakes_are_one_line(words: tuple[str, ...], code: int, cloud: Cloud) 
     assert (ended.code, ended.out) == (code, "")
     (line,) = ended.err.splitlines()
     assert "expected" in line
+
+
+def test_missing_credentials_are_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    # An address in the place of the server that gives credentials to machines of the provider.
+    monkeypatch.setattr("mlbatch.batch.remote._CREDENTIAL_HOSTS", ("127.0.0.1:1/",))
+    monkeypatch.setattr("mlbatch.batch.remote.time.sleep", lambda _: pytest.fail("a second try"))
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_METADATA_ENDPOINT", "http://127.0.0.1:1")
+    with pytest.raises(RecordingError, match="expected credentials, found none in the environment"):
+        remote.head("s3://a-bucket-without-credentials/drive.pcap")

@@ -241,6 +241,10 @@ SHORT = {
     "inspect": {"-r --rig", "-m --metadata", "-v --verbose"},
     "compare": {"-r --rig", "-m --metadata", "-v --verbose"},
     "verify": {"-v --verbose"},
+    "batch": {
+        *("-o --output", "-r --rig", "-f --format", "-j --jobs", "-m --metadata"),
+        *("-q --quiet",),
+    },
 }
 
 
