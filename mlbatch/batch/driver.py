@@ -141,9 +141,11 @@ def _by_threads(
     for task in tasks:
         waiting.put(task)
     alive = min(workers, len(tasks))
-    for _ in range(alive):
-        threading.Thread(target=work, daemon=True).start()
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(alive)]
     try:
+        # An interrupt may come while some have begun a session, and others were not started.
+        for thread in threads:
+            thread.start()
         while alive:
             result = results.get()
             if result is None:
@@ -155,8 +157,10 @@ def _by_threads(
             # Sessions end in order: their outputs can be resumed.
             closed.set()
             stop.now()
-            while alive:
-                alive -= results.get() is None
+            # A thread that is not alive yet will find `closed`.
+            for thread in threads:
+                if thread.is_alive():
+                    thread.join()
 
 
 def result_of(task: Task, stop: Stop) -> Result | None:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
 import signal
+import threading
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from mlbatch.batch.cache import Cache
+from mlbatch.batch.driver import Batch
+from mlbatch.batch.manifest import Common, sessions_of
+from mlbatch.batch.store import tasks_of
+from mlbatch.errors import Interrupted
 from tests.batch.sessions import (
     Dataset,
     end,
@@ -126,6 +133,29 @@ def test_an_interrupt_ends_in_order(good: Dataset, tmp_path: Path) -> None:
     assert "of 4 sessions have ended" in line
     assert not list(processes_of(str(out)))
     assert run(good, out).code == 0
+
+
+@pytest.mark.parametrize("started", [1, 2])
+def test_an_interrupt_while_workers_start_leaves_no_process(
+    started: int, good: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first workers run their sessions already when the interrupt comes."""
+    out = tmp_path / "out"
+    sessions = sessions_of([str(good.manifest)], Common(), {"rate": "value"})
+    tasks = tasks_of(sessions, str(out), Cache.of(None, 1.0), retries=0, pages=False)
+    start_thread = threading.Thread.start
+    count = itertools.count()
+
+    def start_some(thread: threading.Thread) -> None:
+        if next(count) == started:
+            wait_for(lambda: list(processes_of(str(out))))
+            raise KeyboardInterrupt
+        start_thread(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_some)
+    with pytest.raises(Interrupted, match="0 of 4 sessions have ended"):
+        Batch(workers=3).run(tasks)
+    assert not list(processes_of(str(out)))
 
 
 def test_two_drivers_share_a_batch(good: Dataset, tmp_path: Path) -> None:
