@@ -18,7 +18,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import compose, from_quaternion, from_rpy_deg, inverse, rigid
 from mlbatch.frames.tree import Edge, FrameTree, clean, some
-from mlbatch.rig.yaml_tree import Node, read_foreign
+from mlbatch.rig.yaml_tree import Node, read_foreign, read_foreign_blocks
 from mlbatch.units import RAD_PER_DEG
 
 BODY_FROM_SENSOR = "body_from_sensor"
@@ -51,7 +51,7 @@ class ExtrinsicsFiles:
 
     def pose(self, body_frame: str, serial: str) -> F64Array:
         """Return (4, 4) body_from_sensor, m; RigError names file, key, expected and found."""
-        roots = [_read(file, self.node) for file in self.files]
+        roots = [_read(file, self.node, by_key=bool(self.keys)) for file in self.files]
         if self.keys:
             found = _product(roots, self.keys, self.node)
             found = inverse(found) if self.direction == SENSOR_FROM_BODY else found
@@ -111,11 +111,18 @@ class ExtrinsicsFiles:
         return self.node.error(f"{expected} ({names})", found, remedy)
 
 
-def _read(file: Path, node: Node) -> Node:
-    """The tree of a file; errors in it begin with the key of the rig."""
+def _read(file: Path, node: Node, *, by_key: bool) -> Node:
+    """The tree of a file; errors in it begin with the key of the rig.
+
+    by_key: a mistake elsewhere in the file does not matter.
+    """
     try:
         return read_foreign(file)
     except RigError as err:
+        if by_key:
+            blocks = read_foreign_blocks(file)
+            if blocks.entries:
+                return blocks
         raise node.error_here(str(err)) from err
 
 

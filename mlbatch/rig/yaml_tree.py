@@ -7,6 +7,7 @@ Nothing is constructed from tags, and aliases are refused, so that they cannot m
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,8 @@ MAX_DEPTH = 16
 _MAX_DIGITS = 100
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 _KEY = re.compile(r"\w{1,40}", re.ASCII)
+# A key without indentation.
+_BLOCK = re.compile(r"[A-Za-z_][\w.\- ]*:")
 _OPENCV_HEAD = re.compile(r"\A%(?=YAML:\d)")
 # Spellings of YAML 1.1.
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
@@ -36,8 +39,8 @@ class Node:
     """A value of the file: a scalar (`text`), a list (`items`) or a mapping (`entries`).
 
     path: keys from the root, as `sensors[1].name`; line: counts from 1; kind: scalar, list or
-    mapping, or repeated: a key of a foreign file that occurs twice, text: where; plain: a scalar
-    without quotes.
+    mapping, or repeated: a key of a foreign file that occurs twice or is damaged, text: how;
+    plain: a scalar without quotes.
     """
 
     file: Path
@@ -72,7 +75,7 @@ class Node:
         if self.is_null():
             return "nothing"
         if self.kind == "repeated":
-            return f"the key twice ({self.text})"
+            return self.text
         return short(self.text) if self.plain else f"the text {short(self.text)}"
 
     def is_null(self) -> bool:
@@ -168,6 +171,26 @@ def read_foreign(file: Path) -> Node:
     """Read YAML of OpenCV, or JSON: its tags and head are accepted, repeated keys are marked."""
     # Not a directive of YAML, which has a blank there.
     return _read(file, _OPENCV_HEAD.sub("#", _text(file), count=1), _ForeignLoader)
+
+
+def read_foreign_blocks(file: Path) -> Node:
+    """Read a foreign file key by key; what is no YAML is marked and does not affect the others."""
+    lines = _text(file).splitlines()
+    starts = [number for number, line in enumerate(lines) if _BLOCK.match(line)]
+    entries: dict[str, Node] = {}
+    for start, end in itertools.pairwise([*starts, len(lines)]):
+        name = lines[start].partition(":")[0].strip()
+        # Empty lines keep the numbers of lines.
+        text = "\n" * start + "\n".join(lines[start:end])
+        if name in entries:
+            first = f"first on line {entries[name].line}"
+            entries[name] = Node(file, name, start + 1, "repeated", text=f"the key twice ({first})")
+            continue
+        try:
+            entries |= _read(file, text, _ForeignLoader).entries
+        except RigError:
+            entries[name] = Node(file, name, start + 1, "repeated", text="a mistake in YAML")
+    return Node(file, "", 1, "mapping", entries=entries)
 
 
 def _read(file: Path, text: str, kind: type[_Loader]) -> Node:
@@ -272,7 +295,8 @@ def _tree(
         if name in entries:
             first = f"first on line {entries[name].line}"
             if marks_repeated:
-                entries[name] = Node(file, own_path, _line(key), "repeated", text=first)
+                text = f"the key twice ({first})"
+                entries[name] = Node(file, own_path, _line(key), "repeated", text=text)
                 continue
             found = f"it again ({first})"
             message = f"expected each key once, found {found}; remove one of the two"

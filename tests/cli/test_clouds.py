@@ -578,6 +578,27 @@ def test_a_frame_that_no_transform_has_is_named(shell: Shell) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("topic", "word"),
+    [
+        ("/boxi/hesai/points_undistorted", "undistorted"),
+        ("/sensing/lidar/top/rectified/pointcloud", "rectified"),
+        ("/lidar/deskewed", "deskewed"),
+    ],
+)
+def test_points_moved_to_one_time_are_refused_unless_stated(
+    shell: Shell, topic: str, word: str
+) -> None:
+    messages = _bag(_clouds(OUSTER, NS), topic)
+    outcome = _run(shell, messages)
+    assert outcome.code == 1
+    assert f"found a topic that by its name ({word}) has points moved to one time" in outcome.err
+    assert not Path("out").exists()
+    outcome = _run(shell, messages, rig=_rig("{from: start}", topic))
+    assert outcome.code == 0, outcome.err
+    assert _stamps(Path("out")) == _expected()
+
+
 def test_offsets_of_mixed_clocks_are_written_out(shell: Shell) -> None:
     """One lidar counts from power-on, one is right; the delays of their drivers differ by 20 ms.
 

@@ -205,6 +205,38 @@ def test_a_translation_and_a_rotation_are_p_equals_r_q_plus_t(folder: Path) -> N
     np.testing.assert_array_equal(_pose(folder, text), RED)
 
 
+# As published: a text after the tag, and a line with too little indentation.
+BROKEN_ELSEWHERE = """\
+%YAML:1.0
+
+# extrinsics of a camera
+CAMERA_T_IMU:!!opencv-matrix (Left camera to IMU)
+ rows: 4
+   cols: 4
+   dt: d
+   data:   [ 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0., 0., 0., 1. ]
+################## Center Lidar to IMU##################
+LIDAR_T_IMU: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: d
+   data: [ 1, 0, 0, 0,
+           0, 1, 0, 0,
+           0, 0, 1, 0.28,
+           0, 0, 0, 1]
+"""
+
+
+def test_a_mistake_elsewhere_in_the_file_does_not_matter(folder: Path) -> None:
+    (folder / "broken.yaml").write_text(BROKEN_ELSEWHERE)
+    pose = _pose(folder, "{file: broken.yaml, key: LIDAR_T_IMU, direction: body_from_sensor}")
+    np.testing.assert_array_equal(pose, _rows((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0.28)))
+    with pytest.raises(RigError) as caught:
+        _pose(folder, "{file: broken.yaml, key: CAMERA_T_IMU, direction: body_from_sensor}")
+    assert str(caught.value).startswith(f"{folder / 'broken.yaml'}:4: CAMERA_T_IMU: expected a ")
+    assert "found a mistake in YAML; " in str(caught.value)
+
+
 X = "sensors[0].extrinsics"
 MISTAKES = [
     ("{file: none.yaml}", ".file: expected an existing file, found none at"),

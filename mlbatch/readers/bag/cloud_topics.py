@@ -7,6 +7,7 @@ times follows from one message, nor whether several lidars send on the topic.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -23,6 +24,9 @@ from mlbatch.units import NS_PER_S
 # Messages of a topic that are examined, and for how long others are waited for.
 _EXAMINED = 8
 _EXAMINED_NS = 10 * NS_PER_S
+# Words in the names of topics whose points were corrected for the motion of the vehicle:
+# `points_undistorted` of GrandTour, `rectified/pointcloud` of Autoware.
+_MOVED = re.compile(r"undist\w*|deskew\w*|rectified|motion_?comp\w*", re.IGNORECASE)
 # A stream needs a word for an empty frame_id.
 _NO_FRAME = "(empty)"
 
@@ -104,6 +108,11 @@ class CloudTopics:
             found = sensor
         return CONVENTION if found is None else found.points or CONVENTION
 
+    def _is_stated(self, topic: str) -> bool:
+        """Return whether the rig says how the points of a topic are read."""
+        sensors = (one for one in self.rig if one.stream is not None and one.stream.topic == topic)
+        return any(sensor.points is not None for sensor in sensors)
+
     def examine(self, recordings: Sequence[Recording]) -> None:
         """Find lidars and rules by the first messages; topics that cannot be used are removed."""
         found = {topic.name: _Examined() for topic in self.topics}
@@ -148,6 +157,15 @@ class CloudTopics:
     def _decide(self, name: str, examined: _Examined) -> None:
         """Set the rules of a topic, or refuse it."""
         notes: dict[str, None] = {}
+        moved = _MOVED.search(name)
+        if moved is not None and not self._is_stated(name):
+            self.refused[name] = (
+                "expected points where they were measured, found a topic that by its name "
+                f"({moved[0]}) has points moved to one time by the motion of the vehicle; choose "
+                "the topic of the points as measured, or accept these with `points: {from: start}` "
+                f"(or end) in the rig, or leave the topic out with --ignore {name}"
+            )
+            return
         if examined.fault and not examined.samples:
             self.refused[name] = examined.fault
             return
