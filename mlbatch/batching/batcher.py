@@ -323,29 +323,52 @@ class Batcher:
         """
         track = self._tracks[number]
         headers = arrival.headers
+        if arrival.is_rising and len(headers.stamp_ns):
+            low = headers.stamp_ns[:, 0]
+            if self._is_ahead(track, int(low[0]), int(headers.stamp_ns[-1, -1])) and bool(
+                (low >= published).all()
+            ):
+                track.decoded += headers.valid.size
+                self._wait(track, self._columns(arrival))
+                return
         valid = headers.valid.reshape(-1)
         count = int(np.count_nonzero(valid))
         track.decoded += len(valid)
         track.drop("invalid", len(valid) - count)
         if not count:
             return
-        per_packet = headers.valid.shape[1]
-        offsets = arrival.column_offsets
-        if offsets is None:
-            offsets = np.arange(per_packet)
-        ring_index = arrival.ring_index[:, None] + offsets
-        columns = Columns(
-            headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
-        )
-        published = published.repeat(per_packet)
+        columns = self._columns(arrival)
+        published = published.repeat(headers.valid.shape[1])
         if count < len(valid):
             columns = columns.take(valid)
             published = published[valid]
         if not self._is_in_time(track, columns.stamp_ns, int(published[-1])):
             columns = self._without_late(track, columns, published)
         if len(columns):
-            track.waiting.append(columns)
-            track.oldest_ring_index = min(track.oldest_ring_index, int(columns.ring_index.min()))
+            self._wait(track, columns)
+
+    @staticmethod
+    def _columns(arrival: Arrival) -> Columns:
+        """All columns of packets, valid or not."""
+        headers = arrival.headers
+        offsets = arrival.column_offsets
+        if offsets is None:
+            offsets = np.arange(headers.valid.shape[1])
+        ring_index = arrival.ring_index[:, None] + offsets
+        return Columns(
+            headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
+        )
+
+    @staticmethod
+    def _wait(track: Track, columns: Columns) -> None:
+        track.waiting.append(columns)
+        track.oldest_ring_index = min(track.oldest_ring_index, int(columns.ring_index.min()))
+
+    def _is_ahead(self, track: Track, first_ns: int, last_ns: int) -> bool:
+        """True if columns with rising stamps come after all before, without a gap."""
+        wait_ns = self._policy.max_wait_ns
+        has_gap = wait_ns is not None and last_ns - track.newest_ns > wait_ns
+        return not has_gap and first_ns >= track.newest_ns - SLACK_NS
 
     def _is_in_time(self, track: Track, stamp: I64Array, published: int) -> bool:
         """True if no column can be late and none ends a gap: nearly all small batches."""

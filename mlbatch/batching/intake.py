@@ -42,6 +42,8 @@ class Arrival:
     ring_index: I64Array  # (P,) int64, ring index of the packet's first column
     # (C,) int64, ring indexes of a packet's columns relative to the first; None: they count up.
     column_offsets: I64Array | None = None
+    # All columns are valid, and no stamp is smaller than the one before it. False: unknown.
+    is_rising: bool = False
 
     def take(self, index: BoolArray | I64Array) -> Arrival:
         """The packets at `index`."""
@@ -53,6 +55,7 @@ class Arrival:
             ColumnHeaders(headers.stamp_ns[index], headers.encoder[index], headers.valid[index]),
             self.ring_index[index],
             self.column_offsets,
+            self.is_rising,
         )
 
 
@@ -62,6 +65,13 @@ class Accepted:
 
     packets: Arrival
     newest_ns: I64Array  # (A,) int64, largest valid stamp of each packet, NEVER where none is valid
+
+
+def rises(headers: ColumnHeaders) -> bool:
+    """Whether all columns are valid, and no stamp is smaller than the one before it."""
+    stamp = headers.stamp_ns.reshape(-1)
+    is_whole = stamp.size > 0 and bool(headers.valid.all())
+    return is_whole and bool((stamp[1:] >= stamp[:-1]).all())
 
 
 def extremes(headers: ColumnHeaders) -> tuple[I64Array, I64Array]:
@@ -114,7 +124,12 @@ class Intake:
         headers = arrival.headers
         if self._offset_ns:
             headers.stamp_ns = headers.stamp_ns + self._offset_ns
-        low, high = extremes(headers)
+        if arrival.is_rising:
+            # Copies, since some are kept.
+            low = headers.stamp_ns[:, 0].copy()
+            high = headers.stamp_ns[:, -1].copy()
+        else:
+            low, high = extremes(headers)
         if self._held is None and len(high) and self._has_no_step(int(low.min()), int(high.max())):
             self._newest = max(self._newest, int(high.max()))
         else:
@@ -124,6 +139,7 @@ class Intake:
             stamp = arrival.headers.stamp_ns
             measured = high > NEVER
             arrival.headers.stamp_ns = arrival.host_ns[:, None] - (high[:, None] - stamp)
+            arrival.is_rising = False
             high = np.where(measured, arrival.host_ns, NEVER)
         return Accepted(arrival, high)
 
@@ -161,6 +177,8 @@ class Intake:
         if len(key) == 1:
             # One key without an order: a linear search is cheaper than a sort.
             fresh = np.array([key[0] < 0 or not (recent == key).any()])
+        elif _all_differ(recent, key):
+            fresh = np.ones(len(key), np.bool_)
         else:
             fresh = _first_of_kind(recent, key)
         self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
@@ -270,6 +288,13 @@ class Intake:
             f"{back / NS_PER_S:.6f} s; {remedies(self.has_receive_times)}",
             host_ns,
         )
+
+
+def _all_differ(recent: I64Array, key: I64Array) -> bool:
+    """Whether no two keys are equal, the usual case; a sort of values is faster than of indices."""
+    keys = np.concatenate([recent, key])
+    keys.sort()
+    return not bool((keys[1:] == keys[:-1]).any())
 
 
 def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:

@@ -205,14 +205,16 @@ class GapLoss:
     def add(self, headers: ColumnHeaders, host_ns: I64Array) -> None:
         """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
         measured = np.flatnonzero(headers.valid.any(axis=1))
-        ticks = rotor_ticks(headers.encoder)
+        first = rotor_ticks(headers.encoder[:, 0])
+        last = rotor_ticks(headers.encoder[:, -1])
         packets = _Packets(
             # A copy, so that the stamps of all columns are not kept in memory.
             headers.stamp_ns[:, 0].copy(),
             host_ns,
-            ticks[:, 0].astype(np.float64) * _REVOLUTIONS_PER_TICK,
-            ticks[:, -1].astype(np.float64) * _REVOLUTIONS_PER_TICK,
-            (ticks >> (32 - _BIN_BITS)).astype(np.uint16),
+            first.astype(np.float64) * _REVOLUTIONS_PER_TICK,
+            last.astype(np.float64) * _REVOLUTIONS_PER_TICK,
+            # The higher bits of the words are cut off.
+            (headers.encoder >> (32 - _BIN_BITS)).astype(np.uint16),
         )
         if len(measured) < len(packets):
             packets = packets.take(measured)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array, U64Array
-from mlbatch.decode.packet_ring import packet_sums
+from mlbatch.decode.packet_ring import KeptPackets, packet_sums
 from mlbatch.lidar.interface import Records
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
@@ -61,17 +61,32 @@ class ArenaRing:
         place: int | None = None,
     ) -> tuple[U8Array, I64Array]:
         """See `PacketRing`; of the view only the bytes of headers are those of the packets."""
-        count = len(start)
+        kept = self.keep(data, start, oldest_ring_index, place)
+        return self.packets(kept), kept.ring_index
+
+    def keep(
+        self,
+        data: U8Array,
+        start: I64Array,
+        oldest_ring_index: int | None,
+        place: int | None = None,
+    ) -> KeptPackets:
+        """See `PacketRing`; packets stay where they are."""
+        if place is None:
+            data, place, start = self._copied(data, start)
+        kept = KeptPackets(data, start, start + (place + self._records.start))
+        if self._has_sums and len(start):
+            self._add_sums(self.packets(kept), kept.ring_index, oldest_ring_index)
+        return kept
+
+    def packets(self, kept: KeptPackets) -> U8Array:
+        """See `PacketRing`; only the bytes of headers are those of the packets."""
+        count = len(kept.start)
         if count > len(self._headers):
             self._headers = np.zeros((2 * count, self._size), np.uint8)
         headers = self._headers[:count]
-        if place is None:
-            data, place, start = self._copied(data, start)
-        self._loops.gather(data, start, self._header_bytes, headers)
-        places = start + (place + self._records.start)
-        if self._has_sums and count:
-            self._add_sums(headers, places, oldest_ring_index)
-        return headers, places
+        self._loops.gather(kept.data, kept.start, self._header_bytes, headers)
+        return headers
 
     def keep_sums(self) -> None:
         """See `PacketRing`; from now on packets are gathered as a whole."""

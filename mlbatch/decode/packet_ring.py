@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,6 +12,14 @@ from mlbatch.lidar.interface import Records
 
 _FIRST_PACKETS = 64
 _WORD = 8  # bytes
+
+
+class KeptPackets(NamedTuple):
+    """Packets of a ring: `data[start[i] :][:packet_size]`, until the next are kept."""
+
+    data: U8Array
+    start: I64Array  # (P,)
+    ring_index: I64Array  # (P,) of the first column
 
 
 class PacketRing:
@@ -66,6 +76,17 @@ class PacketRing:
         data, start, place: as in `PacketBatch`; oldest_ring_index: first ring index that is still
         needed, None if none is. The view is valid until the next call.
         """
+        kept = self.keep(data, start, oldest_ring_index, place)
+        return self.packets(kept), kept.ring_index
+
+    def keep(
+        self,
+        data: U8Array,
+        start: I64Array,
+        oldest_ring_index: int | None,
+        place: int | None = None,
+    ) -> KeptPackets:
+        """Copy packets in, as `store`; return where they are."""
         count = len(start)
         oldest = self._next if oldest_ring_index is None else oldest_ring_index // self._places
         slot = self._reserve(count, oldest)
@@ -86,7 +107,16 @@ class PacketRing:
             sums += self._sum
             self._sum = sums[-1]
         self._next = slot + count
-        return packets, np.arange(slot, slot + count) * self._places
+        starts = first + np.arange(count) * stride
+        return KeptPackets(self._bytes, starts, np.arange(slot, slot + count) * self._places)
+
+    def packets(self, kept: KeptPackets) -> U8Array:
+        """Return a view (P, packet_size) of packets that were kept last."""
+        stride = self._rows_per_packet * self._records.stride
+        count = len(kept.start)
+        first = int(kept.start[0]) if count else 0
+        rows = kept.data[first : first + count * stride].reshape(count, stride)
+        return rows[:, : self._packet_size]
 
     def keep_sums(self) -> None:
         """Sum packets from now on, for `sum_until`."""

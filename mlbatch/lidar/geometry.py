@@ -25,7 +25,7 @@ from mlbatch.arrays import F32Array, F64Array, I64Array
 _ANGLE_BITS = 32
 _SPEED_BITS = 24
 _REVOLUTION = float(1 << _ANGLE_BITS)
-_SPEED_PER_HZ = float(1 << 48) * 1e-9
+SPEED_PER_HZ = float(1 << 48) * 1e-9
 _SPEED_LIMIT = (1 << (_SPEED_BITS - 1)) - 1
 
 
@@ -106,7 +106,7 @@ def rotor_words(
     ticks *= _REVOLUTION
     angle = np.rint(ticks, out=ticks).astype(np.int64)
     angle &= (1 << _ANGLE_BITS) - 1
-    steps = np.rint(revolutions_per_s * _SPEED_PER_HZ)
+    steps = np.rint(revolutions_per_s * SPEED_PER_HZ)
     speed = np.minimum(np.maximum(steps, -_SPEED_LIMIT), _SPEED_LIMIT).astype(np.int64)
     speed &= (1 << _SPEED_BITS) - 1
     speed <<= _ANGLE_BITS

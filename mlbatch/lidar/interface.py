@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.header_table import HeaderTable
 from mlbatch.lidar.pixel_table import PixelTable
 from mlbatch.types import ColumnHeaders, ImuSamples, Pixels, Stream
 
@@ -142,6 +143,8 @@ class Lidar(Protocol):
     pixel_layout: tuple[str | int | bool, ...]
     # The layout for compiled decoding; None: only `read` decodes it.
     pixels: PixelTable | None
+    # Layout of the headers for compiled loops; None: only numpy reads them.
+    headers: HeaderTable | None
     # The sequence number wraps there; 0: packets have none.
     sequence_modulus: int
     # Destination port of IMU packets; 0: unknown.

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
-from mlbatch.batching.intake import Arrival
+from mlbatch.batching.intake import Arrival, rises
+from mlbatch.decode.packet_ring import KeptPackets
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
@@ -175,11 +176,14 @@ class Ingest:
         oldest_ring_index: int | None,
     ) -> Arrival:
         """Copy packets that may be of a sensor to its ring; give those that are, and are valid."""
+        kept = sensor.ring.keep(batch.data, batch.start[index], oldest_ring_index, batch.place)
+        usual = self._arrive_usual(sensor, batch, index, owned, kept)
+        if usual is not None:
+            return usual
         lidar = sensor.lidar
         counts = sensor.ledger.packets
-        packets, ring_index = sensor.ring.store(
-            batch.data, batch.start[index], oldest_ring_index, batch.place
-        )
+        packets = sensor.ring.packets(kept)
+        ring_index = kept.ring_index
         good = lidar.sent_by_me(packets) & ~owned[index]
         counts.read += int(np.count_nonzero(good))
         owned[index] |= good
@@ -203,6 +207,36 @@ class Ingest:
             headers=headers,
             ring_index=ring_index,
             column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
+            is_rising=rises(headers),
+        )
+
+    def _arrive_usual(
+        self,
+        sensor: Sensor,
+        batch: PacketBatch,
+        index: I64Array,
+        owned: BoolArray,
+        kept: KeptPackets,
+    ) -> Arrival | None:
+        """Packets that compiled loops read; None unless they can read all, which then are good."""
+        if sensor.loops is None or self._stamp_map is not None or owned[index].any():
+            return None
+        lidar = sensor.lidar
+        host_ns = batch.host_ns[index]
+        found = sensor.loops.read(kept.data, kept.start, lidar.packet_size, host_ns)
+        if found is None:
+            return None
+        headers, key = found
+        sensor.ledger.packets.read += len(index)
+        owned[index] = True
+        return Arrival(
+            position=index,
+            host_ns=host_ns,
+            key=key,
+            headers=headers,
+            ring_index=kept.ring_index,
+            column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
+            is_rising=True,
         )
 
     def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:

@@ -21,6 +21,7 @@ from mlbatch.rig.rig import RigSensor
 
 if TYPE_CHECKING:
     from mlbatch.clocks.align import ClockMap
+    from mlbatch.decode.native_headers import HeaderLoops
 
 
 @dataclass(slots=True)
@@ -67,6 +68,7 @@ class Sensor:
     ring_base: int  # first ring number of its channels
     columns_per_s: float | None  # nominal rate, None if unknown
     ring: PacketRing | ArenaRing  # raw packets until their window closes
+    loops: HeaderLoops | None  # read headers that are as usual; None: numpy reads all
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property
@@ -128,6 +130,16 @@ class Sensor:
     def unread(self) -> Sensor:
         """The same sensor with an empty ring and ledger, for a pass of its own."""
         return replace(self, ring=new_ring(self.lidar), ledger=SensorLedger())
+
+
+def header_loops(lidar: Lidar, engine: str) -> HeaderLoops | None:
+    """Compiled loops for the headers of a lidar's packets; None if it has none, or engine numpy."""
+    if engine != "native" or lidar.headers is None:
+        return None
+    # Imported on demand: the library may be missing.
+    from mlbatch.decode.native_headers import HeaderLoops
+
+    return HeaderLoops(lidar.headers)
 
 
 def new_ring(lidar: Lidar, arena: PacketArena | None = None) -> PacketRing | ArenaRing:

@@ -21,7 +21,7 @@ from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
-from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
+from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, header_loops, new_ring
 from mlbatch.readers import merge, open_recordings
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
@@ -124,6 +124,7 @@ class Session:
             ring_base=ring_base,
             columns_per_s=sampler.columns_per_s(found),
             ring=new_ring(lidar, self._arena),
+            loops=header_loops(lidar, self.engine),
         )
 
     def _replay(self) -> FaultReplay | None:

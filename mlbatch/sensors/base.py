@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.header_table import HeaderTable
 from mlbatch.lidar.interface import Records
 from mlbatch.lidar.pixel_table import PixelTable
 from mlbatch.types import ImuSamples
@@ -38,6 +39,7 @@ class BaseLidar:
     calibration: str
 
     pixels: PixelTable | None = None
+    headers: HeaderTable | None = None
     serial: str = ""
     carries_serial: bool = False
     has_reflectivity: bool = False
@@ -98,7 +100,7 @@ def content_keys(packets: U8Array) -> I64Array:
     words = size // 8
     # Bytes beyond whole words are hashed as the last eight bytes, which may overlap the words.
     if words and packets.strides[1] == 1:
-        keys = np.einsum("ij,j->i", packets[:, : words * 8].view("<u8"), _odd_numbers(words))
+        keys = np.einsum("ij,j->i", packets[:, : words * 8].view("<u8"), hash_factors(words))
         if size % 8:
             keys = keys * _ODD + packets[:, size - 8 :].view("<u8")[:, 0]
     else:
@@ -114,6 +116,7 @@ _ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
 @lru_cache(maxsize=16)
-def _odd_numbers(count: int) -> npt.NDArray[np.uint64]:
+def hash_factors(count: int) -> npt.NDArray[np.uint64]:
+    """Return the factors of the words of a packet in `content_keys`: (count,) odd numbers."""
     numbers = np.arange(1, count + 1, dtype=np.uint64) * _ODD
     return np.asarray((numbers ^ numbers >> np.uint64(31)) | np.uint64(1), np.uint64)

@@ -26,6 +26,10 @@ from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.frames import Addresses, Dissection, Frames, dissect
 from mlbatch.types import EXTRAS, Columns, RunInfo, SensorInfo, WindowColumns
 from tests.builders.engines import BOXES_M, Pair
+from tests.builders.headers import ouster_packets, same_as_numpy
+from tests.builders.ouster import OusterSpec
+from tests.builders.velodyne import VelodyneSpec
+from tests.builders.velodyne_streams import PLAIN, made_of
 from tests.decode.test_native_engine import (
     END_NS,
     NAMES,
@@ -106,6 +110,37 @@ def _decode(data: bytes, folder: Path) -> None:
     stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
     columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word)
     pair.check(columns, ScanHeader(0, 0, START_NS, END_NS, True, 0))
+
+
+# -- headers --------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _headed() -> Sequence[tuple[Lidar, U8Array]]:
+    """Lidars whose headers the loops read, and packets of them."""
+    specs = [OusterSpec(name, 16, 512) for name in NAMES]
+    made = [made_of(VelodyneSpec(model, mode)) for model in PLAIN for mode in ("last", "dual")]
+    return (
+        *(ouster_packets(spec) for spec in specs),
+        *((one.lidar, one.sent.payloads[:3]) for one in made),
+    )
+
+
+def _header_seeds() -> Seeds:
+    """Packets of each lidar behind its number."""
+    return tuple(
+        _HEAD.pack(number) + packets.tobytes() for number, (_, packets) in enumerate(_headed())
+    )
+
+
+def _read_headers(data: bytes, folder: Path) -> None:
+    """Headers of packets of any bytes."""
+    data = data.ljust(_HEAD.size, b"\0")
+    (number,) = _HEAD.unpack_from(data)
+    lidar, packets = _headed()[number % len(_headed())]
+    whole = np.frombuffer(data[_HEAD.size :].ljust(packets.size, b"\0")[: packets.size], np.uint8)
+    host_ns = START_NS + 10**9 * np.arange(len(packets)) * (number % 41)
+    same_as_numpy(lidar, whole.reshape(packets.shape), host_ns)
 
 
 # -- frames ---------------------------------------------------------------------------------------
@@ -248,6 +283,7 @@ TARGETS: Sequence[Target] = (
     if trouble()
     else (
         Target("pixels, compiled", _pixel_seeds, _decode, mutated, 20),
+        Target("headers, compiled", _header_seeds, _read_headers, mutated, 20),
         Target("frames, compiled", _frame_seeds, _dissect, _mutated_frames, 10),
         Target("columns, compiled", _stamp_seeds, _merge, mutated, 10),
     )

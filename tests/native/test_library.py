@@ -47,7 +47,9 @@ def declared() -> dict[str, list[tuple[str, bool]]]:
     }
 
 
-@pytest.mark.parametrize("name", ["Ring", "Field", "Group", "Scan", "Part"])
+@pytest.mark.parametrize(
+    "name", ["Ring", "Field", "Group", "Scan", "Part", "Check", "StampedLayout"]
+)
 def test_structs_are_those_of_the_header(name: str) -> None:
     kind = getattr(library, name)
     mirrored = [(member, of is ctypes.c_void_p) for member, of in kind._fields_]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.lidar.header_table import FixedNumber, StampedColumns
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors.crc import crc64
 from mlbatch.sensors.ouster.profiles import (
@@ -32,6 +33,9 @@ BAD_CRC = FAULTS.index("bad_crc")
 # The measurement id follows the stamp in the columns of all layouts.
 _ID_OFFSET = 8
 _ID_BYTES = 2
+_STATUS_OFFSET = 10
+# Frame id in the columns of LEGACY packets: first byte, bytes.
+_LEGACY_FRAME = (10, 2)
 # Firmware before 2.3 leaves the footer empty, 2.3 and 2.4 write DE C0 00 00 EF BE AD DE.
 _NO_CRC = (0, 0xDEADBEEF0000C0DE)
 # Smallest integer type for a number of so many bytes.
@@ -95,6 +99,24 @@ class LegacyHeaders:
                 _ranges(column_starts(self.layout), LEGACY_COLUMN.itemsize),
                 _ranges(ends, LEGACY_STATUS.itemsize),
             ]
+        )
+
+    def table(self, frames: int, rank: I64Array, packets_per_frame: int) -> StampedColumns | None:
+        """Layout for compiled loops; arguments: as in StampedColumns."""
+        size = self.layout.record_size
+        return StampedColumns(
+            columns=self.layout.columns,
+            first_column=self.layout.record_start,
+            column_bytes=size,
+            position_at=_ID_OFFSET,
+            status_at=size - LEGACY_STATUS.itemsize,
+            positions=self.columns_per_frame,
+            frame_field=_LEGACY_FRAME,
+            frames=frames,
+            frames_in_columns=True,
+            rank=rank,
+            packets_per_frame=packets_per_frame,
+            fixed=(),
         )
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
@@ -162,6 +184,29 @@ class PacketHeaders:
             return np.array([[0, self.layout.packet_size]])
         header = np.array([[0, self.layout.record_start]])
         return np.concatenate([header, _ranges(column_starts(self.layout), COLUMN.itemsize)])
+
+    def table(self, frames: int, rank: I64Array, packets_per_frame: int) -> StampedColumns | None:
+        """Layout for compiled loops; arguments: as in StampedColumns."""
+        if self.check_crc and self.header == STANDARD:
+            return None
+        header = HEADERS[self.header]
+        fixed = [FixedNumber(*header.packet_type, LIDAR_PACKET)]
+        if self.serial:
+            fixed.append(FixedNumber(*header.serial, self.serial))
+        return StampedColumns(
+            columns=self.layout.columns,
+            first_column=self.layout.record_start,
+            column_bytes=self.layout.record_size,
+            position_at=_ID_OFFSET,
+            status_at=_STATUS_OFFSET,
+            positions=self.columns_per_frame,
+            frame_field=header.frame_id,
+            frames=frames,
+            frames_in_columns=False,
+            rank=rank,
+            packets_per_frame=packets_per_frame,
+            fixed=tuple(fixed),
+        )
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether the serial number is the sensor's; 0 on either side matches all."""

@@ -15,6 +15,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.header_table import StampedColumns
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.ouster.identify import describe
@@ -190,11 +191,18 @@ class OusterLidar:
         self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
         self._packets_per_frame = in_window
         self.sequence_modulus = self._frame_ids * in_window
+        self.headers = self._header_table()
 
     @property
     def columns_per_s(self) -> float:
         """Columns sent in a second, within the azimuth window."""
         return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
+
+    def _header_table(self) -> StampedColumns | None:
+        """Layout of the headers for compiled loops."""
+        if len(self._rank) * self.columns_per_packet != self._metadata.columns_per_frame:
+            return None
+        return self._headers.table(self._frame_ids, self._rank, self._packets_per_frame)
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """(P,) whether packets carry this sensor's serial number, or none."""

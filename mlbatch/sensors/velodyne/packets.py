@@ -12,9 +12,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array
 from mlbatch.lidar.geometry import Projection, rotor_words
+from mlbatch.lidar.header_table import PacedBlocks
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.sensors.base import BaseLidar, hash_factors
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
@@ -24,6 +25,7 @@ from mlbatch.sensors.velodyne.models import (
     MODE_AT,
     MODES,
     PACKET_SIZE,
+    STAMP_AT,
     STRIDE,
     Layout,
     Model,
@@ -125,6 +127,7 @@ class VelodyneLidar(BaseLidar):
         self.clock_period_ns = HOUR_NS
         self.notes = notes
         self._start_ns, self._ahead_ns = self._timetable()
+        self.headers = self._header_table()
 
     def faults(self, packets: U8Array) -> U8Array:
         """(P,) index into FAULTS."""
@@ -171,6 +174,31 @@ class VelodyneLidar(BaseLidar):
         if not self._options.vertical_offset:
             file = replace(file, vert_offset_m=np.zeros_like(file.vert_offset_m))
         return hdl64_projection(file, self.firing_ns, body_from_sensor, columns)
+
+    def _header_table(self) -> PacedBlocks:
+        """Layout of the headers for compiled loops."""
+        model = self._model
+        measured = self._measured
+        return PacedBlocks(
+            packet_bytes=PACKET_SIZE,
+            columns=self._layout.columns,
+            groups=self._layout.sequences,
+            block_bytes=STRIDE,
+            flags=expected_flags(model.banks, self.returns),
+            hash_factors=hash_factors(PACKET_SIZE // 8),
+            circle=CIRCLE_CDEG,
+            widest=_GAP_CDEG,
+            stamp_at=STAMP_AT,
+            period_ns=HOUR_NS,
+            clock_offset_ns=measured.clock_offset_ns,
+            mode_at=MODE_AT,
+            modes=_MAY_BE_MODE[self.returns] if model.banks == 1 else None,
+            start_ns=self._start_ns,
+            ahead_ns=self._ahead_ns,
+            group_ns=measured.sequence_ns * model.halves,
+            known_speed=measured.speed,
+            follows_rotor=self._options.firing_azimuth,
+        )
 
     def _timetable(self) -> tuple[I64Array, F64Array]:
         """First firing of each column, after the packet's stamp and after its block's azimuth."""
