@@ -333,6 +333,54 @@ class RunInfo:
         return dict(self.variants).get(name, default)
 
 
+class RecordPiece(NamedTuple):
+    """A piece of a packed point record: bytes copied from a point, or a value computed from it.
+
+    kind: a word of RECORD_KINDS; source: first byte of a copy in the kind's array; bytes: length.
+    """
+
+    kind: str
+    offset: int  # bytes, in the record
+    source: int
+    bytes: int
+
+
+# Arrays to copy from (`decode/scan_buffer.py`): point, label, reflectivity. Computed: time in s as
+# float32 (toward zero) and as float64, ring, range in mm, timestamp in s.
+RECORD_KINDS = (
+    "point",
+    "label",
+    "reflectivity",
+    "seconds_f4",
+    "seconds_f8",
+    "ring_i4",
+    "range_mm_u4",
+    "stamp_f8",
+)
+
+
+class RecordLayout(NamedTuple):
+    """Point records that engines can pack while they decode; bytes between pieces are zero."""
+
+    step: int  # bytes of a record
+    pieces: tuple[RecordPiece, ...]
+
+
+class PackedPoints(NamedTuple):
+    """The points of a scan as records of the output.
+
+    buffer: bytes; records begin at `begin` and end at `end`; PACKED_ROOM bytes before them and one
+    behind them are free, for what a message adds. shape: (p,), or (slots, n) when organized.
+    """
+
+    buffer: U8Array
+    begin: int
+    end: int
+    shape: tuple[int, ...]
+
+
+PACKED_ROOM = 4096
+
 # Optional arrays of a scan: those that the output cannot store are not made.
 EXTRAS = frozenset({"reflectivity", "range_m", "column"})
 # Listed with EXTRAS by outputs whose intensity has 8 bits: points outside 0 to 255 are counted.
@@ -379,6 +427,9 @@ class Scan:
     # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     is_partial: bool = False  # the head or the tail
+    # If a writer asked for records (`WriterModule`) and the engine packs them: instead of the
+    # arrays of points, which are empty then.
+    packed: PackedPoints | None = None
 
     @property
     def slices(self) -> int:

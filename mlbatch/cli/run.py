@@ -44,6 +44,7 @@ from mlbatch.writers import (
     extras,
     jobs_for,
     open_writer,
+    record_layout,
     report_paths,
     sync_entries,
     write_text,
@@ -114,7 +115,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
     check_options(name, options)
     check_variants(name, job.variants)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
-    job = replace(job, extras=extras(name, options), jobs=jobs)
+    job = replace(job, extras=extras(name, options), record=record_layout(name, options), jobs=jobs)
     report_path = target.report
     open_output: OpenWriter | None = None
     resume_log = None

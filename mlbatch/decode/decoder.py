@@ -20,7 +20,15 @@ from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
 from mlbatch.report.ledger import PointCounts
-from mlbatch.types import EXTRAS, NO_COLUMNS, RunInfo, Scan, WindowColumns, WindowFigures
+from mlbatch.types import (
+    EXTRAS,
+    NO_COLUMNS,
+    RecordLayout,
+    RunInfo,
+    Scan,
+    WindowColumns,
+    WindowFigures,
+)
 
 __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
@@ -82,11 +90,13 @@ class Decoder:
         only: int | None = None,
         buffers: int = 1,
         engine: str = "numpy",
+        record: RecordLayout | None = None,
     ) -> None:
         """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
 
         only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
-        whose arrays are valid at a time; engine: numpy or native.
+        whose arrays are valid at a time; engine: numpy or native; record: layout of the records
+        that the output takes, which an engine may pack.
         """
         self._info = info
         self._only = only
@@ -119,6 +129,8 @@ class Decoder:
             first_sensor=first_sensor,
             extras=extras if self._has_reflectivity else extras - {"reflectivity"},
             organized_slots=self._slots if self._is_organized else 0,
+            # Points are sorted by arrays.
+            record=None if info.sort == "points" else record,
         )
         self._engine = choice.make(setup)
         self._counts = [self._projectors[which].counts[member] for which, member in self._seat]
@@ -183,7 +195,8 @@ class Decoder:
         by_time(self._unsorted, points, self._buffer)
 
     def _new_buffer(self, rows: int) -> ScanBuffer:
-        return ScanBuffer(rows, self._slots if self._is_organized else None)
+        slots = self._slots if self._is_organized else None
+        return ScanBuffer(rows, slots, self._engine.record)
 
     def _written(self) -> list[int]:
         """Return the points so far of each sensor of the run; 0 without a decoder here."""
@@ -229,6 +242,9 @@ class Decoder:
             overlap=tuple([one.overlap for one in figures]),
             fill=header.fill,
             is_partial=header.is_partial,
+            packed=buffer.packed_points(
+                (self._slots, len(columns)) if self._is_organized else (points,)
+            ),
         )
 
     def _lidar_id(self, columns: WindowColumns) -> U8Array:

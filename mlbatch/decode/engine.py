@@ -9,7 +9,7 @@ from typing import Protocol
 from mlbatch.arrays import I64Array
 from mlbatch.decode.projector import Extras, Projector
 from mlbatch.decode.scan_buffer import ScanBuffer
-from mlbatch.types import WindowColumns
+from mlbatch.types import RecordLayout, WindowColumns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,7 +19,8 @@ class EngineSetup:
     seat: (sensors, 2) int64, index of the projector of each sensor, and its member there; -1: the
     engine skips the sensor. tile_columns: most columns that a projector takes. first_sensor: index
     of the first sensor in the scan. extras: optional arrays of the scan, of any sensor.
-    organized_slots: slots of a row of an organized scan; 0: scans are dense.
+    organized_slots: slots of a row of an organized scan; 0: scans are dense. record: layout of the
+    records that the output takes; None: it takes arrays.
     """
 
     projectors: Sequence[Projector]
@@ -28,10 +29,16 @@ class EngineSetup:
     first_sensor: int
     extras: Extras
     organized_slots: int
+    record: RecordLayout | None = None
 
 
 class Engine(Protocol):
-    """Decodes windows of columns. All engines write the same bytes."""
+    """Decodes windows of columns. All engines write the same bytes.
+
+    record: layout of the records that the engine packs; None: it writes arrays.
+    """
+
+    record: RecordLayout | None
 
     def decode(
         self, columns: WindowColumns, start_ns: int, first_number: int, out: ScanBuffer

@@ -22,8 +22,8 @@ from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.lidar.geometry import Tabled, Turning, rotor_angles
 from mlbatch.lidar.interface import Lidar
 from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
-from mlbatch.native.library import Field, Group, Ring, Scan, address, library
-from mlbatch.types import WindowColumns
+from mlbatch.native.library import Field, Group, Piece, Ring, Scan, address, library
+from mlbatch.types import PACKED_ROOM, RECORD_KINDS, RecordLayout, WindowColumns
 
 # As in `native.h`.
 _TABLED, _TURNING, _COPIED = range(3)
@@ -38,6 +38,11 @@ _BEAMS_OF_FOUR = 4
 _COUNTS = 5
 _UNSURE = np.float32(2)
 _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
+# Columns of an organized scan that are packed together: slots of several columns are adjacent in
+# the output, and all of them fit into the second-level cache.
+_NEAR_COLUMNS = 16
+# Points beyond those of a column that the loops may overwrite.
+_SPARE_POINTS = 4
 # The return type in a label.
 _TYPE_BITS = np.uint64(0xFF << 48)
 
@@ -88,6 +93,10 @@ class NativeEngine:
             boxes_m=address(self._arrays[2]),
             row_slots=setup.organized_slots,
         )
+        # numpy writes its rows of organized scans to arrays.
+        self.record = None if self._organized_numpy else setup.record
+        if self.record is not None:
+            self._set_record(self.record, max(one.slots for one in setup.projectors))
         # Columns in one call: what numpy decodes is copied from a buffer.
         self._most_columns = setup.tile_columns if self._copies else None
 
@@ -117,6 +126,29 @@ class NativeEngine:
         for engine in self._organized_numpy:
             row += engine.decode(columns, start_ns, first_number, out)
         return row
+
+    def _set_record(self, record: RecordLayout, slots: int) -> None:
+        """Have records packed from scratch arrays; slots: most of a column."""
+        is_organized = bool(self._scan.row_slots)
+        near = _NEAR_COLUMNS if is_organized else 1
+        pieces = [
+            Piece(RECORD_KINDS.index(one.kind), one.offset, one.source, one.bytes)
+            for one in record.pieces
+            # Without a sensor that has them, reflectivities are not decoded: they stay 0.
+            if one.kind != "reflectivity" or "reflectivity" in self._extras
+        ]
+        self._pieces = (Piece * len(pieces))(*pieces)
+        if is_organized:
+            self._near = ScanBuffer(near, self._scan.row_slots)
+        else:
+            self._near = ScanBuffer(slots + _SPARE_POINTS, None)
+        scan = self._scan
+        scan.record_bytes = record.step
+        scan.piece_count = len(pieces)
+        scan.pieces = ctypes.addressof(self._pieces)
+        scan.near_columns = near
+        kinds = [RECORD_KINDS[piece.kind] for piece in pieces]
+        self._set_arrays(self._near, "range_mm_u4" in kinds, "reflectivity" in kinds)
 
     def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
         """Point the struct to the columns; return the arrays to keep."""
@@ -155,16 +187,22 @@ class NativeEngine:
         if out is self._out:
             return
         self._out = out
-        scan = self._scan
         extras = self._extras
+        if self.record is not None:
+            self._scan.records = address(out.packed) + PACKED_ROOM
+            return
+        self._set_arrays(out, "range_m" in extras, "reflectivity" in extras)
+        wants_column = "column" in extras and not out.is_organized
+        self._scan.column = address(out.column) if wants_column else None
+
+    def _set_arrays(self, out: ScanBuffer, wants_range: bool, wants_reflectivity: bool) -> None:
+        scan = self._scan
         scan.point = address(out.point)
         scan.label = address(out.label)
-        wants_range = out.is_organized or "range_m" in extras
-        wants_reflectivity = out.is_organized or "reflectivity" in extras
-        wants_column = "column" in extras and not out.is_organized
-        scan.range_m = address(out.range_m) if wants_range else None
-        scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
-        scan.column = address(out.column) if wants_column else None
+        scan.range_m = address(out.range_m) if wants_range or out.is_organized else None
+        scan.reflectivity = (
+            address(out.reflectivity) if wants_reflectivity or out.is_organized else None
+        )
 
 
 class _DecodedGroup:

@@ -18,7 +18,7 @@ from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.decode.engine import EngineSetup
 from mlbatch.decode.projector import Projector, Tile, TileView, points_by_column
 from mlbatch.decode.scan_buffer import ScanBuffer
-from mlbatch.types import WindowColumns
+from mlbatch.types import RecordLayout, WindowColumns
 
 # Four NaN of float32 in one number.
 _NO_POINT = np.full(4, np.nan, np.float32).view(np.complex128)
@@ -47,6 +47,8 @@ class NumpyEngine:
     def __init__(self, setup: EngineSetup) -> None:
         projectors = setup.projectors
         seat = setup.seat
+        # Writers pack its arrays (`writers/point_layouts.py`).
+        self.record: RecordLayout | None = None
         self._projectors = projectors
         self._columns = setup.tile_columns
         self._first_sensor = setup.first_sensor

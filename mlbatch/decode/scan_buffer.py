@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array
+from mlbatch.types import PACKED_ROOM, PackedPoints, RecordLayout
 
 # All of a point but its readings, in one word of 8 bytes that is copied as one. The time, in ns
 # after the start of the scan, is the low half, so that it can be added as a number.
@@ -21,14 +23,21 @@ class ScanBuffer:
 
     point: (rows, 4) or (rows, slots, 4) float32, x, y, z in m and intensity; range_m: float32;
     reflectivity: uint16; label: LABEL; column: (rows,) uint32, number of the column in the scan,
-    empty if organized.
+    empty if organized. record: layout of packed records, None without; with them the other arrays
+    have no rows. packed: bytes of the records.
     """
 
-    def __init__(self, rows: int, slots: int | None) -> None:
+    def __init__(self, rows: int, slots: int | None, record: RecordLayout | None = None) -> None:
         """slots: slots of a row of an organized scan; None: dense, a row is a point."""
-        shape = (rows,) if slots is None else (rows, slots)
         self.rows = rows
         self.is_organized = slots is not None
+        self.record = record
+        # Zeros: what is between pieces is never written.
+        size = 0 if record is None else PACKED_ROOM + rows * (slots or 1) * record.step + 1
+        self.packed = np.zeros(size, np.uint8)
+        if record is not None:
+            rows = 0
+        shape = (rows,) if slots is None else (rows, slots)
         self.point = np.empty((*shape, 4), np.float32)
         self.range_m = np.empty(shape, np.float32)
         self.reflectivity = np.empty(shape, np.uint16)
@@ -42,6 +51,13 @@ class ScanBuffer:
         self.ring = self.label["ring"]
         self.return_type = self.label["return_type"]
         self.lidar_id = self.label["lidar_id"]
+
+    def packed_points(self, shape: tuple[int, ...]) -> PackedPoints | None:
+        """Return the records of a scan of this shape; None if points are not packed."""
+        if self.record is None:
+            return None
+        end = PACKED_ROOM + math.prod(shape) * self.record.step
+        return PackedPoints(self.packed, PACKED_ROOM, end, shape)
 
     def clear(self, rows: I64Array) -> None:
         """Empty all slots of some rows: NaN in float arrays, 0 in integer arrays."""

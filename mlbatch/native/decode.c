@@ -676,7 +676,7 @@ static void emit_extras(const Scan *scan, const Group *group, const int64_t *ord
     }
 }
 
-/* A row of an organized scan: every kept element to its slot, the others empty. */
+/* Row `number` of an organized scan: every kept element to its slot, the others empty. */
 static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
                               const Planes *planes)
 {
@@ -784,11 +784,52 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
         project_turning(group, member, encoder, known, column, planes);
     mark(scan, group, member, planes);
     label(group, known, offset_ns, planes);
-    if (scan->row_slots)
-        return row + emit_organized(scan, group, scan->first_number + column, planes);
+    if (scan->row_slots) {
+        const int64_t number =
+            scan->records ? column % scan->near_columns : scan->first_number + column;
+        return row + emit_organized(scan, group, number, planes);
+    }
     const int64_t *order = group->order ? group->order + table * group->order_step : 0;
     emit_extras(scan, group, order, row, planes);
     return emit_ordered(scan, group, order, row, planes);
+}
+
+/* -- packed records ----------------------------------------------------------------------------- */
+
+/* Decode or copy a column of a dense scan to packed records. Return the next row. */
+static int64_t pack_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                           int64_t row, Planes *planes)
+{
+    Rows rows = {scan->point, scan->label, scan->range_m, scan->reflectivity, 1};
+    int64_t count;
+    if (group->kind == COPIED) {
+        const int64_t from = *group->cursor;
+        count = group->points[column];
+        rows.point = group->copied_point + 4 * from;
+        rows.label = group->copied_label + from;
+        rows.range_m = group->copied_range + from;
+        rows.reflectivity = group->copied_reflectivity + from;
+        *group->cursor += count;
+    } else {
+        count = decode_column(scan, group, member, column, record_of(scan, group, column), 0,
+                              planes);
+    }
+    mlbatch_pack(scan, &rows, count, scan->records + row * scan->record_bytes);
+    return row + count;
+}
+
+/* Pack the columns up to `column` that are in the scratch arrays, slot by slot, so that the
+   columns of a slot are written together. */
+static void pack_near(const Scan *scan, int64_t column)
+{
+    const int64_t slots = scan->row_slots;
+    const int64_t first = column - column % scan->near_columns;
+    for (int64_t slot = 0; slot < slots; slot++) {
+        const Rows rows = {scan->point + 4 * slot, scan->label + slot, scan->range_m + slot,
+                           scan->reflectivity + slot, slots};
+        mlbatch_pack(scan, &rows, column - first + 1,
+                     scan->records + (slot * scan->columns + first) * scan->record_bytes);
+    }
 }
 
 /* Decode all columns of a scan, in their order; return the row after the last point (organized:
@@ -808,18 +849,25 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
             continue;
         const Group *group = scan->groups + number;
         const int64_t first = row;
-        if (group->kind == COPIED) {
-            row = copy_column(scan, group, column, row);
-        } else {
+        if (group->kind != COPIED) {
             if (number != last_group && last_group >= 0) {
                 /* What another group left in beams that this one does not have. */
                 memset(planes.words, 0, sizeof planes.words);
                 memset(planes.reflectivity, 0, sizeof planes.reflectivity);
             }
             last_group = number;
+        }
+        if (scan->records && !scan->row_slots)
+            row = pack_column(scan, group, scan->member_of[sensor], column, row, &planes);
+        else if (group->kind == COPIED)
+            row = copy_column(scan, group, column, row);
+        else
             row = decode_column(scan, group, scan->member_of[sensor], column,
                                 record_of(scan, group, column), row, &planes);
-        }
+        if (scan->records && scan->row_slots
+            && (column % scan->near_columns == scan->near_columns - 1
+                || column == scan->columns - 1))
+            pack_near(scan, column);
         if (scan->column)
             for (int64_t place = first; place < row; place++)
                 scan->column[place] = (uint32_t)(scan->first_number + column);

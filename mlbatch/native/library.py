@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 3
+_ABI = 4
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -106,6 +106,17 @@ class Group(ctypes.Structure):
     ]
 
 
+class Piece(ctypes.Structure):
+    """A piece of a packed record."""
+
+    _fields_: ClassVar = [
+        ("kind", _WORD),
+        ("offset", _WORD),
+        ("source", _WORD),
+        ("bytes", _WORD),
+    ]
+
+
 class Scan(ctypes.Structure):
     """A scan under construction."""
 
@@ -130,6 +141,11 @@ class Scan(ctypes.Structure):
         ("range_m", _ADDRESS),
         ("reflectivity", _ADDRESS),
         ("column", _ADDRESS),
+        ("records", _ADDRESS),
+        ("record_bytes", _WORD),
+        ("piece_count", _WORD),
+        ("pieces", _ADDRESS),
+        ("near_columns", _WORD),
     ]
 
 

@@ -15,7 +15,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 3
+#define MLBATCH_ABI 4
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -112,6 +112,27 @@ typedef struct {
     const uint16_t *copied_reflectivity;
 } Group;
 
+/* Kinds of `Piece`: bytes of the arrays of a scan, and values computed from them, as in
+   `types.RecordKind`. */
+enum {
+    COPY_POINT,
+    COPY_LABEL,
+    COPY_REFLECTIVITY,
+    SECONDS_F4,
+    SECONDS_F8,
+    RING_I4,
+    RANGE_MM_U4,
+    STAMP_F8
+};
+
+/* A piece of a packed record; source and bytes: of a copy, from a row of its array. */
+typedef struct {
+    int64_t kind;
+    int64_t offset;
+    int64_t source;
+    int64_t bytes;
+} Piece;
+
 /* A scan under construction. */
 typedef struct {
     int64_t columns;
@@ -130,13 +151,32 @@ typedef struct {
     const float *boxes_m; /* (box_count, 6) */
     int64_t row_slots;    /* organized: slots of a row; 0: dense */
     /* Outputs, as in `decode/scan_buffer.py`; NULL: none. A dense scan has room for all
-       slots of its columns. */
+       slots of its columns. With `records` the arrays are scratch for `near_columns` columns. */
     float *point;
     int64_t *label;
     float *range_m;
     uint16_t *reflectivity;
     uint32_t *column;
+    /* Packed records of `record_bytes`, in the order of the output: dense as the points, organized
+       (row_slots, columns). NULL: none. */
+    uint8_t *records;
+    int64_t record_bytes;
+    int64_t piece_count;
+    const Piece *pieces;
+    int64_t near_columns;
 } Scan;
+
+/* Values of points to be packed, as the arrays of a scan; step: rows from one to the next. */
+typedef struct {
+    const float *point;
+    const int64_t *label;
+    const float *range_m;
+    const uint16_t *reflectivity;
+    int64_t step;
+} Rows;
+
+/* Pack so many points to records; `pack.c`. */
+void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record);
 
 /* Columns of a sensor that wait for their window: `types.Columns`. */
 typedef struct {

@@ -243,7 +243,14 @@ class Conversion:
 
         def decoder(sources: Sequence[Source], only: int | None) -> Decoder:
             return Decoder(
-                info, sources, boxes_m, job.extras, only, self._buffers, self.session.engine
+                info,
+                sources,
+                boxes_m,
+                job.extras,
+                only,
+                self._buffers,
+                self.session.engine,
+                job.record,
             )
 
         sources = [sensor.source() for sensor in self.sensors]

@@ -14,7 +14,7 @@ from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.types import EXTRAS
+from mlbatch.types import EXTRAS, RecordLayout
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ class Job:
     segment: TimeSegment = field(default_factory=TimeSegment)  # of the session, by receive time
     passed: tuple[str, ...] = ()  # patterns of topics to forward
     extras: frozenset[str] = EXTRAS  # optional contents that the output can store
+    record: RecordLayout | None = None  # records of points that the output takes packed
     stamp: str = "start"  # or middle, end: instant of a window that its message is stamped with
     batching: str = WINDOW  # or a policy of frame-level fusion
     batching_times: str = COMMON  # or own

@@ -24,7 +24,7 @@ from mlbatch.writers import WriterOptions
 # Fields of a job that are not part of its identity: digests of files and sensors replace them, or
 # the output does not depend on them.
 _NOT_IDENTITY = frozenset(
-    {"recordings", "selection", "segment", "extras", "fault_begin_ns", "jobs", "engine"}
+    {"recordings", "selection", "segment", "extras", "record", "fault_begin_ns", "jobs", "engine"}
 )
 # What decoding takes from a calibration, apart from `beams`; see `Lidar`.
 _CALIBRATED = (

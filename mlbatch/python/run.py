@@ -33,6 +33,7 @@ from mlbatch.writers import (
     jobs_for,
     open_writer,
     parse_jobs,
+    record_layout,
     report_paths,
     sync_entries,
     write_text,
@@ -137,7 +138,12 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     )
     check_options(name, writer_options)
     jobs = jobs_for(asked, name, writer_options) if output is not None else asked or 1
-    job = replace(job, extras=extras(name, writer_options), jobs=jobs)
+    job = replace(
+        job,
+        extras=extras(name, writer_options),
+        record=record_layout(name, writer_options),
+        jobs=jobs,
+    )
     if output is None:
         preflight.check_report(job, options.report, None, name)
         _, content = convert(job, None)

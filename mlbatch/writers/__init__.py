@@ -42,10 +42,10 @@ from mlbatch.writers.formats import (
 from mlbatch.writers.threads import jobs_for, parse_jobs
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from mlbatch.types import RunInfo
+    from mlbatch.types import RecordLayout, RunInfo
 
 __all__ = [
     "Checkpoint",
@@ -73,6 +73,7 @@ __all__ = [
     "parse_jobs",
     "partial_path",
     "plugin",
+    "record_layout",
     "report_paths",
     "sync_entries",
     "sync_to_disk",
@@ -171,6 +172,13 @@ def report_paths(target: Path, name: str) -> ReportPaths:
 def extras(name: str, options: WriterOptions) -> frozenset[str]:
     """Return the optional contents of an output, see `WriterModule.extras`."""
     return plugin(name).extras(options)
+
+
+def record_layout(name: str, options: WriterOptions) -> RecordLayout | None:
+    """Return the records that a writer takes packed, see `WriterModule`; None: arrays."""
+    own: Callable[[WriterOptions], RecordLayout | None] | None
+    own = getattr(plugin(name), "record_layout", None)
+    return None if own is None else own(options)
 
 
 def check_options(name: str, options: WriterOptions) -> None:

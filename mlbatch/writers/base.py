@@ -119,6 +119,8 @@ class WriterModule(Protocol):
     # `--compression`, and several threads can write at the same time.
     # Optional, only for folders: FILE_SUFFIXES, a tuple with the suffixes of the files of a scan,
     # without the first dot. Without it the suffix is FORMAT.
+    # Optional: record_layout(options: WriterOptions) -> RecordLayout | None, records of points
+    # that the writer takes packed (`Scan.packed`). Engines that cannot pack give arrays instead.
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
         """Return the optional contents that the output includes.

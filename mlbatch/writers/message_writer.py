@@ -24,6 +24,8 @@ from mlbatch.types import (
     INSTANTS,
     ImuSamples,
     Message,
+    PackedPoints,
+    RecordLayout,
     RunInfo,
     Scan,
     Summary,
@@ -102,6 +104,12 @@ def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
     """Return the inputs of the point layout, IMU samples, and messages in `encodings`."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)
     return frozenset({IMU, *encodings}) | (frozenset() if layout is None else layout.extras)
+
+
+def record_of(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of the point layout; None if only numpy can pack them."""
+    layout = CLOUD_LAYOUTS.get(options.point_layout)
+    return None if layout is None else layout.record
 
 
 def _layout_of(options: WriterOptions) -> Layout:
@@ -216,8 +224,11 @@ class MessageWriter:
         dense = scan.info.layout != "organized"
         cloud = borrow(self.idle, self._new_cloud)
         if is_kept:
-            shape = (scan.points,) if dense else scan.time_ns.T.shape
+            columns = len(scan.column_stamp_ns)
+            shape = (scan.points,) if dense else (scan.time_ns.shape[1], columns)
             return cloud, cloud.blank(shape, stamp_ns(scan))
+        if scan.packed is not None:
+            return cloud, cloud.around(scan.packed, stamp_ns(scan), dense)
         return cloud, cloud.assemble(points_of(scan), stamp_ns(scan), dense)
 
     def send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
@@ -362,6 +373,19 @@ class CloudMessage:
         self._layout.pack(points, records.reshape(points.time_ns.shape))
         self._buffer[end] = dense
         return self._buffer[: end + 1].data
+
+    def around(self, packed: PackedPoints, stamp_ns: int, dense: bool) -> memoryview:
+        """Return the message of packed points, in their buffer; valid as long as that is."""
+        head = self._head(packed.shape, stamp_ns)
+        buffer, start = packed.buffer, packed.begin - len(head)
+        if start < 0:
+            # A frame name of thousands of characters.
+            return memoryview(
+                bytes(head) + buffer[packed.begin : packed.end].tobytes() + bytes([dense])
+            )
+        buffer[start : packed.begin] = np.frombuffer(head, dtype=np.uint8)
+        buffer[packed.end] = dense
+        return buffer[start : packed.end + 1].data
 
     def blank(self, shape: tuple[int, ...], stamp_ns: int) -> memoryview:
         """Return bytes as long as the message of a cloud of this shape, with any content."""

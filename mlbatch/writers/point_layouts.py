@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.errors import ExportError
-from mlbatch.types import BYTE_INTENSITY, Scan, SensorInfo
+from mlbatch.types import BYTE_INTENSITY, RecordLayout, RecordPiece, Scan, SensorInfo
 from mlbatch.units import MM_PER_M, NS_PER_S
 
 Values: TypeAlias = npt.NDArray[np.generic]
@@ -25,6 +25,9 @@ Values: TypeAlias = npt.NDArray[np.generic]
 REALS = "<c16"  # x, y, z, intensity: four float32
 LABEL = "<u8"  # time_ns, ring, return_type, lidar_id
 PAIR = "<u2"  # return_type, lidar_id
+# Kinds of pieces that are copies; the piece of a field that is always zero.
+_COPIES = ("point", "label", "reflectivity")
+_ZERO = ("", 0)
 # Offsets of the parts, bytes.
 _PARTS = {REALS: (0, 4, 8, 12), LABEL: (0, 4, 6, 7)}
 
@@ -156,6 +159,13 @@ class Field:
     dtype: str  # little endian
     offset: int  # bytes
     values: Callable[[Points], Values]  # returns any type that converts to `dtype`
+    # Kind and source of a `RecordPiece` of the same bytes; None: only numpy computes it.
+    piece: tuple[str, int] | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return int(self.dtype[-1])
 
 
 class WideWord(NamedTuple):
@@ -224,6 +234,21 @@ class Layout(NamedTuple):
             }
         )
 
+    @property
+    def record(self) -> RecordLayout | None:
+        """The record as a table for engines; None if one of its fields is computed here only."""
+        pieces: list[RecordPiece] = []
+        for field in self.fields:
+            if field.piece is None:
+                return None
+            kind, source = field.piece
+            piece = RecordPiece(kind, field.offset, source, field.size)
+            if pieces and _is_continued(pieces[-1], piece):
+                pieces[-1] = pieces[-1]._replace(bytes=pieces[-1].bytes + piece.bytes)
+            elif kind:
+                pieces.append(piece)
+        return RecordLayout(self.step, tuple(pieces))
+
     def pack(self, points: Points, out: Records) -> None:
         """Fill `out`, records of this layout in the shape of the point arrays."""
         rows, *rest = points.time_ns.shape
@@ -258,6 +283,16 @@ class Layout(NamedTuple):
                 "itemsize": self.step,
             }
         )
+
+
+def _is_continued(first: RecordPiece, second: RecordPiece) -> bool:
+    """Return whether two pieces are one copy."""
+    return (
+        first.kind == second.kind
+        and first.kind in _COPIES
+        and first.offset + first.bytes == second.offset
+        and first.source + first.bytes == second.source
+    )
 
 
 def _in_sensor(points: Points) -> list[F64Array]:
@@ -354,34 +389,40 @@ def _seconds_absolute(points: Points) -> Values:
 
 
 _XYZ = (
-    Field("x", "<f4", 0, lambda points: points.xyz[..., 0]),
-    Field("y", "<f4", 4, lambda points: points.xyz[..., 1]),
-    Field("z", "<f4", 8, lambda points: points.xyz[..., 2]),
+    Field("x", "<f4", 0, lambda points: points.xyz[..., 0], ("point", 0)),
+    Field("y", "<f4", 4, lambda points: points.xyz[..., 1], ("point", 4)),
+    Field("z", "<f4", 8, lambda points: points.xyz[..., 2], ("point", 8)),
 )
 
 
 def _intensity(offset: int) -> Field:
-    return Field("intensity", "<f4", offset, lambda points: points.intensity)
+    return Field("intensity", "<f4", offset, lambda points: points.intensity, ("point", 12))
 
 
-def _ring(offset: int, dtype: str = "<u2") -> Field:
-    return Field("ring", dtype, offset, lambda points: points.ring)
+def _ring(offset: int) -> Field:
+    return Field("ring", "<u2", offset, lambda points: points.ring, ("label", 4))
 
 
 def _time(offset: int) -> Field:
-    return Field("time", "<f4", offset, lambda points: seconds_toward_zero(points.time_ns))
+    return Field(
+        "time",
+        "<f4",
+        offset,
+        lambda points: seconds_toward_zero(points.time_ns),
+        ("seconds_f4", 0),
+    )
 
 
 def _time_ns(name: str, offset: int) -> Field:
-    return Field(name, "<u4", offset, lambda points: points.time_ns)
+    return Field(name, "<u4", offset, lambda points: points.time_ns, ("label", 0))
 
 
 def _return_type(offset: int) -> Field:
-    return Field("return_type", "u1", offset, lambda points: points.return_type)
+    return Field("return_type", "u1", offset, lambda points: points.return_type, ("label", 6))
 
 
 def _lidar_id(offset: int) -> Field:
-    return Field("lidar_id", "u1", offset, lambda points: points.lidar_id)
+    return Field("lidar_id", "u1", offset, lambda points: points.lidar_id, ("label", 7))
 
 
 _STANDARD = (*_XYZ, _intensity(12), _time(16), _ring(20), _return_type(22), _lidar_id(23))
@@ -390,13 +431,18 @@ _OUSTER = (
     *_XYZ,
     _intensity(16),
     _time_ns("t", 20),
-    Field("reflectivity", "<u2", 24, _reflectivity),
+    Field("reflectivity", "<u2", 24, _reflectivity, ("reflectivity", 0)),
     _ring(26),
     # Near infrared is not part of a scan; PCL needs the field, it is 0.
-    Field("ambient", "<u2", 28, lambda points: np.zeros_like(points.ring)),
-    Field("range", "<u4", 32, _range_mm),
+    Field("ambient", "<u2", 28, lambda points: np.zeros_like(points.ring), _ZERO),
+    Field("range", "<u4", 32, _range_mm, ("range_mm_u4", 0)),
 )
-_HESAI = (*_XYZ, _intensity(12), _ring(16), Field("timestamp", "<f8", 18, _seconds_absolute))
+_HESAI = (
+    *_XYZ,
+    _intensity(12),
+    _ring(16),
+    Field("timestamp", "<f8", 18, _seconds_absolute, ("stamp_f8", 0)),
+)
 _AUTOWARE = (
     *_XYZ,
     Field("intensity", "u1", 12, _intensity_u8),
@@ -410,8 +456,8 @@ _AUTOWARE = (
 _PLY = (
     *_XYZ,
     _intensity(12),
-    Field("time", "<f8", 16, lambda points: seconds(points.time_ns)),
-    _ring(24, "<i4"),
+    Field("time", "<f8", 16, lambda points: seconds(points.time_ns), ("seconds_f8", 0)),
+    Field("ring", "<i4", 24, lambda points: points.ring, ("ring_i4", 0)),
     _return_type(28),
     _lidar_id(29),
 )

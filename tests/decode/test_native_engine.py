@@ -28,8 +28,9 @@ from mlbatch.native.library import library
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.sensors.ouster.sensor import read_calibration
-from mlbatch.types import EXTRAS, RunInfo, SensorInfo
-from tests.builders.engines import BOXES_M, Pair, needs_native
+from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUTS, Layout, points_of
+from tests.builders.engines import BOXES_M, Pair, assert_same, needs_native
 from tests.builders.ouster import OusterSpec, metadata_json
 from tests.golden import test_every_model as models
 
@@ -46,6 +47,12 @@ POSES = (
 NAMES = tuple(name for name in PROFILES if name != "OFF")
 GUARD_ROWS = 64
 GUARD = 0xA5
+# All layouts whose records the loops pack.
+PACKED = tuple(
+    layout
+    for layout in (*CLOUD_LAYOUTS.values(), *PLY_LAYOUTS.values())
+    if layout.record is not None
+)
 # Of kinds that the loops decode, and of two that only numpy does.
 OTHERS = (
     (models.velodyne_sent, ("VLP-16", "dual")),
@@ -104,15 +111,16 @@ cases = st.builds(
 class Guarded(ScanBuffer):
     """A scan buffer between guard rows that nothing may write to."""
 
-    def __init__(self, rows: int, slots: int | None) -> None:
-        super().__init__(rows, slots)
+    def __init__(self, rows: int, slots: int | None, record: RecordLayout | None = None) -> None:
+        super().__init__(rows, slots, record)
         self._guards: list[npt.NDArray[np.uint8]] = []
-        for name in ("point", "range_m", "reflectivity", "label", "column"):
+        for name in ("point", "range_m", "reflectivity", "label", "column", "packed"):
             array = getattr(self, name)
             row = array.itemsize * int(np.prod(array.shape[1:]))
             whole = np.full((len(array) + 2 * GUARD_ROWS) * row, GUARD, np.uint8)
             begin = GUARD_ROWS * row
             end = (GUARD_ROWS + len(array)) * row
+            whole[begin:end] = 0
             self._guards += [whole[:begin], whole[end:]]
             setattr(self, name, whole[begin:end].view(array.dtype).reshape(array.shape))
         self.view_labels()
@@ -152,6 +160,41 @@ def words_of(lidar: Lidar, rng: np.random.Generator, count: int) -> I64Array:
     return rotor_words(rng.uniform(-1, 2, count), speed, int(rng.integers(len(lidar.firing_ns))))
 
 
+class Packing:
+    """Records that the loops pack, against those that numpy packs of arrays."""
+
+    def __init__(
+        self,
+        info: RunInfo,
+        sources: list[Source],
+        boxes_m: npt.NDArray[np.float64],
+        layout: Layout,
+    ) -> None:
+        self._layout = layout
+        self._arrays, self._records = (
+            Decoder(info, sources, boxes_m, layout.extras, engine=engine, record=layout.record)
+            for engine in ("numpy", "native")
+        )
+
+    def check(self, columns: WindowColumns, header: ScanHeader) -> None:
+        """Decode a window by both; the records have the same bytes."""
+        scan = self._arrays.scan(columns, header)
+        found = self._records.scan(columns, header)
+        assert scan.packed is None
+        if found.packed is None:
+            # Rows of an organized scan that only numpy decodes.
+            assert scan.info.layout == "organized"
+            assert_same(scan, found)
+            return
+        points = points_of(scan)
+        expected = np.zeros(points.time_ns.shape, self._layout.dtype)
+        self._layout.pack(points, expected)
+        packed = found.packed
+        assert packed.shape == expected.shape
+        assert packed.buffer[packed.begin : packed.end].tobytes() == expected.tobytes()
+        assert self._arrays.counts == self._records.counts
+
+
 def check(lidars: list[Lidar], case: Case) -> None:
     """Decode the same columns, twice, by both engines."""
     rng = np.random.default_rng(case.seed)
@@ -170,6 +213,7 @@ def check(lidars: list[Lidar], case: Case) -> None:
     pair = Pair(
         *(Decoder(info, sources, boxes_m, case.extras, engine=name) for name in ("numpy", "native"))
     )
+    packing = Packing(info, sources, boxes_m, PACKED[case.seed % len(PACKED)])
     for _ in range(2):
         sensor = rng.integers(0, len(lidars), case.columns)
         place, word = np.empty((2, case.columns), np.int64)
@@ -178,10 +222,10 @@ def check(lidars: list[Lidar], case: Case) -> None:
             place[own] = rng.choice(places, int(own.sum()))
             word[own] = words_of(lidar, rng, int(own.sum()))
         stamp_ns = np.sort(rng.integers(START_NS, END_NS, case.columns))
-        pair.check(
-            WindowColumns(stamp_ns, sensor, place, word),
-            ScanHeader(0, 0, START_NS, END_NS, True, 0),
-        )
+        columns = WindowColumns(stamp_ns, sensor, place, word)
+        header = ScanHeader(0, 0, START_NS, END_NS, True, 0)
+        pair.check(columns, header)
+        packing.check(columns, header)
 
 
 @given(cases, st.sampled_from(NAMES), st.sampled_from((16, 32, 64, 128)))
@@ -212,8 +256,8 @@ def test_nothing_is_written_beyond_the_arrays(
 ) -> None:
     made: list[Guarded] = []
 
-    def guarded(rows: int, slots: int | None) -> Guarded:
-        made.append(Guarded(rows, slots))
+    def guarded(rows: int, slots: int | None, record: RecordLayout | None = None) -> Guarded:
+        made.append(Guarded(rows, slots, record))
         return made[-1]
 
     monkeypatch.setattr(decode, "ScanBuffer", guarded)
@@ -224,6 +268,16 @@ def test_nothing_is_written_beyond_the_arrays(
         check(lidars, Case(seed, 130, layout, EXTRAS, is_cut=False, keeps_repeated=True))
     assert made
     assert all(buffer.is_intact for buffer in made)
+
+
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+@pytest.mark.parametrize("number", range(len(PACKED)), ids=[layout.name for layout in PACKED])
+def test_records_of_every_layout(layout: str, number: int, others: list[Lidar]) -> None:
+    alike = [ouster("RNG15_RFL8_NIR8", 32, 1), ouster("RNG15_RFL8_NIR8", 32, 2)]
+    dual = ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)
+    for lidars in (alike, [dual, *alike], others):
+        case = Case(number, 333, layout, EXTRAS, is_cut=False, keeps_repeated=True)
+        check(lidars, case)
 
 
 def test_records_stay_while_the_loops_run() -> None:

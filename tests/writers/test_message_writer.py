@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.types import IMU, Message, Summary
+from mlbatch.ros.encoding import Cdr
+from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary
 from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
-from mlbatch.writers.message_writer import quaternion, static_edges
+from mlbatch.writers.message_writer import CloudMessage, quaternion, static_edges
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, points_of
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -229,3 +231,16 @@ def test_quaternions_rotate_vectors_as_their_matrix() -> None:
         np.testing.assert_allclose(rotated, rotation @ vector, atol=1e-12)
         assert w >= 0
         assert math.isclose(w * w + sum(part * part for part in axis), 1)
+
+
+@pytest.mark.parametrize("frame", ["base_link", "f" * 2 * PACKED_ROOM])
+def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
+    scan = dense_scan()
+    layout = CLOUD_LAYOUTS["standard"]
+    points = points_of(scan)
+    end = PACKED_ROOM + scan.points * layout.step
+    buffer = np.zeros(end + 1, np.uint8)
+    layout.pack(points, buffer[PACKED_ROOM:end].view(layout.dtype))
+    packed = PackedPoints(buffer, PACKED_ROOM, end, (scan.points,))
+    cloud = CloudMessage(layout, frame, Cdr)
+    assert cloud.around(packed, 5, True).tobytes() == cloud.assemble(points, 5, True).tobytes()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import RunInfo, Scan
+from mlbatch.types import RecordLayout, RunInfo, Scan
 from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions
 from mlbatch.writers.output_file import Bytes
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, points_of
@@ -31,6 +31,11 @@ def extras(options: WriterOptions) -> frozenset[str]:
     return _LAYOUT.extras
 
 
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of all points."""
+    return _LAYOUT.record
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of PCD files."""
     return FolderWriter(target, info, options, FORMAT, PcdEncoder)
@@ -44,6 +49,10 @@ class PcdEncoder:
 
     def encode(self, scan: Scan) -> list[Bytes]:
         """Return the header and all points; an organized scan has a row for each slot."""
+        if scan.packed is not None:
+            shape = scan.packed.shape
+            packed = scan.packed.buffer[scan.packed.begin : scan.packed.end].data
+            return [_header(scan, shape[-1], _height(shape)).encode(), packed]
         points = points_of(scan)
         shape = points.time_ns.shape
         count = points.time_ns.size
@@ -51,8 +60,11 @@ class PcdEncoder:
             self._records = np.zeros(count * 5 // 4, dtype=_LAYOUT.dtype)
         records = self._records[:count]
         _LAYOUT.pack(points, records.reshape(shape))
-        height = shape[0] if len(shape) == 2 else 1
-        return [_header(scan, shape[-1], height).encode(), records.view(np.uint8).data]
+        return [_header(scan, shape[-1], _height(shape)).encode(), records.view(np.uint8).data]
+
+
+def _height(shape: tuple[int, ...]) -> int:
+    return shape[0] if len(shape) == 2 else 1
 
 
 def _header(scan: Scan, width: int, height: int) -> str:

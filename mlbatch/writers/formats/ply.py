@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.types import RunInfo, Scan
+from mlbatch.types import RecordLayout, RunInfo, Scan
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.output_file import Bytes
 from mlbatch.writers.point_layouts import PLY_LAYOUTS, Layout, points_of
@@ -30,6 +30,11 @@ def extras(options: WriterOptions) -> frozenset[str]:
     return frozenset()
 
 
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the vertices."""
+    return PLY_LAYOUTS[options.ply_style].record
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of PLY files."""
     check_dense(FORMAT, info)
@@ -46,7 +51,10 @@ class PlyEncoder:
 
     def encode(self, scan: Scan) -> list[Bytes]:
         """Return the header and all points as vertices."""
-        count = len(scan.time_ns)
+        count = scan.points
+        if scan.packed is not None:
+            packed = scan.packed.buffer[scan.packed.begin : scan.packed.end].data
+            return [self._header(scan, count).encode(), packed]
         if len(self._vertices) < count:
             self._vertices = np.zeros(count * 5 // 4, dtype=self._layout.dtype)
         vertices = self._vertices[:count]

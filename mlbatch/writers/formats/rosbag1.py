@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Ros1
-from mlbatch.types import Message, RunInfo, Summary, Topic
+from mlbatch.types import Message, RecordLayout, RunInfo, Summary, Topic
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of
+from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of, record_of
 from mlbatch.writers.output_file import open_buffered
 
 if TYPE_CHECKING:
@@ -33,6 +33,11 @@ _TF_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
 def extras(options: WriterOptions) -> frozenset[str]:
     """Return the inputs of the point layout, IMU samples and messages."""
     return extras_of(options, "ros1")
+
+
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of the point layout."""
+    return record_of(options)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Cdr
-from mlbatch.types import RunInfo, Topic
+from mlbatch.types import RecordLayout, RunInfo, Topic
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of
+from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
 
 if TYPE_CHECKING:
     from mlbatch.writers.mcap_container import McapContainer
@@ -28,6 +28,11 @@ METADATA = "metadata.yaml"
 def extras(options: WriterOptions) -> frozenset[str]:
     """Return the inputs of the point layout, IMU samples and messages."""
     return extras_of(options, "cdr")
+
+
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of the point layout."""
+    return record_of(options)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
