@@ -21,6 +21,16 @@ static int is_sorted(const Part *parts, int64_t begin, int64_t end)
     return 1;
 }
 
+/* Stamp of the next column of a sensor, INT64_MAX after the last one; moves on to its part. */
+static inline int64_t head_of(const Part *parts, int64_t *next, int64_t end, int64_t *at)
+{
+    while (*next < end && *at == parts[*next].columns) {
+        ++*next;
+        *at = 0;
+    }
+    return *next < end ? parts[*next].stamp_ns[*at] : INT64_MAX;
+}
+
 /* Merge the columns before `until_ns` by stamp, then by sensor, then in their order. Parts come by
    sensor; taken (parts,): columns taken of each. Return the number of columns, -1 if those of a
    sensor are not in order. */
@@ -28,49 +38,53 @@ EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t unti
                              int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
                              int64_t *ring_index, int64_t *encoder)
 {
-    /* Of each sensor: its next part and the end of its parts. */
-    int64_t next[MOST_SENSORS], end[MOST_SENSORS], sensors = 0, count = 0;
+    /* Of each sensor: its next column, the end of its parts, and the stamp there. */
+    int64_t next[MOST_SENSORS], end[MOST_SENSORS], at[MOST_SENSORS], head[MOST_SENSORS];
+    int64_t sensors = 0, count = 0;
     for (int64_t part = 0; part < part_count; part++) {
         taken[part] = 0;
         if (part == 0 || parts[part].sensor != parts[part - 1].sensor)
             next[sensors++] = part;
         end[sensors - 1] = part + 1;
     }
-    for (int64_t one = 0; one < sensors; one++)
+    for (int64_t one = 0; one < sensors; one++) {
         if (!is_sorted(parts, next[one], end[one]))
             return -1;
-    for (;;) {
+        at[one] = 0;
+        head[one] = head_of(parts, next + one, end[one], at + one);
+    }
+    while (sensors) {
         /* The sensor with the smallest stamp, and the stamp at which another one comes first. */
-        int64_t best = -1, smallest = until_ns, limit = until_ns;
-        for (int64_t one = 0; one < sensors; one++) {
-            while (next[one] < end[one] && taken[next[one]] == parts[next[one]].columns)
-                next[one]++;
-            if (next[one] == end[one])
-                continue;
-            const int64_t stamp = parts[next[one]].stamp_ns[taken[next[one]]];
-            if (stamp < smallest) {
+        int64_t best = 0, smallest = head[0], limit = until_ns;
+        for (int64_t one = 1; one < sensors; one++) {
+            if (head[one] < smallest) {
                 /* The one before has a lower number, so that it comes first again when equal. */
                 limit = smallest;
-                smallest = stamp;
+                smallest = head[one];
                 best = one;
-            } else if (best >= 0 && stamp < limit) {
-                limit = stamp + 1;
+            } else if (head[one] < limit) {
+                limit = head[one] + 1;
             }
         }
-        if (best < 0)
-            return count;
+        if (smallest >= until_ns)
+            break;
+        if (limit > until_ns)
+            limit = until_ns;
         const Part *part = parts + next[best];
-        int64_t at = taken[next[best]];
+        const int64_t columns = part->columns;
+        int64_t place = at[best];
         do {
-            stamp_ns[count] = part->stamp_ns[at];
+            stamp_ns[count] = part->stamp_ns[place];
             sensor[count] = part->sensor;
-            ring_index[count] = part->ring_index[at];
-            encoder[count] = part->encoder[at];
+            ring_index[count] = part->ring_index[place];
+            encoder[count] = part->encoder[place];
             count++;
-            at++;
-        } while (at < part->columns && part->stamp_ns[at] < limit);
-        taken[next[best]] = at;
+            place++;
+        } while (place < columns && part->stamp_ns[place] < limit);
+        taken[next[best]] = at[best] = place;
+        head[best] = head_of(parts, next + best, end[best], at + best);
     }
+    return count;
 }
 
 /* Rotor positions are a share of `positions`; 0: rotor words, 2**32 ticks a revolution. */

@@ -160,12 +160,15 @@ def _by_loops(
 ) -> Dissection | None:
     """Content of Ethernet frames; None if some have content that the compiled loops do not read."""
     found = loops.dissect(data, frames.start, frames.captured, frames.original)
-    rest = _dissect(data, frames.take(found.others), addresses)
-    if len(rest.datagrams.frame) or len(rest.fragments):
-        return None
+    skipped: dict[str, int] = {}
+    if len(found.others):
+        rest = _dissect(data, frames.take(found.others), addresses)
+        if len(rest.datagrams.frame) or len(rest.fragments):
+            return None
+        skipped = rest.skipped
     frame, source, destination, ident, offset, more, start, size = found.fragments
     parts = Fragments(frame, source, destination, ident, offset, more != 0, start, size)
-    return Dissection(Datagrams(*found.datagrams), parts, rest.skipped)
+    return Dissection(Datagrams(*found.datagrams), parts, skipped)
 
 
 def _plain(data: U8Array, frames: Frames) -> Dissection | None:
