@@ -27,6 +27,7 @@ _ENCODER_MODULES: Final = ("cases.py", "recordings.py")
 LOW: Final = "RNG15_RFL8_NIR8"
 FULL: Final = "RNG19_RFL8_SIG16_NIR16"
 VLP16: Final = "VLP-16"
+VLS128: Final = "VLS-128"
 PANDAR64: Final = "Pandar64"
 
 # Ethernet, IPv4 and UDP headers, and the header of a pcap record.
@@ -48,6 +49,7 @@ KINDS: Final[Mapping[str, SensorKind]] = {
     LOW: SensorKind(640, 8448, 10_240 * 128, ".json"),
     FULL: SensorKind(640, 24832, 10_240 * 128, ".json"),
     VLP16: SensorKind(754, 1206, 18_084 * 16, ""),
+    VLS128: SensorKind(6030, 1206, 18_090 * 128, ""),
     PANDAR64: SensorKind(3000, 1198, 18_000 * 64, ".csv"),
 }
 
@@ -118,6 +120,23 @@ def _dual(profile: str) -> tuple[BenchSensor, ...]:
     )
 
 
+def _eight(profile: str) -> tuple[BenchSensor, ...]:
+    """Eight OS-1-128 around a vehicle."""
+    return tuple(
+        BenchSensor(
+            name=name,
+            kind=profile,
+            source_ip=f"192.168.7.{11 + number}",
+            port=7502 + 2 * number,
+            phase_ns=number * 12_300_000,
+            translation_m=(1.4 - 0.4 * number, 0.6 * (-1) ** number, 1.8),
+            yaw_deg=45.0 * number,
+            serial=122201000998 + number,
+        )
+        for number, name in enumerate("abcdefgh")
+    )
+
+
 _ROOF: Final = BenchSensor("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
 _LEFT: Final = BenchSensor(
     "left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0
@@ -125,6 +144,7 @@ _LEFT: Final = BenchSensor(
 _RIGHT: Final = BenchSensor(
     "right", VLP16, "192.168.7.23", 2368, 61 * NS_PER_MS, (0.0, -0.8, 1.6), -60.0
 )
+_TOP: Final = BenchSensor("top", VLS128, "192.168.7.41", 2368, 0, (0.0, 0.0, 2.1), 0.0)
 _REAR: Final = BenchSensor("rear", PANDAR64, "192.168.7.31", 2370, 0, (-1.0, 0.0, 1.8), 180.0)
 
 RECORDINGS: Final[Mapping[str, BenchRecording]] = {
@@ -134,6 +154,8 @@ RECORDINGS: Final[Mapping[str, BenchRecording]] = {
         BenchRecording("dual-4-fragments", _dual(LOW), fragments=True),
         BenchRecording("dual-12", _dual(FULL)),
         BenchRecording("dual-12-fragments", _dual(FULL), fragments=True),
+        BenchRecording("eight-4", _eight(LOW)),
+        BenchRecording("vls128", (_TOP,)),
         BenchRecording("three-vlp16", (_ROOF, _LEFT, _RIGHT)),
         BenchRecording("pandar64", (_REAR,)),
         BenchRecording("mixed", (_dual(LOW)[0], _ROOF, _REAR)),
@@ -222,7 +244,9 @@ def _by_jobs(*options: str) -> tuple[Conversion, ...]:
 CASES: Final = (
     Case("dual-4", ("dual-4", "dual-4-fragments")),
     Case("dual-12", ("dual-12", "dual-12-fragments")),
+    Case("eight-4", ("eight-4",)),
     Case("three-vlp16", ("three-vlp16",)),
+    Case("vls128", ("vls128",)),
     Case("pandar64", ("pandar64",)),
     Case("mixed", ("mixed",)),
     Case("dual-4-mcap", ("dual-4",), "mcap", (COPY, WRITE, LIBRARY)),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from mlbatch.bench.cases import CAPTURE, FULL, LOW, VLP16, BenchRecording
+from mlbatch.bench.cases import CAPTURE, FULL, LOW, VLP16, VLS128, BenchRecording
 from mlbatch.bench.measure import BenchError, measure
 from mlbatch.bench.results import Run, Workload
 
@@ -44,12 +44,13 @@ class Peer:
 
 
 _OUSTER: Final = frozenset({LOW, FULL})
-_VELODYNE: Final = frozenset({VLP16})
+_VELODYNE: Final = frozenset({VLP16, VLS128})
 PEERS: Final = (
     Peer("ouster-sdk", "ouster-sdk", "ouster-sdk", _OUSTER),
     Peer("ouster-sdk lean", "ouster-sdk", "ouster-sdk-lean", _OUSTER),
     Peer("ouster-cli", "ouster-sdk", "ouster-cli", _OUSTER, "ply"),
     Peer("velodyne-decoder", "velodyne-decoder", "velodyne-decoder", _VELODYNE),
+    Peer("velodyne-decoder lean", "velodyne-decoder", "velodyne-decoder-lean", _VELODYNE),
 )
 
 
@@ -96,8 +97,10 @@ def run_peer(
 
 
 def _sensor_arguments(recording: BenchRecording, folder: Path) -> Iterator[str]:
-    """Metadata file and pose of each sensor, as `PATH,X,Y,Z,YAW_DEG`."""
+    """Metadata file and pose of each sensor, as `PATH,X,Y,Z,YAW_DEG`; its model without a file."""
     for sensor in recording.sensors:
         if sensor.file:
             pose = (*sensor.translation_m, sensor.yaw_deg)
             yield ",".join([str(folder / sensor.file), *map(str, pose)])
+        else:
+            yield sensor.kind

@@ -7,7 +7,7 @@ peer is another program that does a part of the same work; peers.py passes this 
 the interpreter that has it installed:
 
     python -c TEXT ouster-sdk|ouster-sdk-lean|ouster-cli RESULT RECORDING METADATA,X,Y,Z,YAW_DEG...
-    python -c TEXT velodyne-decoder RESULT RECORDING
+    python -c TEXT velodyne-decoder|velodyne-decoder-lean RESULT RECORDING MODEL...
 
 RESULT is a JSON file: CPU time without start and imports, and what was read. This file imports
 only the standard library at the top, and nothing of mlbatch: imports count in what is measured.
@@ -20,20 +20,29 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import struct
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
 BLOCK_BYTES: Final = 8 << 20
-# Slots of a VLP-16 packet: 12 blocks of 2 firing sequences of 16 channels.
-_VLP16_SLOTS: Final = 384
+# Slots of a packet of a single return: 12 blocks of 32 readings.
+_VELODYNE_SLOTS: Final = 384
+# Names in velodyne-decoder, by model.
+_VELODYNE_MODELS: Final = {"VLP-16": "VLP16", "VLS-128": "VLS128"}
+# In a capture: header of the file, header of a record, and in a record of Ethernet and IPv4 the
+# sender and the payload.
+_FILE_HEADER_BYTES: Final = 24
+_RECORD_HEADER: Final = struct.Struct("<IIII")
+_SENDER_AT: Final = 14 + 12
+_PAYLOAD_AT: Final = 14 + 20 + 8
 # Fields that mlbatch decodes, by profile.
 _LEAN_FIELDS: Final = {
     "RNG15_RFL8_NIR8": ["RANGE", "REFLECTIVITY"],
@@ -184,28 +193,52 @@ class _SweepDecoder(Protocol):
         ...
 
 
-def velodyne_decoder(recording: str) -> dict[str, float]:
-    """Decode the sweeps of each sensor in its own frame, without merging sensors.
+# Receive time, s, sender and payload of a packet.
+_VelodynePacket: TypeAlias = "tuple[float, bytes, bytes]"
 
-    Packets come from dpkt, as in the decoder's `read_pcap`, which supports one sensor per file.
-    """
-    decoder = importlib.import_module("velodyne_decoder")
+
+def _packets_by_dpkt(recording: str) -> Iterator[_VelodynePacket]:
+    """Packets as the decoder's `read_pcap` reads them."""
     pcap = importlib.import_module("dpkt.pcap")
     ethernet = importlib.import_module("dpkt.ethernet")
+    with Path(recording).open("rb") as file:
+        for stamp, frame in pcap.Reader(file):
+            packet = ethernet.Ethernet(frame).data
+            yield stamp, packet.src, packet.data.data
+
+
+def _packets_at_offsets(recording: str) -> Iterator[_VelodynePacket]:
+    """Packets of a capture without any check, the least that a reader can do."""
+    data = Path(recording).read_bytes()
+    at = _FILE_HEADER_BYTES
+    while at < len(data):
+        seconds, micros, kept, _ = _RECORD_HEADER.unpack_from(data, at)
+        at += _RECORD_HEADER.size
+        sender = data[at + _SENDER_AT : at + _SENDER_AT + 4]
+        yield seconds + micros * 1e-6, sender, data[at + _PAYLOAD_AT : at + kept]
+        at += kept
+
+
+def velodyne_decoder(recording: str, *models: str, lean: bool) -> dict[str, float]:
+    """Decode the sweeps of each sensor in its own frame, without merging sensors.
+
+    Packets come from dpkt, as in the decoder's `read_pcap`, which supports one sensor per file;
+    lean: from a bare loop. All sensors are of the first model.
+    """
+    decoder = importlib.import_module("velodyne_decoder")
+    read = _packets_at_offsets if lean else _packets_by_dpkt
+    model = getattr(decoder.Model, _VELODYNE_MODELS[models[0]])
     began_s = time.process_time()
     streams: dict[bytes, _SweepDecoder] = {}
     sweeps = []
     slots = 0
-    with Path(recording).open("rb") as file:
-        for stamp, frame in pcap.Reader(file):
-            packet = ethernet.Ethernet(frame).data
-            if packet.src not in streams:
-                config = decoder.Config(model=decoder.Model.VLP16)
-                streams[packet.src] = decoder.StreamDecoder(config)
-            sweep = streams[packet.src].decode(stamp, packet.data.data)
-            slots += _VLP16_SLOTS
-            if sweep is not None:
-                sweeps.append(len(sweep[1]))
+    for stamp, sender, packet in read(recording):
+        if sender not in streams:
+            streams[sender] = decoder.StreamDecoder(decoder.Config(model=model))
+        sweep = streams[sender].decode(stamp, packet)
+        slots += _VELODYNE_SLOTS
+        if sweep is not None:
+            sweeps.append(len(sweep[1]))
     for stream in streams.values():
         sweep = stream.finish()
         if sweep is not None:
@@ -219,7 +252,8 @@ PROGRAMS: Final[Mapping[str, Callable[..., dict[str, float]]]] = {
     "ouster-sdk": partial(ouster_sdk, lean=False),
     "ouster-sdk-lean": partial(ouster_sdk, lean=True),
     "ouster-cli": ouster_cli,
-    "velodyne-decoder": velodyne_decoder,
+    "velodyne-decoder": partial(velodyne_decoder, lean=False),
+    "velodyne-decoder-lean": partial(velodyne_decoder, lean=True),
 }
 
 

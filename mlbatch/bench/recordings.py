@@ -40,6 +40,7 @@ from mlbatch.bench.cases import (
     RECORDINGS,
     RIG,
     VLP16,
+    VLS128,
     BenchRecording,
     BenchSensor,
     digest,
@@ -217,6 +218,49 @@ def vlp16(serial: int = 0) -> PacketEncoder:
     return PacketEncoder.from_packets(packets, packet_ns, update)
 
 
+# A firing sequence takes 55.277 us; its 128 channels are four blocks of one azimuth.
+_VLS128_BANKS: Final = (0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF)
+_VLS128_BANK_CHANNELS: Final = 32
+_VLS128_SEQUENCES: Final = 3
+_VLS128_SEQUENCE_NS: Final = 55_277
+_VLS128_STEP_MM: Final = 4
+
+
+def vls128(serial: int = 0) -> PacketEncoder:
+    """A VLS-128 at 600 rpm with one return; its packets have no serial number."""
+    shape = (_VLS128_SEQUENCES, len(_VLS128_BANKS))
+    block = np.dtype(
+        [
+            ("flag", "<u2"),
+            ("azimuth_cdeg", "<u2"),
+            ("reading", _READING, _VLS128_BANK_CHANNELS),
+        ]
+    )
+    packet = np.dtype(
+        [
+            ("block", block, shape),
+            ("past_hour_us", "<u4"),
+            ("mode", "u1"),
+            ("product", "u1"),
+        ]
+    )
+    packet_ns = _VLS128_SEQUENCE_NS * _VLS128_SEQUENCES
+    packets = np.zeros(REVOLUTION_NS // packet_ns, packet)
+    packets["mode"] = 0x37
+    packets["product"] = 0xA1
+    packets["block"]["flag"] = _VLS128_BANKS
+    channels = len(_VLS128_BANKS) * _VLS128_BANK_CHANNELS
+    _fill_readings(packets["block"]["reading"], channels, _VLS128_STEP_MM)
+
+    def update(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        sent = payloads.view(packet)[:, 0]
+        sent["past_hour_us"] = begin_ns // NS_PER_US % _US_PER_HOUR
+        shot_ns = begin_ns[:, None] + np.arange(_VLS128_SEQUENCES) * _VLS128_SEQUENCE_NS
+        sent["block"]["azimuth_cdeg"] = _azimuth_cdeg(shot_ns)[:, :, None]
+
+    return PacketEncoder.from_packets(packets, packet_ns, update)
+
+
 _PANDAR64_CHANNELS: Final = 64
 _PANDAR64_BLOCKS: Final = 6
 _PANDAR64_BLOCK_NS: Final = 55_560
@@ -289,6 +333,7 @@ ENCODERS: Final[Mapping[str, Callable[[int], PacketEncoder]]] = {
     LOW: partial(ouster, LOW),
     FULL: partial(ouster, FULL),
     VLP16: vlp16,
+    VLS128: vls128,
     PANDAR64: pandar64,
 }
 

@@ -123,13 +123,15 @@ def test_peers_fit_sensors_and_outputs() -> None:
 
     assert fitting("dual-12", "") == ["ouster-sdk", "ouster-sdk lean"]
     assert fitting("dual-4", "ply") == ["ouster-cli"]
-    assert fitting("three-vlp16", "") == ["velodyne-decoder"]
+    assert fitting("three-vlp16", "") == ["velodyne-decoder", "velodyne-decoder lean"]
+    assert fitting("vls128", "") == ["velodyne-decoder", "velodyne-decoder lean"]
     assert fitting("mixed", "") == fitting("pandar64", "") == fitting("dual-4", "mcap") == []
 
 
-def test_velodyne_decoder_reads_the_packets_of_each_sensor(stubbed: Path) -> None:
+@pytest.mark.parametrize("name", ["velodyne-decoder", "velodyne-decoder lean"])
+def test_velodyne_decoder_reads_the_packets_of_each_sensor(stubbed: Path, name: str) -> None:
     make(VLP16, 0.1, stubbed)
-    run = run_peer(BY_NAME["velodyne-decoder"], sys.executable, VLP16, stubbed, 0.1, stubbed)
+    run = run_peer(BY_NAME[name], sys.executable, VLP16, stubbed, 0.1, stubbed)
     size = (stubbed / "capture.pcap").stat().st_size
     packets = (size - 24) // (1206 + 58)
     # Three sensors with two sweeps each.
