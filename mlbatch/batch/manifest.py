@@ -62,11 +62,38 @@ def _of_pattern(pattern: str, template: str, common: Common, where: str) -> Iter
             f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
             "pattern"
         )
-    for match in matches:
-        inputs = _inputs(match)
+    globs = _globs_of_sweeps(common.rig)
+    found = [(match, _inputs(match) or _folder_of_sweeps(match, globs)) for match in matches]
+    if not any(inputs for _, inputs in found):
+        raise UsageError(
+            f"{where}: expected recordings in what matches {pattern!r}, found none; check the "
+            "pattern, or give the rig that describes folders of sweeps"
+        )
+    for match, inputs in found:
         if inputs:
             name = check_name(_named(template, match), where)
             yield Session(name, inputs, common.rig, common.options)
+
+
+def _globs_of_sweeps(rig: str | None) -> tuple[str, ...]:
+    """Patterns of a rig for files of sweeps; none of one that cannot be read, which fails later."""
+    if rig is None or is_url(rig):
+        return ()
+    from mlbatch.rig.rig import read_rig
+
+    try:
+        sensors = read_rig(Path(rig)).sensors
+    except RigError:
+        return ()
+    return tuple(sensor.sweeps.glob for sensor in sensors if sensor.sweeps is not None)
+
+
+def _folder_of_sweeps(match: str, globs: Sequence[str]) -> tuple[str, ...]:
+    """A folder with files of sweeps, as recording; or nothing."""
+    if is_url(match) or not Path(match).is_dir():
+        return ()
+    is_one = any(next(Path(match).glob(pattern), None) is not None for pattern in globs)
+    return (match,) if is_one else ()
 
 
 def _matches(pattern: str) -> list[str]:

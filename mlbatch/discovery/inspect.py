@@ -283,6 +283,8 @@ class Inspection:
                     stream=sensor.selector,
                     metadata=self.files.get(sensor.name),
                     extrinsics=extrinsics,
+                    points=None if sensor.rig is None else sensor.rig.points,
+                    sweeps=None if sensor.rig is None else sensor.rig.sweeps,
                 )
             )
         # A rig refuses a body frame with the name of a sensor.

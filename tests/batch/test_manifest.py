@@ -176,3 +176,16 @@ def test_a_session_changes_with_the_extrinsics_files_of_its_rig(tmp_path: Path) 
     file.write_text(text.replace("x: 1", "x: 2"))
     after = session_key(session, tmp_path)
     assert {key for key in before if before[key] != after[key]} == {"rig"}
+
+
+def test_folders_of_sweeps_are_sessions_by_the_rig(tmp_path: Path) -> None:
+    touch(tmp_path / "raw", "one/top/1700000000.bin", "two/top/1700000000.bin", "other/notes.txt")
+    (tmp_path / "rig.yaml").write_text(
+        "sensors: [{name: a, points: {glob: top/*.bin, dtype: {x: f4, y: f4, z: f4, t: u4}}}]\n"
+    )
+    head = "sessions: [{glob: raw/*/, name: '{folder}'}]\n"
+    found = read(tmp_path, f"rig: rig.yaml\n{head}")
+    inputs = {name: session.inputs for name, session in found.items()}
+    assert inputs == {name: (str(tmp_path / "raw" / name),) for name in ("one", "two")}
+    with pytest.raises(UsageError, match="found none; check the pattern, or give the rig that"):
+        read(tmp_path, head)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
@@ -344,3 +346,29 @@ def test_a_body_far_away_is_refused(folder: Path) -> None:
         RigError, match="expected at most 10000 m from the body origin, found 33445"
     ):
         _pose(folder, "{file: red.yaml, parent: body}")
+
+
+@given(
+    st.sampled_from(["red.yaml", "kit.yaml", "extrinsic_parameters.json", "opencv.yaml"]),
+    st.text(max_size=20),
+    st.integers(min_value=0, max_value=400),
+    st.sampled_from(["", "key: body_T_lidar, direction: body_from_sensor", "parent: body"]),
+)
+def test_any_text_is_read_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, name: str, noise: str, position: int, keys: str
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    text = FILES[name]
+    noisy = text[:position] + noise + text[position:]
+    (folder / name).write_bytes(noisy.encode("utf-8", "surrogatepass"))
+    answer, pose = _answer(folder, f"{{file: {name}, {keys}}}")
+    assert "\n" not in answer
+    assert pose is None or np.isfinite(pose).all()
+
+
+def _answer(folder: Path, text: str) -> tuple[str, F64Array | None]:
+    """The error of a rig, or its pose."""
+    try:
+        return "", _pose(folder, text)
+    except RigError as err:
+        return str(err), None

@@ -93,7 +93,8 @@ def _offsets(
     for name, kind in fields:
         if kind in _NUMBERS:
             found.append((name, kind, offset))
-        offset += np.dtype(kind).itemsize
+        # The bytes of a type are its last digits: f4, V12.
+        offset += int(kind[1:])
     return tuple(found), offset
 
 

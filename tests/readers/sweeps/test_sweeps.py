@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mlbatch.readers.datasets import DATASET_FILES
-from mlbatch.rig.rig import read_rig
+from mlbatch.readers.sweeps.files import SweepError, read_sweep
+from mlbatch.rig.rig import Sweeps, read_rig
 from mlbatch.rig.write import write_rig
 from tests.builders.run import scan_files
 from tests.builders.sessions import Shell
@@ -213,6 +216,9 @@ NAME = f"{START_NS}.bin"
          f"{NAME}: expected 392 points of 22 bytes, found 8623 bytes of data; copy the file again"),
         ({NAME: pcd(FIELDS, POINTS).replace(b"SIZE 4 4", b"SIZE 4")}, "{glob: top/*.bin}",
          "expected a SIZE, TYPE and COUNT for each of 6 FIELDS, found 5, 6 and 6; the file is dam"),
+        ({NAME: pcd(FIELDS, POINTS).replace(b"SIZE 4 4", b"SIZE 99999 4").replace(
+            b"COUNT 1", b"COUNT 99999")}, "{glob: top/*.bin}",
+         f"{NAME}: expected 392 points of 9999800019 bytes, found 8624 bytes of data; copy"),
         ({NAME: pcd(FIELDS, POINTS).replace(b"POINTS 392", b"POINTS 391")}, "{glob: top/*.bin}",
          "expected POINTS = WIDTH x HEIGHT, found 391 and 392 x 1; the file is damaged"),
         ({NAME: pcd(FIELDS, POINTS, "ascii")[:-12]}, "{glob: top/*.bin}", "; the file is damaged"),
@@ -303,3 +309,63 @@ def test_files_of_datasets_are_refused_with_the_reason(shell: Shell, kind: Any) 
         assert kind.remedy in outcome.err
         assert outcome.err.count("\n") == 1
     assert not Path("out").exists()
+
+
+# -- untrusted files ------------------------------------------------------------------------------
+
+HEAD_LINES = pcd(FIELDS, POINTS[:2]).split(b"DATA")[0].splitlines()
+PIECES = st.sampled_from(
+    [b"0", b"-1", b"4", b"99999", b"999999999999", b"x", b"\xff", b" ", b"F U I", b"binary", b"\n"]
+)
+
+
+def _answer(file: Path) -> str:
+    """Why a file cannot be read, or ""."""
+    try:
+        read_sweep(file, Sweeps("*.pcd", ()), START_NS)
+    except SweepError as err:
+        return str(err)
+    return ""
+
+
+@given(
+    st.integers(0, len(HEAD_LINES) - 1),
+    st.lists(PIECES, max_size=8),
+    st.sampled_from([b"DATA binary\n", b"DATA ascii\n", b"DATA\n", b""]),
+    st.binary(max_size=60),
+)
+def test_any_header_is_read_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory,
+    number: int,
+    words: list[bytes],
+    end: bytes,
+    body: bytes,
+) -> None:
+    lines = list(HEAD_LINES)
+    lines[number] = lines[number].split(b" ")[0] + b" " + b" ".join(words)
+    file = tmp_path_factory.getbasetemp() / "noise.pcd"
+    file.write_bytes(b"\n".join(lines) + b"\n" + end + body)
+    answer = _answer(file)
+    assert answer == "" or answer.startswith(f"{file}: ")
+    assert "\n" not in answer
+
+
+def test_a_rig_of_inspect_describes_the_same_folder(shell: Shell) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    assert _run(shell).code == 0
+    expected = _xyz()
+    assert shell("inspect drive --rig rig.yaml --write-rig again.yaml").code == 0
+    outcome = shell("convert drive --rig again.yaml -o again --keep-partial")
+    assert outcome.code == 0, outcome.err
+    np.testing.assert_array_equal(_xyz("again"), expected)
+
+
+def test_engines_and_jobs_give_the_same_files(shell: Shell) -> None:
+    write_sweeps(Path("drive/top"), _names())
+    _rig(GLOB)
+    found = set()
+    for engine, jobs in (("numpy", 1), ("auto", 1), ("auto", 2)):
+        options = f"--engine {engine} --jobs {jobs} --overwrite"
+        assert shell(f"convert drive --rig rig.yaml -o out {options}").code == 0
+        found.add(b"".join(path.read_bytes() for path in scan_files(Path("out"))))
+    assert len(found) == 1
