@@ -144,6 +144,9 @@ class McapContainer:
         self._metadata: list[MetadataIndex] = []
         self._file.put(MAGIC)
         self._file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
+        # Number and end of the chunks that the system has; ends of later ones.
+        self._handed = (0, self._file.position_bytes)
+        self._waiting_ends: deque[int] = deque()
 
     # -- messages -----------------------------------------------------------------------------
 
@@ -222,8 +225,11 @@ class McapContainer:
         return self._complete_chunks
 
     def written(self) -> tuple[int, int]:
-        """Return the number of written chunks, and the bytes up to their end."""
-        return len(self._chunks), self._file.position_bytes
+        """Return the number of chunks that the system has, and the bytes up to their end."""
+        handed_bytes = self._file.handed_bytes
+        while self._waiting_ends and self._waiting_ends[0] <= handed_bytes:
+            self._handed = self._handed[0] + 1, self._waiting_ends.popleft()
+        return self._handed
 
     def take_chunks(self) -> list[Chunk]:
         """Return the chunks completed since the last call, to be compressed and written."""
@@ -279,6 +285,7 @@ class McapContainer:
                 uncompressed_size=size,
             )
         )
+        self._waiting_ends.append(self._file.position_bytes)
 
     def _end_chunk(self, tail: bytes | memoryview) -> None:
         """Complete the chunk under construction; tail: its last bytes."""
@@ -324,7 +331,7 @@ class McapContainer:
         log_ns = summary.t_init_ns or 0
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)
         self._write_summary()
-        self._file.close()
+        self._file.complete()
         if self._on_finish is not None:
             self._on_finish(self)
 

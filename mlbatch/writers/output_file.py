@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, TypeAlias, TypeVar, cast
 
 from mlbatch.errors import ExportError
+from mlbatch.writers.direct_writes import DirectWrites
 
 Bytes: TypeAlias = bytes | bytearray | memoryview  # views have items of one byte
 Checksum: TypeAlias = Callable[[Bytes, int], int]
@@ -94,6 +95,7 @@ class WriteBehind:
 class OutputFile:
     """A large file, unbuffered; skips the bytes that a continued file already contains.
 
+    From its first `_DROP_BYTES` on it is written past the page cache where the system can.
     kept_bytes: length of the part that a continued file keeps, 0 for a new file;
     position_bytes: of the next byte, written or skipped.
     """
@@ -104,7 +106,8 @@ class OutputFile:
         self.kept_bytes = kept_bytes or 0
         self.position_bytes = 0
         self._dropped_bytes = 0
-        self._file = io.FileIO(path, "w" if kept_bytes is None else "r+")
+        self._direct: DirectWrites | None = None
+        self._file = io.FileIO(path, "w+" if kept_bytes is None else "r+")
         if kept_bytes is not None:
             _truncate(self._file, path, kept_bytes)
 
@@ -118,12 +121,24 @@ class OutputFile:
         if self.position_bytes < self.kept_bytes:
             self.skip(size)
             return
-        write_all(self._file, parts)
+        if self._direct is None:
+            write_all(self._file, parts)
+        else:
+            for part in parts:
+                self._direct.put(part)
         self.position_bytes += size
         if self.position_bytes - self._dropped_bytes >= _DROP_BYTES:
             begin = max(0, self._dropped_bytes - _REPEAT_BYTES)
             drop_from_cache(self._file.fileno(), begin, self.position_bytes)
             self._dropped_bytes = self.position_bytes
+            if self._direct is None:
+                direct = DirectWrites(self._file.fileno(), self.position_bytes)
+                self._direct = direct if direct.is_direct else None
+
+    @property
+    def handed_bytes(self) -> int:
+        """Bytes from the start that the system has."""
+        return self.position_bytes if self._direct is None else self._direct.handed_bytes
 
     def skip(self, size: int) -> None:
         """Advance over kept bytes."""
@@ -131,8 +146,14 @@ class OutputFile:
         if self.position_bytes > self.kept_bytes:
             raise _not_as_before(self.path)
 
+    def complete(self) -> None:
+        """Hand the rest to the system and close the file."""
+        if self._direct is not None:
+            self._direct.finish()
+        self.close()
+
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; what was not handed to the system is lost."""
         self._file.close()
 
 

@@ -15,9 +15,11 @@ from mlbatch.types import IMU, Scan
 from mlbatch.writers import (
     WriterOptions,
     check_target,
+    direct_writes,
     extras,
     format_names,
     open_writer,
+    output_file,
     plugin,
 )
 from tests.builders.scans import (
@@ -202,8 +204,17 @@ def test_stages_in_any_thread_may_come_in_any_order(name: str, tmp_path: Path) -
 
 @each_format
 @pytest.mark.parametrize("kind", ["dense", "organized"])
-def test_a_continued_output_has_the_same_bytes(name: str, kind: str, tmp_path: Path) -> None:
-    """After every number of scans, with other bytes after those of the checkpoint."""
+@pytest.mark.parametrize("is_large", [False, True])
+def test_a_continued_output_has_the_same_bytes(
+    name: str, kind: str, is_large: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After every number of scans, with other bytes after those of the checkpoint.
+
+    is_large: written past the page cache, so that the end of what is written waits in memory.
+    """
+    if is_large:
+        monkeypatch.setattr(output_file, "_DROP_BYTES", 100_000)
+        monkeypatch.setattr(direct_writes, "_STAGE_BYTES", 8 * direct_writes.BLOCK_BYTES)
     try:
         check_target(name, tmp_path / "x", WriterOptions(), kind)
     except UsageError:
@@ -226,7 +237,8 @@ def test_a_continued_output_has_the_same_bytes(name: str, kind: str, tmp_path: P
             run_job(writer.write(scan))
         checkpoint = writer.checkpoint()
         writer.abandon()
-        assert checkpoint.scans == done
+        safe = checkpoint.scans
+        assert safe == done or (is_large and safe == done - 1)
         partial = folder / f"{target.name}.partial"
         if partial.is_file():
             with partial.open("ab") as file:
@@ -236,7 +248,7 @@ def test_a_continued_output_has_the_same_bytes(name: str, kind: str, tmp_path: P
         for number in range(4):
             scan = scan_of(number)
             writer.write_imu(imu_samples(0, scan.start_ns))
-            if number < done:
+            if number < safe:
                 scan.xyz[:] = 0  # the points of skipped scans are not used
                 run_job(writer.skip(scan))
             else:
