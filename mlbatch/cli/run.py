@@ -115,11 +115,12 @@ def _run_one(job: Job, target: Target) -> list[str]:
     check_options(name, options)
     check_variants(name, job.variants)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
-    job = replace(job, extras=extras(name, options), record=record_layout(name, options), jobs=jobs)
+    job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report
     open_output: OpenWriter | None = None
     resume_log = None
     if target.written is not None:
+        job = replace(job, record=record_layout(name, options))
         output = target.written
         preflight.check_output(job, output, name)
         if target.resume and _is_complete(output, overwrite=target.overwrite):

@@ -41,6 +41,8 @@ _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
 # Columns of an organized scan that are packed together: slots of several columns are adjacent in
 # the output, and all of them fit into the second-level cache.
 _NEAR_COLUMNS = 16
+# As in `native.h`.
+_SPARE_SLOTS = 4
 # Points beyond those of a column that the loops may overwrite.
 _SPARE_POINTS = 4
 # The return type in a label.
@@ -139,7 +141,7 @@ class NativeEngine:
         ]
         self._pieces = (Piece * len(pieces))(*pieces)
         if is_organized:
-            self._near = ScanBuffer(near, self._scan.row_slots)
+            self._near = ScanBuffer(near, self._scan.row_slots + _SPARE_SLOTS)
         else:
             self._near = ScanBuffer(slots + _SPARE_POINTS, None)
         scan = self._scan
@@ -191,7 +193,11 @@ class NativeEngine:
         if self.record is not None:
             self._scan.records = address(out.packed) + PACKED_ROOM
             return
-        self._set_arrays(out, "range_m" in extras, "reflectivity" in extras)
+        self._set_arrays(
+            out,
+            out.is_organized or "range_m" in extras,
+            out.is_organized or "reflectivity" in extras,
+        )
         wants_column = "column" in extras and not out.is_organized
         self._scan.column = address(out.column) if wants_column else None
 
@@ -199,10 +205,8 @@ class NativeEngine:
         scan = self._scan
         scan.point = address(out.point)
         scan.label = address(out.label)
-        scan.range_m = address(out.range_m) if wants_range or out.is_organized else None
-        scan.reflectivity = (
-            address(out.reflectivity) if wants_reflectivity or out.is_organized else None
-        )
+        scan.range_m = address(out.range_m) if wants_range else None
+        scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
 
 
 class _DecodedGroup:
@@ -339,7 +343,11 @@ class _DecodedGroup:
         element = _elements(projector)
         number = np.zeros(lidar.returns * struct.width, np.int64)
         number[element] = projector.number
-        struct.slot = self._kept(number)
+        # Slots that are beams are written by fours.
+        table = lidar.pixels
+        fits = table is not None and _fits_fours(projector, table)
+        is_beam = fits and np.array_equal(projector.number, element)
+        struct.slot = None if is_beam else self._kept(number)
         if projector.order is not None:
             struct.order = self._kept(element[projector.order])
         elif lidar.returns > 1:

@@ -676,35 +676,101 @@ static void emit_extras(const Scan *scan, const Group *group, const int64_t *ord
     }
 }
 
-/* Row `number` of an organized scan: every kept element to its slot, the others empty. */
-static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
-                              const Planes *planes)
+/* An organized row: arrays from its first slot; range_m and reflectivity may be NULL. */
+typedef struct {
+    float *point;
+    int64_t *labels;
+    float *range_m;
+    uint16_t *reflectivity;
+} Row;
+
+/* Slots from `first` to `end` without a point; label: of empty slots. */
+static void empty_slots(const Row *row, int64_t first, int64_t end, int64_t label)
 {
     const uint32_t nan_bits = 0x7FC00000;
     float nan;
     memcpy(&nan, &nan_bits, sizeof nan);
-    const int64_t row = number * scan->row_slots, width = group->width;
-    float *point = scan->point + 4 * row, *range_m = scan->range_m + row;
-    int64_t *labels = scan->label + row;
-    uint16_t *reflectivity = scan->reflectivity + row;
-    const int64_t lidar_id =
-        (int64_t)((uint64_t)planes->label[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
-    for (int64_t slot = 0; slot < scan->row_slots; slot++) {
-        for (int64_t axis = 0; axis < 4; axis++)
-            point[4 * slot + axis] = nan;
-        labels[slot] = lidar_id;
-        range_m[slot] = nan;
-        reflectivity[slot] = 0;
+    for (int64_t value = 4 * first; value < 4 * end; value++)
+        row->point[value] = nan;
+    for (int64_t slot = first; slot < end; slot++)
+        row->labels[slot] = label;
+    for (int64_t slot = first; row->range_m && slot < end; slot++)
+        row->range_m[slot] = nan;
+    for (int64_t slot = first; row->reflectivity && slot < end; slot++)
+        row->reflectivity[slot] = 0;
+}
+
+#if defined(__SSE2__)
+/* Slots that are beams, four at a time. No branch depends on which of them have points. */
+static void organize_fours(const Row *row, int64_t beams, int64_t empty, const Planes *planes)
+{
+    const __m128 nan = _mm_castsi128_ps(_mm_set1_epi32(0x7FC00000));
+    const __m128i nothing = _mm_set1_epi64x(empty);
+    for (int64_t beam = 0; beam < beams; beam += 4) {
+        int32_t bytes;
+        memcpy(&bytes, planes->keep + beam, sizeof bytes);
+        /* A byte 0 or 1 of each beam to a mask of 32 bits. */
+        __m128i wide = _mm_cvtsi32_si128(bytes);
+        wide = _mm_unpacklo_epi8(wide, _mm_setzero_si128());
+        wide = _mm_unpacklo_epi16(wide, _mm_setzero_si128());
+        const __m128i kept = _mm_cmpgt_epi32(wide, _mm_setzero_si128());
+        const __m128 mask = _mm_castsi128_ps(kept);
+        const __m128 none = _mm_andnot_ps(mask, nan);
+        __m128 x = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->x + beam), mask), none);
+        __m128 y = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->y + beam), mask), none);
+        __m128 z = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->z + beam), mask), none);
+        __m128 level = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->level + beam), mask), none);
+        _MM_TRANSPOSE4_PS(x, y, z, level);
+        _mm_storeu_ps(row->point + 4 * beam, x);
+        _mm_storeu_ps(row->point + 4 * beam + 4, y);
+        _mm_storeu_ps(row->point + 4 * beam + 8, z);
+        _mm_storeu_ps(row->point + 4 * beam + 12, level);
+        const __m128i *labels = (const __m128i *)(planes->label + beam);
+        const __m128i masks[] = {_mm_unpacklo_epi32(kept, kept), _mm_unpackhi_epi32(kept, kept)};
+        for (int half = 0; half < 2; half++) {
+            const __m128i own = _mm_and_si128(_mm_load_si128(labels + half), masks[half]);
+            _mm_storeu_si128((__m128i *)(row->labels + beam) + half,
+                             _mm_or_si128(own, _mm_andnot_si128(masks[half], nothing)));
+        }
+        if (row->range_m)
+            _mm_storeu_ps(row->range_m + beam,
+                          _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->range_m + beam), mask), none));
     }
+    for (int64_t beam = 0; row->reflectivity && beam < beams; beam++)
+        row->reflectivity[beam] =
+            (uint16_t)(planes->reflectivity[beam] & -(int32_t)planes->keep[beam]);
+}
+#endif
+
+/* Row `number` of an organized scan: every kept element to its slot, the others empty. */
+static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
+                              const Planes *planes)
+{
+    const int64_t first = number * mlbatch_row_step(scan), width = group->width;
+    const Row row = {scan->point + 4 * first, scan->label + first,
+                     scan->range_m ? scan->range_m + first : 0,
+                     scan->reflectivity ? scan->reflectivity + first : 0};
+    const int64_t empty =
+        (int64_t)((uint64_t)planes->label[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+#if defined(__SSE2__)
+    if (!group->slot) {
+        organize_fours(&row, group->beams, empty, planes);
+        empty_slots(&row, group->beams, scan->row_slots, empty);
+        return count_kept(planes->keep, group->beams);
+    }
+#endif
+    empty_slots(&row, 0, scan->row_slots, empty);
     int64_t count = 0;
     for (int64_t which = 0; which < group->returns; which++)
         for (int64_t element = which * width; element < which * width + group->beams; element++)
             if (planes->keep[element]) {
-                const int64_t slot = group->slot[element];
-                put_point(point + 4 * slot, planes, element);
-                labels[slot] = planes->label[element];
-                range_m[slot] = planes->range_m[element];
-                reflectivity[slot] = planes->reflectivity[element];
+                const int64_t slot = group->slot ? group->slot[element] : element;
+                put_point(row.point + 4 * slot, planes, element);
+                row.labels[slot] = planes->label[element];
+                if (row.range_m)
+                    row.range_m[slot] = planes->range_m[element];
+                if (row.reflectivity)
+                    row.reflectivity[slot] = planes->reflectivity[element];
                 count++;
             }
     return count;
@@ -818,20 +884,6 @@ static int64_t pack_column(const Scan *scan, const Group *group, int64_t member,
     return row + count;
 }
 
-/* Pack the columns up to `column` that are in the scratch arrays, slot by slot, so that the
-   columns of a slot are written together. */
-static void pack_near(const Scan *scan, int64_t column)
-{
-    const int64_t slots = scan->row_slots;
-    const int64_t first = column - column % scan->near_columns;
-    for (int64_t slot = 0; slot < slots; slot++) {
-        const Rows rows = {scan->point + 4 * slot, scan->label + slot, scan->range_m + slot,
-                           scan->reflectivity + slot, slots};
-        mlbatch_pack(scan, &rows, column - first + 1,
-                     scan->records + (slot * scan->columns + first) * scan->record_bytes);
-    }
-}
-
 /* Decode all columns of a scan, in their order; return the row after the last point (organized:
    the number of points). Sensors of no group are skipped. */
 EXPORT int64_t mlbatch_decode(const Scan *scan)
@@ -867,7 +919,7 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
         if (scan->records && scan->row_slots
             && (column % scan->near_columns == scan->near_columns - 1
                 || column == scan->columns - 1))
-            pack_near(scan, column);
+            mlbatch_pack_rows(scan, column - column % scan->near_columns, column + 1);
         if (scan->column)
             for (int64_t place = first; place < row; place++)
                 scan->column[place] = (uint32_t)(scan->first_number + column);

@@ -28,6 +28,9 @@
 #define MOST_RETURNS 3
 #define MOST_WORDS 3
 
+/* Slots behind each row of the scratch arrays of an organized scan that is packed. */
+#define SPARE_SLOTS 4
+
 /* Where the columns of a sensor are: `lidar/interface.py`, Records, in the ring of its packets. */
 typedef struct {
     const uint8_t *first; /* column 0 of row 0 */
@@ -94,7 +97,7 @@ typedef struct {
     const int64_t *labels; /* (members * T, E): words of 8 bytes, time 0 */
     const int64_t *order;  /* (T, slots) or NULL: elements in order of output */
     int64_t order_step;    /* from table to table; 0: one for all */
-    const int64_t *slot;   /* (E,): slot in an organized row */
+    const int64_t *slot;   /* (E,): slot in an organized row; NULL: `fits_fours`, the beam */
     int64_t typed;
     int64_t sends_twice;
     /* One return in wire order, runs of fours in the order of the channels, none of them dark. */
@@ -177,6 +180,16 @@ typedef struct {
 
 /* Pack so many points to records; `pack.c`. */
 void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record);
+
+/* Pack the rows of columns [begin, end) of an organized scan, which are in the scratch arrays. */
+void mlbatch_pack_rows(const Scan *scan, int64_t begin, int64_t end);
+
+/* Slots from one row of an organized scan to the next: rows in scratch arrays have spare slots,
+   so that those of one slot are in different sets of the cache. */
+static inline int64_t mlbatch_row_step(const Scan *scan)
+{
+    return scan->records ? scan->row_slots + SPARE_SLOTS : scan->row_slots;
+}
 
 /* Columns of a sensor that wait for their window: `types.Columns`. */
 typedef struct {

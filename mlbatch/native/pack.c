@@ -148,3 +148,43 @@ void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *re
             compute(scan, rows, piece->kind, count, record + piece->offset);
     }
 }
+
+/* Labels with the time in s as float32 bits instead of ns. */
+static void to_seconds(int64_t *labels, int64_t count)
+{
+    uint32_t last_ns = 0, last_bits = 0;
+    for (int64_t slot = 0; slot < count; slot++) {
+        const uint32_t time_ns = time_of(labels[slot]);
+        /* Empty slots have time 0; without a branch, since they are anywhere. */
+        if ((time_ns != last_ns) & (time_ns != 0)) {
+            const float value = seconds_toward_zero(time_ns);
+            last_ns = time_ns;
+            memcpy(&last_bits, &value, sizeof value);
+        }
+        const uint32_t bits = last_bits & -(uint32_t)(time_ns != 0);
+        labels[slot] = (int64_t)((uint64_t)labels[slot] >> 32 << 32 | bits);
+    }
+}
+
+/* Slot by slot, so that the columns of a slot are written together. */
+void mlbatch_pack_rows(const Scan *scan, int64_t begin, int64_t end)
+{
+    const int64_t slots = scan->row_slots, step = mlbatch_row_step(scan), count = end - begin;
+    const int has_seconds = is_standard(scan);
+    for (int64_t row = 0; has_seconds && row < count; row++)
+        to_seconds(scan->label + row * step, slots);
+    for (int64_t slot = 0; slot < slots; slot++) {
+        uint8_t *record = scan->records + (slot * scan->columns + begin) * scan->record_bytes;
+        const Rows rows = {scan->point + 4 * slot, scan->label + slot,
+                           scan->range_m ? scan->range_m + slot : 0,
+                           scan->reflectivity ? scan->reflectivity + slot : 0, step};
+        if (!has_seconds) {
+            mlbatch_pack(scan, &rows, count, record);
+            continue;
+        }
+        for (int64_t row = 0; row < count; row++, record += 24) {
+            memcpy(record, rows.point + 4 * row * step, 16);
+            memcpy(record + 16, rows.label + row * step, 8);
+        }
+    }
+}

@@ -138,12 +138,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     )
     check_options(name, writer_options)
     jobs = jobs_for(asked, name, writer_options) if output is not None else asked or 1
-    job = replace(
-        job,
-        extras=extras(name, writer_options),
-        record=record_layout(name, writer_options),
-        jobs=jobs,
-    )
+    job = replace(job, extras=extras(name, writer_options), jobs=jobs)
     if output is None:
         preflight.check_report(job, options.report, None, name)
         _, content = convert(job, None)
@@ -151,6 +146,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
             write_text(options.report, report_text(content))
         return Run(None, Report(content), options.report)
     preflight.check_output(job, output, name)
+    job = replace(job, record=record_layout(name, writer_options))
     # Also locks the output against other runs.
     log = ResumeLog(output, job, name, writer_options, None)
     resume.forget(output)
