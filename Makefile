@@ -9,6 +9,8 @@
 #   make docs    the documentation as a site, build/site/index.html
 #   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
 #   make test-consumers   programs of others read our outputs, each in an environment of its own
+#   make odometry   KISS-ICP on windows and on fused sweeps, on simulated rigs (docs/odometry.md)
+#   make casestudy   lidar-inertial odometry of one and two lidars (docs/casestudy.md)
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make fuzz-sanitized   its targets of compiled loops, with sanitizers in the C code
 #   make clean   remove what the others made
@@ -19,6 +21,7 @@ LOWEST_PYTHON ?= $(PYTHON)
 VENV := .venv
 LOWEST := .venv-lowest
 CONSUMERS := .venv-consumers
+ODOMETRY := .venv-odometry
 BIN := $(VENV)/bin
 RIG := fixtures/two_lidars
 # Of the compiled engine, which an installation builds.
@@ -26,7 +29,8 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick test-lowest test-consumers lint docs bench fuzz fuzz-sanitized clean
+.PHONY: help demo test coverage test-quick test-lowest test-consumers lint docs bench odometry odometry-quick \
+	casestudy fuzz fuzz-sanitized clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -67,6 +71,17 @@ bench: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow
 	$(BIN)/mlbatch bench $(BENCH)
 
+odometry: $(ODOMETRY)/odometry.stamp
+	$(ODOMETRY)/bin/python examples/odometry/odometry.py $(STUDY)
+
+# A minute: one short recording, two variants.
+odometry-quick: $(ODOMETRY)/odometry.stamp
+	$(ODOMETRY)/bin/python examples/odometry/odometry.py -o build/odometry-quick --seeds 1 \
+		--duration 5 --variants windows "approximate time, times as they come"
+
+casestudy: $(ODOMETRY)/casestudy.stamp
+	PYTHONPATH=examples/odometry $(ODOMETRY)/bin/python examples/casestudy/casestudy.py $(STUDY)
+
 INPUTS ?= 1000000
 SEED ?= 1
 MINUTES ?= 0
@@ -84,7 +99,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) $(ODOMETRY) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
 
 # The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:
@@ -108,6 +123,21 @@ $(VENV)/dev.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 $(VENV)/docs.stamp: $(VENV)/dev.stamp
 	@echo "installing the tools of the site into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
+
+$(ODOMETRY)/odometry.stamp: examples/odometry/requirements.txt pyproject.toml $(SOURCES)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "make: expected Python 3.11 or later, which evo needs, found" \
+			"$$($(PYTHON) --version 2>&1); choose another: make PYTHON=python3.12 odometry"; exit 1; }
+	@echo "installing mlbatch, KISS-ICP and evo into $(ODOMETRY)"
+	@$(PYTHON) -m venv $(ODOMETRY)
+	@$(ODOMETRY)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--requirement examples/odometry/requirements.txt --editable .
+	@touch $@
+
+$(ODOMETRY)/casestudy.stamp: examples/casestudy/requirements.txt $(ODOMETRY)/odometry.stamp
+	@$(ODOMETRY)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--requirement examples/casestudy/requirements.txt
 	@touch $@
 
 $(LOWEST)/dev.stamp: pyproject.toml .ci/lowest.txt

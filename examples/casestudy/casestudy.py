@@ -87,9 +87,7 @@ def main() -> None:
 # -- cells ----------------------------------------------------------------------------------------
 
 
-def _world(
-    scenario: str, seed: int, options: argparse.Namespace
-) -> Iterator[tuple[Cell, Drift]]:
+def _world(scenario: str, seed: int, options: argparse.Namespace) -> Iterator[tuple[Cell, Drift]]:
     """Yield the cells of one forest."""
     folder = options.output / f"{scenario}-{seed:02d}"
     folder.mkdir(parents=True, exist_ok=True)

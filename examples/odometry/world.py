@@ -66,7 +66,8 @@ def _way(random: np.random.Generator, duration_s: float) -> list[list[float]]:
     """Waypoints around the centre, 1.5 to 2.5 m/s; radii that vary make the rig turn."""
     begin = random.uniform(0.0, 360.0)
     sense = random.choice([-1.0, 1.0])
-    time_s, rows, last = 0.0, [], np.zeros(2)
+    rows: list[list[float]] = []
+    time_s, last = 0.0, np.zeros(2)
     while time_s < duration_s + 5.0:
         angle = np.radians(begin + sense * _STEP_DEG * len(rows))
         place = random.uniform(9.0, 14.0) * np.array([np.cos(angle), np.sin(angle)])

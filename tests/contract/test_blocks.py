@@ -163,6 +163,10 @@ FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir"
     "--target",
     "--version",
     "--install-completion",
+    # examples/odometry and evo.
+    "--t_offset",
+    "--truth",
+    "--variants",
 }
 OPTION = re.compile(r"(?<![\w-])(--[a-z][\w-]*)")
 
