@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import quaternion
 from mlbatch.lidar.simulated import PacketTopic
 from mlbatch.ros.encoding import Cdr
@@ -15,6 +16,7 @@ from mlbatch.simulate.trajectory import Poses
 from mlbatch.units import NS_PER_S
 
 TF = "/tf"
+TF_STATIC = "/tf_static"
 # Messages with many packets contain those of a tenth of a second.
 _GROUP_NS = NS_PER_S // 10
 _UNKNOWN = (-1.0, *(0.0,) * 8)
@@ -122,6 +124,17 @@ def imu_message(stamp_ns: int, frame: str, force: Sequence[float], rate: Sequenc
     message.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN)
     message.put("d", *rate, *(0.0,) * 9)
     message.put("d", *force, *(0.0,) * 9)
+    return bytes(message.data)
+
+
+def static_message(stamp_ns: int, parent: str, child: str, parent_from_child: F64Array) -> bytes:
+    """Return a tf2_msgs/TFMessage of a constant transform (4, 4), m."""
+    message = Cdr()
+    message.put("I", 1)
+    message.header(stamp_ns, parent)
+    message.text(child)
+    message.put("d", *parent_from_child[:3, 3].tolist())
+    message.put("d", *quaternion(parent_from_child[:3, :3]).tolist())
     return bytes(message.data)
 
 

@@ -30,10 +30,12 @@ from mlbatch.simulate.containers import (
 from mlbatch.simulate.lidar_stream import LidarStream, Received, SensorClock, with_errors
 from mlbatch.simulate.messages import (
     TF,
+    TF_STATIC,
     PacketMessages,
     Stamped,
     imu_message,
     odometry_message,
+    static_message,
     text_message,
     transform_message,
 )
@@ -294,15 +296,21 @@ class _Run:
         self._bag.message(plan.topic, kind, host_ns, data)
 
     def _write_metadata(self) -> None:
-        """Write the latched messages with the calibrations."""
+        """Write the latched messages with the calibrations, and the place of the body's IMU."""
         if self._bag is None:
             return
+        imu = self._scenario.imu
+        start_ns = self._scenario.start_ns
+        if imu is not None:
+            body = self._scenario.body_frame
+            data = static_message(start_ns, body, imu.name, imu.body_from_imu)
+            self._bag.message(TF_STATIC, "tf2_msgs/TFMessage", start_ns, data, True)
         for stream in self._streams:
             files = stream.lidar.files
             if files.topic:
                 topic = f"/{stream.plan.name}/{files.topic}"
                 data = text_message(files.content.decode())
-                self._bag.message(topic, "std_msgs/String", self._scenario.start_ns, data, True)
+                self._bag.message(topic, "std_msgs/String", start_ns, data, True)
 
     def _close(self) -> None:
         """Write the packets that wait for others, complete the file."""

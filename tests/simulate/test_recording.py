@@ -134,6 +134,8 @@ def test_messages_as_another_reader_sees_them(bags: dict[str, Recorded]) -> None
     assert counts["/left/imu_packets"] == 50
     assert counts["/left/metadata"] == 1
     assert counts["/imu/data"] == 100
+    # The place of that IMU.
+    assert counts["/tf_static"] == 1
     # 754 packets a second, in messages of a tenth of a second.
     assert counts["/rear/velodyne_packets"] == 5
     _, rows = read_tum(recorded.truth)
@@ -158,6 +160,7 @@ def test_a_database_as_another_reader_sees_it(bags: dict[str, Recorded]) -> None
         ("/rear/velodyne_packets", "velodyne_msgs/msg/VelodyneScan"),
         ("/imu/data", "sensor_msgs/msg/Imu"),
         ("/tf", "tf2_msgs/msg/TFMessage"),
+        ("/tf_static", "tf2_msgs/msg/TFMessage"),
     }
     times = [row[1] for row in rows]
     assert times == sorted(times)
