@@ -252,6 +252,8 @@ class WindowColumns:
     sensor: I64Array  # index of the column's sensor
     ring_index: I64Array  # as in `Columns`
     encoder: I64Array  # as in `Columns`
+    # (n, 3, 4) float32, m: what moves the points of a column, body frame; None: nothing.
+    moves: F32Array | None = None
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -263,6 +265,7 @@ class WindowColumns:
             self.sensor[index],
             self.ring_index[index],
             self.encoder[index],
+            None if self.moves is None else self.moves[index],
         )
 
 

@@ -7,7 +7,7 @@ their columns were used, or are counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +71,12 @@ class SweepFusion:
         self._sets = 0
         self.dropped: list[dict[str, int]] = [{} for _ in cutters]
         self.reused = [0] * len(cutters)
+
+    def sets(self, windows: Iterable[Window]) -> Iterator[Window]:
+        """Yield the sets of all windows."""
+        for window in windows:
+            yield from self.push(window)
+        self.finish()
 
     def push(self, window: Window) -> Iterator[Window]:
         """Add the columns of the next window; yield the sets that they complete."""

@@ -55,7 +55,8 @@ class NativeColumnMerge(ColumnMerge):
         for (sensor, columns), used in left:
             if used < len(columns):
                 waiting[sensor].append(columns.take(slice(used, None)))
-        return WindowColumns(*(array[:count] for array in merged))
+        stamp_ns, of, ring_index, encoder = (array[:count] for array in merged)
+        return WindowColumns(stamp_ns, of, ring_index, encoder)
 
     def figures(self, merged: WindowColumns, ends: Sequence[int]) -> list[WindowFigures]:
         """See `ColumnMerge`; numpy computes them if a position is beyond the revolution."""

@@ -119,6 +119,22 @@ def convert(
             "their own sweep, as drivers give them (own).",
         ),
     ] = "common",
+    deskew: Annotated[
+        str | None,
+        typer.Option(
+            help="Move points to one instant of their window by poses: imu, or a trajectory "
+            "(FILE.tum: time x y z qx qy qz qw of the body).",
+            metavar="SOURCE",
+        ),
+    ] = None,
+    deskew_to: Annotated[
+        str | None,
+        one_of(
+            INSTANTS,
+            "--deskew-to",
+            help="Instant of the window that points are moved to.  [default: start]",
+        ),
+    ] = None,
     slices: Annotated[
         int, typer.Option(help="Sub-scans a window, published one by one.", metavar="N")
     ] = 1,
@@ -300,7 +316,7 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.pipeline.job import Job, check_batching, check_sort
+    from mlbatch.pipeline.job import Job, check_batching, check_deskew, check_sort
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
     from mlbatch.writers import parse_jobs
@@ -308,6 +324,7 @@ def convert(
     options.choices(
         layout=(layout, LAYOUTS),
         stamp=(stamp, INSTANTS),
+        deskew_to=(deskew_to or INSTANTS[0], INSTANTS),
         clock=(clock, CLOCKS),
         align_to=(align_to, ALIGN_TO),
         on_jump=(on_jump, ON_JUMP),
@@ -333,6 +350,8 @@ def convert(
         stamp=stamp,
         batching=batching,
         batching_times=batching_times,
+        deskew=deskew or "",
+        deskew_to=deskew_to or INSTANTS[0],
         slices=slices,
         layout=layout,
         sort=check_sort("--sort", sort, layout),
@@ -355,7 +374,7 @@ def convert(
         engine=engine,
     )
     run(
-        check_batching(job),
+        check_deskew(check_batching(job), deskew_to is not None),
         Target(
             output=output,
             format=format_,

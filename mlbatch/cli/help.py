@@ -22,7 +22,7 @@ Rows = list[tuple[str, str]]
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "Input": (*("recordings", "rig", "metadata", "decode", "identity_extrinsics", "whole"),),
     "Batching": (
-        *("batching", "batching_times"),
+        *("batching", "batching_times", "deskew", "deskew_to"),
         *("rate", "slices", "split", "max_wait", "keep_partial", "drop_incomplete"),
         *("tolerance", "timeout"),
     ),

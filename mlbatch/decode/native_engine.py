@@ -154,6 +154,7 @@ class NativeEngine:
 
     def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
         """Point the struct to the columns; return the arrays to keep."""
+        kept: list[npt.NDArray[Any]] = []
         arrays: list[npt.NDArray[Any]] = [
             np.ascontiguousarray(array, np.int64)
             for array in (columns.stamp_ns, columns.sensor, columns.ring_index, columns.encoder)
@@ -161,13 +162,19 @@ class NativeEngine:
         scan = self._scan
         scan.columns = len(columns)
         scan.stamp_ns, scan.sensor, scan.ring_index, scan.encoder = map(address, arrays)
+        scan.moves = None
+        if columns.moves is not None:
+            moves = np.ascontiguousarray(columns.moves, np.float32)
+            scan.moves = address(moves)
+            kept.append(moves)
+        kept += arrays
         if self._turning is not None:
             angles = self._angles(arrays[1], arrays[3])
             for group in self._groups:
                 if group.struct.kind == _TURNING:
                     group.struct.cosine, group.struct.sine = map(address, angles)
-            arrays += angles
-        return arrays
+            kept += angles
+        return kept
 
     def _angles(self, sensor: I64Array, encoder: I64Array) -> list[npt.NDArray[Any]]:
         """Return cosines and sines of all columns; undefined for sensors without rotor words."""

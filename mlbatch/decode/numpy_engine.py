@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.decode.engine import EngineSetup
-from mlbatch.decode.projector import Projector, Tile, TileView, points_by_column
+from mlbatch.decode.projector import Projector, Tile, TileView, move, points_by_column
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import RecordLayout, WindowColumns
 
@@ -126,6 +126,9 @@ class NumpyEngine:
             view = self._tile.view(element, end - begin, projector.slots)
             encoder = columns.encoder[own]
             projector.project(member[own], columns.ring_index[own], encoder, offset_ns[own], view)
+            if columns.moves is not None:
+                # After the filters, whose boxes are in the body frame of each column.
+                move(view.point, columns.moves[own])
             parts.append(_TilePart(projector, view, rows[own], element, encoder))
             element += (end - begin) * projector.slots
             begin = end

@@ -320,6 +320,19 @@ class Projector:
             keep &= ~inside.all(axis=2)
 
 
+def move(point: F32Array, moves: F32Array) -> None:
+    """Move points (n, slots, 4) by the transforms (n, 3, 4) of their columns."""
+    x, y, z = (point[:, :, axis].copy() for axis in range(3))
+    for axis in range(3):
+        first, second, third, constant = moves[:, axis, :, None].transpose(1, 0, 2)
+        # The order of the operations is that of `native/decode.c`.
+        moved = x * first
+        moved += y * second
+        moved += z * third
+        moved += constant
+        point[:, :, axis] = moved
+
+
 def _count_by_member(blocks: Sequence[slice], keep: BoolArray) -> list[int]:
     """Return the number of marked slots by member."""
     return [int(np.count_nonzero(keep[own])) for own in blocks]

@@ -87,6 +87,7 @@ class Integrator:
         self._rest: Standstill | None = None
         self._begin_ns = 0
         self._state: _State | None = None
+        self.gyro_bias: tuple[float, ...] = ()
         # A longer gap than MAX_GAP_NS: the velocity is not known any more.
         self.is_lost = False
 
@@ -103,6 +104,7 @@ class Integrator:
             if len(stamp_ns) == 0 or stamp_ns[-1] - stamp_ns[0] <= STANDSTILL_NS:
                 return self._track(stamp_ns[:0], np.zeros((0, 3, 3)), np.zeros((0, 3)))
             self._rest = standstill(stamp_ns, force, rate, self._name)
+            self.gyro_bias = tuple(self._rest.gyro_bias.tolist())
             self._begin_ns = int(stamp_ns[0])
             self._waiting = []
         if self.is_lost or len(stamp_ns) == 0:

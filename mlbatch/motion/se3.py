@@ -26,7 +26,7 @@ def skew(vectors: F64Array) -> F64Array:
 def exp_rotation(vectors: F64Array) -> F64Array:
     """Return the rotations of rotation vectors."""
     angle = np.sqrt((vectors**2).sum(axis=1))
-    first, second, _ = _coefficients(angle)
+    first, second, _ = coefficients(angle)
     cross = skew(vectors)
     return np.eye(3) + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
 
@@ -88,12 +88,12 @@ def rotations_of(quaternions: F64Array) -> F64Array:
 
 def _left_jacobian(vectors: F64Array) -> F64Array:
     angle = np.sqrt((vectors**2).sum(axis=1))
-    _, second, third = _coefficients(angle)
+    _, second, third = coefficients(angle)
     cross = skew(vectors)
     return np.eye(3) + second[:, None, None] * cross + third[:, None, None] * (cross @ cross)
 
 
-def _coefficients(angle: F64Array) -> tuple[F64Array, F64Array, F64Array]:
+def coefficients(angle: F64Array) -> tuple[F64Array, F64Array, F64Array]:
     """Return sin(a) / a, (1 - cos(a)) / a^2 and (a - sin(a)) / a^3."""
     square = angle * angle
     is_small = angle < _SMALL_RAD

@@ -299,6 +299,20 @@ static void mark(const Scan *scan, const Group *group, int64_t member, Planes *p
     counts[OUTSIDE_BOXES] += left;
 }
 
+/* Move the points of a column by a transform (3, 4), in the order of operations of numpy. */
+static void move_planes(const float *restrict moves, int64_t elements, Planes *planes)
+{
+    float *restrict x = planes->x;
+    float *restrict y = planes->y;
+    float *restrict z = planes->z;
+    for (int64_t element = 0; element < elements; element++) {
+        const float x_m = x[element], y_m = y[element], z_m = z[element];
+        x[element] = x_m * moves[0] + y_m * moves[1] + z_m * moves[2] + moves[3];
+        y[element] = x_m * moves[4] + y_m * moves[5] + z_m * moves[6] + moves[7];
+        z[element] = x_m * moves[8] + y_m * moves[9] + z_m * moves[10] + moves[11];
+    }
+}
+
 /* Labels of all elements; types of dual returns: docs/sources/outputs.md section 3. */
 static void label(const Group *group, int64_t row, int64_t offset_ns, Planes *planes)
 {
@@ -377,12 +391,13 @@ typedef struct {
     __m128 factor, divisor, cosine, sine, speed;
     __m128 low_m, high_m;
     __m128 origin[3]; /* TABLED */
+    __m128 moves[12];
     const float *direction, *origins, *reach, *firing_ns;
     const int64_t *words;
     float *point;
     int64_t *label;
     int64_t used, width, distance_byte, level_byte, reflectivity_byte;
-    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras;
+    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras, has_moves;
 } Column;
 
 static const uint8_t LANES[16] = {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4};
@@ -469,6 +484,15 @@ static inline int outside_boxes(const Scan *scan, const __m128 *xyz)
     return ~_mm_movemask_ps(inside) & 15;
 }
 
+/* As `move_planes`. */
+static inline void move_four(const __m128 *moves, __m128 *xyz)
+{
+    const __m128 x = xyz[0], y = xyz[1], z = xyz[2];
+    for (int axis = 0; axis < 3; axis++, moves += 4)
+        xyz[axis] = _mm_add_ps(
+            _mm_add_ps(multiply_add(x, moves[0], y, moves[1]), _mm_mul_ps(z, moves[2])), moves[3]);
+}
+
 /* Ranges and reflectivities of the lanes in `kept` to rows from `row`. */
 static inline void store_extras(const Scan *scan, int64_t row, int kept, __m128 range_m,
                                 __m128i reflectivity)
@@ -494,7 +518,8 @@ static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
 /* Four beams of a run: their pixels begin at `from`, or (TABLED) their words are in `near` and
    `levels`. Return the next row. */
 static inline int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
-                                  int64_t kind, int64_t step, int is_plain, const uint8_t *from,
+                                  int64_t kind, int64_t step, int is_plain, int has_moves,
+                                  const uint8_t *from,
                                   const uint32_t *near, const uint32_t *levels, int64_t beam, int64_t row, int64_t *counts)
 {
     /* The distance is in the first word, as fields are listed. */
@@ -530,6 +555,8 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
         place_turning(own, own->width, beam, range_m, xyz);
     if (!is_plain && own->has_boxes)
         kept &= outside_boxes(scan, xyz);
+    if (has_moves)
+        move_four(own->moves, xyz);
     __m128i second = first;
     if (kind == TABLED)
         second = _mm_load_si128((const __m128i *)levels);
@@ -551,7 +578,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
 
 /* All runs of a column; with constant steps and kinds the compiler leaves out what is not used. */
 static inline int64_t decode_runs(const Scan *scan, const Group *group, const Column *own,
-                                  int64_t kind, int64_t step, int is_plain,
+                                  int64_t kind, int64_t step, int is_plain, int has_moves,
                                   const uint8_t *record, int64_t row, int64_t *counts)
 {
     int64_t own_counts[COUNTS] = {0};
@@ -568,7 +595,7 @@ static inline int64_t decode_runs(const Scan *scan, const Group *group, const Co
                 gather_every(from + own->level_byte, step, beams, levels);
         }
         for (int64_t beam = 0; beam < beams; beam += 4)
-            row = decode_four(scan, group, own, kind, step, is_plain,
+            row = decode_four(scan, group, own, kind, step, is_plain, has_moves,
                               from + beam * step, near + beam,
                               (own->level_word ? levels : near) + beam, first_beam + beam, row,
                               own_counts);
@@ -617,6 +644,9 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
     own.label = scan->label;
     own.width = width;
     own.is_filtered = own.is_limited || own.has_boxes;
+    own.has_moves = scan->moves != 0;
+    for (int number = 0; own.has_moves && number < 12; number++)
+        own.moves[number] = _mm_set1_ps(scan->moves[12 * column + number]);
     const int is_plain = !own.is_filtered && !own.has_extras;
     int64_t *counts = group->counts + member * COUNTS;
     if (group->kind == TABLED) {
@@ -625,11 +655,16 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
         own.sine = _mm_set1_ps(group->sine[at]);
         for (int axis = 0; axis < 3; axis++)
             own.origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
+        if (is_plain && group->step == 4 && own.has_moves)
+            return decode_runs(scan, group, &own, TABLED, 4, 1, 1, record, row, counts);
         if (is_plain && group->step == 4)
-            return decode_runs(scan, group, &own, TABLED, 4, 1, record, row, counts);
+            return decode_runs(scan, group, &own, TABLED, 4, 1, 0, record, row, counts);
+        if (is_plain && group->step == 12 && own.has_moves)
+            return decode_runs(scan, group, &own, TABLED, 12, 1, 1, record, row, counts);
         if (is_plain && group->step == 12)
-            return decode_runs(scan, group, &own, TABLED, 12, 1, record, row, counts);
-        return decode_runs(scan, group, &own, TABLED, group->step, 0, record, row, counts);
+            return decode_runs(scan, group, &own, TABLED, 12, 1, 0, record, row, counts);
+        return decode_runs(scan, group, &own, TABLED, group->step, 0, own.has_moves, record, row,
+                           counts);
     }
     own.cosine = _mm_set1_ps(group->cosine[column]);
     own.sine = _mm_set1_ps(group->sine[column]);
@@ -638,9 +673,12 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
     const float speed = speed_of(encoder);
     own.speed = _mm_set1_ps(speed);
     own.firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
+    if (is_plain && group->step == 3 && own.has_moves)
+        return decode_runs(scan, group, &own, TURNING, 3, 1, 1, record, row, counts);
     if (is_plain && group->step == 3)
-        return decode_runs(scan, group, &own, TURNING, 3, 1, record, row, counts);
-    return decode_runs(scan, group, &own, TURNING, group->step, 0, record, row, counts);
+        return decode_runs(scan, group, &own, TURNING, 3, 1, 0, record, row, counts);
+    return decode_runs(scan, group, &own, TURNING, group->step, 0, own.has_moves, record, row,
+                       counts);
 }
 #endif
 
@@ -849,6 +887,8 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     else
         project_turning(group, member, encoder, known, column, planes);
     mark(scan, group, member, planes);
+    if (scan->moves)
+        move_planes(scan->moves + 12 * column, group->returns * group->width, planes);
     label(group, known, offset_ns, planes);
     if (scan->row_slots) {
         const int64_t number =

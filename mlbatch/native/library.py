@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 4
+_ABI = 5
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -136,6 +136,7 @@ class Scan(ctypes.Structure):
         ("box_count", _WORD),
         ("boxes_m", _ADDRESS),
         ("row_slots", _WORD),
+        ("moves", _ADDRESS),
         ("point", _ADDRESS),
         ("label", _ADDRESS),
         ("range_m", _ADDRESS),

@@ -15,7 +15,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 4
+#define MLBATCH_ABI 5
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -153,6 +153,7 @@ typedef struct {
     int64_t box_count;
     const float *boxes_m; /* (box_count, 6) */
     int64_t row_slots;    /* organized: slots of a row; 0: dense */
+    const float *moves;   /* (columns, 3, 4) or NULL: moves points after all filters, m */
     /* Outputs, as in `decode/scan_buffer.py`; NULL: none. A dense scan has room for all
        slots of its columns. With `records` the arrays are scratch for `near_columns` columns. */
     float *point;

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
@@ -22,6 +23,8 @@ from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes
+from mlbatch.pipeline.deskew import IMU as IMU_POSES
+from mlbatch.pipeline.deskew import Deskew, ImuPoses, PoseSource, Trajectory
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
@@ -121,12 +124,25 @@ class Conversion:
         self.table: ScanTable | None = None
         self.earlier: Iterator[Outcomes] = iter(())
         self.dropped_incomplete = 0
+        self.deskew = self._deskew()
         self._buffers = buffers
         self._pool: DecodePool | None = None
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
         for note in self.session.setup.notes:
             self.warn(note)
+
+    def _deskew(self) -> Deskew | None:
+        """What moves columns, by `--deskew`; None without."""
+        job = self.job
+        if not job.deskew:
+            return None
+        source: PoseSource
+        if job.deskew == IMU_POSES:
+            source = ImuPoses(self.sensors, self.session.setup.frames())
+        else:
+            source = Trajectory(Path(job.deskew))
+        return Deskew(source, job.deskew_to, job.max_wait_ns, len(self.sensors))
 
     # -- the loop -----------------------------------------------------------------------------
 
@@ -145,6 +161,8 @@ class Conversion:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
                 ingested = self.session.ingest.columns(batch, oldest_ring_indexes)
+                if self.deskew is not None:
+                    self.deskew.source.add(ingested.imu, batch.messages)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -176,13 +194,14 @@ class Conversion:
                     yield from pool.tasks(window, self.earlier)
 
     def _batches(self, windows: Iterator[Window]) -> Iterator[Window]:
-        """Yield what becomes a scan: the windows, or the sets of sweeps in them."""
-        if self.fusion is None:
-            yield from windows
+        """Yield what becomes a scan: windows, or the sets of sweeps in them, with their moves."""
+        batches = windows if self.fusion is None else self.fusion.sets(windows)
+        if self.deskew is None:
+            yield from batches
             return
-        for window in windows:
-            yield from self.fusion.push(window)
-        self.fusion.finish()
+        for window in batches:
+            yield from self.deskew.push(window)
+        yield from self.deskew.finish()
 
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with `--split`, the index of its sensor.
@@ -206,6 +225,8 @@ class Conversion:
             ring_indexes = [self.batcher.oldest_ring_index(sensor.index)]
             if self.fusion is not None:
                 ring_indexes.append(self.fusion.oldest_ring_index(sensor.index))
+            if self.deskew is not None:
+                ring_indexes.append(self.deskew.oldest_ring_index(sensor.index))
             if self._pool is not None:
                 ring_indexes.append(self._pool.oldest_ring_index(sensor.index))
             known = (index for index in ring_indexes if index is not None)
@@ -371,6 +392,8 @@ class Conversion:
             for reason, count in self.fusion.dropped[sensor.index].items():
                 ledger.columns.drop(reason, count)
             ledger.columns.reused = self.fusion.reused[sensor.index]
+        if self.deskew is not None:
+            ledger.columns.drop("no_pose", self.deskew.dropped[sensor.index])
         ledger.points = self.points(sensor.index)
 
     def _refuse_rejected(self) -> None:

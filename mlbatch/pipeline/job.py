@@ -14,7 +14,7 @@ from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.types import EXTRAS, RecordLayout
+from mlbatch.types import EXTRAS, INSTANTS, RecordLayout
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -61,6 +61,8 @@ class Job:
     stamp: str = "start"  # or middle, end: instant of a window that its message is stamped with
     batching: str = WINDOW  # or a policy of frame-level fusion
     batching_times: str = COMMON  # or own
+    deskew: str = ""  # where poses come from: imu, or the path of a trajectory; "": no motion
+    deskew_to: str = INSTANTS[0]  # instant of a window that its points are moved to
     jobs: int = 1  # scans made at the same time
     engine: str = "auto"  # one of `native.ENGINES`
 
@@ -77,6 +79,9 @@ class Job:
             # Also the default: with it nothing is left to guess.
             ("batching_times", self.batching_times if self.is_fused else "", ""),
             ("stamp", self.stamp, "start"),
+            # Without folders: outputs do not depend on where files are.
+            ("deskew", Path(self.deskew).name, ""),
+            ("deskew_to", self.deskew_to if self.deskew else "", ""),
         )
         return tuple((name, value) for name, value, default in values if value != default)
 
@@ -109,6 +114,32 @@ def check_sort(option: str, sort: str, layout: str) -> str:
             "places of their columns; leave one of them out"
         )
     return sort
+
+
+def check_deskew(job: Job, is_given: bool) -> Job:
+    """Return the job; UsageError for poses that cannot be had; is_given: of `--deskew-to`."""
+    if is_given and not job.deskew:
+        raise UsageError(
+            "--deskew-to: expected --deskew, which moves points, found none; give --deskew imu or "
+            "--deskew FILE.tum, or leave it out"
+        )
+    if job.deskew == "constant-velocity":
+        raise UsageError(
+            "--deskew constant-velocity: expected a source of poses, found a model without one: "
+            "the velocity needs odometry; run it on the scans, and give its trajectory "
+            "(--deskew FILE.tum)"
+        )
+    if job.deskew == "imu" and job.selection.host_clock:
+        raise UsageError(
+            "--deskew imu: expected the clocks of the sensors, which IMU samples have, found "
+            "--clock host; leave one of them out"
+        )
+    if job.deskew and job.deskew != "imu" and not Path(job.deskew).is_file():
+        raise UsageError(
+            f"--deskew: expected imu or the file of a trajectory (TUM), found {job.deskew!r}; "
+            "check the path"
+        )
+    return job
 
 
 def check_batching(job: Job) -> Job:

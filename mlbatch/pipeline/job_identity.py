@@ -78,6 +78,8 @@ def input_identity(run: Conversion) -> dict[str, str]:
         found[f"recording {number}"] = f"{path.name} ({size_and_time}, content {content})"
     for path in run.job.selection.metadata:
         found[f"metadata {path.name}"] = _content([path], 0)
+    if run.job.deskew and Path(run.job.deskew).is_file():
+        found["trajectory"] = _content([Path(run.job.deskew)], 0)
     for sensor in run.sensors:
         found[f"calibration of {sensor.name}"] = _calibration(sensor)
         pose = (sensor.body_from_sensor, sensor.clock.offset_ns)

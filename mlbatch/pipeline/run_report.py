@@ -55,6 +55,7 @@ def run_report(run: Conversion) -> RunReport:
         slices=run.job.slices,
         sort=run.job.sort,
         variants=run.job.variants,
+        deskew=None if run.deskew is None else run.deskew.ledger,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
@@ -86,6 +87,9 @@ LOST = 0.001
 # Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
 # calibration; one damaged timestamp in the future makes those that follow it late.
 MANY = 0.01
+# How long an IMU may be integrated without a warning, s, and the error it names, m/s2.
+DRIFT_S = 10
+_USUAL_ERROR = 0.05
 
 
 def _cloud_notes(run: Conversion) -> Iterator[Note]:
@@ -168,10 +172,26 @@ def final_notes(run: Conversion) -> list[Note]:
                 "which the point layout clips; choose one with a float32 intensity"
             )
             notes.append(Note("clipped", sensor.name, text))
+    notes += _motion_notes(run)
     notes += _loss_notes(run)
     notes += _point_notes(run)
     notes += _unassigned_notes(run)
     return notes
+
+
+def _motion_notes(run: Conversion) -> Iterator[Note]:
+    """Velocities that an IMU was integrated to for long."""
+    if run.deskew is None:
+        return
+    seconds = run.deskew.source.integrated_s
+    if seconds > DRIFT_S:
+        yield Note(
+            "deskew_drift",
+            "",
+            f"{run.deskew.source.name} was integrated for {seconds:.0f} s after the standstill: an "
+            f"error of its accelerometer of {_USUAL_ERROR} m/s2 is then a velocity of "
+            f"{_USUAL_ERROR * seconds:.2g} m/s; give a trajectory (--deskew FILE.tum)",
+        )
 
 
 def _loss_notes(run: Conversion) -> Iterator[Note]:
@@ -292,6 +312,13 @@ def why_no_scan(run: Conversion) -> str:
         return (
             f"{where}: no scan: expected --start in the recording, "
             f"{text_of_range(first_ns, last_ns)}, found {text_of_time(start_ns)}; choose another"
+        )
+    if run.deskew is not None and run.deskew.ledger.no_pose:
+        motion = run.deskew.ledger
+        return (
+            f"{where}: no scan: expected poses at the times of the scans for --deskew, found "
+            f"{motion.poses} poses of {motion.source}, none of a whole window, and "
+            f"{'; '.join(spans)}; give a trajectory of this recording, on the clock of its lidars"
         )
     if run.job.is_fused:
         return (

@@ -14,6 +14,7 @@ CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost"
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 # `incomplete`: of windows left out by --drop-incomplete. Of frame-level fusion: `part_sweep`: of
 # sweeps of which the recording has a part only; `no_set`: of sweeps that no set contains.
+# `no_pose`: of windows that --deskew left out.
 COLUMN_REASONS = (
     "before_start",
     "late",
@@ -24,6 +25,7 @@ COLUMN_REASONS = (
     "incomplete",
     "part_sweep",
     "no_set",
+    "no_pose",
 )
 # `no_place`: the output format cannot store them.
 IMU_REASONS = ("bad_stamp", "duplicate", "outside_time", "no_place")

@@ -21,6 +21,7 @@ from mlbatch.report.ledger import (
     check_messages,
     ordered,
 )
+from mlbatch.report.motion import MotionLedger
 from mlbatch.report.scan_table import ScanStatistics
 from mlbatch.types import CaptureCounts
 from mlbatch.units import NS_PER_S
@@ -138,6 +139,7 @@ class RunReport:
     repeated: int = 0  # datagrams that injected faults duplicated, less those they removed
     first_scan: str = ""  # start of the first scan, as text
     variants: tuple[tuple[str, str], ...] = ()  # as `RunInfo.variants`
+    deskew: MotionLedger | None = None  # with --deskew
     command: str = ""  # command line; "" for runs by the Python interface
 
 
@@ -167,6 +169,7 @@ def build_report(run: RunReport) -> Section:
         "sensors": [_sensor(sensor) for sensor in run.sensors],
         "messages": [item._asdict() for item in run.messages],
         **({"faults": [item._asdict() for item in run.faults]} if run.faults else {}),
+        **({"deskew": dict(run.deskew.as_json())} if run.deskew is not None else {}),
         "scans": _scans(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
         "warnings": [item._asdict() for item in run.warnings],
@@ -246,6 +249,8 @@ def summary_lines(run: RunReport) -> list[str]:
             f"{scans.written} scans at {run.rate_hz} Hz ({scans.incomplete} incomplete, "
             f"{scans.empty} empty windows{dropped}), {scans.points} points, clock {run.timescale}"
         )
+    if run.deskew is not None:
+        lines.append(run.deskew.describe())
     if run.first_scan:
         lines.append(f"first scan at {run.first_scan}")
     for name, count in scans.underfilled_by_sensor.items():

@@ -121,6 +121,8 @@ CONVERT: tuple[Key[Values], ...] = (
         *("batching", "windows, or a policy of frame-level fusion"),
         *("window", "latest", "approximate", "collate"),
     ),
+    _text_key("deskew", "where poses come from: imu, or a trajectory"),
+    _choice_key("deskew_to", "instant to move points to", "start", "middle", "end"),
     _choice_key("batching_times", "times of points in fused sweeps", "common", "own"),
     Key(
         *("slices", _whole(1, _MOST_SLICES), (), whole_form(1, _MOST_SLICES)),

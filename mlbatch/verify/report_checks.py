@@ -422,9 +422,21 @@ def check_ledgers(report: Document) -> None:
             known = {name: count or 0 for name, count in outcomes.items()}
             _check_sum(report, (*path, "slots"), (*path, _OUTCOMES[0]), known)
         _check_clipped(report, path)
+    if report.at("deskew") is not None:
+        _check_motion(report)
     for i in range(report.length("messages")):
         path = ("messages", i)
         _check_sum(report, (*path, "read"), (*path, "written"), report.counts(*path, "dropped"))
+
+
+def _check_motion(report: Document) -> None:
+    """Every column of --deskew is moved and written, or has no pose."""
+    no_pose = report.number("deskew", "no_pose") or 0
+    _check_sum(report, ("deskew", "columns"), ("deskew", "moved"), {"no_pose": no_pose})
+    sensors = range(report.length("sensors"))
+    dropped = [report.counts("sensors", i, "columns", "dropped") for i in sensors]
+    counted = sum(counts.get("no_pose", 0) for counts in dropped)
+    report.log.equal("ledger", report.name("deskew", "no_pose"), counted, no_pose)
 
 
 def _check_clipped(report: Document, points: Keys) -> None:
@@ -611,6 +623,8 @@ def _check_windows(report: Document, table: Table, grid: Grid) -> None:
     inside = number[number >= 0]
     gaps = int(inside[-1] - inside[0]) + 1 - len(inside) if len(inside) else 0
     unwritten = sum(report.number("scans", name) or 0 for name in _UNWRITTEN)
+    if report.at("deskew") is not None:
+        unwritten += report.number("deskew", "windows_without_poses") or 0
     report.log.ok("report")
     if gaps > unwritten:
         name = report.name("scans", " + ".join(_UNWRITTEN))

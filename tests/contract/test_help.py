@@ -21,6 +21,8 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--format": "mcap, npz, ply, pcd, las, laz, kitti, nuscenes, rosbag1, rosbag2",
         "--layout": "dense.*organized",
         "--sort": "columns.*points",
+        "--deskew": "imu.*FILE.tum",
+        "--deskew-to": "Instant.*start",
         "--stamp": "window.*stamped",
         "--batching": "window.*latest, approximate, collate",
         "--batching-times": "set.*own sweep",

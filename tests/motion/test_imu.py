@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
 from mlbatch.motion.imu import Integrator, integrated
-from mlbatch.motion.ledger import MotionLedger
-from mlbatch.motion.track import MAX_GAP_NS, column_motion
+from mlbatch.motion.track import MAX_GAP_NS
 from mlbatch.units import STANDARD_GRAVITY
 
 HZ = 100
@@ -123,20 +122,3 @@ def test_an_unusable_imu_is_refused(change: str, expected: str) -> None:
         stamps, force, rate = stamps[:count], force[:count], rate[:count]
     with pytest.raises(RecordingError, match=expected):
         integrated(stamps, force, rate, np.eye(4), "front")
-
-
-def test_every_column_is_moved_or_counted() -> None:
-    track = integrated(*samples(3), np.eye(4))
-    ledger = MotionLedger("imu", "start")
-    # 10 columns before the track, 290 in it, 100 after it.
-    stamps: I64Array = START + (np.arange(400) - 10) * (S // HZ) - 5 * S // 1000
-    ledger.add(column_motion(track, stamps[:150], START + S))
-    ledger.add(column_motion(track, stamps[150:], START + S))
-    # The first pose is at the start, the last 3 s later: columns 11 to 310.
-    assert (ledger.moved, ledger.no_pose) == (300, 100)
-    assert ledger.columns == ledger.moved + ledger.no_pose == 400
-    # No pose at the instant: none of the window.
-    ledger.add(column_motion(track, stamps[20:30], START - S))
-    assert ledger.as_json() == {
-        "source": "imu", "to": "start", "columns": 410, "moved": 300, "no_pose": 110
-    }  # fmt: skip

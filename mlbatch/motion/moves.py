@@ -1,0 +1,131 @@
+"""Transforms of the columns of a window to one instant, for many windows of a growing track.
+
+Between two poses the twist is constant (`PoseTrack.at`), so that the transform of a column is a sum
+of five matrices of its pair of poses, times functions of its share of the way: for a twist with
+translation part p and rotation vector w, W the matrix of w, and a share s,
+
+    rotation     I + s a(s |w|) W + s^2 b(s |w|) W^2
+    translation  s p + s^2 b(s |w|) W p + s^3 c(s |w|) W^2 p
+
+with a, b and c as of `se3.coefficients`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.motion.se3 import coefficients, log_transform, skew
+from mlbatch.motion.track import PoseTrack
+
+# Smaller entries do not change a float32 coordinate.
+_NOTHING = 1e-9
+
+
+class PoseLine:
+    """Poses of the body in order of time; new ones are added at the end.
+
+    poses: how many were added.
+    """
+
+    def __init__(self, track: PoseTrack) -> None:
+        self._track = track
+        self.poses = len(track.stamp_ns)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of the last pose; None without a pose."""
+        stamps = self._track.stamp_ns
+        return int(stamps[-1]) if len(stamps) else None
+
+    def extend(self, track: PoseTrack, keep_ns: int) -> None:
+        """Add later poses; forget those before `keep_ns` but one."""
+        own = self._track
+        first = max(0, int(own.stamp_ns.searchsorted(keep_ns, "right")) - 1)
+        self.poses += len(track.stamp_ns)
+        self._track = PoseTrack(
+            np.concatenate([own.stamp_ns[first:], track.stamp_ns]),
+            np.concatenate([own.rotation[first:], track.rotation]),
+            np.concatenate([own.position_m[first:], track.position_m]),
+            own.source,
+            own.max_gap_ns,
+        )
+
+    def has_poses(self, stamp_ns: I64Array, to_ns: int) -> bool:
+        """Whether there is a pose at all times (n,), which increase, and at `to_ns`."""
+        begin, end = self._span(stamp_ns, to_ns)
+        stamps = self._track.stamp_ns
+        if not len(stamps) or stamps[0] > begin or stamps[-1] < end:
+            return False
+        inside = np.append(stamp_ns, to_ns)
+        after = stamps.searchsorted(inside, "left")
+        is_between = stamps[after] != inside
+        gap_ns = stamps[after] - stamps[np.maximum(after - 1, 0)]
+        return not bool((is_between & (gap_ns > self._track.max_gap_ns)).any())
+
+    def moves(self, stamp_ns: I64Array, to_ns: int) -> F32Array | None:
+        """Return body_at_instant from body_at_column, (n, 3, 4) m, of columns that have poses.
+
+        stamp_ns: (n,), increasing. None where the body did not move.
+        """
+        begin_ns, end_ns = self._span(stamp_ns, to_ns)
+        around = self._around(begin_ns, end_ns)
+        poses = self._track.stamp_ns[around]
+        terms, angle = _pair_terms(self._track.rotation[around], self._track.position_m[around])
+        # The instant as a column more.
+        times = np.append(stamp_ns, to_ns)
+        pair = np.clip(poses.searchsorted(times, "right") - 1, 0, len(poses) - 2)
+        shares: F64Array = (times - poses[pair]) / (poses[1:] - poses[:-1])[pair]
+        weights = _weights(shares, angle[pair])
+        target = (weights[-1] @ terms[pair[-1]]).reshape(3, 4)
+        terms = np.matmul(target[:, :3].T, terms.reshape(-1, 5, 3, 4))
+        terms[:, 0, :, 3] -= target[:, 3] @ target[:, :3]
+        of_columns = terms.reshape(-1, 5, 12)[pair[:-1]]
+        moves: F64Array = np.einsum("ni,nij->nj", weights[:-1], of_columns).reshape(-1, 3, 4)
+        if np.abs(moves - np.eye(3, 4)).max() < _NOTHING:
+            return None
+        return np.ascontiguousarray(moves, np.float32)
+
+    def _around(self, begin_ns: int, end_ns: int) -> slice:
+        """The poses around a span of time, two at least."""
+        stamps = self._track.stamp_ns
+        low = max(0, int(stamps.searchsorted(begin_ns, "right")) - 1)
+        high = min(len(stamps), int(stamps.searchsorted(end_ns, "left")) + 1)
+        low = max(0, min(low, high - 2))
+        return slice(low, max(high, low + 2))
+
+    @staticmethod
+    def _span(stamp_ns: I64Array, to_ns: int) -> tuple[int, int]:
+        return min(int(stamp_ns[0]), to_ns), max(int(stamp_ns[-1]), to_ns)
+
+
+def _weights(shares: F64Array, angle: F64Array) -> F64Array:
+    """Return the weights (n, 5) of the terms for shares (n,) of twists with angles (n,)."""
+    first, second, third = coefficients(shares * angle)
+    square = shares * shares
+    ones = np.ones(len(shares))
+    return np.stack([ones, shares, shares * first, square * second, square * shares * third], 1)
+
+
+def _pair_terms(rotation: F64Array, position_m: F64Array) -> tuple[F64Array, F64Array]:
+    """Return the five matrices (k, 5, 12) of k pairs of poses in the world, and their angles (k,).
+
+    rotation, position_m: of k + 1 poses world_from_body.
+    """
+    begin = rotation[:-1]
+    back = begin.transpose(0, 2, 1)
+    step_m = np.matmul(back, (position_m[1:] - position_m[:-1])[..., None])[..., 0]
+    part, vector = log_transform(np.matmul(back, rotation[1:]), step_m)
+    cross = skew(vector)
+    square = np.matmul(cross, cross)
+    terms = np.zeros((len(part), 5, 3, 4))
+    terms[:, 0, :, :3] = np.eye(3)
+    terms[:, 1, :, 3] = part
+    terms[:, 2, :, :3] = cross
+    terms[:, 3, :, :3] = square
+    terms[:, 3, :, 3] = np.matmul(cross, part[..., None])[..., 0]
+    terms[:, 4, :, 3] = np.matmul(square, part[..., None])[..., 0]
+    in_world: F64Array = np.matmul(begin[:, None], terms)
+    # Relative to the first pose: far from the origin little would be left of a difference.
+    in_world[:, 0, :, 3] += position_m[:-1] - position_m[0]
+    return in_world.reshape(len(part), 5, 12), np.sqrt((vector**2).sum(axis=1))

@@ -1,0 +1,256 @@
+"""`--deskew`: columns of each window get the transforms that move their points to one instant.
+
+A window waits until the poses reach its end, at most `--max-wait`, or 2 s. It is moved as a whole:
+if there is no pose at one of its columns, or at its instant, it is left out and its columns are
+counted as `no_pose`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.batching.windows import Window
+from mlbatch.errors import RigError
+from mlbatch.motion.imu import STANDSTILL_NS, Integrator
+from mlbatch.motion.moves import PoseLine
+from mlbatch.motion.track import PoseTrack
+from mlbatch.motion.tum import read_tum
+from mlbatch.pipeline.passthrough import IMU_TYPE
+from mlbatch.pipeline.sensor import Sensor
+from mlbatch.report.motion import MotionLedger
+from mlbatch.types import ImuSamples, Message, instant_ns
+from mlbatch.units import NS_PER_S
+
+IMU = "imu"
+# What sets of sweeps may begin before the newest window, with room.
+_KEPT_NS = 5 * NS_PER_S
+# An IMU gives no pose before its first second is complete.
+_LEAST_WAIT_NS = 2 * NS_PER_S
+
+
+class PoseSource(Protocol):
+    """Where poses come from; name: for the report; line: the poses so far."""
+
+    name: str
+    line: PoseLine
+    gyro_bias: tuple[float, ...]
+
+    @property
+    def integrated_s(self) -> float:
+        """How long velocities were integrated, s."""
+        ...
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Add what a batch of the recording contains."""
+        ...
+
+    def advance(self, oldest_ns: int) -> None:
+        """Compute poses from all that was added; those before a time are not needed."""
+        ...
+
+
+class Trajectory:
+    """Poses of a file, all known from the start."""
+
+    gyro_bias: tuple[float, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        track = read_tum(path)
+        self.name = path.name
+        self.line = PoseLine(track)
+        self.integrated_s = 0.0
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Nothing: the recording does not add poses."""
+
+    def advance(self, oldest_ns: int) -> None:
+        """Nothing."""
+
+
+class ImuPoses:
+    """Poses integrated from the first IMU of a lidar, else from the first Imu topic."""
+
+    gyro_bias: tuple[float, ...] = ()
+
+    def __init__(self, sensors: Sequence[Sensor], frames: dict[str, F64Array]) -> None:
+        """frames: (4, 4) body_from_frame, m, by name, for recorded topics."""
+        self.name = IMU
+        self.line = PoseLine(_NO_POSES)
+        self._sensors = sensors
+        self._frames = frames
+        # Samples that wait, by the number of their sensor or the name of their topic.
+        self._waiting: dict[int | str, list[_Samples]] = {}
+        self._frame_of: dict[str, str] = {}
+        self._chosen: int | str | None = None
+        self._integrator: Integrator | None = None
+        self._newest_ns: int | None = None
+        self._first_ns: int | None = None
+
+    @property
+    def integrated_s(self) -> float:
+        """From the end of the standstill to the last sample."""
+        if self._first_ns is None or self._newest_ns is None:
+            return 0.0
+        return max(0.0, (self._newest_ns - self._first_ns - STANDSTILL_NS) / NS_PER_S)
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Keep the samples of a batch."""
+        for samples in imu:
+            offset_ns = self._sensors[samples.sensor].clock.imu_offset_ns
+            one = (samples.stamp_ns + offset_ns, samples.acceleration, samples.angular_velocity)
+            self._keep(samples.sensor, one)
+        for message in messages:
+            if message.topic.type == IMU_TYPE:
+                found = _sample_of(message)
+                if found is not None:
+                    frame, sample = found
+                    self._frame_of.setdefault(message.topic.name, frame)
+                    self._keep(message.topic.name, sample)
+
+    def _keep(self, key: int | str, samples: _Samples) -> None:
+        if self._chosen in (None, key) and len(samples[0]):
+            self._waiting.setdefault(key, []).append(samples)
+
+    def advance(self, oldest_ns: int) -> None:
+        """Integrate the samples that wait."""
+        if self._chosen is None and not self._choose():
+            return
+        parts = self._waiting.pop(self._chosen, []) if self._chosen is not None else []
+        if not parts or self._integrator is None:
+            return
+        stamp_ns, force, rate = (np.concatenate(part) for part in zip(*parts, strict=True))
+        # Repeated samples, and those that were received after later ones, add nothing.
+        newest = np.maximum.accumulate(stamp_ns)
+        before = np.concatenate([[self._newest_ns or -1], newest[:-1]])
+        fresh = stamp_ns > before
+        if not fresh.any():
+            return
+        self._newest_ns = int(newest[-1])
+        self._first_ns = int(stamp_ns[0]) if self._first_ns is None else self._first_ns
+        track = self._integrator.push(stamp_ns[fresh], force[fresh], rate[fresh])
+        self.gyro_bias = self._integrator.gyro_bias
+        if len(track.stamp_ns):
+            self.line.extend(track, oldest_ns - _KEPT_NS)
+
+    def _choose(self) -> bool:
+        """Choose the IMU; False while there are no samples."""
+        numbers = sorted(key for key in self._waiting if isinstance(key, int))
+        topics = sorted(key for key in self._waiting if isinstance(key, str))
+        for number in numbers:
+            sensor = self._sensors[number]
+            sensor_from_imu = sensor.lidar.sensor_from_imu()
+            if sensor_from_imu is not None:
+                pose = sensor.body_from_sensor @ sensor_from_imu
+                return self._use(number, pose, f"the IMU of {sensor.name}")
+        for topic in topics:
+            frame = self._frame_of[topic].lstrip("/")
+            if frame not in self._frames:
+                raise RigError(
+                    f"--deskew imu: {topic}: expected a static transform to the frame {frame!r}, "
+                    "found none; record /tf_static, or give a trajectory (FILE.tum)"
+                )
+            return self._use(topic, self._frames[frame], f"the IMU {topic}")
+        return False
+
+    def _use(self, key: int | str, body_from_imu: F64Array, name: str) -> bool:
+        self._chosen = key
+        self._waiting = {key: self._waiting[key]}
+        self.name = name
+        self._integrator = Integrator(body_from_imu, name)
+        return True
+
+
+# Stamps (n,), specific force (n, 3) in m/s2, angular velocity (n, 3) in rad/s.
+_Samples = tuple[I64Array, F64Array, F64Array]
+_NO_POSES = PoseTrack(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
+
+def _sample_of(message: Message) -> tuple[str, _Samples] | None:
+    """Frame and sample of a sensor_msgs/Imu; None for a damaged one."""
+    from mlbatch.verify.encoding import MessageCursor
+    from mlbatch.verify.verdict import DamageError
+
+    try:
+        cursor = MessageCursor.of_message(message.data, message.topic.encoding)
+        stamp_ns, frame = cursor.header()
+        values = np.array(cursor.floats(37))
+    except DamageError:
+        return None
+    # Orientation and its covariance, angular velocity and its, acceleration and its.
+    rate, force = values[13:16], values[25:28]
+    if not np.isfinite(values[13:28]).all() or stamp_ns <= 0:
+        return None
+    return frame, (np.array([stamp_ns]), force[None], rate[None])
+
+
+class Deskew:
+    """Takes windows, yields them with the transforms of their columns."""
+
+    def __init__(self, source: PoseSource, to: str, max_wait_ns: int | None, sensors: int) -> None:
+        """to: a word of INSTANTS; max_wait_ns: how long windows wait for poses; None: for ever."""
+        self.source = source
+        self._to = to
+        self._max_wait_ns = None if max_wait_ns is None else max(max_wait_ns, _LEAST_WAIT_NS)
+        self._waiting: deque[Window] = deque()
+        self._counts = MotionLedger(source.name, to)
+        # Columns of each sensor in windows that were left out.
+        self.dropped = [0] * sensors
+
+    def push(self, window: Window) -> Iterator[Window]:
+        """Add the next window; yield those whose poses are known."""
+        self._waiting.append(window)
+        self.source.advance(self._waiting[0].start_ns)
+        while self._waiting and self._is_due(window.end_ns):
+            yield from self._moved(self._waiting.popleft())
+
+    def finish(self) -> Iterator[Window]:
+        """End of input: no later pose is waited for."""
+        if self._waiting:
+            self.source.advance(self._waiting[0].start_ns)
+        while self._waiting:
+            yield from self._moved(self._waiting.popleft())
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the windows that wait; None: none."""
+        parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._waiting)
+        return min((int(part.min()) for part in parts if len(part)), default=None)
+
+    @property
+    def ledger(self) -> MotionLedger:
+        """Counts so far."""
+        return replace(
+            self._counts,
+            source=self.source.name,
+            poses=self.source.line.poses,
+            gyro_bias=self.source.gyro_bias,
+        )
+
+    def _is_due(self, newest_end_ns: int) -> bool:
+        end_ns = self._waiting[0].end_ns
+        newest_ns = self.source.line.newest_ns
+        if newest_ns is not None and newest_ns >= end_ns:
+            return True
+        return self._max_wait_ns is not None and newest_end_ns - end_ns >= self._max_wait_ns
+
+    def _moved(self, window: Window) -> Iterator[Window]:
+        columns = window.columns
+        counts = self._counts
+        counts.columns += len(columns)
+        to_ns = instant_ns(self._to, window.start_ns, window.end_ns)
+        line = self.source.line
+        if not line.has_poses(columns.stamp_ns, to_ns):
+            counts.windows_without_poses += 1
+            counts.no_pose += len(columns)
+            for sensor, figures in enumerate(window.figures):
+                self.dropped[sensor] += figures.columns
+            return
+        counts.moved += len(columns)
+        moves = line.moves(columns.stamp_ns, to_ns)
+        yield replace(window, columns=replace(columns, moves=moves))

@@ -1,0 +1,231 @@
+"""`--deskew`: points moved to one instant of their window, by trajectories worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mlbatch
+from tests.builders.sessions import FIXTURE, REPOSITORY, Arrays, Shell, arrays, names, report_of
+
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+WORDS = f"convert {CAPTURE} --rig {RIG} -q"
+FOUR = REPOSITORY / "fixtures" / "four_makers"
+MIXED = f"convert {FOUR / 'four_makers.pcap'} --rig {FOUR / 'rig.yaml'} -q"
+NS = 10**9
+# Poses every 50 ms.
+STEP_S = 0.05
+SAME = ("intensity", "range_m", "time_ns", "ring", "return_type", "lidar_id", "column")
+
+
+def epoch_s(words: str) -> int:
+    """A second before the first scan."""
+    return int(arrays("usual/000000.npz")["start_ns"]) // NS - 1
+
+
+def trajectory(name: str, begin_s: float, end_s: float, speed: float, turn: float) -> None:
+    """Poses of a body that drives along x and turns to the left around z, at constant rates."""
+    lines = ["# time x y z qx qy qz qw"]
+    for number in range(math.ceil((end_s - begin_s) / STEP_S) + 1):
+        after_s = number * STEP_S
+        half = turn * after_s / 2
+        pose = (speed * after_s, 0.0, 0.0, 0.0, 0.0, math.sin(half), math.cos(half))
+        ns = round(begin_s * NS) + round(after_s * NS)
+        lines.append(f"{ns // NS}.{ns % NS:09d} " + " ".join(f"{value:.12f}" for value in pose))
+    Path(name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def usual(shell: Shell, words: str) -> int:
+    """Convert without motion; the second before the first scan."""
+    assert shell(f"{words} -o usual").code == 0
+    return epoch_s(words)
+
+
+def instant_ns(scan: Arrays, to: str) -> int:
+    start, end = int(scan["start_ns"]), int(scan["end_ns"])
+    return {"start": start, "middle": (start + end) // 2, "end": end}[to]
+
+
+def test_a_body_at_rest_leaves_all_bytes(shell: Shell) -> None:
+    begin_s = usual(shell, WORDS)
+    trajectory("rest.tum", begin_s, begin_s + 5, 0.0, 0.0)
+    assert shell(f"{WORDS} -o rest --deskew rest.tum").code == 0
+    assert names("rest") == names("usual")
+    for name in names("rest"):
+        old, new = arrays(f"usual/{name}"), arrays(f"rest/{name}")
+        assert set(new) - set(old) == {"deskew", "deskew_to"}
+        assert (str(new["deskew"]), str(new["deskew_to"])) == ("rest.tum", "start")
+        for key, value in old.items():
+            assert value.tobytes() == new[key].tobytes(), key
+
+
+@pytest.mark.parametrize("to", ["start", "middle", "end"])
+def test_a_drive_along_x_moves_points_by_speed_times_time(shell: Shell, to: str) -> None:
+    """At 10 m/s a column 30 ms after the instant is moved by 0.3 m; nothing else changes."""
+    begin_s = usual(shell, WORDS)
+    trajectory("drive.tum", begin_s, begin_s + 5, 10.0, 0.0)
+    assert shell(f"{WORDS} -o moved --deskew drive.tum --deskew-to {to}").code == 0
+    assert names("moved") == names("usual")
+    for name in names("moved"):
+        old, new = arrays(f"usual/{name}"), arrays(f"moved/{name}")
+        for key in (*SAME, "column_stamp_ns", "column_lidar_id", "fill", "complete", "start_ns"):
+            np.testing.assert_array_equal(new[key], old[key], err_msg=key)
+        after_s = (old["column_stamp_ns"][old["column"]] - instant_ns(old, to)) / NS
+        expected = old["xyz"].astype(np.float64)
+        expected[:, 0] += 10.0 * after_s
+        np.testing.assert_allclose(new["xyz"], expected, atol=2e-5)
+        assert np.abs(after_s).max() > 0.04
+    report = report_of("moved/report.json")
+    columns = sum(sensor["columns"]["written"] for sensor in report["sensors"])
+    assert report["deskew"] == {
+        **{"source": "drive.tum", "to": to, "poses": 101, "columns": columns, "moved": columns},
+        **{"no_pose": 0, "windows_without_poses": 0},
+    }
+    assert shell("verify moved").code == 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "",
+        "--layout organized",
+        "--sort points",
+        "--slices 4",
+        "--split",
+        "--exclude-box=-3,-3,-3,3,3,3 --min-range 1 --max-range 40",
+        "--batching latest",
+        "--batching collate --batching-times own",
+    ],
+)
+@pytest.mark.parametrize("words", [WORDS, MIXED])
+def test_every_vendor_by_both_engines(shell: Shell, words: str, options: str) -> None:
+    """A turn to the left at 1 rad/s with 5 m/s: the same bytes by numpy, compiled, three jobs."""
+    begin_s = usual(shell, words)
+    trajectory("turn.tum", begin_s, begin_s + 5, 5.0, 1.0)
+    line = f"{words} {options}"
+    assert shell(f"{line} -o still --engine native").code == 0
+    assert shell(f"{line} -o numpy --deskew turn.tum --engine numpy").code == 0
+    assert shell(f"{line} -o native --deskew turn.tum --engine native").code == 0
+    assert shell(f"{line} -o jobs --deskew turn.tum --engine native --jobs 3").code == 0
+    files = [path.relative_to("numpy") for path in sorted(Path("numpy").rglob("*.npz"))]
+    assert files
+    for file in files:
+        content = ("numpy" / file).read_bytes()
+        assert content == ("native" / file).read_bytes() == ("jobs" / file).read_bytes()
+        _check_turn(arrays(f"still/{file}"), arrays(f"numpy/{file}"), begin_s)
+    verified = shell("verify native")
+    assert verified.code == 0, verified.out
+
+
+def _check_turn(old: Arrays, new: Arrays, begin_s: int) -> None:
+    """Points in the world at their own time are those of the moved ones at the start."""
+    for key in SAME:
+        if key in old:
+            np.testing.assert_array_equal(new[key], old[key], err_msg=key)
+    stamps = old["column_stamp_ns"]
+    column = old["column"] if "column" in old else np.arange(len(stamps))[:, None]
+    after_s = (stamps - begin_s * NS)[column] / NS
+    seen = in_world(old["xyz"].astype(np.float64), after_s)
+    start_s = (int(old["start_ns"]) - begin_s * NS) / NS
+    moved = in_world(new["xyz"].astype(np.float64), np.full(after_s.shape, start_s))
+    # Between two poses the body drives on an arc instead of along x: by 5 mm at most.
+    distance = np.abs(seen - moved)
+    assert np.nanmax(distance, initial=0.0) < 0.01
+
+
+def in_world(xyz: np.ndarray, after_s: np.ndarray) -> np.ndarray:
+    cosine, sine = np.cos(after_s), np.sin(after_s)
+    x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
+    return np.stack([cosine * x - sine * y + 5.0 * after_s, sine * x + cosine * y, z + 0 * x], -1)
+
+
+def test_boxes_are_of_the_body_where_a_column_was_measured(shell: Shell) -> None:
+    """The own machine is at the same place in every column: the same points are left out."""
+    box = "--exclude-box=-6,-6,-6,6,6,6"
+    begin_s = usual(shell, WORDS)
+    trajectory("drive.tum", begin_s, begin_s + 5, 20.0, 0.5)
+    assert shell(f"{WORDS} {box} -o still").code == 0
+    assert shell(f"{WORDS} {box} -o moved --deskew drive.tum").code == 0
+    for one, other in zip(
+        report_of("still/report.json")["sensors"],
+        report_of("moved/report.json")["sensors"],
+        strict=True,
+    ):
+        assert one["points"] == other["points"]
+        assert one["points"]["box"] > 0
+
+
+def test_windows_without_poses_are_left_out_and_counted(shell: Shell) -> None:
+    """A trajectory from 0.25 s after scan 0 to 0.45 s: scan 3 alone is covered."""
+    usual(shell, WORDS)
+    start_ns = int(arrays("usual/000000.npz")["start_ns"])
+    trajectory("short.tum", start_ns / NS + 0.25, start_ns / NS + 0.45, 1.0, 0.0)
+    done = shell(f"convert {CAPTURE} --rig {RIG} -o part --deskew short.tum --deskew-to end")
+    assert done.code == 0
+    count = len(names("usual"))
+    assert f"poses of short.tum; {count - 1} windows without poses left out" in done.out
+    assert names("part") == ["000003.npz"]
+    report = report_of("part/report.json")
+    assert report["deskew"]["windows_without_poses"] == count - 1
+    for sensor in report["sensors"]:
+        columns = sensor["columns"]
+        assert columns["dropped"]["no_pose"] > 0
+        assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
+    verified = shell("verify part --json")
+    assert verified.code == 0
+    checks = {one["name"]: one for one in json.loads(verified.out)["checks"]}
+    assert checks["geometry"]["outcome"] == "not checkable"
+    assert "--deskew" in checks["geometry"]["limit"]
+
+
+def test_a_trajectory_of_another_time_is_an_error(shell: Shell) -> None:
+    trajectory("old.tum", 1000, 1005, 1.0, 0.0)
+    done = shell(f"{WORDS} -o out --deskew old.tum")
+    assert done.code == 1
+    assert "expected poses at the times of the scans for --deskew, found 101 poses" in done.err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    "output",
+    ["out.mcap", "out.bag --stamp middle", "out --format ply", "out --format las", "out -f kitti"],
+)
+def test_every_format_can_be_checked_and_read(shell: Shell, output: str) -> None:
+    begin_s = usual(shell, WORDS)
+    trajectory("turn.tum", begin_s, begin_s + 5, 5.0, 1.0)
+    assert shell(f"{WORDS} -o {output} --deskew turn.tum --deskew-to middle").code == 0
+    path = output.split()[0]
+    verified = shell(f"verify {path}")
+    assert verified.code == 0, verified.out
+    assert shell(f"{WORDS} -o moved --deskew turn.tum --deskew-to middle").code == 0
+    for scan, name in zip(mlbatch.read(path), names("moved"), strict=True):
+        np.testing.assert_allclose(scan.xyz, arrays(f"moved/{name}")["xyz"], atol=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--deskew-to end", "--deskew-to: expected --deskew, which moves points"),
+        ("--deskew constant-velocity", "needs odometry"),
+        ("--deskew imu --clock host", "--deskew imu: expected the clocks of the sensors"),
+        ("--deskew none.tum", "--deskew: expected imu or the file of a trajectory"),
+        ("--deskew imu --deskew-to now", "--deskew-to: expected start or middle or end"),
+    ],
+)
+def test_options_without_a_meaning(shell: Shell, words: str, message: str) -> None:
+    done = shell(f"{WORDS} -o out {words}")
+    assert done.code == 2
+    assert message in done.err
+
+
+def test_an_imu_that_is_not_recorded_gives_no_poses(shell: Shell) -> None:
+    """The IMU packets of the recording are fewer than a second of a standstill."""
+    done = shell(f"{WORDS} -o out --deskew imu")
+    assert done.code == 1
+    assert "expected" in done.err
+    assert not Path("out").exists()
