@@ -80,8 +80,14 @@ class PoseLine:
         target = (weights[-1] @ terms[pair[-1]]).reshape(3, 4)
         terms = np.matmul(target[:, :3].T, terms.reshape(-1, 5, 3, 4))
         terms[:, 0, :, 3] -= target[:, 3] @ target[:, :3]
-        of_columns = terms.reshape(-1, 5, 12)[pair[:-1]]
-        moves: F64Array = np.einsum("ni,nij->nj", weights[:-1], of_columns).reshape(-1, 3, 4)
+        # Columns between two poses follow each other.
+        terms = terms.reshape(-1, 5, 12)
+        moves: F64Array = np.empty((len(stamp_ns), 12))
+        bounds = stamp_ns.searchsorted(poses[1:-1]).tolist()
+        for matrices, begin, end in zip(terms, [0, *bounds], [*bounds, len(stamp_ns)], strict=True):
+            if begin < end:
+                np.matmul(weights[begin:end], matrices, out=moves[begin:end])
+        moves = moves.reshape(-1, 3, 4)
         if np.abs(moves - np.eye(3, 4)).max() < _NOTHING:
             return None
         return np.ascontiguousarray(moves, np.float32)
