@@ -163,6 +163,8 @@ class Recording:
     last_ns: int | None = field(default=None, kw_only=True)
     # Part of `size_bytes` that the current pass has read.
     position_bytes: int = field(default=0, kw_only=True)
+    # Ignored by containers that have one implementation.
+    engine: str = field(default="numpy", kw_only=True)
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, in file order; each call is a new pass.
@@ -179,7 +181,8 @@ class Recording:
         return None
 
     def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `native`; ignored by containers that have one implementation."""
+        """Read by `numpy` or `native` from the next pass on."""
+        self.engine = engine
 
     def use_arena(self, arena: PacketArena) -> bool:
         """Read the next pass into an arena; False for containers that cannot."""

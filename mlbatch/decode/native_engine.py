@@ -22,11 +22,12 @@ from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.lidar.geometry import Tabled, Turning, rotor_angles
 from mlbatch.lidar.interface import Lidar
 from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
+from mlbatch.lidar.placed import PlacedPoints
 from mlbatch.native.library import Field, Group, Piece, Ring, Scan, address, library
 from mlbatch.types import PACKED_ROOM, RECORD_KINDS, RecordLayout, WindowColumns
 
 # As in `native.h`.
-_TABLED, _TURNING, _COPIED = range(3)
+_TABLED, _TURNING, _COPIED, _PLACED = range(4)
 _TYPED_BY = {"": 0, "order": 1, "level": 2}
 _MOST_BEAMS = 256
 _MOST_RETURNS = 3
@@ -223,7 +224,8 @@ class _DecodedGroup:
         """projectors: with equal `_group_key`; struct: to be filled."""
         lidar = projectors[0].lidar
         table = lidar.pixels
-        if table is None:
+        projection = projectors[0].projection
+        if table is None and not isinstance(projection, PlacedPoints):
             raise ValueError(f"no pixel layout for {lidar.model}")
         self._rings = [source.ring for one in projectors for source in one.sources]
         self._counters = [counts for one in projectors for counts in one.counts]
@@ -239,17 +241,18 @@ class _DecodedGroup:
         struct.width = _width(lidar)
         struct.returns = lidar.returns
         struct.slots = self._slots
-        struct.step = table.step
         struct.counts = self._kept(self._counts)
-        self._set_pixels(projectors[0], table)
-        projection = projectors[0].projection
-        if isinstance(projection, Tabled):
+        if table is not None:
+            self._set_pixels(projectors[0], table)
+            struct.fits_fours = _fits_fours(projectors[0], table)
+        if isinstance(projection, PlacedPoints):
+            self._set_places(projectors[0], projection)
+        elif isinstance(projection, Tabled):
             self._set_angle_table(projectors[0], projection)
         else:
             rotors = [one.projection for one in projectors]
             self._set_rotors([one for one in rotors if isinstance(one, Turning)], lidar.channels)
         self._set_slots(projectors[0])
-        struct.fits_fours = _fits_fours(projectors[0], table)
         self._set_labels(projectors)
         if any(one.is_limited for one in projectors):
             limits_m = np.concatenate([one.limits_m for one in projectors])
@@ -298,6 +301,7 @@ class _DecodedGroup:
         structs = (Field * len(fields))(*(Field(*field) for field in fields))
         self._arrays.append(structs)
         struct = self.struct
+        struct.step = table.step
         struct.run_count = len(runs[0])
         struct.runs = self._kept(np.array(runs, np.int64))
         struct.word_count = len(layouts[0][0])
@@ -312,6 +316,16 @@ class _DecodedGroup:
             and "reflectivity" in projector.extras
             and table.returns[0].reflectivity is not None
         )
+
+    def _set_places(self, projector: Projector, projection: PlacedPoints) -> None:
+        struct = self.struct
+        struct.kind = _PLACED
+        # Bytes of a slot, for prefetches.
+        struct.step = projector.lidar.records.size // projector.slots
+        struct.runs = self._kept(np.array([projection.first_byte, 0, projector.slots], np.int64))
+        struct.direction = self._kept(projection.rotation)
+        struct.origin = self._kept(projection.translation_m)
+        struct.tables = len(projector.lidar.firing_ns)
 
     def _set_angle_table(self, projector: Projector, projection: Tabled) -> None:
         width = self.struct.width
@@ -419,6 +433,9 @@ def is_decoded(projector: Projector) -> bool:
     """Return whether the loops can decode the sensors of a projector."""
     lidar = projector.lidar
     projection = projector.projection
+    if isinstance(projection, PlacedPoints):
+        # A projector of one sensor, whose columns are whole packets.
+        return lidar.channels <= _MOST_BEAMS and not lidar.has_reflectivity
     if isinstance(projection, Tabled):
         is_known = projection.origin.shape[2] == 1
     else:

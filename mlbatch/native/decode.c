@@ -3,6 +3,7 @@
    The same float32 operations as `decode/projector.py` and `lidar/geometry.py`, column by column.
    A column is decoded to planes, one value a beam, which fit into the first cache; an element is
    `return * width + beam`. Beams beyond those of the lidar have no return. */
+#include <math.h>
 #include <string.h>
 
 #include "native.h"
@@ -242,6 +243,45 @@ static void project_turning(const Group *group, int64_t member, int64_t encoder,
             y[beam] = range_m[beam] * direction[1][beam] + origin[1][beam];
             z[beam] = range_m[beam] * direction[2][beam] + origin[2][beam];
         }
+    }
+}
+
+/* Square roots of a multiple of four numbers; all compilers round them correctly. */
+static void take_roots(float *values, int64_t count)
+{
+#if defined(__SSE2__)
+    for (int64_t at = 0; at < count; at += 4)
+        _mm_storeu_ps(values + at, _mm_sqrt_ps(_mm_loadu_ps(values + at)));
+#else
+    for (int64_t at = 0; at < count; at++)
+        values[at] = sqrtf(values[at]);
+#endif
+}
+
+/* Placed: points that a driver computed, rotated and shifted. */
+static void read_placed(const Group *group, int64_t member, const uint8_t *record, Planes *planes)
+{
+    const int64_t beams = group->beams;
+    const uint8_t *from = record + group->runs[0];
+    float *restrict x = planes->x;
+    float *restrict y = planes->y;
+    float *restrict z = planes->z;
+    float *restrict range_m = planes->range_m;
+    memcpy(x, from, (size_t)beams * 4);
+    memcpy(y, from + 4 * beams, (size_t)beams * 4);
+    memcpy(z, from + 8 * beams, (size_t)beams * 4);
+    memcpy(planes->level, from + 12 * beams, (size_t)beams * 4);
+    for (int64_t beam = beams; beam < group->width; beam++)
+        x[beam] = y[beam] = z[beam] = 0;
+    for (int64_t beam = 0; beam < group->width; beam++)
+        range_m[beam] = x[beam] * x[beam] + y[beam] * y[beam] + z[beam] * z[beam];
+    take_roots(range_m, group->width);
+    const float *turn = group->direction + 9 * member, *shift_m = group->origin + 3 * member;
+    for (int64_t beam = 0; beam < group->width; beam++) {
+        const float before[] = {x[beam], y[beam], z[beam]};
+        x[beam] = before[0] * turn[0] + before[1] * turn[1] + before[2] * turn[2] + shift_m[0];
+        y[beam] = before[0] * turn[3] + before[1] * turn[4] + before[2] * turn[5] + shift_m[1];
+        z[beam] = before[0] * turn[6] + before[1] * turn[7] + before[2] * turn[8] + shift_m[2];
     }
 }
 
@@ -682,6 +722,27 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
 }
 #endif
 
+#if defined(__SSE2__)
+/* Kept elements in their order, four at a time; the slots are a multiple of four. */
+static int64_t emit_fours(const Scan *scan, const Group *group, int64_t row, const Planes *planes)
+{
+    for (int64_t beam = 0; beam < group->slots; beam += 4) {
+        uint32_t marks;
+        memcpy(&marks, planes->keep + beam, 4);
+        /* One bit a byte: 1, 0x100, 0x10000, 0x1000000. */
+        const int kept = (int)((marks | marks >> 7 | marks >> 14 | marks >> 21) & 15);
+        if (!kept)
+            continue;
+        const __m128i *labels = (const __m128i *)(planes->label + beam);
+        row = store_kept(scan->point, scan->label, row, kept, _mm_load_ps(planes->x + beam),
+                         _mm_load_ps(planes->y + beam), _mm_load_ps(planes->z + beam),
+                         _mm_load_ps(planes->level + beam), _mm_load_si128(labels),
+                         _mm_load_si128(labels + 1));
+    }
+    return row;
+}
+#endif
+
 /* Kept elements in order of output. Returns the next row. */
 static int64_t emit_ordered(const Scan *scan, const Group *group, const int64_t *order,
                             int64_t first_row, const Planes *planes)
@@ -880,9 +941,11 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     if (group->fits_fours && !scan->row_slots)
         return decode_fused(scan, group, member, column, known, record, row);
 #endif
-    for (int64_t which = 0; which < group->returns; which++)
+    for (int64_t which = 0; which < group->returns && group->kind != PLACED; which++)
         read_return(group, record, which, planes);
-    if (group->kind == TABLED)
+    if (group->kind == PLACED)
+        read_placed(group, member, record, planes);
+    else if (group->kind == TABLED)
         project_tabled(group, member, encoder, planes);
     else
         project_turning(group, member, encoder, known, column, planes);
@@ -897,6 +960,10 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     }
     const int64_t *order = group->order ? group->order + table * group->order_step : 0;
     emit_extras(scan, group, order, row, planes);
+#if defined(__SSE2__)
+    if (group->kind == PLACED && group->slots % 4 == 0)
+        return emit_fours(scan, group, row, planes);
+#endif
     return emit_ordered(scan, group, order, row, planes);
 }
 

@@ -28,8 +28,20 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
+    "mlbatch_cloud_points": (
+        *(_WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS, _WORD),
+        *(_WORD, _ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 3),
+    ),
+    "mlbatch_cloud_order": (_WORD, *[_ADDRESS] * 5),
+    "mlbatch_cloud_columns": (_WORD, *[_ADDRESS] * 3, _WORD, _WORD, _ADDRESS, _ADDRESS),
+    "mlbatch_cloud_runs": (_WORD, *[_ADDRESS] * 6),
+    "mlbatch_cloud_slots": (_WORD, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 4),
+    "mlbatch_cloud_pack": (
+        *(_ADDRESS, _WORD, *[_ADDRESS] * 4),
+        *(_WORD, *[_ADDRESS] * 4, *[_WORD] * 3, _ADDRESS, _ADDRESS),
+    ),
 }
-_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather")
+_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather", "mlbatch_cloud_pack")
 
 
 class Ring(ctypes.Structure):

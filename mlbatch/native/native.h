@@ -51,7 +51,7 @@ typedef struct {
 
 enum { DISTANCE, INTENSITY, REFLECTIVITY, FIELDS };
 
-enum { TABLED, TURNING, COPIED };
+enum { TABLED, TURNING, COPIED, PLACED };
 
 enum { NOT_TYPED, TYPED_BY_ORDER, TYPED_BY_LEVEL };
 
@@ -60,7 +60,7 @@ enum { COLUMNS, FOUND, DISTINCT, IN_RANGE, OUTSIDE_BOXES, COUNTS };
 
 /* Sensors that are decoded alike (the members). E: elements, returns * width; T: firing tables. */
 typedef struct {
-    int64_t kind; /* TABLED, TURNING, COPIED */
+    int64_t kind; /* TABLED, TURNING, COPIED, PLACED */
     int64_t beams;
     int64_t width; /* beams, rounded up to a multiple of 16 */
     int64_t returns;
@@ -81,7 +81,9 @@ typedef struct {
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
        TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
        of the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from bit 3) of the direction
-       are not zero; from bit 6 the same of the origin. */
+       are not zero; from bit 6 the same of the origin.
+       PLACED: pixels are planes of float32 from the byte of the first run: x, y, z, intensity;
+       direction (members, 3, 3): rotation; origin (members, 3): translation, m. */
     const float *direction;
     const float *origin;
     const int64_t *first_row;
@@ -282,5 +284,25 @@ EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *sou
 EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
                            int64_t range_count, const int64_t *ranges, int64_t row_bytes,
                            uint8_t *out);
+EXPORT int64_t mlbatch_cloud_points(int64_t count, const uint8_t *rows, int64_t step,
+                              const int64_t *real_at, const int64_t *real_type, int64_t time_type,
+                              int64_t fields, const int64_t *field_at, const int64_t *field_bytes,
+                              int64_t room, float *reals, uint8_t *const *out, int64_t *placed);
+EXPORT int64_t mlbatch_cloud_order(int64_t count, const int64_t *stamp_ns, const uint16_t *ring,
+                             uint64_t *words, uint64_t *spare, int64_t *order);
+EXPORT int64_t mlbatch_cloud_columns(int64_t count, const int64_t *stamp_ns, const uint16_t *ring,
+                               const int64_t *order, int64_t slots, int64_t by_ring,
+                               int32_t *column, uint16_t *slot);
+EXPORT int64_t mlbatch_cloud_runs(int64_t count, const int64_t *stamp_ns, int64_t *stamps,
+                            int64_t *spare, int32_t *column, int64_t *begins,
+                            int64_t *stamp_count);
+EXPORT int64_t mlbatch_cloud_slots(int64_t count, const uint16_t *ring, int64_t slots,
+                             int64_t stamp_count, int32_t *used, int32_t *layers,
+                             int32_t *column, uint16_t *slot);
+EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t *begins,
+                         const int32_t *column, const uint16_t *slot, const int64_t *stamp_ns,
+                         int64_t room, const float *reals, const uint16_t *ring,
+                         const uint8_t *return_type, const uint8_t *tag, int64_t slots,
+                         int64_t size, int64_t columns, uint16_t *used, uint8_t *packets);
 
 #endif

@@ -8,7 +8,9 @@ return type and tag (uint8); zeros up to a multiple of 8 bytes. A slot at x = y 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -130,6 +132,10 @@ def layout_of(points: Points, kind: int) -> Layout:
     return Layout(kind, min(widest, usual, MOST_SLOTS))
 
 
+# Packs the points of one message; `ros.native_points` has a compiled one.
+Pack: TypeAlias = Callable[["Points", "Layout", int], U8Array]
+
+
 def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
     """Packets (P, layout.size) of the points of one message, columns in order of time.
 
@@ -147,11 +153,7 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
     # The last ring of the last time may have fewer points than others.
     columns = int(column.max()) + 1
     size = layout.size
-    if columns * size > _MOST_GROWTH * message_bytes + _FREE_BYTES:
-        raise CloudError(
-            f"expected points that share times as in the first cloud (up to {layout.slots} one), "
-            f"found {columns} times for {len(points)} points; record the clouds of one driver alone"
-        )
+    check_columns(columns, len(points), layout, message_bytes)
     packets = np.zeros((columns, size), np.uint8)
     head = packets[:, : HEAD.itemsize].view(HEAD)[:, 0]
     head[:] = layout.begin
@@ -166,6 +168,15 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
         flat.view(plane.dtype.newbyteorder("<"))[place] = plane[order]
         at += width * layout.slots
     return packets
+
+
+def check_columns(columns: int, points: int, layout: Layout, message_bytes: int) -> None:
+    """CloudError where so many columns of a message would fill the memory."""
+    if columns * layout.size > _MOST_GROWTH * message_bytes + _FREE_BYTES:
+        raise CloudError(
+            f"expected points that share times as in the first cloud (up to {layout.slots} one), "
+            f"found {columns} times for {points} points; record the clouds of one driver alone"
+        )
 
 
 def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:

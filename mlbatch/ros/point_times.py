@@ -122,7 +122,8 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
     if time.dtype.kind == "f":
         ns = _float_ns(time.astype(np.float64), unit_ns)
     else:
-        ns = time.astype(np.int64) * unit_ns
+        ns = time.astype(np.int64)
+        ns *= unit_ns
     unit = _unit_name(unit_ns)
     why = f" ({rule.inferred})" if rule.inferred else ""
     if is_absolute:
@@ -139,7 +140,8 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
     elif rule.origin == START and low < 0:
         ns -= int(ns.min())
         words = "after"
-    return zero.base_ns + ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
+    ns += zero.base_ns
+    return ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
 
 
 def _last_ns(all_times: Times, high: Any, unit_ns: int, longest_ns: int) -> int:
@@ -157,8 +159,11 @@ def _last_ns(all_times: Times, high: Any, unit_ns: int, longest_ns: int) -> int:
 def _float_ns(value: npt.NDArray[np.float64], unit_ns: int) -> I64Array:
     """Times in ns, rounded; in two parts, as a float64 of ns since 1970 has a step of 256."""
     whole = np.floor(value)
-    ns = whole.astype(np.int64) * unit_ns
-    ns += np.rint((value - whole) * unit_ns).astype(np.int64)
+    ns = whole.astype(np.int64)
+    ns *= unit_ns
+    part = np.subtract(value, whole, out=whole)
+    part *= unit_ns
+    ns += np.rint(part, out=part).astype(np.int64)
     return ns
 
 

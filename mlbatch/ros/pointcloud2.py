@@ -14,20 +14,18 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import BoolArray, F32Array, U16Array
+from mlbatch.arrays import U16Array
 from mlbatch.ros.encoding import Cursor, MessageError
 from mlbatch.ros.point_packets import CloudError, Points
+from mlbatch.ros.point_rows import AXES, Rows, Take, take_rows
 from mlbatch.ros.point_times import CONVENTION, TIME_NAMES, CloudSample, PointRule, Zero, stamps
 from mlbatch.types import Message
 
-# A structured array; numpy has no type for the fields of a dtype.
-Rows: TypeAlias = npt.NDArray[Any]
 _Whole = TypeVar("_Whole", np.uint8, np.uint16)
 
 # sensor_msgs/PointField: datatype by its number.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_FIELDS = 256
-_AXES = ("x", "y", "z")
 # Names of a field by its role; the first that a cloud has counts.
 _ROLES: Mapping[str, tuple[str, ...]] = {
     "time": TIME_NAMES,
@@ -99,39 +97,37 @@ def by_convention(frame: str) -> PointRule:
     return CONVENTION
 
 
-def read_cloud(message: Message, rules: Rules = by_convention) -> Cloud:
+def read_cloud(message: Message, rules: Rules = by_convention, take: Take = take_rows) -> Cloud:
     """The points of a message; rules: by its frame_id; CloudError if they cannot be read."""
     raw = _raw(message, rules)
     rule = rules(raw.frame)
-    reals, placed, keep = _kept(raw.rows)
-    rows = raw.rows[keep]
-    count = len(rows)
+    taken = take(raw.rows)
+    fields = taken.fields
+    count = len(fields["time"])
     stamp_ns = np.empty(0, np.int64)
     meaning = ""
     if count:
-        stamp_ns, meaning = stamps(rows["time"], raw.zero, rule, raw.rows["time"])
+        stamp_ns, meaning = stamps(fields["time"], raw.zero, rule, raw.rows["time"])
         if count > _MOST_AT_ONCE and stamp_ns.min() == stamp_ns.max():
             raise CloudError(
                 f"field {raw.zero.field}: expected times of the points, found one for all {count} "
                 "points of the cloud"
             )
-    ring = _ring(rows, rule)
-    return_type = _whole(rows, "return_type", np.uint8)
-    tag = _whole(rows, "tag", np.uint8)
+    ring = _ring(fields, rule)
+    return_type = _whole(fields, "return_type", np.uint8)
+    tag = _whole(fields, "tag", np.uint8)
     points = Points(
         stamp_ns,
-        reals[:, keep],
+        taken.reals,
         ring,
         np.zeros(count, np.uint8) if return_type is None else return_type,
         np.zeros(count, np.uint8) if tag is None else tag,
     )
-    without_place = len(keep) - int(np.count_nonzero(placed))
-    lidar_id = _whole(rows, "lidar_id", np.uint16)
+    without_place = len(raw.rows) - taken.placed
+    lidar_id = _whole(fields, "lidar_id", np.uint16)
     if raw.lidar_id is not None:
         lidar_id = np.full(count, raw.lidar_id, np.uint16)
-    return Cloud(
-        points, lidar_id, meaning, raw.frame, without_place, len(keep) - count - without_place
-    )
+    return Cloud(points, lidar_id, meaning, raw.frame, without_place, taken.placed - count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +142,10 @@ class CloudHead:
 def sample_cloud(message: Message, rules: Rules) -> CloudHead:
     """Frame, lidars and times of a message as they are stored; CloudError as in `read_cloud`."""
     raw = _raw(message, rules)
-    rows = raw.rows[_kept(raw.rows)[2]]
-    time = rows["time"]
-    _ring(rows, rules(raw.frame))
-    ids = _whole(rows, "lidar_id", np.uint16)
+    fields = take_rows(raw.rows).fields
+    time = fields["time"]
+    _ring(fields, rules(raw.frame))
+    ids = _whole(fields, "lidar_id", np.uint16)
     lidar_ids = () if ids is None else tuple(np.unique(ids).tolist())
     if raw.lidar_id is not None:
         lidar_ids = (raw.lidar_id,)
@@ -166,20 +162,9 @@ def _raw(message: Message, rules: Rules) -> _Raw:
         raise CloudError(str(err)) from err
 
 
-def _kept(rows: Rows) -> tuple[F32Array, BoolArray, BoolArray]:
-    """Reals (4, n) of points; those with a place (n,); of these those with a finite time (n,)."""
-    time = rows["time"]
-    reals = _reals(rows)
-    x, y, z, _ = reals
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared = x * x + y * y + z * z
-    placed = (squared > 0) & (squared < np.inf)
-    return reals, placed, placed & np.isfinite(time) if time.dtype.kind == "f" else placed
-
-
-def _ring(rows: Rows, rule: PointRule) -> U16Array | None:
+def _ring(fields: Mapping[str, npt.NDArray[Any]], rule: PointRule) -> U16Array | None:
     """The ring of each point; None where there is none, FieldError where the rig names another."""
-    ring = _whole(rows, "ring", np.uint16)
+    ring = _whole(fields, "ring", np.uint16)
     if rule.ring and ring is None:
         raise FieldError(
             f"{rule.at('ring')}expected a field of whole numbers from 0 to 65535, found others in "
@@ -188,25 +173,16 @@ def _ring(rows: Rows, rule: PointRule) -> U16Array | None:
     return ring
 
 
-def _reals(rows: Rows) -> F32Array:
-    """x, y, z and intensity, (4, n); intensity 0 where there is no finite one."""
-    reals = np.zeros((4, len(rows)), np.float32)
-    # A place beyond all float32 is infinite, and is left out as such.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for plane, name in zip(reals, (*_AXES, "intensity"), strict=True):
-            if name in (rows.dtype.names or ()):
-                plane[:] = rows[name]
-    intensity = reals[3]
-    intensity[~np.isfinite(intensity)] = 0
-    return reals
-
-
-def _whole(rows: Rows, name: str, kind: type[_Whole]) -> npt.NDArray[_Whole] | None:
+def _whole(
+    fields: Mapping[str, npt.NDArray[Any]], name: str, kind: type[_Whole]
+) -> npt.NDArray[_Whole] | None:
     """A field of whole numbers that fit `kind`; None where there is none."""
-    if name not in (rows.dtype.names or ()):
+    values = fields.get(name)
+    if values is None or values.dtype.kind == "f":
         return None
-    values = rows[name]
-    if values.dtype.kind == "f" or (values < 0).any() or (values > np.iinfo(kind).max).any():
+    if values.dtype == kind:
+        return values
+    if len(values) and (values.min() < 0 or values.max() > np.iinfo(kind).max):
         return None
     return values.astype(kind)
 
@@ -303,7 +279,7 @@ def _layout(
     fields: Mapping[str, _Field], step: int, rule: PointRule
 ) -> tuple[np.dtype[np.void], _Field]:
     """The dtype of points, with fields named by role; and the time field."""
-    chosen = {axis: fields[axis] for axis in _AXES if axis in fields}
+    chosen = {axis: fields[axis] for axis in AXES if axis in fields}
     given = {"time": rule.time, "ring": rule.ring}
     for role, names in _ROLES.items():
         if given.get(role):
@@ -314,7 +290,7 @@ def _layout(
         if found is not None:
             chosen[role] = found
     present = ", ".join(fields) or "none"
-    if not all(axis in chosen for axis in _AXES):
+    if not all(axis in chosen for axis in AXES):
         raise CloudError(f"expected fields x, y, z, found {present}; choose a topic of points")
     if "time" not in chosen:
         raise CloudError(
@@ -334,8 +310,8 @@ def _layout(
 
 def _check(role: str, field: _Field, step: int) -> None:
     """Refuse a field that contradicts its name."""
-    if field.type not in _TYPES or (role in _AXES and _TYPES[field.type][0] != "f"):
-        expected = "7 or 8 (float)" if role in _AXES else "1 to 8"
+    if field.type not in _TYPES or (role in AXES and _TYPES[field.type][0] != "f"):
+        expected = "7 or 8 (float)" if role in AXES else "1 to 8"
         raise CloudError(
             f"field {field.name}: expected datatype {expected}, found {field.type}; "
             "convert the recording"

@@ -16,7 +16,8 @@ import numpy as np
 
 from mlbatch.arrays import U8Array
 from mlbatch.readers.bag.cloud_topics import CloudTopics
-from mlbatch.ros.point_packets import CloudError, Points, layout_of, pack
+from mlbatch.ros.point_packets import CloudError, Pack, Points, layout_of, pack
+from mlbatch.ros.point_rows import Take, take_rows
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, read_cloud
 from mlbatch.types import (
     Message,
@@ -77,6 +78,16 @@ class _TopicCounts:
         return f"{start}left out of {self.points} points: {left_out}"
 
 
+def _loops(engine: str) -> tuple[Take, Pack]:
+    """What takes the points of a message, and what packs them."""
+    if engine != "native":
+        return take_rows, pack
+    # Imported on demand: the library may be missing.
+    from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
+
+    return take_rows_compiled, pack_compiled
+
+
 @dataclass(slots=True)
 class _Packed:
     """Packets (n, size) of one lidar in a message."""
@@ -93,13 +104,15 @@ class CloudRecording(WrappedRecording):
     `keep` names them.
     """
 
-    __slots__ = ("_counts", "clouds", "streams")
+    __slots__ = ("_counts", "_pack_points", "_take", "clouds", "streams")
 
     def __init__(self, inner: Recording, streams: StreamTable, clouds: CloudTopics) -> None:
         super().__init__(inner)
         self.streams = streams
         self.clouds = clouds
         self._counts: dict[str, _TopicCounts] = {}
+        self._take: Take = take_rows
+        self._pack_points: Pack = pack
 
     @property
     def verdicts(self) -> list[str]:
@@ -119,6 +132,7 @@ class CloudRecording(WrappedRecording):
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, those of clouds among them; each call is a new pass."""
         self._counts = {topic.name: _TopicCounts() for topic in self.clouds.topics}
+        self._take, self._pack_points = _loops(self.inner.engine)
         self.inner.keep = self.keep | self._counts.keys()
         batches = self.inner.packets()
         try:
@@ -162,7 +176,7 @@ class CloudRecording(WrappedRecording):
         name = message.topic.name
         counts = self.inner.counts
         try:
-            cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame))
+            cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame), self._take)
             packed = [
                 _Packed(message, stream, packets)
                 for stream, points in self._by_lidar(name, cloud)
@@ -205,10 +219,12 @@ class CloudRecording(WrappedRecording):
         if layout.by_ring:
             if points.ring is None:
                 raise CloudError("expected rings as in the first cloud, found none")
-            known = points.ring < layout.slots
-            self._counts[stream.topic].beyond_rings += len(points) - int(np.count_nonzero(known))
-            points = points.take(known)
-        return pack(points, layout, len(message.data)) if len(points) else None
+            if len(points) and int(points.ring.max()) >= layout.slots:
+                known = points.ring < layout.slots
+                beyond = len(points) - int(np.count_nonzero(known))
+                self._counts[stream.topic].beyond_rings += beyond
+                points = points.take(known)
+        return self._pack_points(points, layout, len(message.data)) if len(points) else None
 
     def _joined(self, batch: PacketBatch, packed: Sequence[_Packed]) -> PacketBatch:
         """Packets of the recording and of its clouds, in receive order."""

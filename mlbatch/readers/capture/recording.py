@@ -63,16 +63,14 @@ class Walker(Protocol):
 class CaptureRecording(Recording):
     """A capture file.
 
-    walker: makes the Walker of a pass, with compiled loops or None; engine: `native` for compiled
-    loops. For tests: buffer_bytes, and together (False: fragments one at a time). Results do not
-    depend on engine, buffer_bytes and together.
+    walker: makes the Walker of a pass, with compiled loops or None. For tests: buffer_bytes, and
+    together (False: fragments one at a time). Results do not depend on them.
     """
 
     walker: Callable[[CaptureLoops | None], Walker]
     streams: StreamTable
     buffer_bytes: int = BUFFER_BYTES
     together: bool = True
-    engine: str = "numpy"
     # Of the next pass; None: each buffer is used again.
     arena: PacketArena | None = None
     # Start of the first record in the last bytes of a file (True: all its records), and bytes of
@@ -103,10 +101,6 @@ class CaptureRecording(Recording):
         stream = StreamNumbers(addresses, streams).numbers(datagrams.source, datagrams.port)
         host_ns = frames.host_ns[datagrams.frame]
         return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns)
-
-    def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `native` from the next pass on."""
-        self.engine = engine
 
     def use_arena(self, arena: PacketArena) -> bool:
         """Read the next pass into an arena."""

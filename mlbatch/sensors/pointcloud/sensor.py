@@ -10,7 +10,6 @@ number among the points of its timestamp.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
+from mlbatch.lidar.placed import LastRead, PlacedPoints
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
@@ -138,7 +138,7 @@ class CloudLidar(BaseLidar):
         self.calibration = "none"
         self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
         self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
-        self._scratch = _LastRead(np.empty((0, REALS, slots), np.float32))
+        self._scratch = LastRead()
 
     def faults(self, packets: U8Array) -> U8Array:
         """`bad_header` for packets of another layout."""
@@ -176,35 +176,4 @@ class CloudLidar(BaseLidar):
 
     def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
         """Transform of the recorded coordinates."""
-        return _MovedPoints(self._scratch, body_from_sensor)
-
-
-@dataclass(slots=True)
-class _LastRead:
-    """Coordinates of the last columns read, (n, REALS, slots), a view of their records."""
-
-    reals: F32Array
-
-
-class _MovedPoints:
-    """The last columns read, moved into the body frame; implements `Projection`."""
-
-    def __init__(self, last_read: _LastRead, body_from_sensor: F64Array) -> None:
-        self._last_read = last_read
-        self._rotation = body_from_sensor[:3, :3].astype(np.float32)
-        self._translation_m = body_from_sensor[:3, 3].astype(np.float32)
-
-    def prepare(self, member: I64Array, encoder: I64Array) -> None:
-        """No rotor: nothing to prepare."""
-
-    def project(self, range_m: F32Array, out: F32Array) -> None:
-        """Rotate and translate, axis by axis in a fixed order; empty slots get any value."""
-        reals = self._last_read.reals
-        x, y, z = (reals[:, axis] for axis in range(3))
-        for axis, (row, shift_m) in enumerate(
-            zip(self._rotation, self._translation_m, strict=True)
-        ):
-            moved = x * row[0]
-            moved += y * row[1]
-            moved += z * row[2]
-            np.add(moved, shift_m, out=out[:, :, axis])
+        return PlacedPoints(self._scratch, body_from_sensor, HEAD.itemsize)
