@@ -248,7 +248,9 @@ class CloudRecording(WrappedRecording):
             end += count * size
         columns = np.concatenate(parts, axis=1)
         columns = columns[:, np.argsort(columns[4], kind="stable")]
-        return PacketBatch(np.concatenate(data), columns[0], columns[1], columns[2], columns[3])
+        # A single cloud is not copied.
+        joined = data[0] if len(data) == 1 else np.concatenate(data)
+        return PacketBatch(joined, columns[0], columns[1], columns[2], columns[3])
 
     def _number(self, stream: Stream) -> int:
         """Number of a stream; its packets have no receive time of their own."""
