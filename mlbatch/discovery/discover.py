@@ -193,6 +193,8 @@ def discover(
     notes += _unused(matched.sensors, selection.metadata)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
+    if clouds is not None:
+        notes += _clouds_apart(sampler, chosen, clouds)
     if to_convert:
         _refuse_shared_addresses(sampler, chosen)
         _refuse_incomparable_clocks(sampler, chosen, selection, clouds)
@@ -460,6 +462,36 @@ def _cloud_notes(
     if not to_convert:
         for topic, text in clouds.refused.items():
             yield Note("cloud_time", "", f"{topic}: {text}")
+
+
+# Clouds farther apart by their log times need more than different delays of their drivers.
+_CLOUDS_APART_NS = 150 * NS_PER_MS
+
+
+def _clouds_apart(
+    sampler: Sampler, chosen: Sequence[DetectedSensor], clouds: CloudTopics
+) -> Iterator[Note]:
+    """A warning where the clouds of two sensors are late against their log times by other times.
+
+    Differences that a run refuses have an error of their own.
+    """
+    cloudy = [sensor for sensor in chosen if not sampler.has_receive_times(sensor)]
+    ahead_ns = {sensor.name: _ahead_ns(sampler, sensor, clouds) for sensor in cloudy}
+    known = {name: ns for name, ns in ahead_ns.items() if ns is not None}
+    if len(known) < 2:
+        return
+    first = min(known, key=lambda name: known[name])
+    last = max(known, key=lambda name: known[name])
+    apart_ns = known[last] - known[first]
+    if _CLOUDS_APART_NS < apart_ns <= COMPARABLE_NS:
+        yield Note(
+            "cloud_time",
+            "",
+            f"by the log times of their messages the points of {last} are "
+            f"{apart_ns / NS_PER_MS:.0f} ms later than those of {first}: their clocks, or the "
+            "zeros of their times, may differ; check that both see walls at one place in motion, "
+            "and give clock.offset_s or points: {from: ...} in the rig",
+        )
 
 
 def _refuse_left_out(texts: Sequence[str], recordings: Sequence[Recording]) -> None:

@@ -633,6 +633,29 @@ def test_offsets_of_mixed_clocks_are_written_out(shell: Shell) -> None:
     assert found == {*_expected(20 * MS), *_expected(10 * us)}
 
 
+@pytest.mark.parametrize(("ahead", "is_warned"), [(100 * MS, False), (500 * MS, True)])
+def test_clouds_apart_by_their_log_times_are_warned_about(
+    shell: Shell, ahead: int, is_warned: bool
+) -> None:
+    """Both lidars are logged 3 ms after their last points; the clock of the second is ahead."""
+    messages = [
+        *_bag(_clouds(OUSTER, NS), "/one/points"),
+        *_bag(_clouds(OUSTER, NS, header=ahead), "/two/points"),
+    ]
+    rig = (
+        "sensors:\n  - {name: one, stream: {topic: /one/points}, points: {from: start}}\n"
+        "  - {name: two, stream: {topic: /two/points}, points: {from: start}%s}\n"
+    )
+    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % "")
+    assert outcome.code == 0, outcome.err
+    text = "the points of two are 500 ms later than those of one: their clocks"
+    assert (text in outcome.err) == is_warned
+    clock = f", clock: {{offset_s: {-ahead / 1e9}}}"
+    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % clock)
+    assert outcome.code == 0, outcome.err
+    assert "later than those" not in outcome.err
+
+
 def test_log_times_that_are_copies_show_no_offset(shell: Shell) -> None:
     behind = -1_699_999_500 * 1000 * MS
     messages = [
