@@ -34,8 +34,10 @@ from tests.decode.test_native_engine import (
     END_NS,
     NAMES,
     OTHERS,
+    PACKED,
     POSES,
     START_NS,
+    Packing,
     lidar_of,
     ouster,
     packets_of,
@@ -73,11 +75,11 @@ def _pixel_seeds() -> Seeds:
     )
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=128)
 def _pair(
-    number: int, layout: str, *, is_cut: bool, keeps_repeated: bool
-) -> tuple[Pair, PacketRing]:
-    """Decoders of both engines for one lidar."""
+    number: int, layout: str, *, is_cut: bool, keeps_repeated: bool, is_packed: bool
+) -> tuple[Pair | Packing, PacketRing]:
+    """Decoders of both engines for one lidar, of arrays or of packed records."""
     lidar = _lidars()[number]
     pose = POSES[number % len(POSES)]
     ring = PacketRing(lidar.packet_size, lidar.records)
@@ -86,6 +88,8 @@ def _pair(
     info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, pose)
     run = RunInfo((info,), "base_link", "10", "utc", 1, layout)
     boxes_m = np.array(BOXES_M if is_cut else ()).reshape(-1, 6)
+    if is_packed:
+        return Packing(run, sources, boxes_m, PACKED[number % len(PACKED)]), ring
     engines = ("numpy", "native")
     return Pair(*(Decoder(run, sources, boxes_m, EXTRAS, engine=name) for name in engines)), ring
 
@@ -97,9 +101,13 @@ def _decode(data: bytes, folder: Path) -> None:
     lidar = _lidars()[number % len(_lidars())]
     rng = np.random.default_rng(number)
     layout = str(rng.choice(("dense", "organized")))
-    is_cut, keeps_repeated = rng.random(2) < 0.5
+    is_cut, keeps_repeated, is_packed = (rng.random(3) < 0.5).tolist()
     pair, ring = _pair(
-        number % len(_lidars()), layout, is_cut=bool(is_cut), keeps_repeated=bool(keeps_repeated)
+        number % len(_lidars()),
+        layout,
+        is_cut=is_cut,
+        keeps_repeated=keeps_repeated,
+        is_packed=is_packed,
     )
     size = lidar.packet_size * _PACKETS
     packets = np.frombuffer(data[_HEAD.size :].ljust(size, b"\0")[:size], np.uint8)
