@@ -34,7 +34,7 @@ LIMIT_NS = 2**31 * NS_PER_S
 # With more segments the clock is unsteady, and later packets are not used.
 MAX_SEGMENTS = 64
 # Packets that are evaluated together; one by one would take a hundred times as long.
-_BATCH = 4096
+_BATCH = 16384
 # Upper limit of the shortest transport delay.
 SHORTEST_DELAY_NS = NS_PER_MS
 # Longest delay by a queue; in a recording this short, all packets may be delayed.
