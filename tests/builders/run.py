@@ -15,10 +15,10 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
+from mlbatch import readers
 from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.cli import main
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.pipeline import session
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
@@ -218,7 +218,7 @@ def buffers_of(size: int) -> Iterator[None]:
             recording.buffer_bytes = size
         return recording
 
-    with patch.object(session, "open_recording", opened):
+    with patch.object(readers, "open_recording", opened):
         yield
 
 

@@ -18,9 +18,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from mlbatch import readers
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.faults import Fault, parse_fault
-from mlbatch.pipeline import session as session_module
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable
@@ -100,7 +100,7 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(session_module, "open_recording", opened):
+        with patch.object(readers, "open_recording", opened):
             return printed(replace(self.job, faults=faults))
 
     @property
