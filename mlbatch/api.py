@@ -84,6 +84,10 @@ def scans(
     decode: Mapping[str, str] | None = None,
     strict: bool = False,
     engine: str = "auto",
+    batching: str = "window",
+    batching_times: str = "common",
+    deskew: AnyPath | None = None,
+    deskew_to: str | None = None,
 ) -> Iterator[Scan]:
     """Yield the merged scans of one session, each with arrays of its own.
 
@@ -114,6 +118,10 @@ def scans(
         max_wait=max_wait,
         min_range=min_range,
         max_range=max_range,
+        batching=batching,
+        batching_times=batching_times,
+        deskew=deskew,
+        deskew_to=deskew_to,
     )
     yield from scans_of(options.apply(job))
 
@@ -139,6 +147,11 @@ def convert(
     keep_repeated: bool = False,
     sort: str = "columns",
     copy_topics: Names = (),
+    stamp: str = "start",
+    batching: str = "window",
+    batching_times: str = "common",
+    deskew: AnyPath | None = None,
+    deskew_to: str | None = None,
     format: str | None = None,
     point_layout: str = "standard",
     compression: str = "none",
@@ -178,6 +191,11 @@ def convert(
         exclude_boxes=exclude_boxes,
         keep_repeated=keep_repeated,
         copy_topics=copy_topics,
+        stamp=stamp,
+        batching=batching,
+        batching_times=batching_times,
+        deskew=deskew,
+        deskew_to=deskew_to,
     )
     target = OutputOptions(
         format=format,

@@ -13,9 +13,18 @@ from typing import TypeAlias
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.native import ALIASES, ENGINES
-from mlbatch.pipeline.job import Job, check_ranges_m, check_slices, check_sort, wait_ns
+from mlbatch.pipeline.job import (
+    Job,
+    check_batching,
+    check_deskew,
+    check_ranges_m,
+    check_slices,
+    check_sort,
+    wait_ns,
+)
 from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.readers.inputs import expand
+from mlbatch.types import INSTANTS
 from mlbatch.units import parse_rate
 
 AnyPath: TypeAlias = "str | PathLike[str]"
@@ -131,10 +140,18 @@ class ScanOptions:
     exclude_boxes: Iterable[Box] = ()
     keep_repeated: bool = False
     copy_topics: Names = ()
+    stamp: str = "start"
+    batching: str = "window"
+    batching_times: str = "common"
+    # "imu", or the path of a trajectory.
+    deskew: AnyPath | None = None
+    deskew_to: str | None = None
 
     def apply(self, job: Job) -> Job:
         """A job with these options."""
         choice("layout", self.layout, ("dense", "organized"))
+        choice("stamp", self.stamp, INSTANTS)
+        choice("deskew_to", self.deskew_to or INSTANTS[0], INSTANTS)
         check_ranges_m("min_range", self.min_range, "max_range", self.max_range)
         if not 0 <= self.drop_incomplete <= 100:
             raise UsageError(
@@ -142,7 +159,7 @@ class ScanOptions:
                 f"{self.drop_incomplete:g}; correct it"
             )
         start, end, are_dates = limits_of("start", self.start, "end", self.end)
-        return replace(
+        job = replace(
             job,
             # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
             rate=None if self.rate is None else parse_rate(str(self.rate)),
@@ -161,7 +178,13 @@ class ScanOptions:
             max_range_m=self.max_range,
             boxes_m=tuple(_box(box) for box in self.exclude_boxes),
             passed=names_of(self.copy_topics),
+            stamp=self.stamp,
+            batching=self.batching,
+            batching_times=self.batching_times,
+            deskew=str(path_of("deskew", self.deskew) or ""),
+            deskew_to=self.deskew_to or INSTANTS[0],
         )
+        return check_deskew(check_batching(job), self.deskew_to is not None)
 
 
 def _box(values: Box) -> tuple[float, ...]:

@@ -28,7 +28,7 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import time_limit
-from mlbatch.python.options import Box, Moment, Rate, ScanOptions
+from mlbatch.python.options import AnyPath, Box, Moment, Rate, ScanOptions
 from mlbatch.readers import merge, open_recordings
 from mlbatch.types import ImuSamples, StreamTable
 from mlbatch.units import NS_PER_S
@@ -175,6 +175,10 @@ class Recording:
         max_range: float = math.inf,
         exclude_boxes: Iterable[Box] = (),
         keep_repeated: bool = False,
+        batching: str = "window",
+        batching_times: str = "common",
+        deskew: AnyPath | None = None,
+        deskew_to: str | None = None,
     ) -> Iterator[Scan]:
         """Yield the scans that `convert` would write, each with arrays of its own.
 
@@ -197,6 +201,10 @@ class Recording:
             max_range=max_range,
             exclude_boxes=exclude_boxes,
             keep_repeated=keep_repeated,
+            batching=batching,
+            batching_times=batching_times,
+            deskew=deskew,
+            deskew_to=deskew_to,
         )
         return scans_of(options.apply(self.job))
 

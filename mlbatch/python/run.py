@@ -28,6 +28,7 @@ from mlbatch.writers import (
     WriterOptions,
     check_options,
     check_target,
+    check_variants,
     choose_format,
     extras,
     jobs_for,
@@ -137,6 +138,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         fsync=options.fsync,
     )
     check_options(name, writer_options)
+    check_variants(name, job.variants)
     jobs = jobs_for(asked, name, writer_options) if output is not None else asked or 1
     job = replace(job, extras=extras(name, writer_options), jobs=jobs)
     if output is None:
