@@ -8,7 +8,7 @@ from __future__ import annotations
 import random
 import struct
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +24,8 @@ from mlbatch.native.capture import CaptureLoops, Found
 from mlbatch.native.library import trouble
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.frames import Addresses, Dissection, Frames, dissect
+from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
+from mlbatch.ros.point_rows import take_rows
 from mlbatch.types import EXTRAS, Columns, RunInfo, SensorInfo, WindowColumns
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import ouster_packets, same_as_numpy
@@ -46,6 +48,9 @@ from tests.decode.test_native_engine import (
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated
 from tests.fuzz.readers import capture_records
+
+if not trouble():
+    from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
 
 _ETHERNET = 1
 _PACKETS = 3
@@ -223,6 +228,49 @@ def _content(size: int, found: Dissection) -> object:
     return [one.tolist() for one in arrays], found.skipped, bool(inside.all())
 
 
+# -- clouds ---------------------------------------------------------------------------------------
+
+_CLOUD_ROW = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "intensity")]
+    + [("time", "<u4"), ("ring", "<u2"), ("tag", "u1")]
+)
+
+
+def _cloud_seeds() -> Seeds:
+    """Rows of clouds by column and by ring."""
+    rows = np.zeros((40, 16), _CLOUD_ROW)
+    rows["x"] = 10 + np.arange(16)
+    rows["ring"] = np.arange(16)
+    rows["time"] = 55_296 * np.arange(40)[:, None]
+    return rows.tobytes(), rows.T.tobytes(), rows[::-1].tobytes()
+
+
+def _cloud(data: bytes, folder: Path) -> None:
+    """Rows of any bytes, taken and packed."""
+    count = len(data) // _CLOUD_ROW.itemsize
+    rows = np.frombuffer(data[: count * _CLOUD_ROW.itemsize], _CLOUD_ROW)
+    one, other = take_rows(rows), take_rows_compiled(rows)
+    if (one.placed, one.reals.tobytes()) != (other.placed, other.reals.tobytes()):
+        raise BrokenLaw("compiled loops take other points than numpy")
+    for role, values in one.fields.items():
+        if values.tobytes() != other.fields[role].tobytes():
+            raise BrokenLaw(f"compiled loops take another {role} than numpy")
+    if not len(one.reals[0]):
+        return
+    ring, tag = one.fields["ring"], one.fields["tag"]
+    stamp_ns = START_NS + one.fields["time"].astype(np.int64)
+    points = Points(stamp_ns, one.reals, ring.astype(np.uint16), np.zeros_like(tag), tag)
+    if _packed(pack, points) != _packed(pack_compiled, points):
+        raise BrokenLaw("compiled loops pack other columns than numpy")
+
+
+def _packed(pack_points: Callable[[Points, Layout, int], U8Array], points: Points) -> object:
+    try:
+        return pack_points(points, layout_of(points, 0), 1 << 22).tobytes()
+    except CloudError as err:
+        return str(err)
+
+
 # -- columns --------------------------------------------------------------------------------------
 
 _SENSORS = 3
@@ -293,6 +341,7 @@ TARGETS: Sequence[Target] = (
         Target("pixels, compiled", _pixel_seeds, _decode, mutated, 20),
         Target("headers, compiled", _header_seeds, _read_headers, mutated, 20),
         Target("frames, compiled", _frame_seeds, _dissect, _mutated_frames, 10),
+        Target("clouds, compiled", _cloud_seeds, _cloud, mutated, 10),
         Target("columns, compiled", _stamp_seeds, _merge, mutated, 10),
     )
 )
