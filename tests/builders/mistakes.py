@@ -252,7 +252,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "jobs": (
         f"{FIX} --jobs 0",
         2,
-        "--jobs: expected 1 to 64, found 0; give the number of free cores",
+        "--jobs: expected 1 to 64, or auto, found 0; give the number of free cores",
     ),
     "level of compression": (
         f"{FIX} -o x.mcap --compression zstd:23",
