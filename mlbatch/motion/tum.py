@@ -21,12 +21,14 @@ _TIME = re.compile(r"(\d{1,12})(?:\.(\d*))?", re.ASCII)
 _EXPONENT = re.compile(r"\d(?:\.\d+)?[eE][+]?\d{1,2}", re.ASCII)
 _VALUES = 8
 _DIGITS = 9
+# Of stamps: 2038; a count of ms, us or ns is beyond.
+_LATEST_NS = 2**31 * NS_PER_S
 
 
 def read_tum(path: Path) -> PoseTrack:
     """Read a trajectory; RigError with file and line for the first mistake."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as err:
         reason = getattr(err, "strerror", None) or "bytes that are not UTF-8"
         raise RigError(
@@ -84,10 +86,12 @@ def _values(place: str, words: list[str]) -> tuple[int, list[float]]:
 
 def _stamp_ns(text: str) -> int | None:
     """Return a time in ns, None for no time; numpy writes exponents, which have fewer digits."""
-    if _EXPONENT.fullmatch(text):
-        return round(float(text) * NS_PER_S)
     match = _TIME.fullmatch(text)
-    if match is None:
+    if _EXPONENT.fullmatch(text):
+        stamp_ns = round(float(text) * NS_PER_S)
+    elif match is not None:
+        fraction = (match[2] or "")[:_DIGITS].ljust(_DIGITS, "0")
+        stamp_ns = int(match[1]) * NS_PER_S + int(fraction)
+    else:
         return None
-    fraction = (match[2] or "")[:_DIGITS].ljust(_DIGITS, "0")
-    return int(match[1]) * NS_PER_S + int(fraction)
+    return stamp_ns if stamp_ns < _LATEST_NS else None

@@ -37,6 +37,12 @@ def test_exponents_are_read_as_numpy_writes_them(tmp_path: Path) -> None:
     assert read_tum(path).stamp_ns.tolist() == [1_500_000_000, 2_500_000_000]
 
 
+def test_a_byte_order_mark_is_no_content(tmp_path: Path) -> None:
+    path = tmp_path / "drive.tum"
+    path.write_bytes(b"\xef\xbb\xbf" + GOOD.encode())
+    assert len(read_tum(path).stamp_ns) == 3
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -45,6 +51,11 @@ def test_exponents_are_read_as_numpy_writes_them(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 one\n", r":1: expected 8 finite numbers"),
         ("-1 0 0 0 0 0 0 1\n", r":1: expected 8 finite numbers, the first a time in s since 1970"),
         ("1 0 0 nan 0 0 0 1\n", r":1: expected 8 finite numbers"),
+        ("177788160000 0 0 0 0 0 0 1\n", r":1: expected 8 finite numbers, the first a time in s"),
+        (
+            "1.777881600e+18 0 0 0 0 0 0 1\n",
+            r":1: expected 8 finite numbers, the first a time in s",
+        ),
         ("1 0 0 0 0 0 1 1\n", r":1: expected a unit quaternion x, y, z, w, found norm 1.414"),
         ("1 0 0 0 0 0 0 1\n", r": expected at least 2 poses, found 1"),
         ("", r": expected at least 2 poses, found 0"),
