@@ -26,7 +26,7 @@ from mlbatch.verify.scan_checks import (
     fits_columns,
     valid_points,
 )
-from mlbatch.verify.table import OutputTotals, check_table
+from mlbatch.verify.table import OutputTotals, Table, check_table
 from mlbatch.verify.verdict import CheckLog
 
 # Called with the number of scans checked, and of all scans (0: unknown).
@@ -35,6 +35,8 @@ Progress = Callable[[int, int], object]
 _MOST_SENSORS = 256
 # Stamps end at 2^31 s; times of points are added to them in 64 bits.
 _MOST_NS = 2**62
+# In the report: windows or sets that --deskew left out.
+_LEFT_OUT = ("deskew", "windows_without_poses")
 
 
 class MessageWindow(NamedTuple):
@@ -67,6 +69,7 @@ class Examination:
         self._grid_checks = GridChecks(log, self._grid, metadata.t_init_ns, where)
         self._by_time = metadata.sort == "points"
         self._is_fused = metadata.batching is not None
+        self._is_moved = metadata.deskew is not None
         self._stamp = metadata.stamp or "start"
         self._own_times = metadata.batching_times == "own"
         if metadata.sort not in (None, "columns", "points"):
@@ -82,7 +85,7 @@ class Examination:
         self._duplicates = DuplicateColumns(log)
         poses = None if files.report is None else poses_of(files.report)
         # Moved points are not at their ranges from the sensor.
-        fits = poses is not None and len(poses) == self._sensors and metadata.deskew is None
+        fits = poses is not None and len(poses) == self._sensors and not self._is_moved
         self._geometry = GeometryChecks(log, poses if fits else None)
 
     def scan(self, scan: StoredScan) -> None:
@@ -129,11 +132,11 @@ class Examination:
         """Window of the message of a scan by its stamp; number: of the message in its topic."""
         table = self._files.table
         if self._is_fused:
-            row = None if table is None else table.row(number, 0)
-            if table is None or row is None:
+            if table is None or number >= len(table):
                 # A scan without a line of the table is a violation there.
                 return MessageWindow(stamp_ns, place=number)
-            window = MessageWindow(int(table.start_ns[row]), int(table.end_ns[row]), number)
+            index = int(table.index[number])
+            window = MessageWindow(int(table.start_ns[number]), int(table.end_ns[number]), index)
         elif self._stamp == "start" or self._grid is None:
             return MessageWindow(stamp_ns)
         else:
@@ -164,15 +167,31 @@ class Examination:
         if table is not None:
             check_table(self.log, table, self._grid, self._grid_checks.first)
             if self._is_fused:
-                # Sets are numbered; where they begin is known from their columns alone.
-                expected = list(range(len(table)))
-                self.log.equal("index", f"{table.where} index", expected, table.index.tolist())
+                self._check_numbers(table)
             self.totals.check_table(apart=self._is_fused)
         if report is not None:
             check_ledgers(report)
             if not self._is_fused:
                 check_period(report)
             check_report(report, self.totals, table, self._grid)
+
+    def _check_numbers(self, table: Table) -> None:
+        """Sets are numbered; where they begin is known from their columns alone."""
+        where = f"{table.where} index"
+        found = table.index.tolist()
+        if not self._is_moved:
+            self.log.equal("index", where, list(range(len(found))), found)
+            return
+        # Sets that --deskew left out have numbers, too; `check_table` finds those that step back.
+        report = self._files.report
+        left_out = 0 if report is None else report.number(*_LEFT_OUT) or 0
+        if found and found[0] < 0:
+            self.log.fail("index", where, "0 or more", found[0])
+        elif found and report is not None and found[-1] >= len(found) + left_out:
+            expected = f"numbers below {len(found) + left_out}"
+            self.log.fail("index", where, expected, found[-1])
+        else:
+            self.log.ok("index", len(found))
 
     def _check_rings(self) -> None:
         """Rings of a sensor follow those of all earlier sensors."""

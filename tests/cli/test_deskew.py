@@ -183,6 +183,22 @@ def test_windows_without_poses_are_left_out_and_counted(shell: Shell) -> None:
     assert "--deskew" in checks["geometry"]["limit"]
 
 
+@pytest.mark.parametrize("output", ["sets", "sets.mcap", "sets.bag"])
+def test_sets_keep_their_numbers_where_others_have_no_poses(shell: Shell, output: str) -> None:
+    """The trajectory begins 0.4 s after the recording: the first sets are left out."""
+    begin_s = usual(shell, WORDS) + 1.4
+    trajectory("late.tum", begin_s, begin_s + 4, 0.0, 0.0)
+    line = f"{WORDS} --batching latest"
+    assert shell(f"{line} -o all").code == 0
+    assert shell(f"{line} -o {output} --deskew late.tum").code == 0
+    expected = {scan.index: scan.start_ns for scan in mlbatch.read("all")}
+    found = {scan.index: scan.start_ns for scan in mlbatch.read(output)}
+    assert found == {index: ns for index, ns in expected.items() if ns >= begin_s * NS}
+    assert 0 < len(found) < len(expected)
+    verified = shell(f"verify {output}")
+    assert verified.code == 0, verified.out
+
+
 def test_a_trajectory_of_another_time_is_an_error(shell: Shell) -> None:
     trajectory("old.tum", 1000, 1005, 1.0, 0.0)
     done = shell(f"{WORDS} -o out --deskew old.tum")
