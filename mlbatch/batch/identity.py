@@ -49,9 +49,11 @@ def session_key(session: Session, cwd: Path) -> Key:
         "rig": "" if session.rig is None else _rig(session.rig),
         "calibrations": _calibrations(local),
     }
-    named = [option for option in session.options if option.name == "--metadata"]
-    texts = [value for option in named for value in option.values]
+    texts = _values(session, "--metadata")
     found["metadata"] = "; ".join(f"{text} {_digest(cwd / text)}" for text in texts)
+    poses = _values(session, "--deskew") or _trajectories(session.rig)
+    if poses:
+        found["trajectory"] = " ".join(_digest(cwd / text) for text in poses)
     return found
 
 
@@ -113,6 +115,25 @@ def _digest(file: Path) -> str:
     except OSError:
         # `convert` names what is wrong with it.
         return "unreadable"
+
+
+def _values(session: Session, name: str) -> list[str]:
+    """Values of an option of a session."""
+    return [value for one in session.options if one.name == name for value in one.values]
+
+
+def _trajectories(rig: str | None) -> list[str]:
+    """Values of --deskew in the options of a rig; paths are those of the command line."""
+    if rig is None or is_url(rig):
+        return []
+    from mlbatch.rig.rig import read_rig
+
+    try:
+        options = read_rig(Path(rig)).options
+    except MlbatchError:
+        # `convert` names what is wrong with it.
+        return []
+    return [value for one in options if one.name == "deskew" for value in one.values]
 
 
 def _rig(rig: str) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.batch.identity import session_key
+from mlbatch.batch.identity import changed, session_key
 from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
 from mlbatch.batch.session import OWN, Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
@@ -189,3 +189,21 @@ def test_folders_of_sweeps_are_sessions_by_the_rig(tmp_path: Path) -> None:
     assert inputs == {name: (str(tmp_path / "raw" / name),) for name in ("one", "two")}
     with pytest.raises(UsageError, match="found none; check the pattern, or give the rig that"):
         read(tmp_path, head)
+
+
+@pytest.mark.parametrize("place", ["option", "rig"])
+def test_the_key_changes_with_the_trajectory(tmp_path: Path, place: str) -> None:
+    """The same name, other poses: a finished session is converted again."""
+    touch(tmp_path, "a.pcap")
+    rig = tmp_path / "rig.yaml"
+    section = "convert: {deskew: drive.tum}\n" if place == "rig" else ""
+    rig.write_text("sensors: [{name: left, stream: {port: 7502}}]\n" + section, encoding="utf-8")
+    options = () if place == "rig" else (Option("--deskew", ("drive.tum",)),)
+    session = Session("a", (str(tmp_path / "a.pcap"),), str(rig), options)
+    keys = []
+    for x in (1, 2, 1):
+        text = f"0 {x} 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"
+        (tmp_path / "drive.tum").write_text(text, encoding="utf-8")
+        keys.append(session_key(session, tmp_path))
+    assert keys[0] == keys[2]
+    assert changed(keys[0], keys[1]) == "trajectory"
