@@ -17,8 +17,8 @@ from mlbatch.errors import UsageError
 _PATH_TYPES = ("path", "file", "directory")
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
-    *("convert", "batch", "batch-status", "inspect", "compare", "sensors", "verify", "report"),
-    *("digest", "diff", "simulate", "schema", "bench"),
+    *("convert", "merge", "batch", "batch-status", "inspect", "compare", "sensors", "verify"),
+    *("report", "digest", "diff", "simulate", "schema", "bench"),
 )
 
 

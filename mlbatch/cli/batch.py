@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Options of `convert` that a batch has itself, or that have no meaning for many sessions.
 _OWN = ("recordings", "output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
-_WITHOUT = (*_OWN, "report", "html", "dry_run")
+_WITHOUT = (*_OWN, "report", "html", "dry_run", "shard")
 
 
 def batch(

@@ -269,6 +269,13 @@ def convert(
             help="Also write a page of the run (HTML), see mlbatch report.", metavar="FILE"
         ),
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            help="Make every Nth scan only, from the Kth on; mlbatch merge joins all N shards.",
+            metavar="K/N",
+        ),
+    ] = None,
     jobs: Annotated[
         str,
         typer.Option(
@@ -317,6 +324,7 @@ def convert(
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job, check_batching, check_deskew, check_sort
+    from mlbatch.pipeline.shards import parse_shard
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
     from mlbatch.writers import parse_jobs
@@ -371,6 +379,7 @@ def convert(
         fault_seed=options.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
+        shard=None if shard is None else parse_shard(shard),
         engine=engine,
     )
     run(

@@ -47,8 +47,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     ),
     "Clocks": ("clock", "align_clocks", "align_to", "on_jump"),
     "Run": (
-        *("dry_run", "jobs", "engine", "resume", "strict", "fail_on", "fault", "fault_seed"),
-        *("quiet", "verbose", "help"),
+        *("dry_run", "shard", "jobs", "engine", "resume", "strict", "fail_on"),
+        *("fault", "fault_seed", "quiet", "verbose", "help"),
     ),
 }
 # Commands with few options have no groups.

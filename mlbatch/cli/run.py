@@ -22,6 +22,7 @@ from mlbatch.errors import (
     Interrupted,
     NoScanError,
     RecordingError,
+    UsageError,
     one_line,
 )
 from mlbatch.pipeline import preflight, resume
@@ -31,6 +32,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
+from mlbatch.pipeline.shard_part import ShardOutput, check_format
 from mlbatch.report.limits import Limit, exceeded
 from mlbatch.report.report import RunReport, build_report, report_text, summary_lines, summary_rows
 from mlbatch.types import RunInfo
@@ -44,6 +46,7 @@ from mlbatch.writers import (
     extras,
     jobs_for,
     open_writer,
+    plugin,
     record_layout,
     report_paths,
     sync_entries,
@@ -114,11 +117,14 @@ def _run_one(job: Job, target: Target) -> list[str]:
     )
     check_options(name, options)
     check_variants(name, job.variants)
+    if job.shard is not None:
+        _check_shard(target, name)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
     job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report
     open_output: OpenWriter | None = None
     resume_log = None
+    shard_output = None
     if target.written is not None:
         job = replace(job, record=record_layout(name, options))
         output = target.written
@@ -131,19 +137,25 @@ def _run_one(job: Job, target: Target) -> list[str]:
             check_target(name, output, options, job.layout)
             if warning := preflight.check_disk(job, output):
                 _say(f"warning: {warning}")
-        open_output = _opener(name, output, options)
-        report_path = report_path or report_paths(output, name).report
+        if job.shard is not None:
+            shard_output = ShardOutput(job.shard, name, options, resume_log)
+        open_output = _opener(name, output, options, shard_output)
+        if shard_output is None:
+            report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
     _check_page(target, report_path, name)
     stages = ("clocks", "convert") if job.align_clocks_to else ("convert",)
     shown = not target.quiet
     with progress_bar(*stages, is_shown=shown, is_verbose=target.verbose) as progress:
         conversion, inputs = _converted(
-            job, open_output, progress, resume_log, _report_writer(target, report_path)
+            job, open_output, progress, resume_log, _last(target, report_path, shard_output)
         )
     inputs = replace(inputs, command=_command())
     for note in conversion.notes:
         _say(f"warning: {note.code}: {note.message}")
+    if shard_output is not None:
+        _print_shard(shard_output, inputs, target)
+        return []
     _write_page(conversion, inputs, target)
     if open_output is None and report_path is not None:
         write_text(report_path, report_text(inputs))
@@ -211,6 +223,47 @@ def _converted(
         ) from err
 
 
+def _check_shard(target: Target, name: str) -> None:
+    """Refuse options that have no meaning for a shard; name: of the format."""
+    given = {
+        "--dry-run": target.dry_run,
+        "--report": target.report is not None or target.prints_report,
+        "--html": target.html is not None,
+        "--fail-on": bool(target.limits),
+        "--on-jump split": target.split_jumps,
+    }
+    for option, is_given in given.items():
+        if is_given:
+            raise UsageError(
+                f"--shard: expected no {option}, since a shard has a part of the points and no "
+                f"report, found both; leave {option} out, see mlbatch merge"
+            )
+    check_format(name, plugin(name).SUFFIX)
+
+
+def _print_shard(output: ShardOutput, inputs: RunReport, target: Target) -> None:
+    """Print what a shard has written."""
+    account = output.account
+    if target.quiet or account is None:
+        return
+    scans = sum(bool(scan.sizes) for scan in account.scans)
+    number, count = account.shard.number, account.shard.count
+    typer.echo(
+        one_line(
+            f"wrote {target.written}: shard {number} of {count}, {scans} of {len(account.scans)} "
+            f"scans, {inputs.scans.points} points; join all {count} with mlbatch merge"
+        )
+    )
+
+
+def _last(target: Target, report_path: Path | None, shard_output: ShardOutput | None) -> Last:
+    """Writes what an output has in the end: the report, or the account of a shard."""
+    if shard_output is None:
+        return _report_writer(target, report_path)
+    complete = shard_output.complete
+    return lambda inputs, partial: complete(replace(inputs, command=_command()), partial)
+
+
 def _report_writer(target: Target, report_path: Path | None) -> Last:
     """Writes the report before the output has its name, so that no output is without one."""
 
@@ -266,9 +319,12 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
     write_page(target.html, Source(report, table, target.written, target.html))
 
 
-def _opener(name: str, output: Path, options: WriterOptions) -> OpenWriter:
+def _opener(
+    name: str, output: Path, options: WriterOptions, shard_output: ShardOutput | None
+) -> OpenWriter:
     def start(info: RunInfo) -> ScanWriter:
-        return open_writer(name, output, info, options)
+        writer = open_writer(name, output, info, options)
+        return writer if shard_output is None else shard_output.around(writer, info)
 
     return start
 

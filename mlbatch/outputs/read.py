@@ -22,7 +22,7 @@ from mlbatch.outputs.table import ScanRow, TableOfRun
 from mlbatch.types import RunInfo
 from mlbatch.verify.commented import CommentedReader
 from mlbatch.verify.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
-from mlbatch.verify.folders import ScanFile, entries, scan_files
+from mlbatch.verify.folders import ScanFile, entries, refuse_shard, scan_files
 from mlbatch.verify.las import LasReader
 from mlbatch.verify.pcd import PcdReader
 from mlbatch.verify.ply import PlyReader
@@ -87,6 +87,7 @@ def _scans(path: Path) -> Iterator[Scan]:
 
 
 def _scans_of_folder(path: Path) -> Iterator[Scan]:
+    refuse_shard(path)
     inside = entries(path)
     if any(entry.name == _METADATA for entry in inside):
         from mlbatch.verify.rosbag2 import open_bag

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.page.values import Values
+from mlbatch.verify.folders import refuse_shard
 from mlbatch.verify.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
 
 _REPORT_SUFFIX = f".{REPORT}"
@@ -95,6 +96,7 @@ def page_of(output: Path) -> Path:
 
 
 def _of_output(path: Path, report: Path | None) -> Source:
+    refuse_shard(path)
     places = ReportPlaces.of(path, report)
     text = places.report_text()
     table = places.table_text()

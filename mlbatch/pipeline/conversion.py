@@ -88,7 +88,8 @@ class Conversion:
     """One run: `windows`, `tasks` or `scans` drive it, `close` ends it.
 
     info, table: None before the first window; earlier: outcomes of the scans that a resumed output
-    already contains; dropped_incomplete: windows left out by `--drop-incomplete`.
+    already contains; dropped_incomplete: windows left out by `--drop-incomplete`;
+    notes_before_points: number of warnings that precede those about points.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -124,6 +125,7 @@ class Conversion:
         self.table: ScanTable | None = None
         self.earlier: Iterator[Outcomes] = iter(())
         self.dropped_incomplete = 0
+        self.notes_before_points = 0
         self.deskew = self._deskew()
         self._buffers = buffers
         self._pool: DecodePool | None = None
@@ -282,6 +284,8 @@ class Conversion:
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
             own_times=job.batching_times == OWN,
+            shard=job.shard,
+            slices=job.slices,
         )
         return self._pool
 
@@ -367,7 +371,12 @@ class Conversion:
         for sensor in self.sensors:
             self._complete_ledger(sensor)
         self._refuse_rejected()
-        for note in (*run_report.final_notes(self), *self.session.clocks.notes()):
+        for note in run_report.final_notes(self):
+            self.warn(note)
+        self.notes_before_points = len(self.notes)
+        # A shard has a part of the points: their notes are made when all are merged.
+        points = [] if self.job.shard is not None else run_report.notes_of_run(self)
+        for note in (*points, *run_report.unassigned_notes(self), *self.session.clocks.notes()):
             self.warn(note)
         # A later message may be the first without receive times.
         self.session.refuse_untimed()

@@ -12,7 +12,8 @@ import numpy as np
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
-from mlbatch.report.ledger import PointCounts
+from mlbatch.pipeline.shards import Shard
+from mlbatch.report.ledger import POINT_COUNTERS, PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
@@ -116,15 +117,21 @@ class DecodePool:
         split: bool,
         counts_clipped: bool = False,
         own_times: bool = False,
+        shard: Shard | None = None,
+        slices: int = 1,
     ) -> None:
         """workers: one a thread; each has lidars of its own if there are several.
 
-        own_times: times of points count from the first column of their sensor.
+        own_times: times of points count from the first column of their sensor; shard: the only
+        scans to decode, None: all; slices: of a window.
         Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
         self._rings = [source.ring for source in sources]
         self._split = split
         self._own_times = own_times
+        self._shard = shard
+        self._slices = slices
+        self._no_points = [[0] * len(POINT_COUNTERS) for _ in sources]
         self._open: list[DecodeTask] = []
         self.workers = [
             DecodeWorker(
@@ -172,9 +179,16 @@ class DecodePool:
         only: int | None,
         earlier: Iterator[Outcomes],
     ) -> DecodeTask:
-        task = DecodeTask(columns, label, only, next(earlier, None))
+        outcomes = next(earlier, None)
+        if outcomes is None and not self._is_own(label):
+            outcomes = self._no_points
+        task = DecodeTask(columns, label, only, outcomes)
         self._open.append(task)
         return task
+
+    def _is_own(self, label: ScanHeader) -> bool:
+        shard = self._shard
+        return shard is None or shard.has(label.index, label.slice, self._slices)
 
     def content(self, task: DecodeTask, before: int) -> int:
         """Checksum of a task's timestamps, of all packets up to its last, and of `before`."""

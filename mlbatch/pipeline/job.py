@@ -14,6 +14,7 @@ from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment
+from mlbatch.pipeline.shards import Shard
 from mlbatch.types import EXTRAS, INSTANTS, RecordLayout
 from mlbatch.units import NS_PER_S
 
@@ -63,6 +64,7 @@ class Job:
     batching_times: str = COMMON  # or own
     deskew: str = ""  # where poses come from: imu, or the path of a trajectory; "": no motion
     deskew_to: str = INSTANTS[0]  # instant of a window that its points are moved to
+    shard: Shard | None = None  # the only scans to make; None: all
     jobs: int = 1  # scans made at the same time
     engine: str = "auto"  # one of `native.ENGINES`
 

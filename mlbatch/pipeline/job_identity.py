@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -46,6 +47,8 @@ _CALIBRATED = (
     "calibration",
 )
 _DIGITS = 12
+# In `_size_and_time`.
+_TIME_OF_CHANGE = re.compile(r", changed at -?\d+ ns")
 
 # A file of a recording is sampled at its start, at its end and at blocks between, at equal
 # distances; small ones are read as a whole. A session has so many blocks, for any size.
@@ -87,6 +90,14 @@ def input_identity(run: Conversion) -> dict[str, str]:
     found["rig"] = _digest(run.session.setup.rig)
     found["sensors"] = ", ".join(sensor.name for sensor in run.sensors)
     return found
+
+
+def identity_of_parts(identity: Mapping[str, str]) -> dict[str, str]:
+    """What the identities of all shards of a conversion share.
+
+    Recordings may be copies, which have other times.
+    """
+    return {key: _TIME_OF_CHANGE.sub("", text) for key, text in identity.items() if key != "shard"}
 
 
 def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:

@@ -74,6 +74,8 @@ def check_disk(job: Job, output: Path) -> str:
     if _is_limited(job):
         return ""
     recorded = sum(path.stat().st_size for path in job.recordings if path.is_file())
+    if job.shard is not None:
+        recorded //= job.shard.count
     check_free_space(output, recorded // LEAST_OUTPUT)
     free = shutil.disk_usage(output.parent).free
     if free < recorded:

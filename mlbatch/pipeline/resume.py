@@ -129,6 +129,21 @@ class ResumeLog:
         """Bytes of the output's file to keep; None: nothing to resume."""
         return None if self._state is None else self._state.kept_bytes
 
+    @property
+    def identity(self) -> dict[str, str]:
+        """Identity of the job and, once it runs, of its inputs."""
+        return self._identity
+
+    @property
+    def run(self) -> Conversion | None:
+        """The run, once it has begun."""
+        return self._run
+
+    @property
+    def content(self) -> int:
+        """Checksum of what was read for the scans so far."""
+        return self._content
+
     def join(self, run: Conversion) -> None:
         """Pass the finished scans to a run; UsageError if it is another job."""
         self._run = run

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
 from mlbatch.pipeline.time_limits import text_of_range, text_of_time
-from mlbatch.report.ledger import ordered
+from mlbatch.report.ledger import PointCounts, ordered
 from mlbatch.report.report import (
     ClockReport,
     FaultReport,
@@ -164,18 +164,8 @@ def final_notes(run: Conversion) -> list[Note]:
                 "future (damaged?) or a stall; see --decode crc=check, --max-wait"
             )
             notes.append(Note("late", sensor.name, text))
-        points = sensor.ledger.points
-        if points.clipped:
-            text = (
-                f"{sensor.name}: {points.clipped} of {points.written} points "
-                f"({points.clipped / points.written:.2%}) have an intensity outside 0 to 255, "
-                "which the point layout clips; choose one with a float32 intensity"
-            )
-            notes.append(Note("clipped", sensor.name, text))
     notes += _motion_notes(run)
     notes += _loss_notes(run)
-    notes += _point_notes(run)
-    notes += _unassigned_notes(run)
     return notes
 
 
@@ -218,11 +208,25 @@ def _loss_notes(run: Conversion) -> Iterator[Note]:
             yield Note("loss", sensor.name, f"{sensor.name}: {'; '.join(texts)}")
 
 
-def _point_notes(run: Conversion) -> Iterator[Note]:
-    """Scans with columns but no points: of a sensor, and of all."""
-    if run.table is None:
-        return
-    scans = run.table.statistics(0)
+def notes_of_run(run: Conversion) -> Iterator[Note]:
+    """Warnings about the points of a run."""
+    points = [(sensor.name, sensor.ledger.points) for sensor in run.sensors]
+    return point_notes(points, _NO_SCANS if run.table is None else run.table.statistics(0))
+
+
+def point_notes(points: Sequence[tuple[str, PointCounts]], scans: ScanStatistics) -> Iterator[Note]:
+    """Clipped intensities; scans with columns but no points: of a sensor, and of all.
+
+    points: name and counts of each sensor.
+    """
+    for name, counts in points:
+        if counts.clipped:
+            text = (
+                f"{name}: {counts.clipped} of {counts.written} points "
+                f"({counts.clipped / counts.written:.2%}) have an intensity outside 0 to 255, "
+                "which the point layout clips; choose one with a float32 intensity"
+            )
+            yield Note("clipped", name, text)
     for name, count in scans.no_points.items():
         text = (
             f"{name}: {count} of {scans.written} scans have its columns but none of its points: no "
@@ -234,7 +238,7 @@ def _point_notes(run: Conversion) -> Iterator[Note]:
         yield Note("empty_cloud", "", text)
 
 
-def _unassigned_notes(run: Conversion) -> Iterator[Note]:
+def unassigned_notes(run: Conversion) -> Iterator[Note]:
     """Warnings about lidar packets of no sensor, unless the user left them out.
 
     Those of `setup.noted` have a warning since the start.

@@ -11,6 +11,8 @@ from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
+# What a shard has instead of a report.
+_SHARD = "shard.json"
 # Files with other suffixes are ignored.
 _FIRST, _SECOND = ".pcd.bin", ".time.bin"
 _OUTPUTS = (".npz", ".ply", ".pcd", ".las", ".laz", ".bin", ".partial", ".mcap", ".bag")
@@ -78,6 +80,14 @@ def entries(folder: Path) -> list[Path]:
         return sorted(folder.iterdir())
     except OSError as err:
         raise VerifyError(f"{folder}: expected a readable folder, found {err.strerror!r}") from err
+
+
+def refuse_shard(folder: Path) -> None:
+    """Raise VerifyError for the folder of a shard, which has a part of the scans."""
+    if (folder / _SHARD).is_file():
+        raise VerifyError(
+            f"{folder}: expected a whole output, found one shard of it; join all with mlbatch merge"
+        )
 
 
 def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:

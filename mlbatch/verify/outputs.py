@@ -14,7 +14,7 @@ from mlbatch.verify import messages, npz
 from mlbatch.verify.examination import Examination, Progress
 from mlbatch.verify.file_formats import FileFormat, format_of
 from mlbatch.verify.float_rows import RowReader
-from mlbatch.verify.folders import entries, scan_files
+from mlbatch.verify.folders import entries, refuse_shard, scan_files
 from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
 from mlbatch.verify.report_checks import (
     TABLE,
@@ -84,6 +84,7 @@ def check_output(output: Output) -> Verdict:
 
 
 def _check_of_folder(path: Path) -> Callable[[Output], Verdict]:
+    refuse_shard(path)
     inside = entries(path)
     if any(entry.name == _METADATA for entry in inside):
         return _check_rosbag2

@@ -9,6 +9,7 @@ from mlbatch.errors import UsageError
 from mlbatch.writers.atomic import (
     REPORT_JSON,
     SCANS_CSV,
+    SHARD_JSON,
     check_free_space,
     check_name,
     discard,
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     from mlbatch.types import RecordLayout, RunInfo
 
 __all__ = [
+    "REPORT_JSON",
+    "SHARD_JSON",
     "Checkpoint",
     "ReportPaths",
     "ScanJob",

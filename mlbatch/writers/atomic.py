@@ -24,6 +24,8 @@ from mlbatch.writers.formats import format_of_files
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
+# In a folder with the scans of one shard, instead of both.
+SHARD_JSON = "shard.json"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
 _SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.([\w.]+)")
 # Names that only mlbatch gives, or that its first versions wrote without a scans.csv.
@@ -120,8 +122,8 @@ def is_taken(name: str) -> bool:
 
 
 def _is_own_file(name: str, *, marked: bool) -> bool:
-    """marked: there is a scans.csv in the output."""
-    if name in (SCANS_CSV, REPORT_JSON):
+    """marked: there is a scans.csv in the output, or a shard.json."""
+    if name in (SCANS_CSV, REPORT_JSON, SHARD_JSON):
         return True
     scan = _SCAN_FILE.fullmatch(name)
     if scan is None:
@@ -247,7 +249,7 @@ def _check_replaceable(target: Path, overwrite: bool, folder: bool) -> None:
 def _strangers(folder: Path, deep: bool) -> Iterator[Path]:
     """Yield entries of a folder that no run wrote; deep: enter folders of single sensors."""
     folders = (folder,) if deep else (folder, folder.parent)
-    marked = any((one / SCANS_CSV).is_file() for one in folders)
+    marked = any((one / name).is_file() for one in folders for name in (SCANS_CSV, SHARD_JSON))
     for entry in folder.iterdir():
         if deep and entry.is_dir() and not entry.is_symlink():
             yield from _strangers(entry, deep=False)

@@ -117,6 +117,10 @@ class FolderWriter:
         path = self._output.partial / SCANS_CSV
         with export_errors(path):
             path.write_text(summary.scans_csv, encoding="utf-8", newline="\n")
+        self.finish_part(last)
+
+    def finish_part(self, last: Callable[[Path], None] | None = None) -> None:
+        """Move the folder to its final path with the files of scans alone; last: as in `finish`."""
         self._output.sync()
         if last is not None:
             last(self._output.partial)
@@ -149,6 +153,15 @@ class FolderWriter:
         if self._lists:
             key = (scan.index < 0, scan.index, scan.slice)
             self._entries.setdefault(sensor, []).append(Entry(key, scan.start_ns))
+        return self.files(scan, sensor)
+
+    @property
+    def folder(self) -> Path:
+        """The folder under construction."""
+        return self._output.partial
+
+    def files(self, scan: Scan, sensor: int | None) -> dict[str, Path]:
+        """Return the files of a scan by suffix, in the folder under construction."""
         stem = scan_name(scan.index, scan.slice, scan.slices)
         folder = self._folders[sensor]
         return {suffix: folder / f"{stem}.{suffix}" for suffix in self._encoders}

@@ -57,6 +57,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--html": "page.*HTML",
         "--dry-run": "report.*split.*line.*segment",
         "--report": "JSON",
+        "--shard": "scan.*merge",
         "--jobs": "same time",
         "--compression": "none, lz4, zstd.*LEVEL",
         "--engine": "auto, numpy, or native",
@@ -67,6 +68,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--no-fsync": "on the disk",
         "--quiet": "progress",
         "--verbose": "chosen",
+    },
+    "merge": {
+        "--output": "[Ff]older.*all",
+        "--fail-on": r"3.*loss>0\.1%.*repeatable",
+        "--overwrite": "existing",
+        "--no-fsync": "on the disk",
+        "--quiet": "summary",
     },
     "batch": {
         "--output": "[Ff]older.*URL",
@@ -142,7 +150,7 @@ OPTIONS: dict[str, dict[str, str]] = {
 }
 # Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
 _OWN = ("--output", "--rig", "--jobs", "--overwrite", "--resume", "--quiet", "--verbose")
-_PASSED = set(OPTIONS["convert"]) - {*_OWN, "--report", "--html", "--dry-run"}
+_PASSED = set(OPTIONS["convert"]) - {*_OWN, "--report", "--html", "--dry-run", "--shard"}
 # There `--only` names sessions.
 _PASSED -= {"--only", "--include-sensor"}
 OPTIONS["batch"] |= {name: OPTIONS["convert"][name] for name in sorted(_PASSED)}
@@ -243,6 +251,7 @@ SHORT = {
     "inspect": {"-r --rig", "-m --metadata", "-v --verbose"},
     "compare": {"-r --rig", "-m --metadata", "-v --verbose"},
     "verify": {"-v --verbose"},
+    "merge": {"-o --output", "-q --quiet"},
     "batch": {
         *("-o --output", "-r --rig", "-f --format", "-j --jobs", "-m --metadata"),
         *("-q --quiet",),

@@ -16,6 +16,7 @@ SENSORS = "sensors: [{name: a}]\n"
 # Options of one run, and those that the rig has a key for.
 NOT_IN_A_RIG = {
     *("--rig", "--output", "--report", "--html", "--dry-run", "--resume", "--overwrite"),
+    "--shard",
     *("--rate", "--metadata", "--exclude-box"),
 }
 ALIASES = {"--include-sensor", "--exclude-sensor", "--copy-topic"}

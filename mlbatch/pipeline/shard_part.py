@@ -1,0 +1,367 @@
+"""The folder that a shard writes: its scans and shard.json, neither report.json nor scans.csv.
+
+shard.json has the account of the whole recording, which every shard makes, with the points of the
+shard's own scans alone. From those of all shards the report and the table of scans follow.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mlbatch
+from mlbatch.errors import RecordingError, UsageError
+from mlbatch.pipeline.job_identity import identity_of_parts
+from mlbatch.pipeline.resume import ResumeLog
+from mlbatch.pipeline.shards import Shard
+from mlbatch.report.json_records import from_json, to_json
+from mlbatch.report.report import RunReport
+from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.writers import (
+    SHARD_JSON,
+    Checkpoint,
+    ScanJob,
+    ScanWriter,
+    WriterOptions,
+    partial_path,
+    write_text,
+)
+from mlbatch.writers.scan_folder import FolderWriter
+
+SCHEMA = "mlbatch.shard/1"
+
+
+@dataclass(frozen=True, slots=True)
+class ShardScan:
+    """A scan of the whole recording; the fields are those of `Scan`, but these.
+
+    only: with `--split` the index of its sensor; stamps_ns: of the first and the last column, none
+    without a column; sizes: bytes of its files, by suffix, {} of another shard's scan.
+    """
+
+    only: int | None
+    index: int
+    slice: int
+    start_ns: int
+    end_ns: int
+    stamps_ns: tuple[int, ...]
+    complete: bool
+    ready_host_ns: int
+    columns_per_sensor: tuple[int, ...]
+    points_per_sensor: tuple[int, ...]
+    max_gap_ns: tuple[int, ...]
+    coverage: tuple[float, ...]
+    overlap: tuple[float, ...]
+    fill: tuple[float, ...]
+    is_partial: bool
+    sizes: dict[str, int]
+
+    def scan(self, info: RunInfo) -> Scan:
+        """The scan without its points."""
+        nothing = np.zeros(0, np.uint8)
+        return Scan(
+            info=info,
+            index=self.index,
+            slice=self.slice,
+            start_ns=self.start_ns,
+            end_ns=self.end_ns,
+            complete=self.complete,
+            ready_host_ns=self.ready_host_ns,
+            xyz=np.zeros((0, 3), np.float32),
+            intensity=np.zeros(0, np.float32),
+            reflectivity=None,
+            range_m=None,
+            time_ns=np.zeros(0, np.uint32),
+            ring=np.zeros(0, np.uint16),
+            return_type=nothing,
+            lidar_id=nothing,
+            column=None,
+            column_stamp_ns=np.array(self.stamps_ns, np.int64),
+            column_lidar_id=nothing,
+            points=sum(self.points_per_sensor),
+            columns_per_sensor=self.columns_per_sensor,
+            points_per_sensor=self.points_per_sensor,
+            max_gap_ns=self.max_gap_ns,
+            coverage=self.coverage,
+            overlap=self.overlap,
+            fill=np.array(self.fill, np.float32),
+            is_partial=self.is_partial,
+        )
+
+
+def _figures(scan: Scan, only: int | None) -> ShardScan:
+    """What the account keeps of a scan."""
+    stamps = scan.column_stamp_ns
+    return ShardScan(
+        only,
+        scan.index,
+        scan.slice,
+        scan.start_ns,
+        scan.end_ns,
+        (int(stamps[0]), int(stamps[-1])) if len(stamps) else (),
+        bool(scan.complete),
+        int(scan.ready_host_ns),
+        tuple(map(int, scan.columns_per_sensor)),
+        tuple(map(int, scan.points_per_sensor)),
+        tuple(map(int, scan.max_gap_ns)),
+        tuple(map(float, scan.coverage)),
+        tuple(map(float, scan.overlap)),
+        tuple(scan.fill.tolist()),
+        bool(scan.is_partial),
+        {},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """Content of shard.json.
+
+    identity: what all shards share, see `identity_of_parts`; content: checksum of what was read;
+    notes_before_points: warnings of the report that precede those about points.
+    """
+
+    shard: Shard
+    identity: dict[str, str]
+    content: int
+    format: str
+    ply_style: str
+    is_split: bool
+    is_strict: bool
+    columns_per_s: tuple[float | None, ...]
+    notes_before_points: int
+    info: RunInfo
+    report: RunReport
+    scans: tuple[ShardScan, ...]
+
+    def shared(self) -> dict[str, Any]:
+        """What must be the same in the accounts of all shards, as JSON values."""
+        found = _fields(to_json(replace(self, scans=())))
+        del found["shard"]
+        report = found["report"]
+        for name in ("timing", "command"):
+            del report[name]
+        for one in report["inputs"]:
+            one["path"] = Path(one["path"]).name
+        for sensor in report["sensors"]:
+            del sensor["ledger"]["points"]
+        for name in ("points", "no_points", "empty_clouds"):
+            del report["scans"][name]
+        alike = (replace(scan, sizes={}, points_per_sensor=()) for scan in self.scans)
+        found["scans"] = [to_json(scan) for scan in alike]
+        return found
+
+
+# -- writing ----------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class ShardWriter:
+    """Writes the scans of one shard to a folder, and notes all scans; see `ScanWriter`.
+
+    scans: of the whole recording, in their order; info: of the run.
+    """
+
+    inner: FolderWriter
+    shard: Shard
+    info: RunInfo
+    scans: list[ShardScan] = field(default_factory=list)
+
+    def has(self, scan: Scan) -> bool:
+        """Whether a scan is of this shard."""
+        return self.shard.has(scan.index, scan.slice, scan.slices)
+
+    def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that writes a scan, or only notes another shard's."""
+        return _NotedJob(self, scan, sensor, self.inner.write)
+
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job that keeps the files of a scan, or only notes another shard's."""
+        return _NotedJob(self, scan, sensor, self.inner.skip)
+
+    def flush(self) -> ScanJob:
+        """Return the job of the folder."""
+        return self.inner.flush()
+
+    def checkpoint(self) -> Checkpoint:
+        """Return the scans whose files are closed, and those of others before them."""
+        return self.inner.checkpoint()
+
+    def write_imu(self, samples: ImuSamples) -> None:
+        """Ignore IMU samples, as all folders of scans do."""
+
+    def write_message(self, message: Message) -> None:
+        """Ignore messages, as all folders of scans do."""
+
+    def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
+        """Move the folder to its final path, without a table of scans."""
+        self.inner.finish_part(last)
+
+    def abandon(self) -> None:
+        """Close what is open."""
+        self.inner.abandon()
+
+    def sized_scans(self) -> tuple[ShardScan, ...]:
+        """All scans, those of this shard with the sizes of their files."""
+        sized = []
+        for figures in self.scans:
+            scan = figures.scan(self.info)
+            sizes = {}
+            if self.has(scan):
+                files = self.inner.files(scan, figures.only)
+                sizes = {suffix: path.stat().st_size for suffix, path in files.items()}
+            sized.append(replace(figures, sizes=sizes))
+        return tuple(sized)
+
+
+Start = Callable[[Scan, int | None], ScanJob]
+
+
+class _NotedJob(ScanJob):
+    """Notes a scan, in order; has it written by another job if it is of this shard."""
+
+    def __init__(self, writer: ShardWriter, scan: Scan, sensor: int | None, start: Start) -> None:
+        self._writer = writer
+        self._scan = scan
+        self._sensor = sensor
+        self._is_own = writer.has(scan)
+        self._job = start(scan, sensor) if self._is_own else ScanJob()
+
+    def pack(self) -> None:
+        self._job.pack()
+
+    def append(self) -> None:
+        self._writer.scans.append(_figures(self._scan, self._sensor))
+        self._job.append()
+
+    def compress(self) -> None:
+        self._job.compress()
+
+    def commit(self) -> None:
+        if self._is_own:
+            self._job.commit()
+        else:
+            self._writer.inner.count({})
+
+
+def _not_a_folder(name: str) -> str:
+    return (
+        f"--shard: expected a format with a file for each scan (npz, ply, pcd, las, laz, kitti, "
+        f"nuscenes), found {name}, one file for all scans; give --format npz and a folder"
+    )
+
+
+def check_format(name: str, suffix: str | None) -> None:
+    """Raise UsageError for a format whose scans are in one file; suffix: of that file."""
+    # The folder of a ROS 2 bag has one file with all scans, too.
+    if suffix is not None or name == "rosbag2":
+        raise UsageError(_not_a_folder(name))
+
+
+class ShardOutput:
+    """The output of a shard: its writer, and what `convert` calls last.
+
+    account: content of shard.json, once it is written.
+    """
+
+    def __init__(self, shard: Shard, name: str, options: WriterOptions, log: ResumeLog) -> None:
+        """name: of the format; log: of the run."""
+        self.account: Account | None = None
+        self._shard = shard
+        self._name = name
+        self._options = options
+        self._log = log
+        self._writer: ShardWriter | None = None
+
+    def around(self, writer: ScanWriter, info: RunInfo) -> ShardWriter:
+        """Return the writer of this shard; UsageError for a format that is no folder of scans."""
+        if not isinstance(writer, FolderWriter):
+            writer.abandon()
+            raise UsageError(_not_a_folder(self._name))
+        self._writer = ShardWriter(writer, self._shard, info)
+        return self._writer
+
+    def complete(self, report: RunReport, folder: Path) -> None:
+        """Write shard.json into the folder of the shard."""
+        run = self._log.run
+        writer = self._writer
+        if run is None or writer is None:
+            return
+        options = self._options
+        self.account = Account(
+            shard=self._shard,
+            identity=identity_of_parts(self._log.identity),
+            content=self._log.content,
+            format=self._name,
+            ply_style=options.ply_style,
+            is_split=options.split,
+            is_strict=run.job.strict,
+            columns_per_s=tuple(sensor.columns_per_s for sensor in run.sensors),
+            notes_before_points=run.notes_before_points,
+            info=writer.info,
+            report=report,
+            scans=writer.sized_scans(),
+        )
+        head = {"schema": SCHEMA, "version": mlbatch.__version__}
+        text = json.dumps(head | _fields(to_json(self.account)), separators=(",", ":"))
+        write_text(folder / SHARD_JSON, text + "\n", options.fsync)
+
+
+# -- reading ----------------------------------------------------------------------------------
+
+
+def read_account(part: Path) -> Account:
+    """The account of a shard; UsageError if there is none, RecordingError if it is damaged."""
+    path = part / SHARD_JSON
+    try:
+        content = _fields(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise UsageError(f"{part}: expected the folder of a shard, found {_found(part)}") from None
+    except NotADirectoryError:
+        raise UsageError(
+            f"{part}: expected the folder of a shard, found a file; name what convert --shard wrote"
+        ) from None
+    except OSError as err:
+        raise RecordingError(
+            f"{path}: expected a readable file, found {err.strerror!r}; check the disk"
+        ) from err
+    except ValueError as err:
+        raise _damaged(path, str(err)) from err
+    schema = content.pop("schema", None)
+    version = content.pop("version", None)
+    if (schema, version) != (SCHEMA, mlbatch.__version__):
+        raise UsageError(
+            f"{path}: expected a shard of mlbatch {mlbatch.__version__}, found one of "
+            f"{version}; merge with that version, or convert again"
+        )
+    try:
+        account: Account = from_json(Account, content)
+    except (ValueError, TypeError) as err:
+        raise _damaged(path, str(err)) from err
+    return account
+
+
+def _damaged(path: Path, why: str) -> RecordingError:
+    return RecordingError(
+        f"{path}: expected the account of a shard, found damaged content ({why}); convert this "
+        "shard again with --overwrite"
+    )
+
+
+def _found(part: Path) -> str:
+    partial = partial_path(part)
+    if partial.exists():
+        return f"that of an interrupted run ({partial.name}); run this shard again with --resume"
+    if part.is_dir():
+        return f"a folder without {SHARD_JSON}; name what convert --shard wrote"
+    return "nothing; run the conversion of this shard, or check the name"
+
+
+def _fields(found: object) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise ValueError("no JSON object")
+    return found

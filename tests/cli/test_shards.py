@@ -1,0 +1,495 @@
+"""`convert --shard` and `merge`: the output of one run, or one clear line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mlbatch.errors import ExportError
+from mlbatch.pipeline import resume, shard_merge, state_file
+from mlbatch.types import Scan
+from mlbatch.writers import atomic
+from mlbatch.writers.formats import npz
+from mlbatch.writers.output_file import Bytes
+from tests.builders.sessions import FIXTURE, Outcome, Shell
+from tests.resume_storm import contents, write_recordings
+
+CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
+# From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
+SCANS = 7
+
+
+@pytest.fixture
+def shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Shell:
+    """The command line, in an empty folder; every scan gets a line of the state file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
+    for module in (state_file, atomic):
+        monkeypatch.setattr(module, "sync_to_disk", lambda path: None)
+    return Shell(monkeypatch, capsys)
+
+
+def _shards(shell: Shell, words: str, count: int, mixed: bool = False) -> list[str]:
+    """Convert all shards; gives their folders. mixed: by both engines, with one job or several."""
+    folders = []
+    for number in range(1, count + 1):
+        engine = ("numpy", "native")[number % 2]
+        more = f" --engine {engine} --jobs {number}" if mixed else ""
+        done = shell(f"convert {words} --shard {number}/{count} -o part{number} -q{more}")
+        assert done.code == 0, done.err
+        folders.append(f"part{number}")
+    return folders
+
+
+def _merged(shell: Shell, folders: Sequence[str], more: str = "") -> Outcome:
+    Path("merged").mkdir(exist_ok=True)
+    return shell(f"merge {' '.join(folders)} -o merged/out -q {more}")
+
+
+def _whole(shell: Shell, words: str) -> tuple[dict[str, object], Outcome]:
+    """All files of one run, and what it printed."""
+    Path("whole").mkdir()
+    outcome = shell(f"convert {words} -o whole/out -q")
+    assert outcome.code == 0, outcome.err
+    return contents(Path("whole")), outcome
+
+
+def _assert_as_one_run(shell: Shell, words: str, count: int, mixed: bool = False) -> None:
+    whole, one_run = _whole(shell, words)
+    merged = _merged(shell, _shards(shell, words, count, mixed)[::-1])
+    assert merged.code == 0, merged.err
+    assert contents(Path("merged")) == whole
+    assert merged.err == one_run.err
+
+
+# -- the law ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 10])
+def test_shards_give_the_bytes_of_one_run(shell: Shell, count: int) -> None:
+    _assert_as_one_run(shell, CAPTURE, count)
+
+
+def test_every_shard_has_its_scans_and_no_report(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 3)
+    names = [sorted(os.listdir(f"part{number}")) for number in (1, 2, 3)]
+    assert names == [
+        ["000000.npz", "000003.npz", "000006.npz", "shard.json"],
+        ["000001.npz", "000004.npz", "shard.json"],
+        ["000002.npz", "000005.npz", "shard.json"],
+    ]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "--format ply --ply-style float",
+        "--format pcd",
+        "--format las",
+        "--format kitti",
+        "--format nuscenes --keep-partial",
+        "--split --slices 2",
+        "--layout organized --keep-partial",
+        "--sort points --slices 3",
+        "--batching latest",
+        "--align-clocks",
+        "--drop-incomplete 70 --fault drop:left:30% --fault-seed 5",
+        "--fault stall:left:0.3s-0.5s --max-wait 0.05 --keep-partial",
+        "--exclude-box=-1000,-1000,-1000,1000,1000,1000",
+        "--start +0.2 --end +0.5",
+    ],
+)
+def test_options_give_the_bytes_of_one_run(shell: Shell, options: str) -> None:
+    _assert_as_one_run(shell, f"{CAPTURE} {options}", 3)
+
+
+def test_engines_and_jobs_may_differ_between_shards(shell: Shell) -> None:
+    _assert_as_one_run(shell, f"{CAPTURE} --slices 2", 4, mixed=True)
+
+
+def test_a_bag_with_messages_gives_the_bytes_of_one_run(shell: Shell) -> None:
+    write_recordings(Path(), turns=6)
+    _assert_as_one_run(shell, "bag/drive.mcap --identity-extrinsics --pass /chatter", 2)
+
+
+def test_a_clock_step_is_the_error_of_one_run(shell: Shell) -> None:
+    write_recordings(Path(), turns=6)
+    whole = shell("convert jumps/drive.pcap -o out")
+    shard = shell("convert jumps/drive.pcap -o part --shard 1/2")
+    assert (shard.code, shard.err) == (whole.code, whole.err)
+    assert shard.code == 1
+    assert not Path("part").exists()
+
+
+def test_counts_of_the_report_are_those_of_all_shards(shell: Shell) -> None:
+    folders = _shards(shell, CAPTURE, 2)
+    accounts = [json.loads(Path(one, "shard.json").read_text()) for one in folders]
+    assert _merged(shell, folders).code == 0
+    report = json.loads(Path("merged/out/report.json").read_text())
+    for number, sensor in enumerate(report["sensors"]):
+        own = [one["report"]["sensors"][number]["ledger"]["points"]["written"] for one in accounts]
+        assert all(own)
+        assert sensor["points"]["written"] == sum(own)
+    assert report["timing"]["cpu_s"] > sum(one["report"]["timing"]["cpu_s"] for one in accounts)
+    commands = report["command"].split(" && ")
+    assert [words.split()[1] for words in commands] == ["convert", "convert", "merge"]
+
+
+def test_the_merged_output_is_valid(shell: Shell) -> None:
+    assert _merged(shell, _shards(shell, CAPTURE, 3)).code == 0
+    assert shell("verify merged/out").code == 0
+
+
+def test_parts_stay_and_can_be_merged_again(shell: Shell) -> None:
+    folders = _shards(shell, CAPTURE, 2)
+    before = {path: path.read_bytes() for path in Path().glob("part*/*")}
+    assert _merged(shell, folders).code == 0
+    assert _merged(shell, folders, "--overwrite").code == 0
+    assert {path: path.read_bytes() for path in Path().glob("part*/*")} == before
+
+
+def test_another_file_system_gets_copies(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    def other(source: Path, path: Path) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", other)
+    _assert_as_one_run(shell, CAPTURE, 2)
+
+
+def test_copies_of_a_recording_are_the_same_recording(shell: Shell) -> None:
+    for name in ("one", "two"):
+        Path(name).mkdir()
+        shutil.copyfile(FIXTURE / "two_lidars.pcap", f"{name}/two_lidars.pcap")
+    os.utime("two/two_lidars.pcap", (1, 1))
+    for number, name in enumerate(("one", "two"), 1):
+        words = CAPTURE.replace(str(FIXTURE / "two_lidars.pcap"), f"{name}/two_lidars.pcap")
+        assert shell(f"convert {words} --shard {number}/2 -o part{number} -q").code == 0
+    whole, _ = _whole(shell, CAPTURE)
+    assert _merged(shell, ["part1", "part2"]).code == 0
+    merged = contents(Path("merged"))
+    assert {k: v for k, v in merged.items() if not k.endswith("report.json")} == {
+        k: v for k, v in whole.items() if not k.endswith("report.json")
+    }
+
+
+def test_a_limit_is_checked_on_all_scans(shell: Shell) -> None:
+    folders = _shards(shell, f"{CAPTURE} --fault drop:left:30%", 2)
+    outcome = _merged(shell, folders, "--fail-on loss>1%")
+    assert outcome.code == 3
+    assert "limit exceeded" in outcome.err
+    assert Path("merged/out/report.json").is_file()
+
+
+def test_strict_holds_for_the_points_of_all_scans(shell: Shell) -> None:
+    box = "--exclude-box=-1000,-1000,-1000,1000,1000,1000"
+    folders = _shards(shell, f"{CAPTURE} {box} --strict", 2)
+    one_run = shell(f"convert {CAPTURE} {box} --strict -o one")
+    outcome = _merged(shell, folders)
+    assert (outcome.code, outcome.err) == (one_run.code, one_run.err)
+    assert outcome.code == 1
+    assert os.listdir("merged") == []
+
+
+# -- interrupted ------------------------------------------------------------------------------
+
+
+def test_an_interrupted_shard_is_resumed(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = _whole(shell, CAPTURE)
+    encode = npz.NpzEncoder.encode
+    saved: list[int] = []
+
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
+        if scan.index == 4 and 4 not in saved:
+            saved.append(4)
+            raise KeyboardInterrupt
+        saved.append(scan.index)
+        return encode(encoder, scan)
+
+    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
+    words = f"convert {CAPTURE} --shard 1/2 -o part1"
+    assert shell(words).code == 130
+    assert shell(f"convert {CAPTURE} --shard 2/2 -o part2").code == 0
+    early = _merged(shell, ["part1", "part2"])
+    assert early.code == 2
+    assert early.err == (
+        "mlbatch: error: part1: expected the folder of a shard, found that of an interrupted run "
+        "(part1.partial); run this shard again with --resume\n"
+    )
+    saved.clear()
+    saved.append(4)
+    resumed = shell(f"{words} --resume")
+    assert resumed.code == 0
+    assert resumed.err == "mlbatch: part1: resumed after 4 scans\n"
+    # The fourth is of the other shard; of this one two are safe.
+    assert saved[1:] == [4, 6]
+    assert _merged(shell, ["part1", "part2"]).code == 0
+    assert contents(Path("merged")) == whole
+
+
+def test_a_shard_is_not_resumed_as_another(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    encode = npz.NpzEncoder.encode
+
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
+        if scan.index == 4:
+            raise KeyboardInterrupt
+        return encode(encoder, scan)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(npz.NpzEncoder, "encode", ending)
+        assert shell(f"convert {CAPTURE} --shard 1/2 -o part").code == 130
+    outcome = shell(f"convert {CAPTURE} --shard 2/2 -o part --resume")
+    assert outcome.code == 2
+    assert "expected the job of the interrupted run, found shard '2/2' instead of '1/2'" in (
+        outcome.err
+    )
+
+
+def test_an_interrupted_merge_leaves_nothing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = _shards(shell, CAPTURE, 2)
+    link = os.link
+    calls = 0
+
+    def ending(source: Path, path: Path) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            signal.raise_signal(signal.SIGTERM)
+        link(source, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", ending)
+        assert _merged(shell, folders).code == 130
+    assert calls == 4
+    assert os.listdir("merged") == []
+    assert _merged(shell, folders).code == 0
+
+
+def test_a_full_disk_leaves_nothing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*paths: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    folders = _shards(shell, CAPTURE, 2)
+    monkeypatch.setattr(os, "link", full)
+    monkeypatch.setattr(shutil, "copyfile", full)
+    outcome = _merged(shell, folders)
+    assert outcome.code == 1
+    assert "No space left on device" in outcome.err
+    assert "free space on this disk" in outcome.err
+    assert os.listdir("merged") == []
+
+
+# -- what is no whole conversion ---------------------------------------------------------------
+
+
+def _changed(folder: str, change: dict[str, Any]) -> None:
+    path = Path(folder, "shard.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+
+
+def _refused(shell: Shell, folders: Sequence[str], code: int, *words: str) -> None:
+    outcome = _merged(shell, folders)
+    assert outcome.code == code
+    assert outcome.err.count("\n") == 1
+    for word in words:
+        assert word in outcome.err, outcome.err
+    assert not list(Path("merged").iterdir())
+
+
+def test_a_missing_part_is_named(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 3)
+    _refused(shell, ["part1", "part3"], 2, "expected all 3 shards, found 2: 2/3 missing")
+
+
+def test_a_part_given_twice_is_named(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    shutil.copytree("part1", "copy")
+    _refused(shell, ["part1", "copy", "part2"], 2, "copy: expected every shard once", "part1")
+
+
+def test_parts_of_other_counts_are_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    assert shell(f"convert {CAPTURE} --shard 3/3 -o third -q").code == 0
+    _refused(shell, ["part1", "part2", "third"], 2, "third: expected one of 2 shards", "3/3")
+
+
+def test_parts_with_other_options_are_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    assert shell(f"convert {CAPTURE} --shard 2/2 --min-range 3 -o other -q").code == 0
+    _refused(shell, ["part1", "other"], 2, "other: expected the job of part1", "min range m '3.0'")
+
+
+def test_parts_of_other_recordings_are_refused(shell: Shell) -> None:
+    write_recordings(Path(), turns=6)
+    shutil.copytree("session", "other")
+    with Path("other/drive.pcap").open("r+b") as file:
+        file.seek(-40, os.SEEK_END)
+        file.write(b"\0" * 8)
+    words = "--identity-extrinsics -q"
+    assert shell(f"convert session/drive.pcap {words} --shard 1/2 -o part1").code == 0
+    assert shell(f"convert other/drive.pcap {words} --shard 2/2 -o part2").code == 0
+    _refused(shell, ["part1", "part2"], 2, "part2: expected the job of part1", "drive.pcap")
+
+
+def test_parts_that_read_other_packets_are_refused(shell: Shell) -> None:
+    """Samples of a large recording may be the same; what was read for the scans is not."""
+    _shards(shell, CAPTURE, 2)
+    _changed("part2", {"content": 1})
+    _refused(shell, ["part1", "part2"], 1, "part2: expected the account of part1", "content 1")
+
+
+def test_parts_that_counted_otherwise_are_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    report = json.loads(Path("part2/shard.json").read_text())["report"]
+    report["sensors"][0]["ledger"]["packets"]["lost"] += 1
+    _changed("part2", {"report": report})
+    _refused(shell, ["part1", "part2"], 1, "report.sensors[0].ledger.packets.lost 1 instead of 0")
+
+
+def test_points_that_no_scan_has_are_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    report = json.loads(Path("part2/shard.json").read_text())["report"]
+    counts = report["sensors"][0]["ledger"]["points"]
+    counts["written"] += 1
+    counts["slots"] += 1
+    _changed("part2", {"report": report})
+    _refused(shell, ["part1", "part2"], 1, "the ledger does not balance")
+
+
+def test_a_renamed_shard_is_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    shutil.copytree("part1", "renamed")
+    _changed("renamed", {"shard": {"number": 2, "count": 2}})
+    _refused(shell, ["part1", "renamed"], 1, "renamed: expected the scans of shard 2/2")
+
+
+@pytest.mark.parametrize("damage", ["lost", "short"])
+def test_a_damaged_part_is_named(shell: Shell, damage: str) -> None:
+    _shards(shell, CAPTURE, 2)
+    file = Path("part2/000003.npz")
+    size = file.stat().st_size
+    if damage == "lost":
+        file.unlink()
+        _refused(shell, ["part1", "part2"], 1, "part2/000003.npz", "No such file")
+    else:
+        os.truncate(file, size - 1)
+        _refused(shell, ["part1", "part2"], 1, f"expected {size} bytes, found {size - 1}")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"schema": "mlbatch.shard/1"}', "\xff"])
+def test_a_damaged_account_is_named(shell: Shell, text: str) -> None:
+    _shards(shell, CAPTURE, 2)
+    Path("part2/shard.json").write_text(text, encoding="latin-1")
+    outcome = _merged(shell, ["part1", "part2"])
+    assert outcome.code in (1, 2)
+    assert outcome.err.startswith("mlbatch: error: part2/shard.json: expected ")
+    assert outcome.err.count("\n") == 1
+
+
+def test_a_field_of_another_kind_is_named(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    _changed("part2", {"content": "7"})
+    _refused(shell, ["part1", "part2"], 1, "part2/shard.json", "damaged content", "'7'")
+
+
+def test_a_shard_of_another_version_is_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    _changed("part2", {"version": "9.9"})
+    _refused(shell, ["part1", "part2"], 2, "found one of 9.9")
+
+
+@pytest.mark.parametrize(
+    ("folder", "words"),
+    [
+        ("nothing", "found nothing; run the conversion of this shard"),
+        ("empty", "found a folder without shard.json"),
+        ("file", "found a file"),
+    ],
+)
+def test_other_folders_are_refused(shell: Shell, folder: str, words: str) -> None:
+    _shards(shell, CAPTURE, 2)
+    Path("empty").mkdir()
+    Path("file").write_text("")
+    _refused(shell, ["part1", folder], 2, words)
+
+
+@pytest.mark.parametrize("target", ["part1", "part1/out", "."])
+def test_an_output_among_the_parts_is_refused(shell: Shell, target: str) -> None:
+    folders = _shards(shell, CAPTURE, 2)
+    before = sorted(Path().glob("**/*"))
+    outcome = shell(f"merge {' '.join(folders)} -o {target} --overwrite")
+    assert outcome.code == 1
+    assert outcome.err.count("\n") == 1
+    assert sorted(Path().glob("**/*")) == before
+
+
+def test_an_existing_output_stays(shell: Shell) -> None:
+    whole, _ = _whole(shell, CAPTURE)
+    folders = _shards(shell, CAPTURE, 2)
+    outcome = shell(f"merge {' '.join(folders)} -o whole/out")
+    assert outcome.code == 1
+    assert "found an existing one; choose another or --overwrite" in outcome.err
+    assert contents(Path("whole")) == whole
+
+
+def test_an_output_that_another_run_writes_is_refused(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def busy(path: Path) -> None:
+        raise ExportError(f"{path}: expected no other run that writes it, found one; wait")
+
+    folders = _shards(shell, CAPTURE, 2)
+    monkeypatch.setattr(shard_merge.resume, "read_state", busy)
+    outcome = _merged(shell, folders)
+    assert outcome.code == 1
+    assert "found one; wait" in outcome.err
+
+
+@pytest.mark.parametrize("command", ["verify", "digest", "report"])
+def test_a_shard_is_not_taken_for_a_whole_output(shell: Shell, command: str) -> None:
+    _shards(shell, CAPTURE, 2)
+    outcome = shell(f"{command} part1")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: part1: expected a whole output, found one shard of it; join all with "
+        "mlbatch merge\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("-o out.mcap", "found mcap, one file for all scans; give --format npz"),
+        ("-o out.bag", "found rosbag1"),
+        ("-o out --format rosbag2", "found rosbag2"),
+        ("--dry-run", "expected no --dry-run"),
+        ("-o out --report report.json", "expected no --report"),
+        ("-o out --report -", "expected no --report"),
+        ("-o out --html page.html", "expected no --html"),
+        ("-o out --fail-on loss>1%", "expected no --fail-on"),
+        ("-o out --on-jump split", "expected no --on-jump split"),
+    ],
+)
+def test_options_without_meaning_for_a_shard_are_refused(
+    shell: Shell, options: str, words: str
+) -> None:
+    outcome = shell(f"convert {CAPTURE} --shard 1/2 {options}")
+    assert outcome.code == 2
+    assert words in outcome.err
+    assert outcome.err.count("\n") == 1
+    assert os.listdir() == []
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "2", "1/0", "a/b", "-1/2", "1/2/3", "٣/٤"])
+def test_other_texts_are_no_shards(shell: Shell, text: str) -> None:
+    outcome = shell("convert", *CAPTURE.split(), "-o", "out", f"--shard={text}")
+    assert outcome.code == 2
+    assert f"--shard: expected K/N with K from 1 to N, found '{text}'" in outcome.err
