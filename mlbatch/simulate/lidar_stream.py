@@ -10,7 +10,7 @@ from mlbatch.arrays import F64Array, I64Array
 from mlbatch.lidar.simulated import Sent, Shots
 from mlbatch.simulate.models import simulated_lidar
 from mlbatch.simulate.scenario import Clock, ImuErrors, LidarPlan, Scenario
-from mlbatch.simulate.scene import Rays
+from mlbatch.simulate.scene import Rays, Scene
 from mlbatch.units import NS_PER_S
 
 
@@ -107,6 +107,8 @@ class LidarStream:
             distance_m[chosen], level[chosen] = self._scenario.scene.cast(
                 rays, self.plan.max_range_m
             )
+            if self._scenario.body is not None:
+                self._hide(self._scenario.body, shots, chosen, distance_m, level)
         if self.plan.noise_m > 0.0:
             noise = random.standard_normal(len(distance_m), dtype=np.float32)
             distance_m += self.plan.noise_m * noise
@@ -116,6 +118,20 @@ class LidarStream:
         self.shots += len(chosen)
         self.returns += int(np.isfinite(distance_m).sum())
         return distance_m.reshape(shape), level.reshape(shape)
+
+    def _hide(
+        self, body: Scene, shots: Shots, chosen: I64Array, distance_m: F64Array, level: F64Array
+    ) -> None:
+        """Replace what is behind the machine itself; its poses do not matter."""
+        turn, arm = self.plan.body_from_sensor[:3, :3], self.plan.body_from_sensor[:3, 3]
+        shape = shots.direction.shape
+        origin = np.broadcast_to(np.matmul(shots.origin_m, turn.T) + arm, shape)
+        direction = np.matmul(shots.direction, turn.T).reshape(-1, 3)[chosen]
+        rays = Rays.of(origin.reshape(-1, 3)[chosen], direction, np.zeros(len(chosen)))
+        own_m, own_level = body.cast(rays, self.plan.max_range_m)
+        nearer = own_m < distance_m[chosen]
+        distance_m[chosen[nearer]] = own_m[nearer]
+        level[chosen[nearer]] = own_level[nearer]
 
     def _world_rays(self, shots: Shots) -> tuple[F64Array, F64Array, F64Array]:
         """Return origins and directions (n, c, 3), world frame, and true times (n, c).

@@ -114,7 +114,10 @@ class TruthPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenario:
-    """A rig that moves in a scene; start_ns: epoch of its start (true time)."""
+    """A rig that moves in a scene; start_ns: epoch of its start (true time).
+
+    body: surfaces of the machine itself, body frame.
+    """
 
     name: str
     seed: int
@@ -123,6 +126,7 @@ class Scenario:
     body_frame: str
     trajectory: Trajectory
     scene: Scene
+    body: Scene | None
     lidars: tuple[LidarPlan, ...]
     imu: ImuPlan | None
     truth: TruthPlan
@@ -150,8 +154,8 @@ def read_scenario(
 
 
 _KEYS = (
-    *("schema", "seed", "duration_s", "start", "body_frame", "motion", "scene", "sensors"),
-    *("imu", "truth"),
+    *("schema", "seed", "duration_s", "start", "body_frame", "motion", "scene", "body"),
+    *("sensors", "imu", "truth"),
 )
 
 
@@ -171,6 +175,7 @@ def _scenario(root: Node, name: str, seed: int | None, duration_s: float | None)
             "add waypoints, or shorten the duration",
         )
     start = fields["start"].word("a time", _TEXT) if "start" in fields else _DEFAULT_START
+    lidars = _lidars(fields["sensors"])
     return Scenario(
         name=name,
         seed=seed,
@@ -179,7 +184,8 @@ def _scenario(root: Node, name: str, seed: int | None, duration_s: float | None)
         body_frame=_word(fields, "body_frame", "base_link", _NAME, "a frame name"),
         trajectory=trajectory,
         scene=_scene(fields["scene"], terrain, level, trajectory, lasts_s, seed),
-        lidars=_lidars(fields["sensors"]),
+        body=_body(fields["body"], lidars) if "body" in fields else None,
+        lidars=lidars,
         imu=_imu(fields["imu"]) if "imu" in fields else None,
         truth=_truth(fields["truth"]) if "truth" in fields else TruthPlan(),
     )
@@ -308,6 +314,7 @@ def _sway(node: Node) -> Sway:
 _SCENE_KEYS = ("rectangles", "boxes", "stems", "terrain", "forest")
 _RECTANGLE_KEYS = ("corner_m", "along_m", "across_m", "reflectivity")
 _BOX_KEYS = ("centre_m", "size_m", "yaw_deg", "velocity_mps", "repeat_s", "reflectivity")
+_PART_KEYS = ("centre_m", "size_m", "yaw_deg", "reflectivity")
 _STEM_KEYS = ("base_m", "height_m", "radius_m", "top_radius_m", "reflectivity")
 _TERRAIN_KEYS = ("half_size_m", "cell_m", "relief_m", "wavelength_m", "reflectivity")
 _FOREST_KEYS = (
@@ -364,6 +371,20 @@ def _scene(
     return Scene(tuple(kinds), terrain, level)
 
 
+def _body(node: Node, lidars: Sequence[LidarPlan]) -> Scene:
+    """Return the boxes that move with the rig; a lidar within one would see nothing else."""
+    items = node.elements("boxes")
+    if not items:
+        raise node.error("at least one box", node.shown, "remove the key")
+    rows = [_box(item, _PART_KEYS) for item in items]
+    boxes = Boxes(*_columns(rows))
+    for number, item in enumerate(items):
+        for plan in lidars:
+            if boxes.contains(number, plan.body_from_sensor[:3, 3]):
+                raise item.error("a box without a lidar in it", plan.name, "move one of the two")
+    return Scene((boxes,))
+
+
 def _columns(rows: Sequence[tuple[object, ...]]) -> list[F64Array]:
     """Return one array per value of the rows."""
     return [np.array(column, np.float64) for column in zip(*rows, strict=True)]
@@ -381,8 +402,8 @@ def _rectangle(node: Node) -> tuple[object, ...]:
     return _vector(fields["corner_m"]), along, across, _reflectivity(fields)
 
 
-def _box(node: Node) -> tuple[object, ...]:
-    fields = node.fields(_BOX_KEYS, required=_BOX_KEYS[:2])
+def _box(node: Node, keys: tuple[str, ...] = _BOX_KEYS) -> tuple[object, ...]:
+    fields = node.fields(keys, required=keys[:2])
     return (
         _vector(fields["centre_m"]),
         _vector(fields["size_m"], _SMALL_M),

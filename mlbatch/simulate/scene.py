@@ -176,6 +176,13 @@ class Boxes:
             centre[:, moving] += own_s * self.velocity_mps.T.take(index[moving], axis=1)
         return centre
 
+    def contains(self, box: int, place_m: F64Array) -> bool:
+        """Return whether a place (3,) is in a box at the start."""
+        x, y, z = place_m - self.centre_m[box]
+        cosine, sine = math.cos(self.yaw_rad[box]), math.sin(self.yaw_rad[box])
+        own = np.array([cosine * x + sine * y, cosine * y - sine * x, z])
+        return bool((np.abs(own) <= 0.5 * self.size_m[box]).all())
+
     def bounds(self, time_s: tuple[float, float]) -> Bounds:
         """Return what contains the surfaces during a time."""
         index = np.arange(len(self.centre_m))

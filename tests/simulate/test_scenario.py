@@ -45,6 +45,17 @@ def mistake(folder: Path, text: str) -> str:
         ("model: VLP-16", "model: VLP-16, rate_hz: 7", "rate_hz: expected 10 or 5 or 15 or 20"),
         ("model: VLP-16", "model: VLP-16, address: 10.5.5.300", "address: expected an IPv4"),
         ("model: VLP-16", "model: VLP-16, dropout: 2", "dropout: expected a number from 0 to 1"),
+        (
+            "sensors:\n",
+            "body:\n  - {centre_m: [0, 0, 0], size_m: [1, 1, 1]}\nsensors:\n",
+            r"body\[0\]: expected a box without a lidar in it, found one",
+        ),
+        ("sensors:\n", "body: []\nsensors:\n", "body: expected at least one box, found"),
+        (
+            "sensors:\n",
+            "body:\n  - {centre_m: [0, 0, -1], size_m: [1, 1, 1], repeat_s: 1}\nsensors:\n",
+            r"body\[0\]\.repeat_s: expected a key of centre_m, size_m, yaw_deg, reflectivity",
+        ),
         (ONE, 2 * ONE, r"sensors\[1\]: expected a name of its own, found one again"),
         ("truth: {", "truth: {topic: odom, ", "truth.topic: expected a topic, found 'odom'"),
         ("seed: 7", "start: tomorrow", "start: expected a time as 2026-05-04T08:00:00Z"),
