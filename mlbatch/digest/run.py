@@ -18,7 +18,11 @@ _SCANS = (
     *("written", "empty", "incomplete", "dropped_incomplete", "underfilled"),
     *("underfilled_by_sensor", "without", "no_points", "empty_clouds", "points"),
 )
-_GRID = ("rate_hz", "period_ns", "t_init_ns", "slices", "sort")
+# Stamps of messages, sets and the instant of points are only there if they are not the usual ones.
+_GRID = (
+    *("rate_hz", "period_ns", "t_init_ns", "slices", "sort"),
+    *("stamp", "batching", "batching_times", "deskew_to"),
+)
 
 
 def run_files(output: Path) -> RunFiles:
@@ -34,7 +38,7 @@ def _inside(output: Path) -> tuple[str, str]:
     from mlbatch.verify.mcap_file import McapFile
     from mlbatch.verify.verdict import CheckLog
 
-    if output.is_dir() or not output.name.endswith(".mcap"):
+    if not output.is_file() or not output.name.endswith(".mcap"):
         return "", ""
     file = McapFile(CheckLog(), output, output.name)
     report = file.metadata.get("mlbatch.report", {}).get("json", "")

@@ -153,7 +153,24 @@ def test_json(tmp_path: Path) -> None:
     assert json.loads(command("diff", a, a, "--json").out)["same"] is True
 
 
-def test_no_output_is_one_line(tmp_path: Path) -> None:
-    found = command("diff", tmp_path / "nothing", tmp_path / "nowhere")
+def test_stamps_of_messages_are_compared(tmp_path: Path) -> None:
+    """The same points at other header stamps are other messages."""
+    usual = convert(tmp_path / "a", "mcap")
+    late = convert(tmp_path / "b", "mcap", "--stamp", "end")
+    found = diff(usual, late)
+    assert [(one.where, one.expected, one.found) for one in found.run] == [
+        ("grid.stamp", None, "end"),
+    ]
+    assert not found.same
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [("nothing", "nowhere"), ("a/out.mcap", "none.mcap"), ("none.mcap", "a/out.mcap")],
+)
+def test_no_output_is_one_line(tmp_path: Path, a: str, b: str) -> None:
+    convert(tmp_path / "a", "mcap")
+    found = command("diff", tmp_path / a, tmp_path / b)
     assert (found.code, found.out) == (1, "")
     assert len(found.err.splitlines()) == 1
+    assert "check the name" in found.err
