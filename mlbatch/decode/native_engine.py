@@ -70,7 +70,8 @@ class NativeEngine:
             own = [setup.projectors[index] for index in indices]
             members = _members(setup.projectors, indices, setup.seat)
             if is_decoded(own[0]):
-                self._groups.append(_DecodedGroup(own, self._structs[number]))
+                is_dense = not setup.organized_slots
+                self._groups.append(_DecodedGroup(own, self._structs[number], is_dense=is_dense))
             else:
                 seat = np.stack([np.minimum(members, 0), members], axis=1)
                 engine = NumpyEngine(replace(setup, projectors=own, seat=seat))
@@ -220,8 +221,8 @@ class NativeEngine:
 class _DecodedGroup:
     """Sensors that the loops decode, and the arrays that their struct points to."""
 
-    def __init__(self, projectors: Sequence[Projector], struct: Group) -> None:
-        """projectors: with equal `_group_key`; struct: to be filled."""
+    def __init__(self, projectors: Sequence[Projector], struct: Group, *, is_dense: bool) -> None:
+        """projectors: with equal `_group_key`; struct: to be filled; is_dense: of dense scans."""
         lidar = projectors[0].lidar
         table = lidar.pixels
         projection = projectors[0].projection
@@ -242,16 +243,20 @@ class _DecodedGroup:
         struct.returns = lidar.returns
         struct.slots = self._slots
         struct.counts = self._kept(self._counts)
+        # Of the pixels of a column, in order of output; None: beams are in wire order.
+        self._places = _places(projectors[0], table) if is_dense and table is not None else None
         if table is not None:
             self._set_pixels(projectors[0], table)
-            struct.fits_fours = _fits_fours(projectors[0], table)
+            struct.fits_fours = self._places is not None or _fits_fours(projectors[0], table)
+        if self._places is not None:
+            struct.places = self._kept(self._places)
         if isinstance(projection, PlacedPoints):
             self._set_places(projectors[0], projection)
         elif isinstance(projection, Tabled):
             self._set_angle_table(projectors[0], projection)
         else:
             rotors = [one.projection for one in projectors]
-            self._set_rotors([one for one in rotors if isinstance(one, Turning)], lidar.channels)
+            self._set_rotors([one for one in rotors if isinstance(one, Turning)], projectors[0])
         self._set_slots(projectors[0])
         self._set_labels(projectors)
         if any(one.is_limited for one in projectors):
@@ -327,36 +332,43 @@ class _DecodedGroup:
         struct.origin = self._kept(projection.translation_m)
         struct.tables = len(projector.lidar.firing_ns)
 
+    def _beams(self, projector: Projector, values: F32Array) -> F32Array:
+        """Return values by beam (the last axis) in the order of the loops, padded to planes."""
+        if self._places is not None and projector.order is not None:
+            values = values.take(projector.order[0], axis=-1)
+        return _padded(values, self.struct.width)
+
     def _set_angle_table(self, projector: Projector, projection: Tabled) -> None:
-        width = self.struct.width
         shape = (len(projector.sources), projector.lidar.channels)
         struct = self.struct
         struct.kind = _TABLED
-        struct.direction = self._kept(_padded(projection.vectors, width))
+        struct.direction = self._kept(self._beams(projector, projection.vectors))
         struct.cosine = self._kept(projection.cosine)
         struct.sine = self._kept(projection.sine)
         struct.origin = self._kept(projection.origin)
         struct.first_row = self._kept(projection.first_position)
         struct.rows = len(projection.cosine)
         reach_m = np.broadcast_to(projection.reaches_m, shape)
-        struct.reach = self._kept(_padded(reach_m, width))
+        struct.reach = self._kept(self._beams(projector, reach_m))
         struct.tables = 1
 
-    def _set_rotors(self, members: Sequence[Turning], channels: int) -> None:
+    def _set_rotors(self, members: Sequence[Turning], projector: Projector) -> None:
         first = members[0]
         struct = self.struct
-        width = struct.width
         struct.kind = _TURNING
-        struct.direction = self._kept(_padded(np.stack([one.direction for one in members]), width))
-        struct.origin = self._kept(_padded(np.stack([one.origin for one in members]), width))
+        directions = np.stack([one.direction for one in members])
+        struct.direction = self._kept(self._beams(projector, directions))
+        origins = np.stack([one.origin for one in members])
+        struct.origin = self._kept(self._beams(projector, origins))
         struct.used = self._kept(np.array([_used_vectors(one) for one in members], np.int64))
         struct.tables = len(first.firing_ns)
         if first.has_reach:
+            channels = projector.lidar.channels
             reaches_m = [np.broadcast_to(one.reach_m, (channels,)) for one in members]
-            struct.reach = self._kept(_padded(np.stack(reaches_m), width))
+            struct.reach = self._kept(self._beams(projector, np.stack(reaches_m)))
         if not first.fires_at_once:
             firing_ns = np.concatenate([one.firing_ns for one in members])
-            struct.firing_ns = self._kept(_padded(firing_ns, width))
+            struct.firing_ns = self._kept(self._beams(projector, firing_ns))
 
     def _set_slots(self, projector: Projector) -> None:
         lidar = projector.lidar
@@ -369,7 +381,9 @@ class _DecodedGroup:
         fits = table is not None and _fits_fours(projector, table)
         is_beam = fits and np.array_equal(projector.number, element)
         struct.slot = None if is_beam else self._kept(number)
-        if projector.order is not None:
+        if self._places is not None:
+            struct.order = None
+        elif projector.order is not None:
             struct.order = self._kept(element[projector.order])
         elif lidar.returns > 1:
             struct.order = self._kept(element)
@@ -385,6 +399,8 @@ class _DecodedGroup:
         if _typed_by(first.lidar):
             # The loops add the types of dual returns.
             words &= ~_TYPE_BITS
+        if self._places is not None and first.order is not None:
+            words = words.take(first.order[0], axis=1)
         labels = np.zeros((len(words), first.lidar.returns * self.struct.width), np.int64)
         labels[:, _elements(first)] = words.view(np.int64)
         self.struct.labels = self._kept(labels)
@@ -480,6 +496,24 @@ def _fits_fours(projector: Projector, table: PixelTable) -> bool:
             return False
         channel += run.channels
     return channel == lidar.channels == projector.slots
+
+
+def _places(projector: Projector, table: PixelTable) -> I64Array | None:
+    """Return first bytes of the pixels of a column in order of output: (slots,); `Group.places`.
+
+    None for wire order, and where the loops decode columns in passes.
+    """
+    lidar = projector.lidar
+    order = projector.order
+    if lidar.returns > 1 or order is None or len(order) > 1 or table.dark:
+        return None
+    if lidar.has_reflectivity or projector.slots % _BEAMS_OF_FOUR:
+        return None
+    place = np.full(lidar.channels, -1, np.int64)
+    for run in table.returns[0].runs:
+        pixels = np.arange(run.channels)
+        place[run.channel + pixels] = run.first_byte + pixels * table.step
+    return place[order[0]] if bool((place >= 0).all()) else None
 
 
 def _fields(layout: ReturnLayout) -> tuple[list[int], list[tuple[int, int, int, bool]]]:

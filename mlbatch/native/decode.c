@@ -56,6 +56,13 @@ static void gather(const uint8_t *from, int64_t step, int64_t count, uint32_t *o
     }
 }
 
+/* Words of pixels at any places. */
+static void gather_at(const uint8_t *from, const int64_t *places, int64_t count, uint32_t *out)
+{
+    for (int64_t pixel = 0; pixel < count; pixel++)
+        memcpy(out + pixel, from + places[pixel], 4);
+}
+
 /* Swap the two bytes of a big-endian field; other bits of the words stay. */
 static void swap_bytes(uint32_t *words, const Field *field, int64_t width)
 {
@@ -104,7 +111,10 @@ static void to_reflectivities(const uint32_t *restrict words, const Field *field
 static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
 {
     const int64_t *run = group->runs + which * group->run_count * 3;
-    for (int64_t number = 0; number < group->run_count; number++, run += 3)
+    for (int64_t word = 0; group->places && word < group->word_count; word++)
+        gather_at(record + group->word_bytes[word], group->places, group->slots,
+                  planes->words[word]);
+    for (int64_t number = 0; !group->places && number < group->run_count; number++, run += 3)
         for (int64_t word = 0; word < group->word_count; word++)
             gather(record + run[0] + group->word_bytes[word], group->step, run[2],
                    planes->words[word] + run[1]);
@@ -555,16 +565,17 @@ static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
     return _mm_and_si128(_mm_srl_epi32(words, shift), mask);
 }
 
-/* Four beams of a run: their pixels begin at `from`, or (TABLED) their words are in `near` and
+/* Four beams of a run: their pixels begin at `from`; with `is_read` their words are in `near` and
    `levels`. Return the next row. */
 static inline int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
                                   int64_t kind, int64_t step, int is_plain, int has_moves,
-                                  const uint8_t *from,
-                                  const uint32_t *near, const uint32_t *levels, int64_t beam, int64_t row, int64_t *counts)
+                                  int is_read, const uint8_t *from, const uint32_t *near,
+                                  const uint32_t *levels, int64_t beam, int64_t row,
+                                  int64_t *counts)
 {
     /* The distance is in the first word, as fields are listed. */
-    const __m128i first = kind == TABLED ? _mm_load_si128((const __m128i *)near)
-                                         : load_four(from + own->distance_byte, step);
+    const __m128i first = is_read ? _mm_load_si128((const __m128i *)near)
+                                  : load_four(from + own->distance_byte, step);
     __m128i value = _mm_srl_epi32(first, own->shift);
     if (own->is_big) {
         const __m128i byte = _mm_set1_epi32(0xFF);
@@ -598,7 +609,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     if (has_moves)
         move_four(own->moves, xyz);
     __m128i second = first;
-    if (kind == TABLED)
+    if (is_read)
         second = _mm_load_si128((const __m128i *)levels);
     else if (own->level_word)
         second = load_four(from + own->level_byte, step);
@@ -614,6 +625,18 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     return store_kept(own->point, own->label, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(level),
                       _mm_add_epi64(_mm_loadu_si128(labels), own->offsets),
                       _mm_add_epi64(_mm_loadu_si128(labels + 1), own->offsets));
+}
+
+/* Add the counts of a column; points: of it. */
+static inline void add_counts(const Column *own, int64_t points, const int64_t *own_counts,
+                              int64_t *counts)
+{
+    /* What no filter leaves out are points. */
+    const int64_t found = own->is_filtered ? own_counts[FOUND] : points;
+    counts[FOUND] += found;
+    counts[DISTINCT] += found;
+    counts[IN_RANGE] += own->has_boxes ? own_counts[IN_RANGE] : points;
+    counts[OUTSIDE_BOXES] += points;
 }
 
 /* All runs of a column; with constant steps and kinds the compiler leaves out what is not used. */
@@ -635,18 +658,31 @@ static inline int64_t decode_runs(const Scan *scan, const Group *group, const Co
                 gather_every(from + own->level_byte, step, beams, levels);
         }
         for (int64_t beam = 0; beam < beams; beam += 4)
-            row = decode_four(scan, group, own, kind, step, is_plain, has_moves,
+            row = decode_four(scan, group, own, kind, step, is_plain, has_moves, kind == TABLED,
                               from + beam * step, near + beam,
                               (own->level_word ? levels : near) + beam, first_beam + beam, row,
                               own_counts);
     }
-    /* What no filter leaves out are points. */
-    const int64_t points = row - first_row;
-    const int64_t found = own->is_filtered ? own_counts[FOUND] : points;
-    counts[FOUND] += found;
-    counts[DISTINCT] += found;
-    counts[IN_RANGE] += own->has_boxes ? own_counts[IN_RANGE] : points;
-    counts[OUTSIDE_BOXES] += points;
+    add_counts(own, row - first_row, own_counts, counts);
+    return row;
+}
+
+/* The same of a column whose beams come in another order than their pixels. */
+static inline int64_t decode_places(const Scan *scan, const Group *group, const Column *own,
+                                    int64_t kind, int is_plain, const uint8_t *record, int64_t row,
+                                    int64_t *counts)
+{
+    int64_t own_counts[COUNTS] = {0};
+    const int64_t first_row = row;
+    _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
+    gather_at(record + own->distance_byte, group->places, group->slots, near);
+    if (own->level_word)
+        gather_at(record + own->level_byte, group->places, group->slots, levels);
+    for (int64_t beam = 0; beam < group->slots; beam += 4)
+        row = decode_four(scan, group, own, kind, 0, is_plain, own->has_moves, 1, record,
+                          near + beam, (own->level_word ? levels : near) + beam, beam, row,
+                          own_counts);
+    add_counts(own, row - first_row, own_counts, counts);
     return row;
 }
 
@@ -695,6 +731,8 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
         own.sine = _mm_set1_ps(group->sine[at]);
         for (int axis = 0; axis < 3; axis++)
             own.origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
+        if (group->places)
+            return decode_places(scan, group, &own, TABLED, 0, record, row, counts);
         if (is_plain && group->step == 4 && own.has_moves)
             return decode_runs(scan, group, &own, TABLED, 4, 1, 1, record, row, counts);
         if (is_plain && group->step == 4)
@@ -713,6 +751,10 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
     const float speed = speed_of(encoder);
     own.speed = _mm_set1_ps(speed);
     own.firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
+    if (group->places && is_plain)
+        return decode_places(scan, group, &own, TURNING, 1, record, row, counts);
+    if (group->places)
+        return decode_places(scan, group, &own, TURNING, 0, record, row, counts);
     if (is_plain && group->step == 3 && own.has_moves)
         return decode_runs(scan, group, &own, TURNING, 3, 1, 1, record, row, counts);
     if (is_plain && group->step == 3)

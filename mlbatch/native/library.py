@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 5
+_ABI = 6
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -87,6 +87,7 @@ class Group(ctypes.Structure):
         ("dark_count", _WORD),
         ("dark", _ADDRESS),
         ("has_reflectivity", _WORD),
+        ("places", _ADDRESS),
         ("rings", _ADDRESS),
         ("direction", _ADDRESS),
         ("origin", _ADDRESS),

@@ -15,7 +15,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 5
+#define MLBATCH_ABI 6
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -76,6 +76,9 @@ typedef struct {
     int64_t dark_count;
     const int64_t *dark; /* (dark_count,): channels without returns */
     int64_t has_reflectivity;
+    /* (slots,): first bytes of the pixels in order of output, in which beams then are everywhere;
+       only of one return without reflectivities, for dense scans. NULL: as in `runs`. */
+    const int64_t *places;
     Ring *rings; /* (members,) */
     /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
@@ -102,7 +105,7 @@ typedef struct {
     const int64_t *slot;   /* (E,): slot in an organized row; NULL: `fits_fours`, the beam */
     int64_t typed;
     int64_t sends_twice;
-    /* One return in wire order, runs of fours in the order of the channels, none of them dark. */
+    /* One return, none dark, in fours: in runs in the order of the channels, or with `places`. */
     int64_t fits_fours;
     int64_t drops_repeated;
     const float *limits_m; /* (members, 2) or NULL */

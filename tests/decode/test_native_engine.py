@@ -61,6 +61,9 @@ OTHERS = (
     (models.hesai_sent, ("AT128", "37")),
     (models.hesai_sent, ("Pandar128E3X", "37")),
     (models.robosense_sent, ("RS-16", "dual")),
+    # Pixels that are not in the order of their shots.
+    (models.velodyne_sent, ("VLS-128", "strongest")),
+    (models.velodyne_sent, ("VLP-32C", "strongest")),
 )
 
 
@@ -242,7 +245,7 @@ def test_any_pixels_of_any_rig(case: Case, chosen: list[int], others: list[Lidar
     check([[*others, *alike][number] for number in chosen], case)
 
 
-@pytest.mark.parametrize("chosen", [[0, 0, 0], [0, 2, 0], [5, 0, 5], [4, 1, 4]])
+@pytest.mark.parametrize("chosen", [[0, 0, 0], [0, 2, 0], [5, 0, 5], [4, 1, 4], [6, 7, 6]])
 def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: list[Lidar]) -> None:
     for seed, layout in enumerate(("dense", "organized", "dense")):
         case = Case(seed, 700, layout, EXTRAS, is_cut=seed == 0, keeps_repeated=False)
@@ -250,7 +253,7 @@ def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: li
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
-@pytest.mark.parametrize("chosen", [[0], [2], [3, 0], [5, 6, 2, 7]])
+@pytest.mark.parametrize("chosen", [[0], [2], [3, 0], [5, 8, 2, 9], [6, 7]])
 def test_nothing_is_written_beyond_the_arrays(
     layout: str, chosen: list[int], others: list[Lidar], monkeypatch: pytest.MonkeyPatch
 ) -> None:
