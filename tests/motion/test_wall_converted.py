@@ -15,6 +15,8 @@ from tests.builders.simulated import record, scenario_text
 from tests.motion.test_wall import IMU, MOTION, SCENE, SENSORS, WALL
 
 pytestmark = pytest.mark.long
+# Scans of 0.1 s, the first from 0.1 s on, that begin after the standstill of 1.5 s.
+MOVING = 15
 OWN_IMU = (
     "    imu: {gyro_noise: 0.002, accel_noise: 0.02, gyro_bias: [0.01, -0.02, 0.015], "
     "accel_bias: [0.05, -0.03, 0.04]}\n"
@@ -58,13 +60,14 @@ def test_the_wall_is_flat(shell: Shell, tmp_path: Path, model: str, suffix: str)
     assert shell(f"{words} -o bent").code == 0
     # The platform turns by 4 degrees and drives 0.2 m in a scan.
     assert bend_m(Path("bent")).max() > 0.2
-    # Ranges count 1 or 2 mm (Helios: 5 mm), angles 0.01 degrees: also at rest.
-    limit_m = 3.5e-3 if model == "Helios 32" else 3e-3
     for to in ("start", "end") if is_ouster else ("middle",):
         assert shell(f"{words} -o {to} --deskew {drive.truth} --deskew-to {to}").code == 0
         flat_m = bend_m(Path(to))
         assert len(flat_m) > 35
-        assert flat_m.max() < limit_m
+        assert flat_m[MOVING:].max() < 3e-3
+        # At rest nothing is moved: Helios counts 2.5 mm and 0.01 degrees, 22 m away and at 66
+        # degrees to the wall 2.3 mm from it, which also tilts the plane of 5652 points.
+        assert flat_m[:MOVING].max() < 3.5e-3
     # With noise and biases of a small IMU: of the lidar, or recorded.
     assert shell(f"{words} -o imu --deskew imu").code == 0
     flat_m = bend_m(Path("imu"))
