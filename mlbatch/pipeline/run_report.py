@@ -170,9 +170,18 @@ def final_notes(run: Conversion) -> list[Note]:
 
 
 def _motion_notes(run: Conversion) -> Iterator[Note]:
-    """Velocities that an IMU was integrated to for long."""
+    """Windows without poses, and velocities that an IMU was integrated to for long."""
     if run.deskew is None:
         return
+    motion = run.deskew.ledger
+    if motion.windows_without_poses:
+        yield Note(
+            "no_pose",
+            "",
+            f"{motion.source} has no poses of {motion.windows_without_poses} windows with "
+            f"{motion.no_pose} of {motion.columns} columns, which were left out; give a trajectory "
+            "of the whole recording",
+        )
     seconds = run.deskew.source.integrated_s
     if seconds > DRIFT_S:
         yield Note(

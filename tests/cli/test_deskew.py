@@ -172,6 +172,9 @@ def test_windows_without_poses_are_left_out_and_counted(shell: Shell) -> None:
     assert names("part") == ["000003.npz"]
     report = report_of("part/report.json")
     assert report["deskew"]["windows_without_poses"] == count - 1
+    warned = next(one for one in report["warnings"] if one["code"] == "no_pose")
+    assert f"short.tum has no poses of {count - 1} windows" in warned["message"]
+    assert "warning: no_pose: short.tum has no poses" in done.err
     for sensor in report["sensors"]:
         columns = sensor["columns"]
         assert columns["dropped"]["no_pose"] > 0
