@@ -24,6 +24,8 @@ _LEAST_SAMPLES = 20
 # Largest standard deviation at a standstill: engines run, hands shake.
 _MOST_RATE = 0.05
 _MOST_FORCE = 0.5
+# Largest mean rate, rad/s: more than the bias of small gyroscopes (5 degrees/s), so a turn.
+_MOST_BIAS = 0.2
 _GRAVITY_TOLERANCE = 0.05
 
 
@@ -54,6 +56,13 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
             f"{spread_rate:.3g} rad/s and {spread_force:.3g} m/s2; begin the recording at rest, or "
             "use another source of poses"
         )
+    bias = rate[rows].mean(axis=0)
+    turn = float(np.sqrt((bias**2).sum()))
+    if turn > _MOST_BIAS:
+        raise RecordingError(
+            f"{name}: expected the rig to stand in the first second, found a mean of {turn:.3g} "
+            "rad/s; begin the recording at rest, or use another source of poses"
+        )
     gravity = force[rows].mean(axis=0)
     size = float(np.sqrt((gravity**2).sum()))
     if abs(size / STANDARD_GRAVITY - 1.0) > _GRAVITY_TOLERANCE:
@@ -61,7 +70,7 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
             f"{name}: expected {STANDARD_GRAVITY:.2f} m/s2 at rest, found {size:.3f}; check the "
             "units of the IMU"
         )
-    return Standstill(rate[rows].mean(axis=0), gravity)
+    return Standstill(bias, gravity)
 
 
 @dataclass(slots=True)

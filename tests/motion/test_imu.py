@@ -67,6 +67,17 @@ def test_a_turn_in_place_about_the_body_not_about_the_imu() -> None:
     assert heading == pytest.approx(2.0, abs=0.5 / HZ)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_steady_turn_from_the_start_is_no_bias(axis: int) -> None:
+    """0.5 rad/s has no deviation, either; taken as a bias the turn would be lost."""
+    stamps, force, rate = samples(3)
+    rate[:, axis] = 0.5
+    with pytest.raises(RecordingError, match=r"in the first second, found a mean of 0\.5"):
+        integrated(stamps, force, rate, np.eye(4))
+    rate[:, axis] = 0.1
+    integrated(stamps, force, rate, np.eye(4))
+
+
 def moving() -> Samples:
     stamps, force, rate = samples(4)
     random = np.random.default_rng(1)
