@@ -18,10 +18,11 @@ from mlbatch.units import NS_PER_MS
 # -- recordings -----------------------------------------------------------------------------------
 
 CAPTURE: Final = "capture.pcap"
+BAG: Final = "clouds.mcap"
 RIG: Final = "rig.yaml"
 # File in a recording's folder: digest of the modules that made the recording.
 DIGEST: Final = "made-by.sha256"
-_ENCODER_MODULES: Final = ("cases.py", "recordings.py")
+_ENCODER_MODULES: Final = ("cases.py", "clouds.py", "recordings.py", "scene.py")
 
 # Sensor kinds: an Ouster profile, or a model of another vendor.
 LOW: Final = "RNG15_RFL8_NIR8"
@@ -29,6 +30,12 @@ FULL: Final = "RNG19_RFL8_SIG16_NIR16"
 VLP16: Final = "VLP-16"
 VLS128: Final = "VLS-128"
 PANDAR64: Final = "Pandar64"
+# Kinds of decoded clouds, by the order of their points.
+BY_RING: Final = "clouds by ring"
+BY_COLUMN: Final = "clouds by column"
+CLOUD_RINGS: Final = 64
+CLOUD_COLUMNS: Final = 2048
+_CLOUD_POINTS: Final = CLOUD_RINGS * CLOUD_COLUMNS
 
 # Ethernet, IPv4 and UDP headers, and the header of a pcap record.
 _HEADERS_BYTES: Final = 14 + 20 + 8 + 16
@@ -36,7 +43,7 @@ _HEADERS_BYTES: Final = 14 + 20 + 8 + 16
 
 @dataclass(frozen=True, slots=True)
 class SensorKind:
-    """Packet rate and size of a sensor kind."""
+    """Packet rate and size of a sensor kind; of clouds, those of messages."""
 
     packets_per_s: int
     packet_bytes: int
@@ -51,12 +58,17 @@ KINDS: Final[Mapping[str, SensorKind]] = {
     VLP16: SensorKind(754, 1206, 18_084 * 16, ""),
     VLS128: SensorKind(6030, 1206, 18_090 * 128, ""),
     PANDAR64: SensorKind(3000, 1198, 18_000 * 64, ".csv"),
+    BY_RING: SensorKind(10, 32 * _CLOUD_POINTS, 10 * _CLOUD_POINTS, ""),
+    BY_COLUMN: SensorKind(10, 32 * _CLOUD_POINTS, 10 * _CLOUD_POINTS, ""),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class BenchSensor:
-    """A sensor of a standard recording; kind: a key of KINDS; phase_ns: delay of its rotor."""
+    """A sensor of a standard recording; kind: a key of KINDS; phase_ns: delay of its rotor.
+
+    topic: of its clouds; empty: it sends packets.
+    """
 
     name: str
     kind: str
@@ -66,6 +78,7 @@ class BenchSensor:
     translation_m: tuple[float, float, float]
     yaw_deg: float
     serial: int = 0
+    topic: str = ""
 
     @property
     def file(self) -> str:
@@ -83,8 +96,18 @@ class BenchRecording:
     fragments: bool = False
 
     @property
+    def is_bag(self) -> bool:
+        """Whether it is a bag of decoded clouds, not a capture of packets."""
+        return any(sensor.topic for sensor in self.sensors)
+
+    @property
+    def file(self) -> str:
+        """Name of the recording itself in its folder."""
+        return BAG if self.is_bag else CAPTURE
+
+    @property
     def bytes_per_s(self) -> int:
-        """Approximate size of its capture per second."""
+        """Approximate size of the recording per second."""
         kinds = [KINDS[sensor.kind] for sensor in self.sensors]
         return sum(kind.packets_per_s * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
 
@@ -137,6 +160,20 @@ def _eight(profile: str) -> tuple[BenchSensor, ...]:
     )
 
 
+def _clouds(kind: str) -> tuple[BenchSensor, ...]:
+    """Two lidars of 64 rings, decoded by their drivers."""
+    left = BenchSensor("a", kind, "", 0, 0, (0.0, 0.6, 1.8), 0.0, topic="/a/points")
+    right = replace(
+        left,
+        name="b",
+        phase_ns=37_100_000,
+        translation_m=(0.0, -0.6, 1.8),
+        yaw_deg=90.0,
+        topic="/b/points",
+    )
+    return left, right
+
+
 _ROOF: Final = BenchSensor("roof", VLP16, "192.168.7.21", 2368, 0, (0.0, 0.0, 2.0), 0.0)
 _LEFT: Final = BenchSensor(
     "left", VLP16, "192.168.7.22", 2368, 23 * NS_PER_MS, (0.0, 0.8, 1.6), 60.0
@@ -159,6 +196,8 @@ RECORDINGS: Final[Mapping[str, BenchRecording]] = {
         BenchRecording("three-vlp16", (_ROOF, _LEFT, _RIGHT)),
         BenchRecording("pandar64", (_REAR,)),
         BenchRecording("mixed", (_dual(LOW)[0], _ROOF, _REAR)),
+        BenchRecording("clouds-by-ring", _clouds(BY_RING)),
+        BenchRecording("clouds-by-column", _clouds(BY_COLUMN)),
     )
 }
 
@@ -171,10 +210,10 @@ def digest() -> str:
     return hashlib.sha256(b"".join(sources)).hexdigest()
 
 
-def is_current(folder: Path) -> bool:
+def is_current(folder: Path, recording: BenchRecording) -> bool:
     """Whether a folder contains a complete recording made by the modules of this version."""
     made_by = folder / DIGEST
-    if not (folder / CAPTURE).is_file() or not made_by.is_file():
+    if not (folder / recording.file).is_file() or not made_by.is_file():
         return False
     return made_by.read_text(encoding="utf-8") == digest()
 
@@ -249,6 +288,8 @@ CASES: Final = (
     Case("vls128", ("vls128",)),
     Case("pandar64", ("pandar64",)),
     Case("mixed", ("mixed",)),
+    Case("clouds-by-ring", ("clouds-by-ring",)),
+    Case("clouds-by-column", ("clouds-by-column",)),
     Case("dual-4-mcap", ("dual-4",), "mcap", (COPY, WRITE, LIBRARY)),
     Case("dual-4-npz", ("dual-4",), "npz", (COPY, WRITE)),
     Case("dual-4-ply", ("dual-4",), "ply", (COPY, WRITE)),

@@ -1,5 +1,7 @@
 """Makes a standard recording: packets of lidars, as a pcap capture with rig and metadata files.
 
+Recordings of decoded clouds are MCAP files, made by clouds.py.
+
     python -m mlbatch.bench.recordings dual-4 12 FOLDER
 
 It runs in a process of its own, so that the measuring process does not import numpy. The packets
@@ -31,7 +33,6 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.bench.cases import (
-    CAPTURE,
     DIGEST,
     FULL,
     KINDS,
@@ -45,14 +46,13 @@ from mlbatch.bench.cases import (
     BenchSensor,
     digest,
 )
+from mlbatch.bench.clouds import write_clouds
+from mlbatch.bench.scene import EPOCH_NS, REVOLUTION_NS, scene
 from mlbatch.types import Stream
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 # -- packets --------------------------------------------------------------------------------------
 
-# Time of the first shot.
-EPOCH_NS: Final = 1_700_000_000 * NS_PER_S
-REVOLUTION_NS: Final = 100 * NS_PER_MS
 # From the last shot of a packet to its capture.
 _TRAVEL_NS: Final = 300 * NS_PER_US
 _CDEG_PER_REVOLUTION: Final = 36_000
@@ -85,20 +85,6 @@ class PacketEncoder:
         payloads = self.revolution[numbers % len(self.revolution)]
         self.update(payloads, numbers, begin_ns)
         return begin_ns + self.packet_ns + _TRAVEL_NS, payloads
-
-
-def scene(columns: int, channels: int) -> tuple[I64Array, I64Array]:
-    """Ranges in mm, 0 for none, and reflectivities 0 to 255: (columns, channels) each."""
-    random = np.random.default_rng(columns * channels)
-    column = np.arange(columns)[:, None] * (2 * np.pi / columns)
-    channel = np.arange(channels) * (8 / channels)
-    wave = np.sin(3 * column + channel) + 0.3 * np.sin(11 * column - channel)
-    range_mm = np.rint(14_000 + 9_000 * wave + random.normal(0, 15, wave.shape)).astype(np.int64)
-    # No-return regions, and single shots without a return.
-    sky = np.cos(5 * column + 2 * channel) > 0.85
-    range_mm[sky | (random.random(wave.shape) < 0.03)] = 0
-    reflectivity = np.rint(90 + 60 * wave + random.normal(0, 10, wave.shape)).astype(np.int64)
-    return range_mm, np.where(range_mm > 0, reflectivity.clip(1, 255), 0)
 
 
 _OUSTER_BEAMS: Final = 128
@@ -439,21 +425,26 @@ def _ip_headers(source_ip: str, ids: I64Array, flags: int, size: int) -> U8Array
 
 
 def make(recording: BenchRecording, seconds: float, folder: Path) -> None:
-    """Write capture, rig and the files that its sensors need into an existing folder."""
-    sources = []
+    """Write recording, rig and the files that its sensors need into an existing folder."""
     for sensor in recording.sensors:
         if sensor.file:
             text = _FILES[KINDS[sensor.kind].suffix](sensor)
             (folder / sensor.file).write_text(text, encoding="utf-8")
-        encoder = ENCODERS[sensor.kind](sensor.serial)
-        sources.append(Source(encoder, Stream(sensor.source_ip, sensor.port), sensor.phase_ns))
     (folder / RIG).write_text(_rig(recording.sensors), encoding="utf-8")
-    mtu = ETHERNET_MTU if recording.fragments else JUMBO_MTU
-    # Renamed when complete: a capture that exists is complete.
-    partial_path = folder / f"{CAPTURE}.partial"
-    write_capture(partial_path, sources, seconds, mtu)
-    partial_path.replace(folder / CAPTURE)
+    # Renamed when complete: a recording that exists is complete.
+    partial_path = folder / f"{recording.file}.partial"
+    if recording.is_bag:
+        write_clouds(partial_path, recording.sensors, seconds)
+    else:
+        mtu = ETHERNET_MTU if recording.fragments else JUMBO_MTU
+        write_capture(partial_path, [_source(one) for one in recording.sensors], seconds, mtu)
+    partial_path.replace(folder / recording.file)
     (folder / DIGEST).write_text(digest(), encoding="utf-8")
+
+
+def _source(sensor: BenchSensor) -> Source:
+    encoder = ENCODERS[sensor.kind](sensor.serial)
+    return Source(encoder, Stream(sensor.source_ip, sensor.port), sensor.phase_ns)
 
 
 def _rig(sensors: Sequence[BenchSensor]) -> str:
@@ -463,13 +454,20 @@ def _rig(sensors: Sequence[BenchSensor]) -> str:
         x, y, z = sensor.translation_m
         lines += [
             f"  - name: {sensor.name}",
-            f"    stream: {{source_ip: {sensor.source_ip}, port: {sensor.port}}}",
+            f"    stream: {_selector(sensor)}",
             f"    extrinsics: {{translation_m: [{x}, {y}, {z}],"
             f" rotation_rpy_deg: [0, 0, {sensor.yaw_deg}]}}",
         ]
         if sensor.file:
             lines.append(f"    metadata: {sensor.file}")
     return "\n".join(lines) + "\n"
+
+
+def _selector(sensor: BenchSensor) -> str:
+    """How the rig names the stream of a sensor."""
+    if sensor.topic:
+        return f"{{topic: {sensor.topic}}}"
+    return f"{{source_ip: {sensor.source_ip}, port: {sensor.port}}}"
 
 
 def _evenly_spaced(first_deg: float, last_deg: float, count: int) -> list[float]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from mlbatch.bench.cases import CAPTURE, RIG, Case, Conversion, disk_bytes, is_current
+from mlbatch.bench.cases import RECORDINGS, RIG, Case, Conversion, disk_bytes, is_current
 from mlbatch.bench.measure import BYTES_PER_MB, BenchError, machine, measure
 from mlbatch.bench.peers import PEERS, Peer, installed, run_peer
 from mlbatch.bench.results import (
@@ -200,7 +200,7 @@ class BenchSession:
     def _recording(self, name: str) -> Path:
         """Folder of a recording, which is made unless a current one exists."""
         folder = self.folder / f"{name}-{self.settings.seconds:g}s"
-        if not is_current(folder):
+        if not is_current(folder, RECORDINGS[name]):
             folder.mkdir(exist_ok=True)
             self.settings.progress(f"making {name}")
             module = [sys.executable, "-m", "mlbatch.bench.recordings"]
@@ -210,9 +210,9 @@ class BenchSession:
 
     def _convert(self, conversion: Conversion) -> Run:
         folder = self._recording(conversion.recording)
-        capture = folder / CAPTURE
+        recording = folder / RECORDINGS[conversion.recording].file
         report_path = self.scratch / "report.json"
-        command = [sys.executable, "-m", "mlbatch", "convert", str(capture), "--quiet"]
+        command = [sys.executable, "-m", "mlbatch", "convert", str(recording), "--quiet"]
         command += ["--rig", str(folder / RIG), "--report", str(report_path), *conversion.options]
         command += ["--engine", conversion.engine, *_OUTPUT_OPTIONS[conversion.output]]
         usage = measure(conversion.name, command, self.scratch)
@@ -224,7 +224,7 @@ class BenchSession:
             points=report["scans"]["points"],
             scans=report["scans"]["written"],
             recorded_s=self.settings.seconds,
-            read_bytes=capture.stat().st_size,
+            read_bytes=recording.stat().st_size,
             written_bytes=_delete_outputs(self.scratch),
         )
         # Floors repeat the output, else the first recording.

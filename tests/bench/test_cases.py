@@ -30,12 +30,12 @@ def test_a_kept_recording_is_current_unless_its_encoders_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = RECORDINGS["three-vlp16"]
-    assert not is_current(tmp_path)
+    assert not is_current(tmp_path, recording)
     make(recording, 0.2, tmp_path)
-    assert is_current(tmp_path)
+    assert is_current(tmp_path, recording)
     with monkeypatch.context() as changed:
         changed.setattr(cases, "digest", lambda: "of other encoders")
-        assert not is_current(tmp_path)
-    assert is_current(tmp_path)
+        assert not is_current(tmp_path, recording)
+    assert is_current(tmp_path, recording)
     (tmp_path / CAPTURE).unlink()
-    assert not is_current(tmp_path)
+    assert not is_current(tmp_path, recording)
