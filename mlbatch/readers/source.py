@@ -186,10 +186,11 @@ class Window:
         """Place in the file of byte `at` of `data`."""
         return self._origin + at
 
-    def refill(self, need: int = 0) -> bool:
+    def refill(self, need: int = 0, most: int = 0) -> bool:
         """Move the unread bytes to the front and read more after them; False at the file's end.
 
-        The buffer grows where the unread bytes fill it, or are to be `need` bytes.
+        The buffer grows where the unread bytes fill it, or are to be `need` bytes. most: unread
+        bytes after which reading stops; 0: no limit but the buffer.
         """
         front = self._front
         if self.begin > self.end:
@@ -212,7 +213,10 @@ class Window:
         self.data[front : front + kept] = unread
         self.begin = front
         self.end = front + kept
-        count = self._source.fill(self.data.data[self.end : len(self.data) - SLACK])
+        stop = len(self.data) - SLACK
+        if most > kept:
+            stop = min(stop, front + most)
+        count = self._source.fill(self.data.data[self.end : stop])
         self.end += count
         return count > 0
 

@@ -48,6 +48,10 @@ _MAX_DEFINITION_BYTES = 1 << 24
 _MOST_STARTS = 1 << 18
 # Records that are only outside chunks; the others may be anywhere.
 _OF_THE_FILE = (Op.CHUNK, Op.DATA_END, Op.FOOTER)
+# Behind a record of _LARGE_BYTES so many bytes are read: the next head. More would be moved to the
+# front of the buffer before the rest of the next record is read.
+_LARGE_BYTES = 1 << 20
+_AHEAD_BYTES = 1 << 14
 _SKIPPED = range(Op.CHUNK + 1, Op.DATA_END)
 
 
@@ -198,6 +202,8 @@ class Walk:
     # Place in the file; None outside of chunks.
     _chunk_end: int | None = None
     _done: bool = False
+    # Bytes of an incomplete record at the window's first byte; 0: not known.
+    _need: int = 0
     _decompressor: Decompressor = field(default_factory=Decompressor)
 
     def __post_init__(self) -> None:
@@ -208,7 +214,7 @@ class Walk:
         window = Window(self.source, self.buffer_bytes)
         window.begin = len(MAGIC)
         starts: list[int] = []
-        while not self._done and window.refill():
+        while not self._done and window.refill(most=self._most):
             yield from self._walk(window, starts)
             self.place = window.place
             yield from self._scanner.gather(window.data, starts)
@@ -216,6 +222,11 @@ class Walk:
                 return
         if not self._done:
             yield from self._end(window)
+
+    @property
+    def _most(self) -> int:
+        """How far the next bytes are read; 0: as far as the buffer goes."""
+        return self._need + _AHEAD_BYTES if self._need >= _LARGE_BYTES else 0
 
     def _walk(self, window: Window, starts: list[int]) -> Iterator[Messages]:
         """Walk until more bytes are needed, or to the end of the data."""
@@ -226,6 +237,7 @@ class Walk:
                 bound = self._chunk_end - window.place_of(0)
             span = self._scanner.scan(window.data, window.begin, min(window.end, bound), starts)
             window.begin = span.next
+            self._need = span.need
             if span.full:
                 yield from self._scanner.gather(window.data, starts)
                 continue
@@ -278,6 +290,7 @@ class Walk:
             self._note(place, f"{fault}; the chunk was not read")
             window.begin = after
         elif after > window.end:
+            self._need = after - at
             return False
         else:
             yield from self._scanner.gather(window.data, starts)
