@@ -58,11 +58,14 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message without lidar packets, as stored."""
+    """A message without lidar packets, as stored.
+
+    data: a view that is valid until the next batch where the topic is in `Recording.lend`.
+    """
 
     topic: Topic
     host_ns: int  # log time
-    data: bytes
+    data: bytes | memoryview
 
 
 # All further streams are this one: addresses may be invented without end.
@@ -114,6 +117,8 @@ class PacketBatch:
     host_ns: I64Array  # (n,) receive time at the capture host, of the completing fragment
     messages: tuple[Message, ...] = ()  # of the topics in `Recording.keep`, in file order
     place: int | None = None  # of `data[0]` in the `PacketArena` of the pass; None: elsewhere
+    # (n,) hashes of the contents, as `lidar.content_keys`; None: not known.
+    content_key: I64Array | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -127,6 +132,7 @@ class PacketBatch:
             self.stream[index],
             self.host_ns[index],
             place=self.place,
+            content_key=None if self.content_key is None else self.content_key[index],
         )
 
 
@@ -155,6 +161,8 @@ class Recording:
     topics: tuple[Topic, ...] = field(default=(), kw_only=True)
     # Topics whose messages the batches include; set before `packets` is called.
     keep: frozenset[str] = field(default=frozenset(), kw_only=True)
+    # Those of them whose messages may be views of the batch; set before `packets` is called.
+    lend: frozenset[str] = field(default=frozenset(), kw_only=True)
     # Frames of the current pass.
     counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)
     # Damage of the recording, one line each.
@@ -192,7 +200,7 @@ class Recording:
 class WrappedRecording(Recording):
     """A recording that changes the packets of another one.
 
-    Only `keep` is its own; attributes that are not set here are looked up in `inner`.
+    Only `keep` and `lend` are its own; attributes that are not set here are looked up in `inner`.
     """
 
     __slots__ = ("inner",)
@@ -200,6 +208,7 @@ class WrappedRecording(Recording):
     def __init__(self, inner: Recording) -> None:
         self.inner = inner
         self.keep = frozenset()
+        self.lend = frozenset()
 
     def __getattr__(self, name: str) -> object:
         """Called for slots without a value."""

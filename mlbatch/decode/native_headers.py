@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.lidar.geometry import SPEED_PER_HZ
-from mlbatch.lidar.header_table import HeaderTable, PacedBlocks, StampedColumns
+from mlbatch.lidar.header_table import HeaderTable, PacedBlocks, SingleColumns, StampedColumns
 from mlbatch.native.library import Check, PacedLayout, StampedLayout, address, library
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
@@ -26,32 +26,56 @@ class HeaderLoops:
         self._library = library()
         self._arrays: list[Any] = []
         self._columns = table.columns
-        self._layout: StampedLayout | PacedLayout
-        if isinstance(table, StampedColumns):
+        self._single: SingleColumns | None = None
+        self._layout: StampedLayout | PacedLayout | None = None
+        if isinstance(table, SingleColumns):
+            self._single = table
+            self._factors = self._kept(table.hash_factors)
+        elif isinstance(table, StampedColumns):
             self._layout = self._stamped(table)
         else:
             self._layout = self._paced(table)
         self._all_valid: BoolArray = np.ones((0, table.columns), np.bool_)
 
     def read(
-        self, data: U8Array, start: I64Array, size: int, host_ns: I64Array
+        self,
+        data: U8Array,
+        start: I64Array,
+        size: int,
+        host_ns: I64Array,
+        content_key: I64Array | None = None,
     ) -> tuple[ColumnHeaders, I64Array] | None:
         """Return the columns of packets and their sequence numbers; None unless all are as usual.
 
-        data, start: as in `PacketBatch`; size: of a packet; host_ns: (P,) receive times. Of columns
-        as usual all are valid, and timestamps never decrease.
+        data, start: as in `PacketBatch`; size: of a packet; host_ns: (P,) receive times;
+        content_key: (P,) hashes, None: not known. Of columns as usual all are valid, and timestamps
+        never decrease.
         """
         count = len(start)
         if not count or int(start.min()) < 0 or int(start.max()) + size > len(data):
             return None
         start = np.ascontiguousarray(start)
-        key = np.empty(count, np.int64)
+        is_known = content_key is not None and self._single is not None
+        key = content_key if is_known and content_key is not None else np.empty(count, np.int64)
         stamp_ns = np.empty((count, self._columns), np.int64)
         encoder = np.empty((count, self._columns), np.int64)
         arrays = (key, stamp_ns, encoder)
         place = address(data)
-        layout = ctypes.addressof(self._layout)
-        if isinstance(self._layout, StampedLayout):
+        layout = None if self._layout is None else ctypes.addressof(self._layout)
+        if self._single is not None:
+            encoder.fill(0)
+            good = self._library.mlbatch_single(
+                place,
+                count,
+                address(start),
+                self._single.packet_bytes,
+                self._single.first_word,
+                self._single.stamp_at,
+                None if is_known else self._factors,
+                address(key),
+                address(stamp_ns),
+            )
+        elif isinstance(self._layout, StampedLayout):
             good = self._library.mlbatch_stamped(
                 layout, place, count, address(start), *map(address, arrays)
             )

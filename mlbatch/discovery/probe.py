@@ -266,18 +266,19 @@ class MetadataCollector:
 
     def _read(self, message: Message) -> None:
         topic = message.topic
+        data = bytes(message.data)
         last_part = _last_part(topic)
         if topic.type in TRANSFORM_TYPES:
-            transforms = ros.decode_transforms(topic, message.data)
+            transforms = ros.decode_transforms(topic, data)
             self.extrinsics.add_transforms("tf_static" if last_part == STATIC else "tf", transforms)
         elif topic.type == TEXT_TYPE and last_part == METADATA:
-            self._add_text(topic, ros.decode_string(topic, message.data).encode())
+            self._add_text(topic, ros.decode_string(topic, data).encode())
         elif topic.type == BYTES_TYPE and last_part == CORRECTIONS:
-            self._add_text(topic, ros.decode_bytes(topic, message.data))
+            self._add_text(topic, ros.decode_bytes(topic, data))
         elif topic.type == readers.CORRECTION_TYPE:
-            self._add_text(topic, message.data)
+            self._add_text(topic, data)
         elif topic.type == TEXT_TYPE and last_part == DESCRIPTION:
-            self.extrinsics.add_urdf(ros.decode_string(topic, message.data))
+            self.extrinsics.add_urdf(ros.decode_string(topic, data))
 
     def _add_text(self, topic: Topic, text: bytes) -> None:
         """Keep the first text of a topic: the settings at the start of the recording."""

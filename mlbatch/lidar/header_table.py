@@ -55,7 +55,7 @@ class PacedBlocks(NamedTuple):
     groups: int
     block_bytes: int
     flags: I64Array  # (blocks,)
-    hash_factors: U64Array  # (packet_bytes // 8,), as `sensors.base.content_keys`
+    hash_factors: U64Array  # (packet_bytes // 8,), as `lidar.content_keys`
     circle: int  # azimuths of a revolution
     widest: int  # step between groups without a gap
     stamp_at: int  # first byte
@@ -70,4 +70,18 @@ class PacedBlocks(NamedTuple):
     follows_rotor: bool  # rotor words have the speed
 
 
-HeaderTable = StampedColumns | PacedBlocks
+class SingleColumns(NamedTuple):
+    """Packets of one column, whose first eight bytes all packets of a sensor share.
+
+    The timestamp has 8 bytes, ns; rotors do not matter. The sequence number of a packet is the hash
+    of its content.
+    """
+
+    packet_bytes: int
+    first_word: int
+    stamp_at: int  # first byte
+    hash_factors: U64Array  # (packet_bytes // 8,), as `lidar.content_keys`
+    columns: int = 1
+
+
+HeaderTable = StampedColumns | PacedBlocks | SingleColumns

@@ -143,6 +143,8 @@ class Lidar(Protocol):
     pixel_layout: tuple[str | int | bool, ...]
     # The layout for compiled decoding; None: only `read` decodes it.
     pixels: PixelTable | None
+    # Whether records have coordinates instead of readings: compiled loops read them as well.
+    has_places: bool
     # Layout of the headers for compiled loops; None: only numpy reads them.
     headers: HeaderTable | None
     # The sequence number wraps there; 0: packets have none.

@@ -381,3 +381,337 @@ EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t
         memcpy(packets + number * size + COUNT, used + number, 2);
     }
 }
+
+/* -- rows straight to packets ------------------------------------------------------------------ */
+
+/* Clouds of a spinning lidar with a ring for each point, from the rows of a message to packets
+   without planes in between; what is unusual is left to the functions above. */
+
+/* Times are inserted at most so often a point, counted in times that are moved. */
+enum { MOST_MOVED = 4 };
+
+/* What `mlbatch_cloud_times` finds. times (room,): distinct, in order, of one type; by_order
+   (room,): their numbers, in order of appearance; is_used (room,): by number, whether a point has
+   it; number (points,), begins (MOST_RUNS + 1,): as there. */
+typedef struct {
+    int64_t count, step, room, known, moved, placed, found, runs;
+    const uint8_t *rows;
+    const int64_t *axes_at;
+    int64_t time_at;
+    void *times;
+    int32_t *by_order, *number;
+    uint8_t *is_used;
+    int64_t *begins;
+} Times;
+
+/* Give the next number to a time at `at`. Return 0 where there is no room, or too much is moved. */
+static int insert_number(Times *all, int64_t at)
+{
+    const size_t after = (size_t)(all->known - at);
+    all->moved += (int64_t)after;
+    if (all->known == all->room || all->moved > MOST_MOVED * all->count + all->room)
+        return 0;
+    memmove(all->by_order + at + 1, all->by_order + at, after * sizeof *all->by_order);
+    all->by_order[at] = (int32_t)all->known;
+    all->is_used[all->known++] = 0;
+    return 1;
+}
+
+static inline float real_at(const uint8_t *from)
+{
+    float value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+/* Number the times of all points: most are the last one, or the one after it. Shots without a place
+   say which times there are, too: most are then known after the first run. Return 0 for an unusual
+   cloud. */
+#define FOLLOW(name, type, IS_FINITE) \
+    static int name(Times *all) \
+    { \
+        type *times = all->times; \
+        type last = 0, after = 0; \
+        int64_t at = -1; \
+        int32_t own = -1; \
+        int has_after = 0; \
+        const uint8_t *row = all->rows; \
+        const int64_t count = all->count, step = all->step, time_at = all->time_at; \
+        const int64_t x_at = all->axes_at[0], y_at = all->axes_at[1], z_at = all->axes_at[2]; \
+        int32_t *restrict number = all->number; \
+        int64_t placed = 0, found = 0; \
+        for (int64_t point = 0; point < count; point++, row += step) { \
+            const float x = real_at(row + x_at); \
+            const float y = real_at(row + y_at); \
+            const float z = real_at(row + z_at); \
+            const float squared = x * x + y * y + z * z; \
+            type time; \
+            memcpy(&time, row + time_at, sizeof time); \
+            const int is_placed = (squared > 0.0f) & (squared < INFINITY); \
+            placed += is_placed; \
+            if (!is_placed || !(IS_FINITE)) { \
+                number[point] = -1; \
+                if ((IS_FINITE) && all->known < all->room \
+                    && (!all->known || time > times[all->known - 1])) { \
+                    times[all->known] = time; \
+                    if (!insert_number(all, all->known)) \
+                        return 0; \
+                    has_after = 0; \
+                } \
+                continue; \
+            } \
+            found++; \
+            if (own >= 0 && time == last) { \
+                number[point] = own; \
+                continue; \
+            } \
+            if (has_after && time == after) { \
+                at++; \
+            } else { \
+                int64_t low = own >= 0 && time > last ? at + 1 : 0, high = all->known; \
+                if (own < 0 || time < last) { \
+                    if (all->runs == MOST_RUNS) \
+                        return 0; \
+                    all->begins[all->runs++] = point; \
+                } \
+                while (low < high) { \
+                    const int64_t middle = (low + high) / 2; \
+                    if (times[middle] < time) \
+                        low = middle + 1; \
+                    else \
+                        high = middle; \
+                } \
+                at = low; \
+                if (at == all->known || times[at] != time) { \
+                    const size_t later = (size_t)(all->known - at); \
+                    if (!insert_number(all, at)) \
+                        return 0; \
+                    memmove(times + at + 1, times + at, later * sizeof *times); \
+                    times[at] = time; \
+                } \
+            } \
+            last = time; \
+            own = all->by_order[at]; \
+            all->is_used[own] = 1; \
+            number[point] = own; \
+            has_after = at + 1 < all->known; \
+            if (has_after) \
+                after = times[at + 1]; \
+        } \
+        all->placed = placed; \
+        all->found = found; \
+        return 1; \
+    }
+
+FOLLOW(follow_u4, uint32_t, 1)
+FOLLOW(follow_i4, int32_t, 1)
+FOLLOW(follow_f4, float, time - time == 0)
+FOLLOW(follow_f8, double, time - time == 0)
+
+/* Find the points that have a place and a finite time, and their times. Places are float32.
+
+   rows: of `step` bytes; axes_at (3,); times (room,): of the type `time_type`: the distinct ones
+   in order; number (count,): of the time of each point in order of appearance, -1: no point;
+   by_order, is_used (room,): scratch; rank (room + 1,): of each number in order, behind that of
+   -1; begins (MOST_RUNS + 1,): runs in which times do not fall; figures (3,): points with a place,
+   points found, runs. Return how many times there are, or -1 for an unusual cloud. */
+EXPORT int64_t mlbatch_cloud_times(int64_t count, const uint8_t *rows, int64_t step,
+                             const int64_t *axes_at, int64_t time_at, int64_t time_type,
+                             int64_t room, uint8_t *times, int32_t *number, int32_t *by_order,
+                             uint8_t *is_used, int32_t *rank, int64_t *begins, int64_t *figures)
+{
+    Times all = {.count = count, .step = step, .room = room, .rows = rows, .axes_at = axes_at,
+                 .time_at = time_at, .times = times, .by_order = by_order, .number = number,
+                 .is_used = is_used, .begins = begins};
+    int is_usual = 0;
+    switch (time_type) {
+    case UINT32: is_usual = follow_u4(&all); break;
+    case INT32: is_usual = follow_i4(&all); break;
+    case FLOAT32: is_usual = follow_f4(&all); break;
+    case FLOAT64: is_usual = follow_f8(&all); break;
+    default: break;
+    }
+    if (!is_usual)
+        return -1;
+    begins[all.runs] = count;
+    /* Only times of points. */
+    const int64_t bytes = time_type == FLOAT64 ? 8 : 4;
+    int64_t used = 0;
+    rank[0] = -1;
+    for (int64_t at = 0; at < all.known; at++) {
+        const int32_t own = by_order[at];
+        rank[own + 1] = is_used[own] ? (int32_t)used : -1;
+        if (!is_used[own])
+            continue;
+        memmove(times + used * bytes, times + at * bytes, (size_t)bytes);
+        used++;
+    }
+    figures[0] = all.placed;
+    figures[1] = all.found;
+    figures[2] = all.runs;
+    return used;
+}
+
+/* How `mlbatch_cloud_fill` reads rows and writes packets. */
+typedef struct {
+    const uint8_t *rows;
+    int64_t step;
+    const int64_t *at, *types; /* of its fields */
+    const int32_t *number, *rank;
+    int64_t slots, size;
+    uint8_t *packets;
+} Fill;
+
+enum { X_AT, Y_AT, Z_AT, INTENSITY_AT, RING_AT, TYPE_AT, TAG_AT };
+enum { PACKET_HEAD = 24 };
+
+/* An intensity that is no finite number is 0. */
+#define AS_REAL(type) \
+    { \
+        type value; \
+        memcpy(&value, from, sizeof value); \
+        found = (float)value; \
+        break; \
+    }
+
+static inline float intensity_at(const uint8_t *from, int64_t type)
+{
+    float found = 0;
+    switch (type) {
+    case INT8: AS_REAL(int8_t)
+    case UINT8: AS_REAL(uint8_t)
+    case INT16: AS_REAL(int16_t)
+    case UINT16: AS_REAL(uint16_t)
+    case INT32: AS_REAL(int32_t)
+    case UINT32: AS_REAL(uint32_t)
+    case FLOAT32: AS_REAL(float)
+    case FLOAT64: AS_REAL(double)
+    default: break;
+    }
+    return found - found == 0.0f ? found : 0.0f;
+}
+
+/* Write the points from `*next` on to the columns below `end`; columns do not fall up to `stop`.
+   Return how many, -1 where a ring is not below `slots`. */
+static inline int64_t fill_run(const Fill *fill, int64_t *next, int64_t stop, int64_t end,
+                               int64_t intensity_type, int64_t ring_type, int has_more)
+{
+    const int64_t *at = fill->at;
+    const int64_t x_at = at[X_AT], y_at = at[Y_AT], z_at = at[Z_AT];
+    const int64_t intensity_byte = at[INTENSITY_AT], ring_at = at[RING_AT];
+    const int64_t slots = fill->slots, plane = 4 * slots, size = fill->size, step = fill->step;
+    const int32_t *rank = fill->rank + 1, *number = fill->number;
+    uint8_t *packets = fill->packets + PACKET_HEAD;
+    int64_t written = 0, point = *next;
+    const uint8_t *row = fill->rows + point * step;
+    for (; point < stop; point++, row += step) {
+        const int64_t column = rank[number[point]];
+        if (column >= end)
+            break;
+        if (column < 0)
+            continue;
+        uint16_t ring = row[ring_at];
+        if (ring_type == UINT16)
+            memcpy(&ring, row + ring_at, sizeof ring);
+        if (ring >= slots)
+            return -1;
+        uint8_t *packet = packets + column * size;
+        uint8_t *slot = packet + 4 * (int64_t)ring;
+        uint32_t axes[AXES];
+        memcpy(axes, row + x_at, 4);
+        memcpy(axes + 1, row + y_at, 4);
+        memcpy(axes + 2, row + z_at, 4);
+        const float intensity = intensity_at(row + intensity_byte, intensity_type);
+        memcpy(slot, axes, 4);
+        memcpy(slot + plane, axes + 1, 4);
+        memcpy(slot + 2 * plane, axes + 2, 4);
+        memcpy(slot + 3 * plane, &intensity, 4);
+        packet += 4 * plane;
+        memcpy(packet + 2 * (int64_t)ring, &ring, sizeof ring);
+        if (has_more) {
+            packet += 2 * slots + ring;
+            if (fill->types[TYPE_AT])
+                packet[0] = row[at[TYPE_AT]];
+            if (fill->types[TAG_AT])
+                packet[slots] = row[at[TAG_AT]];
+        }
+        written++;
+    }
+    *next = point;
+    return written;
+}
+
+/* Slots of a packet that have a point: a place is not zero. */
+static int64_t count_slots(const uint8_t *packet, int64_t slots)
+{
+    const uint8_t *x = packet + PACKET_HEAD, *y = x + 4 * slots, *z = y + 4 * slots;
+    int32_t found = 0;
+    for (int64_t slot = 0; slot < slots; slot++) {
+        uint32_t bits[AXES];
+        memcpy(bits, x + 4 * slot, 4);
+        memcpy(bits + 1, y + 4 * slot, 4);
+        memcpy(bits + 2, z + 4 * slot, 4);
+        /* All but their signs. */
+        found += (bits[0] | bits[1] | bits[2]) << 1 != 0;
+    }
+    return found;
+}
+
+/* Write the points that `mlbatch_cloud_times` found to packets by ring, each of `size` bytes.
+
+   fields_at (7,): bytes of x, y, z, intensity, ring, return type and tag in a row; types (7,): of
+   them, 0: none; the ring, which must be there, is UINT8 or UINT16, return type and tag are UINT8.
+   head (24,): of all packets; stamp_ns (columns,); keys (columns,): by `mlbatch_content_key` with
+   `odd`, not written if that is NULL. Return 1; 0 where a ring is not below `slots`,
+   or a column has two points of a ring: the packets are then not complete. */
+EXPORT int64_t mlbatch_cloud_fill(const uint8_t *rows, int64_t step, const int64_t *fields_at,
+                            const int64_t *types, int64_t runs, const int64_t *begins,
+                            const int32_t *number, const int32_t *rank, int64_t columns,
+                            const int64_t *stamp_ns, const uint8_t *head, int64_t slots,
+                            int64_t size, const uint64_t *odd, uint8_t *packets,
+                            int64_t *keys)
+{
+    /* NEAR: columns whose packets stay in the cache. */
+    enum { STAMP = 8, NUMBER = 16, COUNT = 20, NEAR = 64 };
+    const Fill fill = {rows, step, fields_at, types, number, rank, slots, size, packets};
+    const int has_more = types[TYPE_AT] || types[TAG_AT];
+    const int is_plain = types[INTENSITY_AT] == FLOAT32 && !has_more;
+    int64_t next[MOST_RUNS];
+    memcpy(next, begins, (size_t)runs * sizeof *next);
+    for (int64_t first = 0; first < columns; first += NEAR) {
+        const int64_t end = first + NEAR < columns ? first + NEAR : columns;
+        memset(packets + first * size, 0, (size_t)((end - first) * size));
+        int64_t left = 0;
+        for (int64_t run = 0; run < runs; run++) {
+            const int64_t stop = begins[run + 1];
+            int64_t written;
+            /* With constant types the compiler leaves out the branches. */
+            if (is_plain && types[RING_AT] == UINT16)
+                written = fill_run(&fill, next + run, stop, end, FLOAT32, UINT16, 0);
+            else if (is_plain)
+                written = fill_run(&fill, next + run, stop, end, FLOAT32, UINT8, 0);
+            else
+                written = fill_run(&fill, next + run, stop, end, types[INTENSITY_AT],
+                                   types[RING_AT], has_more);
+            if (written < 0)
+                return 0;
+            left += written;
+        }
+        for (int64_t column = first; column < end; column++) {
+            uint8_t *packet = packets + column * size;
+            const uint32_t own = (uint32_t)column;
+            const uint16_t points = (uint16_t)count_slots(packet, slots);
+            left -= points;
+            memcpy(packet, head, PACKET_HEAD);
+            memcpy(packet + STAMP, stamp_ns + column, 8);
+            memcpy(packet + NUMBER, &own, sizeof own);
+            memcpy(packet + COUNT, &points, sizeof points);
+            if (odd)
+                keys[column] = mlbatch_content_key(packet, size, odd);
+        }
+        /* Two points of a ring are in one slot. */
+        if (left)
+            return 0;
+    }
+    return 1;
+}

@@ -765,6 +765,81 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
 #endif
 
 #if defined(__SSE2__)
+static inline __m128 turn_four(const __m128 *row, __m128 x, __m128 y, __m128 z)
+{
+    const __m128 sum = _mm_add_ps(_mm_mul_ps(x, row[0]), _mm_mul_ps(y, row[1]));
+    return _mm_add_ps(_mm_add_ps(sum, _mm_mul_ps(z, row[2])), row[3]);
+}
+
+/* Points that a driver computed, from their planes to rows of a dense scan, four at a time: the
+   operations of `read_placed`, `mark`, `move_planes`, `label` and `emit_fours`. For `fits_places`.
+   Return the next row. */
+static int64_t decode_placed(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                             int64_t known, const uint8_t *record, int64_t row)
+{
+    enum { ROWS = 3, STEP = 4 };
+    const int64_t beams = group->beams;
+    const float *planes = (const float *)(const void *)(record + group->runs[0]);
+    const float *turn = group->direction + 9 * member, *shift_m = group->origin + 3 * member;
+    const float *moves = scan->moves ? scan->moves + 12 * column : 0;
+    __m128 turns[ROWS][STEP], moved[ROWS][STEP];
+    for (int axis = 0; axis < ROWS; axis++)
+        for (int step = 0; step < STEP; step++) {
+            turns[axis][step] = _mm_set1_ps(step < ROWS ? turn[ROWS * axis + step]
+                                                        : shift_m[axis]);
+            moved[axis][step] = _mm_set1_ps(moves ? moves[STEP * axis + step] : 0.0f);
+        }
+    const float *limits_m = group->limits_m ? group->limits_m + 2 * member : 0;
+    const __m128 low_m = _mm_set1_ps(limits_m ? limits_m[0] : 0.0f);
+    const __m128 high_m = _mm_set1_ps(limits_m ? limits_m[1] : 0.0f);
+    const __m128i offset_ns = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
+    const int64_t *words = group->labels + known * group->width;
+    const int64_t first_row = row;
+    int64_t found = 0;
+    for (int64_t beam = 0; beam < beams; beam += 4) {
+        const __m128 x = _mm_loadu_ps(planes + beam);
+        const __m128 y = _mm_loadu_ps(planes + beams + beam);
+        const __m128 z = _mm_loadu_ps(planes + 2 * beams + beam);
+        const __m128 range_m = _mm_sqrt_ps(_mm_add_ps(
+            _mm_add_ps(_mm_mul_ps(x, x), _mm_mul_ps(y, y)), _mm_mul_ps(z, z)));
+        __m128 keep = _mm_cmpgt_ps(range_m, _mm_setzero_ps());
+        found += LANES[_mm_movemask_ps(keep)];
+        if (limits_m)
+            keep = _mm_and_ps(keep, _mm_and_ps(_mm_cmpge_ps(range_m, low_m),
+                                               _mm_cmple_ps(range_m, high_m)));
+        const int kept = _mm_movemask_ps(keep);
+        if (!kept)
+            continue;
+        __m128 body[ROWS];
+        for (int axis = 0; axis < ROWS; axis++)
+            body[axis] = turn_four(turns[axis], x, y, z);
+        if (moves) {
+            const __m128 before[] = {body[0], body[1], body[2]};
+            for (int axis = 0; axis < ROWS; axis++)
+                body[axis] = turn_four(moved[axis], before[0], before[1], before[2]);
+        }
+        const __m128i *own = (const __m128i *)(words + beam);
+        row = store_kept(scan->point, scan->label, row, kept, body[0], body[1], body[2],
+                         _mm_loadu_ps(planes + 3 * beams + beam),
+                         _mm_add_epi64(_mm_loadu_si128(own), offset_ns),
+                         _mm_add_epi64(_mm_loadu_si128(own + 1), offset_ns));
+    }
+    int64_t *counts = group->counts + member * COUNTS;
+    counts[FOUND] += found;
+    counts[DISTINCT] += found;
+    counts[IN_RANGE] += row - first_row;
+    counts[OUTSIDE_BOXES] += row - first_row;
+    return row;
+}
+
+/* Whether `decode_placed` does all that a scan asks for. */
+static int fits_places(const Scan *scan, const Group *group)
+{
+    return group->kind == PLACED && group->beams % 4 == 0 && group->slots == group->beams
+        && group->typed == NOT_TYPED && !group->order && !scan->row_slots && !scan->box_count
+        && !scan->range_m && !scan->reflectivity;
+}
+
 /* Kept elements in their order, four at a time; the slots are a multiple of four. */
 static int64_t emit_fours(const Scan *scan, const Group *group, int64_t row, const Planes *planes)
 {
@@ -982,6 +1057,8 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
 #if defined(__SSE2__)
     if (group->fits_fours && !scan->row_slots)
         return decode_fused(scan, group, member, column, known, record, row);
+    if (fits_places(scan, group))
+        return decode_placed(scan, group, member, column, known, record, row);
 #endif
     for (int64_t which = 0; which < group->returns && group->kind != PLACED; which++)
         read_return(group, record, which, planes);

@@ -1,6 +1,6 @@
 /* Headers of packets to columns: `decode/native_headers.py`.
 
-   Both functions read packets that are as they usually are, and stop at any other: the caller then
+   All functions read packets that are as they usually are, and stop at any other: the caller then
    reads all packets of the batch with numpy. The results are the same. They keep no state. */
 #include <string.h>
 
@@ -13,7 +13,7 @@
 #define PREFETCH(from) ((void)(from))
 #endif
 
-enum { AHEAD = 2, WORD = 8 };
+enum { AHEAD = 2 };
 
 /* Little-endian number of up to 8 bytes. */
 static inline int64_t number_at(const uint8_t *from, int64_t bytes)
@@ -101,24 +101,6 @@ EXPORT int64_t mlbatch_stamped(const StampedLayout *layout, const uint8_t *data,
 }
 
 /* -- a timestamp in each packet, an azimuth in each block --------------------------------------- */
-
-/* `sensors/base.py`, content_keys. */
-static int64_t content_key(const uint8_t *packet, int64_t bytes, const uint64_t *odd)
-{
-    const uint64_t golden = UINT64_C(0x9E3779B97F4A7C15);
-    const int64_t words = bytes / WORD;
-    uint64_t key = 0, word;
-    for (int64_t number = 0; number < words; number++) {
-        memcpy(&word, packet + WORD * number, WORD);
-        key += word * odd[number];
-    }
-    if (bytes % WORD) {
-        memcpy(&word, packet + bytes - WORD, WORD);
-        key = key * golden + word;
-    }
-    key ^= key >> 29;
-    return (int64_t)(key * golden >> 1);
-}
 
 /* To the nearest integer, halves to the even one; below 2**51. */
 static inline double nearest(double value)
@@ -211,9 +193,33 @@ EXPORT int64_t mlbatch_paced(const PacedLayout *layout, const uint8_t *data, int
                 return packet;
             newest = stamp_ns[column];
         }
-        key[packet] = content_key(from, layout->packet_bytes, layout->odd);
+        key[packet] = mlbatch_content_key(from, layout->packet_bytes, layout->odd);
         stamp_ns += columns;
         encoder += columns;
+    }
+    return packets;
+}
+
+/* -- a packet is a column ----------------------------------------------------------------------- */
+
+/* Packets of one column, which begin with the 8 bytes `first_word` and have a timestamp of 8 bytes,
+   ns. key: as `content_keys`; stamp_ns: (packets,). Return the number of packets before the first
+   unusual one. odd: NULL: keys are known. */
+EXPORT int64_t mlbatch_single(const uint8_t *data, int64_t packets, const int64_t *start,
+                              int64_t packet_bytes, int64_t first_word, int64_t stamp_at,
+                              const uint64_t *odd, int64_t *key, int64_t *stamp_ns)
+{
+    int64_t newest = INT64_MIN;
+    for (int64_t packet = 0; packet < packets; packet++) {
+        const uint8_t *from = data + start[packet];
+        int64_t word;
+        memcpy(&word, from, sizeof word);
+        memcpy(stamp_ns + packet, from + stamp_at, sizeof *stamp_ns);
+        if (word != first_word || stamp_ns[packet] < newest)
+            return packet;
+        newest = stamp_ns[packet];
+        if (odd)
+            key[packet] = mlbatch_content_key(from, packet_bytes, odd);
     }
     return packets;
 }

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 6
+_ABI = 7
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -24,6 +24,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
     "mlbatch_stamped": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 4),
     "mlbatch_paced": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
+    "mlbatch_single": (_ADDRESS, _WORD, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 3),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
@@ -36,6 +37,14 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_cloud_columns": (_WORD, *[_ADDRESS] * 3, _WORD, _WORD, _ADDRESS, _ADDRESS),
     "mlbatch_cloud_runs": (_WORD, *[_ADDRESS] * 6),
     "mlbatch_cloud_slots": (_WORD, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 4),
+    "mlbatch_cloud_times": (
+        *(_WORD, _ADDRESS, _WORD, _ADDRESS, _WORD, _WORD, _WORD),
+        *[_ADDRESS] * 7,
+    ),
+    "mlbatch_cloud_fill": (
+        *(_ADDRESS, _WORD, _ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 3),
+        *(_WORD, _ADDRESS, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 3),
+    ),
     "mlbatch_cloud_pack": (
         *(_ADDRESS, _WORD, *[_ADDRESS] * 4),
         *(_WORD, *[_ADDRESS] * 4, *[_WORD] * 3, _ADDRESS, _ADDRESS),

@@ -9,13 +9,14 @@
 #define MLBATCH_NATIVE_H
 
 #include <stdint.h>
+#include <string.h>
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "the engine native reads little-endian words"
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 6
+#define MLBATCH_ABI 7
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -249,7 +250,7 @@ typedef struct {
     int64_t mode_at;
     const uint8_t *modes; /* (256,) allowed ones, or NULL */
     int64_t packet_bytes;
-    const uint64_t *odd;      /* (words,): `sensors/base.py`, content_keys */
+    const uint64_t *odd;      /* (words,): `lidar/content_keys.py` */
     const int64_t *start_ns;  /* (columns,) after the packet's timestamp */
     const double *ahead_ns;   /* (columns,) after the azimuth of their group */
     double group_ns;
@@ -258,6 +259,26 @@ typedef struct {
     double steps_per_hz;
     int64_t follows_rotor;
 } PacedLayout;
+
+/* Hash of a packet: `lidar/content_keys.py`. */
+static inline int64_t mlbatch_content_key(const uint8_t *packet, int64_t bytes,
+                                          const uint64_t *odd)
+{
+    enum { WORD = 8 };
+    const uint64_t golden = UINT64_C(0x9E3779B97F4A7C15);
+    const int64_t words = bytes / WORD;
+    uint64_t key = 0, word;
+    for (int64_t number = 0; number < words; number++) {
+        memcpy(&word, packet + WORD * number, WORD);
+        key += word * odd[number];
+    }
+    if (bytes % WORD) {
+        memcpy(&word, packet + bytes - WORD, WORD);
+        key = key * golden + word;
+    }
+    key ^= key >> 29;
+    return (int64_t)(key * golden >> 1);
+}
 
 EXPORT int64_t mlbatch_abi(void);
 EXPORT int64_t mlbatch_decode(const Scan *scan);
@@ -275,6 +296,9 @@ EXPORT int64_t mlbatch_stamped(const StampedLayout *layout, const uint8_t *data,
 EXPORT int64_t mlbatch_paced(const PacedLayout *layout, const uint8_t *data, int64_t packets,
                              const int64_t *start, const int64_t *host_ns, int64_t *key,
                              int64_t *stamp_ns, int64_t *encoder);
+EXPORT int64_t mlbatch_single(const uint8_t *data, int64_t packets, const int64_t *start,
+                              int64_t packet_bytes, int64_t first_word, int64_t stamp_at,
+                              const uint64_t *odd, int64_t *key, int64_t *stamp_ns);
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);
@@ -307,5 +331,15 @@ EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t
                          int64_t room, const float *reals, const uint16_t *ring,
                          const uint8_t *return_type, const uint8_t *tag, int64_t slots,
                          int64_t size, int64_t columns, uint16_t *used, uint8_t *packets);
+EXPORT int64_t mlbatch_cloud_times(int64_t count, const uint8_t *rows, int64_t step,
+                             const int64_t *axes_at, int64_t time_at, int64_t time_type,
+                             int64_t room, uint8_t *times, int32_t *number, int32_t *by_order,
+                             uint8_t *is_used, int32_t *rank, int64_t *begins, int64_t *figures);
+EXPORT int64_t mlbatch_cloud_fill(const uint8_t *rows, int64_t step, const int64_t *fields_at,
+                            const int64_t *types, int64_t runs, const int64_t *begins,
+                            const int32_t *number, const int32_t *rank, int64_t columns,
+                            const int64_t *stamp_ns, const uint8_t *head, int64_t slots,
+                            int64_t size, const uint64_t *odd, uint8_t *packets,
+                            int64_t *keys);
 
 #endif

@@ -223,7 +223,8 @@ class Ingest:
             return None
         lidar = sensor.lidar
         host_ns = batch.host_ns[index]
-        found = sensor.loops.read(kept.data, kept.start, lidar.packet_size, host_ns)
+        known = None if batch.content_key is None else batch.content_key[index]
+        found = sensor.loops.read(kept.data, kept.start, lidar.packet_size, host_ns, known)
         if found is None:
             return None
         headers, key = found

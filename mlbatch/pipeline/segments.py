@@ -36,6 +36,7 @@ class ClippedRecording(WrappedRecording):
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield the packets of the segment, in file order; each call is a new pass."""
         self.inner.keep = self.keep
+        self.inner.lend = self.lend
         batches = self.inner.packets()
         try:
             for batch in batches:

@@ -147,6 +147,6 @@ def new_ring(lidar: Lidar, arena: PacketArena | None = None) -> PacketRing | Are
 
     What numpy decodes is copied, since it gathers records, which are then close to each other.
     """
-    if arena is None or lidar.pixels is None:
+    if arena is None or (lidar.pixels is None and not lidar.has_places):
         return PacketRing(lidar.packet_size, lidar.records)
     return ArenaRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)

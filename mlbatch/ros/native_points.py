@@ -15,11 +15,11 @@ from mlbatch.ros.point_packets import HEAD, Layout, Points, check_columns, pack
 from mlbatch.ros.point_rows import REAL_ROLES, Rows, TakenRows
 
 # sensor_msgs/PointField, by numpy's name of the type.
-_NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # A field that is not there.
-_NONE = (0, 0)
+NONE = (0, 0)
 # As in `clouds.c`.
-_MOST_RUNS = 512
+MOST_RUNS = 512
 # Slots of a point: else most of them are empty, and the points are sorted.
 _MOST_USED = 8
 
@@ -27,7 +27,7 @@ _MOST_USED = 8
 def take_rows_compiled(rows: Rows) -> TakenRows:
     """See `point_rows.take_rows`."""
     known = dict(rows.dtype.fields or {})
-    reals_of = [_field(known, name) for name in REAL_ROLES]
+    reals_of = [field_of(known, name) for name in REAL_ROLES]
     # The time is the first: it decides which points are kept.
     roles = ["time", *(role for role in known if role not in ("time", *REAL_ROLES))]
     others = [known[role] for role in roles]
@@ -45,7 +45,7 @@ def take_rows_compiled(rows: Rows) -> TakenRows:
         rows.strides[0],
         address(real_at),
         address(real_type),
-        _NUMBERS[known["time"][0].str[1:]],
+        NUMBERS[known["time"][0].str[1:]],
         len(roles),
         address(field_at),
         address(field_bytes),
@@ -59,12 +59,12 @@ def take_rows_compiled(rows: Rows) -> TakenRows:
     )
 
 
-def _field(known: dict[str, Any], name: str) -> tuple[int, int]:
+def field_of(known: dict[str, Any], name: str) -> tuple[int, int]:
     """Byte in a row and number of the type of a field."""
     if name not in known:
-        return _NONE
+        return NONE
     dtype, first = known[name][:2]
-    return first, _NUMBERS[dtype.str[1:]]
+    return first, NUMBERS[dtype.str[1:]]
 
 
 def pack_compiled(points: Points, layout: Layout, message_bytes: int) -> U8Array:
@@ -130,7 +130,7 @@ def _by_runs(points: Points, layout: Layout) -> _Placed | None:
     stamp_ns = np.ascontiguousarray(points.stamp_ns)
     stamps, spare = np.empty((2, count), np.int64)
     column = np.empty(count, np.int32)
-    begins = np.empty(_MOST_RUNS + 1, np.int64)
+    begins = np.empty(MOST_RUNS + 1, np.int64)
     found = np.zeros(1, np.int64)
     runs = loops.mlbatch_cloud_runs(
         count,

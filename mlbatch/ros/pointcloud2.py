@@ -75,7 +75,7 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True)
-class _Raw:
+class RawCloud:
     """Points of a message before conversion.
 
     rows: fields by role; stamp_ns, frame: of the header; lidar_id: of all points, None without.
@@ -99,7 +99,7 @@ def by_convention(frame: str) -> PointRule:
 
 def read_cloud(message: Message, rules: Rules = by_convention, take: Take = take_rows) -> Cloud:
     """The points of a message; rules: by its frame_id; CloudError if they cannot be read."""
-    raw = _raw(message, rules)
+    raw = raw_cloud(message, rules)
     rule = rules(raw.frame)
     taken = take(raw.rows)
     fields = taken.fields
@@ -141,7 +141,7 @@ class CloudHead:
 
 def sample_cloud(message: Message, rules: Rules) -> CloudHead:
     """Frame, lidars and times of a message as they are stored; CloudError as in `read_cloud`."""
-    raw = _raw(message, rules)
+    raw = raw_cloud(message, rules)
     fields = take_rows(raw.rows).fields
     time = fields["time"]
     _ring(fields, rules(raw.frame))
@@ -155,7 +155,7 @@ def sample_cloud(message: Message, rules: Rules) -> CloudHead:
     return CloudHead(raw.frame, lidar_ids, sample)
 
 
-def _raw(message: Message, rules: Rules) -> _Raw:
+def raw_cloud(message: Message, rules: Rules) -> RawCloud:
     try:
         return _READERS[message.topic.type](message, rules)
     except MessageError as err:
@@ -194,7 +194,7 @@ def _cursor(message: Message) -> Cursor:
     return Cursor(message.topic.encoding, message.data, 0, len(message.data))
 
 
-def _custom(message: Message, rules: Rules) -> _Raw:
+def _custom(message: Message, rules: Rules) -> RawCloud:
     """The points of a Livox CustomMsg."""
     cursor = _cursor(message)
     stamp_ns, frame = cursor.header()
@@ -217,7 +217,7 @@ def _custom(message: Message, rules: Rules) -> _Raw:
         if given not in ("", own):
             raise _unknown_field(rules(frame), key, given, (own,))
     zero = Zero("offset_time (uint32)", base_ns, base)
-    return _Raw(rows, zero, stamp_ns or base_ns, frame, lidar_id)
+    return RawCloud(rows, zero, stamp_ns or base_ns, frame, lidar_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ class _Field:
     count: int
 
 
-def _cloud2(message: Message, rules: Rules) -> _Raw:
+def _cloud2(message: Message, rules: Rules) -> RawCloud:
     """The points of a sensor_msgs/PointCloud2."""
     cursor = _cursor(message)
     stamp_ns, frame = cursor.header()
@@ -255,7 +255,7 @@ def _cloud2(message: Message, rules: Rules) -> _Raw:
     rows: Rows = np.ndarray((height, width), layout, message.data, at, (row_step, step))
     type_name = np.dtype(_TYPES[time.type]).name
     zero = Zero(f"{time.name} ({type_name})", stamp_ns, "the header's stamp")
-    return _Raw(rows.reshape(-1), zero, stamp_ns, frame)
+    return RawCloud(rows.reshape(-1), zero, stamp_ns, frame)
 
 
 def _fields(cursor: Cursor) -> dict[str, _Field]:
@@ -338,7 +338,7 @@ def _unknown_field(rule: PointRule, key: str, name: str, known: Sequence[str]) -
     )
 
 
-_READERS: Mapping[str, Callable[[Message, Rules], _Raw]] = {
+_READERS: Mapping[str, Callable[[Message, Rules], RawCloud]] = {
     "sensor_msgs/PointCloud2": _cloud2,
     "livox_ros_driver/CustomMsg": _custom,
     "livox_ros_driver2/CustomMsg": _custom,

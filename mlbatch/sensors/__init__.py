@@ -19,8 +19,8 @@ from typing import Protocol, cast
 from mlbatch import entry_points
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
+from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.interface import Calibration, SensorModel
-from mlbatch.sensors.base import content_keys
 from mlbatch.sensors.options import DECODE_OPTIONS
 
 __all__ = [

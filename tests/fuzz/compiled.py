@@ -18,6 +18,7 @@ from mlbatch.arrays import I64Array, U8Array
 from mlbatch.batching.merge import ColumnMerge, column_merge
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
 from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.lidar.content_keys import content_keys, hash_factors
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.capture import CaptureLoops, Found
@@ -25,7 +26,7 @@ from mlbatch.native.library import trouble
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.frames import Addresses, Dissection, Frames, dissect
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
-from mlbatch.ros.point_rows import take_rows
+from mlbatch.ros.point_rows import Rows, take_rows
 from mlbatch.types import EXTRAS, Columns, RunInfo, SensorInfo, WindowColumns
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import ouster_packets, same_as_numpy
@@ -51,6 +52,7 @@ from tests.fuzz.readers import capture_records
 
 if not trouble():
     from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
+    from mlbatch.ros.native_rows import RowPacker
 
 _ETHERNET = 1
 _PACKETS = 3
@@ -262,6 +264,37 @@ def _cloud(data: bytes, folder: Path) -> None:
     points = Points(stamp_ns, one.reals, ring.astype(np.uint16), np.zeros_like(tag), tag)
     if _packed(pack, points) != _packed(pack_compiled, points):
         raise BrokenLaw("compiled loops pack other columns than numpy")
+    _pack_at_once(rows)
+
+
+def _pack_at_once(rows: Rows) -> None:
+    """Rows whose rings fit, straight to packets, unless they are unusual."""
+    layout = Layout(0, 16, by_ring=True)
+    rows = rows.copy()
+    rows["ring"] %= layout.slots
+    factors = hash_factors(layout.size // 8)
+    found = RowPacker().pack(
+        rows,
+        lambda time: (START_NS + time.astype(np.int64), ""),
+        layout,
+        1 << 22,
+        lambda count, size: np.full((count, size), 0xA5, np.uint8),
+        factors,
+    )
+    if found is None:
+        return
+    one = take_rows(rows)
+    stamp_ns = START_NS + one.fields["time"].astype(np.int64)
+    tag = one.fields["tag"]
+    points = Points(stamp_ns, one.reals, one.fields["ring"], np.zeros_like(tag), tag)
+    expected = pack(points, layout, 1 << 22)
+    if found.packets.tobytes() != expected.tobytes():
+        raise BrokenLaw("compiled loops pack rows at once to other columns than numpy")
+    if (found.placed, found.points) != (one.placed, len(points)):
+        raise BrokenLaw("compiled loops count other points than numpy")
+    keys = found.content_key
+    if keys is None or keys.tolist() != content_keys(expected).tolist():
+        raise BrokenLaw("compiled loops give packets other keys than numpy")
 
 
 def _packed(pack_points: Callable[[Points, Layout, int], U8Array], points: Points) -> object:

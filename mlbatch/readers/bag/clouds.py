@@ -11,14 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mlbatch.arrays import U8Array
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.lidar.content_keys import hash_factors
+from mlbatch.native.arena import PacketArena
 from mlbatch.readers.bag.cloud_topics import CloudTopics
 from mlbatch.ros.point_packets import CloudError, Pack, Points, layout_of, pack
 from mlbatch.ros.point_rows import Take, take_rows
-from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, read_cloud
+from mlbatch.ros.point_times import stamps
+from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, raw_cloud, read_cloud
 from mlbatch.types import (
     Message,
     PacketBatch,
@@ -27,6 +31,9 @@ from mlbatch.types import (
     StreamTable,
     WrappedRecording,
 )
+
+if TYPE_CHECKING:
+    from mlbatch.ros.native_rows import PackedRows, RowPacker
 
 # A batch ends when this many bytes of packets have been made.
 _BATCH_BYTES = 8 << 20
@@ -58,6 +65,13 @@ class _TopicCounts:
         self.without_place += cloud.without_place
         self.without_time += cloud.without_time
 
+    def add_packed(self, rows: int, packed: PackedRows) -> None:
+        """Count a cloud of so many rows that was packed at once."""
+        self.time_meanings.setdefault(packed.time_meaning)
+        self.points += rows
+        self.without_place += rows - packed.placed
+        self.without_time += packed.placed - packed.points
+
     def add_fault(self, why: str) -> None:
         """Count a cloud that could not be read."""
         self.faults += 1
@@ -78,23 +92,39 @@ class _TopicCounts:
         return f"{start}left out of {self.points} points: {left_out}"
 
 
-def _loops(engine: str) -> tuple[Take, Pack]:
-    """What takes the points of a message, and what packs them."""
+def _loops(engine: str) -> tuple[Take, Pack, RowPacker | None]:
+    """What takes the points of a message, what packs them, and what does both at once."""
     if engine != "native":
-        return take_rows, pack
+        return take_rows, pack, None
     # Imported on demand: the library may be missing.
     from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
+    from mlbatch.ros.native_rows import RowPacker
 
-    return take_rows_compiled, pack_compiled
+    return take_rows_compiled, pack_compiled, RowPacker()
+
+
+class _Room:
+    """Memory for the packets of a cloud: in an arena, at `place`."""
+
+    def __init__(self, arena: PacketArena) -> None:
+        self.place: int | None = None
+        self._arena = arena
+
+    def __call__(self, packets: int, size: int) -> U8Array:
+        """Memory (packets, size) with any content."""
+        region, self.place = self._arena.reserve(packets * size)
+        return region.reshape(packets, size)
 
 
 @dataclass(slots=True)
 class _Packed:
-    """Packets (n, size) of one lidar in a message."""
+    """Packets (n, size) of one lidar in a message; place, content_key: as in `PacketBatch`."""
 
     message: Message
     stream: Stream
     packets: U8Array
+    place: int | None = None
+    content_key: I64Array | None = None
 
 
 class CloudRecording(WrappedRecording):
@@ -104,7 +134,10 @@ class CloudRecording(WrappedRecording):
     `keep` names them.
     """
 
-    __slots__ = ("_counts", "_pack_points", "_take", "clouds", "streams")
+    __slots__ = (
+        *("_arena", "_counts", "_next_arena", "_pack_points", "_pack_rows", "_scratch", "_take"),
+        *("clouds", "streams"),
+    )
 
     def __init__(self, inner: Recording, streams: StreamTable, clouds: CloudTopics) -> None:
         super().__init__(inner)
@@ -113,6 +146,16 @@ class CloudRecording(WrappedRecording):
         self._counts: dict[str, _TopicCounts] = {}
         self._take: Take = take_rows
         self._pack_points: Pack = pack
+        self._pack_rows: RowPacker | None = None
+        # For packets of this pass, and of the next one; `_scratch`: where none is given.
+        self._scratch = PacketArena()
+        self._arena = self._scratch
+        self._next_arena: PacketArena | None = None
+
+    def use_arena(self, arena: PacketArena) -> bool:
+        """Pack the clouds of the next pass into an arena."""
+        self._next_arena = arena
+        return True
 
     @property
     def verdicts(self) -> list[str]:
@@ -132,16 +175,25 @@ class CloudRecording(WrappedRecording):
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, those of clouds among them; each call is a new pass."""
         self._counts = {topic.name: _TopicCounts() for topic in self.clouds.topics}
-        self._take, self._pack_points = _loops(self.inner.engine)
+        self._take, self._pack_points, self._pack_rows = _loops(self.inner.engine)
+        arena = self._next_arena
+        self._next_arena = None
+        self._scratch = PacketArena()
+        self._arena = self._scratch if arena is None else arena
         self.inner.keep = self.keep | self._counts.keys()
+        # Clouds are read before the next batch.
+        self.inner.lend = frozenset(self._counts.keys() - self.keep)
         batches = self.inner.packets()
         try:
             for batch in batches:
+                # The last one is not in use any more.
+                self._scratch.keep_from(None)
                 for part in self._with_clouds(batch):
                     if len(part) or part.messages:
                         yield part
         finally:
             batches.close()
+            self.inner.lend = frozenset()
             self.inner.notes += [
                 f"{name}: {counts.faults} clouds could not be read; the first: {counts.first_fault}"
                 for name, counts in self._counts.items()
@@ -176,6 +228,9 @@ class CloudRecording(WrappedRecording):
         name = message.topic.name
         counts = self.inner.counts
         try:
+            at_once = self._packed_at_once(message)
+            if at_once is not None:
+                return [at_once]
             cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame), self._take)
             packed = [
                 _Packed(message, stream, packets)
@@ -193,6 +248,39 @@ class CloudRecording(WrappedRecording):
             counts.frames += len(one.packets)
             counts.datagrams += len(one.packets)
         return packed
+
+    def _packed_at_once(self, message: Message) -> _Packed | None:
+        """The packets of a usual cloud of one lidar that has a layout; None for others."""
+        name = message.topic.name
+        lidars = self.clouds.lidars[name]
+        if self._pack_rows is None or not lidars.frames:
+            return None
+        raw = raw_cloud(message, lambda frame: self.clouds.rule(name, frame))
+        if raw.lidar_id is not None:
+            return None
+        stream = lidars.stream(name, raw.frame, None)
+        layout = self.clouds.layouts.get(stream)
+        if layout is None:
+            return None
+        rule = self.clouds.rule(name, raw.frame)
+        room = _Room(self._arena)
+        packed = self._pack_rows.pack(
+            raw.rows,
+            lambda times: stamps(times, raw.zero, rule, raw.rows["time"]),
+            layout,
+            len(message.data),
+            room,
+            None if self._arena is self._scratch else hash_factors(layout.size // 8),
+        )
+        if packed is None:
+            return None
+        self._counts[name].add_packed(len(raw.rows), packed)
+        self.clouds.frames.setdefault(stream, raw.frame)
+        self.inner.counts.frames += len(packed.packets)
+        self.inner.counts.datagrams += len(packed.packets)
+        # Places in the scratch memory are of this pass alone.
+        place = None if self._arena is self._scratch else room.place
+        return _Packed(message, stream, packed.packets, place, packed.content_key)
 
     def _by_lidar(self, topic: str, cloud: Cloud) -> Iterator[tuple[Stream, Points]]:
         """The points of each lidar, and its stream; none without points."""
@@ -249,8 +337,14 @@ class CloudRecording(WrappedRecording):
         columns = np.concatenate(parts, axis=1)
         columns = columns[:, np.argsort(columns[4], kind="stable")]
         # A single cloud is not copied.
-        joined = data[0] if len(data) == 1 else np.concatenate(data)
-        return PacketBatch(joined, columns[0], columns[1], columns[2], columns[3])
+        is_single = len(data) == 1
+        joined = data[0] if is_single else np.concatenate(data)
+        start, size, stream, host_ns, _ = columns
+        found = PacketBatch(joined, start, size, stream, host_ns)
+        if is_single:
+            found.place = packed[0].place
+            found.content_key = packed[0].content_key
+        return found
 
     def _number(self, stream: Stream) -> int:
         """Number of a stream; its packets have no receive time of their own."""

@@ -128,7 +128,8 @@ class _Unpacking:
             topic = self._recording.topics[number]
             rows = np.flatnonzero(portion.topic == number)
             if topic.name in self._recording.keep:
-                kept += [(row, _message(topic, portion, row)) for row in rows.tolist()]
+                lends = topic.name in self._recording.lend
+                kept += [(row, _message(topic, portion, row, lends)) for row in rows.tolist()]
             unpacker = self._unpacker(number, topic, len(rows))
             if unpacker is None:
                 continue
@@ -193,9 +194,9 @@ class _Unpacking:
         ]
 
 
-def _message(topic: Topic, portion: Portion, row: int) -> Message:
+def _message(topic: Topic, portion: Portion, row: int, lends: bool) -> Message:
     data = portion.data[int(portion.begin[row]) : int(portion.end[row])]
-    return Message(topic, int(portion.log_ns[row]), data.tobytes())
+    return Message(topic, int(portion.log_ns[row]), data.data if lends else data.tobytes())
 
 
 def _joined(

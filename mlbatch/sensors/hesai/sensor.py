@@ -15,9 +15,10 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
+from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
-from mlbatch.sensors.base import BaseLidar, content_keys
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
 from mlbatch.sensors.hesai.at128 import at128_projection

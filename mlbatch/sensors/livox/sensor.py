@@ -15,9 +15,10 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
+from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
-from mlbatch.sensors.base import BaseLidar, content_keys
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.livox.identify import describe, identify
 from mlbatch.sensors.livox.packets import (
     HEADER_SIZE,

@@ -16,7 +16,9 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError
+from mlbatch.lidar.content_keys import hash_factors
 from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
+from mlbatch.lidar.header_table import SingleColumns
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.lidar.placed import LastRead, PlacedPoints
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
@@ -42,6 +44,7 @@ _FITS = 100
 _BAD_HEADER = FAULTS.index("bad_header")
 # Magic, version, kind and slots: the same in all packets of a topic.
 _SHARED_BYTES = 8
+_STAMP_AT = 8
 # The table number of a rotor word has room for so many rings.
 _RINGS = 128
 
@@ -110,6 +113,7 @@ def describe(size: int, sample: U8Array) -> str | None:
 class CloudLidar(BaseLidar):
     """A topic of clouds; implements `Lidar`."""
 
+    has_places = True
     sends_twice = False
     typed_by = ""
 
@@ -139,6 +143,14 @@ class CloudLidar(BaseLidar):
         self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
         self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
         self._scratch = LastRead()
+        # In columns of one point, rotor words differ.
+        if slots > 1:
+            self.headers = SingleColumns(
+                layout.size,
+                int(self._shared.view("<i8")),
+                _STAMP_AT,
+                hash_factors(layout.size // 8),
+            )
 
     def faults(self, packets: U8Array) -> U8Array:
         """`bad_header` for packets of another layout."""

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array
+from mlbatch.lidar.content_keys import hash_factors
 from mlbatch.lidar.geometry import Projection, rotor_words
 from mlbatch.lidar.header_table import PacedBlocks
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.base import BaseLidar, hash_factors
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection

@@ -1,0 +1,150 @@
+"""Rows of clouds straight to packets by compiled loops (`native/clouds.c`), where they are usual.
+
+Usual are clouds of a spinning lidar: a ring for each point, times that rise in a few runs, one
+lidar a message. The packets are those of `pointcloud2.read_cloud` and `point_packets.pack`, which
+read all other clouds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.arrays import I64Array, U8Array, U64Array
+from mlbatch.native.library import address, library
+from mlbatch.ros.native_points import MOST_RUNS, field_of
+from mlbatch.ros.point_packets import Layout, check_columns
+from mlbatch.ros.point_rows import AXES, Rows
+
+# In the order of `clouds.c`, and types that these fields may have; None: any.
+_ROLES = (*AXES, "intensity", "ring", "return_type", "tag")
+_TYPES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(AXES, ("f4",)),
+    "ring": ("u1", "u2"),
+    "return_type": ("u1",),
+    "tag": ("u1",),
+    "time": ("i4", "u4", "f4", "f8"),
+}
+# Distinct times of the points of a cloud that are followed.
+_MOST_TIMES = 1 << 15
+
+# Stamps (n,) of times (n,), and their meaning.
+Stamps: TypeAlias = Callable[[npt.NDArray[Any]], tuple[I64Array, str]]
+# Memory (packets, bytes) for packets, with any content.
+Room: TypeAlias = Callable[[int, int], U8Array]
+
+
+class PackedRows(NamedTuple):
+    """Packets (P, size) of a message; placed: rows with a place; points: those with a time, too.
+
+    content_key: (P,) as `lidar.content_keys`, None without factors.
+    """
+
+    packets: U8Array
+    content_key: I64Array | None
+    time_meaning: str
+    placed: int
+    points: int
+
+
+class RowPacker:
+    """Packs the rows of messages; its scratch arrays are used again."""
+
+    def __init__(self) -> None:
+        self._times: npt.NDArray[np.uint64] = np.empty(_MOST_TIMES, np.uint64)
+        self._number: npt.NDArray[np.int32] = np.empty(0, np.int32)
+        # By order, whether they are used, ranks, begins of runs; and figures.
+        self._scratch: tuple[npt.NDArray[Any], ...] = (
+            np.empty(_MOST_TIMES, np.int32),
+            np.empty(_MOST_TIMES, np.uint8),
+            np.empty(_MOST_TIMES + 1, np.int32),
+            np.empty(MOST_RUNS + 1, np.int64),
+            np.empty(3, np.int64),
+        )
+        self._scratch_at = [address(one) for one in self._scratch]
+        self._times_at = address(self._times)
+        self._number_at = 0
+
+    def pack(
+        self,
+        rows: Rows,
+        stamps: Stamps,
+        layout: Layout,
+        message_bytes: int,
+        room: Room,
+        factors: U64Array | None = None,
+    ) -> PackedRows | None:
+        """Packets of rows (n,) by ring; None where these are unusual. CloudError as `pack`.
+
+        factors: (layout.size // 8,) of their words in content keys, or None.
+        """
+        known = dict(rows.dtype.fields or {})
+        if not layout.by_ring or not _is_usual(known) or not len(rows):
+            return None
+        loops = library()
+        if len(rows) > len(self._number):
+            self._number = np.empty(len(rows), np.int32)
+            self._number_at = address(self._number)
+        fields = np.array([field_of(known, role) for role in _ROLES], np.int64)
+        fields_at, types = fields.T.copy()
+        axes_at = address(fields_at)
+        time_at, time_type = field_of(known, "time")
+        time_kind = known["time"][0]
+        rows_at = rows.__array_interface__["data"][0]
+        columns = loops.mlbatch_cloud_times(
+            len(rows),
+            rows_at,
+            rows.strides[0],
+            axes_at,
+            time_at,
+            time_type,
+            _MOST_TIMES,
+            self._times_at,
+            self._number_at,
+            *self._scratch_at,
+        )
+        placed, points, runs = self._scratch[-1].tolist()
+        # One time for all points is an error elsewhere.
+        if columns < 2:
+            return None
+        stamp_ns, meaning = stamps(self._times.view(time_kind)[:columns])
+        # Times in s may be the same in ns.
+        if not bool((stamp_ns[1:] > stamp_ns[:-1]).all()):
+            return None
+        check_columns(columns, points, layout, message_bytes)
+        packets = room(columns, layout.size)
+        content_key = np.empty(columns, np.int64)
+        head = layout.begin
+        _, _, ranks_at, begins_at, _ = self._scratch_at
+        is_packed = loops.mlbatch_cloud_fill(
+            rows_at,
+            rows.strides[0],
+            axes_at,
+            address(types),
+            runs,
+            begins_at,
+            self._number_at,
+            ranks_at,
+            columns,
+            address(stamp_ns),
+            address(head),
+            layout.slots,
+            layout.size,
+            None if factors is None else address(factors),
+            address(packets),
+            address(content_key),
+        )
+        if not is_packed:
+            return None
+        known_key = None if factors is None else content_key
+        return PackedRows(packets, known_key, meaning, placed, points)
+
+
+def _is_usual(known: dict[str, Any]) -> bool:
+    """Whether the loops read all fields of rows; lidars that share messages are told apart."""
+    if "lidar_id" in known or not {*AXES, "ring", "time"} <= known.keys():
+        return False
+    return all(known[role][0].str[1:] in types for role, types in _TYPES.items() if role in known)
