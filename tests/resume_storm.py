@@ -76,6 +76,7 @@ _ONE_JOB = {
     "rosbag2": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", "--pass", "/chatter")),
     "rosbag2 zstd": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", *ZSTD)),
     "npz": Case("session/drive.pcap", "out", TWO),
+    "npz shard": Case("session/drive.pcap", "out", (*TWO, "--shard", "2/3")),
     "npz split": Case("session/drive.pcap", "out", (*TWO, "--split", "--slices", "2")),
     "ply": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--min-range", "4.1")),
     "jumps": Case("jumps/drive.pcap", "out.mcap", ("--on-jump", "split", "--keep-partial")),
@@ -240,6 +241,11 @@ def contents(folder: Path) -> dict[str, object]:
                 for k, v in json.loads(path.read_text()).items()
                 if k not in ("timing", "command")
             }
+        elif path.name == "shard.json":
+            account = json.loads(path.read_text())
+            for key in ("timing", "command"):
+                del account["report"][key]
+            found[name] = account
         else:
             found[name] = path.read_bytes()
     return found

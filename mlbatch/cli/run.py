@@ -246,12 +246,12 @@ def _print_shard(output: ShardOutput, inputs: RunReport, target: Target) -> None
     account = output.account
     if target.quiet or account is None:
         return
-    scans = sum(bool(scan.sizes) for scan in account.scans)
     number, count = account.shard.number, account.shard.count
     typer.echo(
         one_line(
-            f"wrote {target.written}: shard {number} of {count}, {scans} of {len(account.scans)} "
-            f"scans, {inputs.scans.points} points; join all {count} with mlbatch merge"
+            f"wrote {target.written}: shard {number} of {count}, {len(account.scans)} of "
+            f"{account.total} scans, {inputs.scans.points} points; join all {count} with mlbatch "
+            "merge"
         )
     )
 

@@ -7,6 +7,7 @@ be the same. Each has the points of its own scans, whose sum completes the repor
 from __future__ import annotations
 
 import contextlib
+import heapq
 import os
 import resource
 import shutil
@@ -103,20 +104,21 @@ def _check_same(parts: Sequence[Part]) -> None:
                 f"{part.folder}: expected the account of {parts[0].folder}, found another: "
                 f"{found}; a recording was changed: convert both shards again"
             )
-    for number, scan in enumerate(parts[0].account.scans):
-        owner = _owner(parts, scan)
-        for part in parts:
-            has = bool(part.account.scans[number].sizes)
-            if has != (part is owner):
-                raise RecordingError(
-                    f"{part.folder}: expected the scans of shard {part.account.shard}, found "
-                    "others; convert this shard again with --overwrite"
-                )
-
-
-def _owner(parts: Sequence[Part], scan: ShardScan) -> Part:
     slices = parts[0].account.info.slices
-    return next(part for part in parts if part.account.shard.has(scan.index, scan.slice, slices))
+    for part in parts:
+        shard = part.account.shard
+        if not all(shard.has(scan.index, scan.slice, slices) for scan in part.account.scans):
+            raise RecordingError(
+                f"{part.folder}: expected the scans of shard {shard}, found others; convert this "
+                "shard again with --overwrite"
+            )
+    total = parts[0].account.total
+    numbers = [scan.number for _, scan in _merged_scans(parts)]
+    if numbers != list(range(total)):
+        raise RecordingError(
+            f"expected the {total} scans of the recording in {len(parts)} shards, found "
+            f"{len(numbers)}; convert all shards again"
+        )
 
 
 def _first_difference(where: str, expected: Any, found: Any) -> str:
@@ -161,9 +163,8 @@ def merge(
         if not isinstance(writer, FolderWriter):
             raise UsageError(f"{account.format}: expected a format with a file for each scan")
         table = ScanTable(account.info, account.columns_per_s)
-        for figures in _merged_scans(parts):
+        for owner, figures in _merged_scans(parts):
             scan = figures.scan(account.info)
-            owner = _owner(parts, figures)
             for suffix, path in writer.files(scan, figures.only).items():
                 size = figures.sizes.get(suffix)
                 _take(owner.folder / path.relative_to(writer.folder), size, path)
@@ -207,10 +208,14 @@ def _check_apart(parts: Sequence[Part], target: Path) -> None:
             )
 
 
-def _merged_scans(parts: Sequence[Part]) -> Iterator[ShardScan]:
-    """All scans in order, each with the points and sizes of the shard that made it."""
-    for number, scan in enumerate(parts[0].account.scans):
-        yield _owner(parts, scan).account.scans[number]
+def _merged_scans(parts: Sequence[Part]) -> Iterator[tuple[Part, ShardScan]]:
+    """All scans in order, each with the part that has it."""
+    scans = (
+        [(scan.number, number, scan) for scan in part.account.scans]
+        for number, part in enumerate(parts)
+    )
+    for _, number, scan in heapq.merge(*scans, key=lambda one: one[:2]):
+        yield parts[number], scan
 
 
 def _take(source: Path, size: int | None, path: Path) -> None:

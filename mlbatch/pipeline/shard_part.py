@@ -6,6 +6,7 @@ shard's own scans alone. From those of all shards the report and the table of sc
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -38,12 +39,14 @@ SCHEMA = "mlbatch.shard/1"
 
 @dataclass(frozen=True, slots=True)
 class ShardScan:
-    """A scan of the whole recording; the fields are those of `Scan`, but these.
+    """A scan of a shard; the fields are those of `Scan`, but these.
 
-    only: with `--split` the index of its sensor; stamps_ns: of the first and the last column, none
-    without a column; sizes: bytes of its files, by suffix, {} of another shard's scan.
+    number: among all scans of the recording; only: with `--split` the index of its sensor;
+    stamps_ns: of the first and the last column, none without a column; sizes: bytes of its files,
+    by suffix.
     """
 
+    number: int
     only: int | None
     index: int
     slice: int
@@ -94,10 +97,11 @@ class ShardScan:
         )
 
 
-def _figures(scan: Scan, only: int | None) -> ShardScan:
+def _figures(scan: Scan, number: int, only: int | None) -> ShardScan:
     """What the account keeps of a scan."""
     stamps = scan.column_stamp_ns
     return ShardScan(
+        number,
         only,
         scan.index,
         scan.slice,
@@ -122,7 +126,8 @@ class Account:
     """Content of shard.json.
 
     identity: what all shards share, see `identity_of_parts`; content: checksum of what was read;
-    notes_before_points: warnings of the report that precede those about points.
+    notes_before_points: warnings of the report that precede those about points; total: number of
+    scans of all shards; figures: digest of all of them, without points; scans: of this shard.
     """
 
     shard: Shard
@@ -136,12 +141,15 @@ class Account:
     notes_before_points: int
     info: RunInfo
     report: RunReport
+    total: int
+    figures: str
     scans: tuple[ShardScan, ...]
 
     def shared(self) -> dict[str, Any]:
         """What must be the same in the accounts of all shards, as JSON values."""
         found = _fields(to_json(replace(self, scans=())))
         del found["shard"]
+        del found["scans"]
         report = found["report"]
         for name in ("timing", "command"):
             del report[name]
@@ -151,8 +159,6 @@ class Account:
             del sensor["ledger"]["points"]
         for name in ("points", "no_points", "empty_clouds"):
             del report["scans"][name]
-        alike = (replace(scan, sizes={}, points_per_sensor=()) for scan in self.scans)
-        found["scans"] = [to_json(scan) for scan in alike]
         return found
 
 
@@ -161,19 +167,36 @@ class Account:
 
 @dataclass(slots=True)
 class ShardWriter:
-    """Writes the scans of one shard to a folder, and notes all scans; see `ScanWriter`.
+    """Writes the scans of one shard to a folder, and notes them; see `ScanWriter`.
 
-    scans: of the whole recording, in their order; info: of the run.
+    info: of the run; total: number of scans of all shards; scans: of this one.
     """
 
     inner: FolderWriter
     shard: Shard
     info: RunInfo
+    total: int = 0
     scans: list[ShardScan] = field(default_factory=list)
+    _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+
+    @property
+    def figures(self) -> str:
+        """Digest of the figures of all scans."""
+        return self._digest.hexdigest()
 
     def has(self, scan: Scan) -> bool:
         """Whether a scan is of this shard."""
         return self.shard.has(scan.index, scan.slice, scan.slices)
+
+    def note(self, scan: Scan, sensor: int | None) -> None:
+        """Note the next scan, of any shard."""
+        figures = _figures(scan, self.total, sensor)
+        # Points of other shards are unknown.
+        known = to_json(replace(figures, points_per_sensor=()))
+        self._digest.update(json.dumps(known).encode())
+        self.total += 1
+        if self.has(scan):
+            self.scans.append(figures)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan, or only notes another shard's."""
@@ -206,14 +229,11 @@ class ShardWriter:
         self.inner.abandon()
 
     def sized_scans(self) -> tuple[ShardScan, ...]:
-        """All scans, those of this shard with the sizes of their files."""
+        """The scans of this shard with the sizes of their files."""
         sized = []
         for figures in self.scans:
-            scan = figures.scan(self.info)
-            sizes = {}
-            if self.has(scan):
-                files = self.inner.files(scan, figures.only)
-                sizes = {suffix: path.stat().st_size for suffix, path in files.items()}
+            files = self.inner.files(figures.scan(self.info), figures.only)
+            sizes = {suffix: path.stat().st_size for suffix, path in files.items()}
             sized.append(replace(figures, sizes=sizes))
         return tuple(sized)
 
@@ -235,7 +255,7 @@ class _NotedJob(ScanJob):
         self._job.pack()
 
     def append(self) -> None:
-        self._writer.scans.append(_figures(self._scan, self._sensor))
+        self._writer.note(self._scan, self._sensor)
         self._job.append()
 
     def compress(self) -> None:
@@ -304,6 +324,8 @@ class ShardOutput:
             notes_before_points=run.notes_before_points,
             info=writer.info,
             report=report,
+            total=writer.total,
+            figures=writer.figures,
             scans=writer.sized_scans(),
         )
         head = {"schema": SCHEMA, "version": mlbatch.__version__}

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline import resume, shard_merge, state_file
+from mlbatch.pipeline import resume, state_file
 from mlbatch.types import Scan
 from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
@@ -364,6 +364,19 @@ def test_points_that_no_scan_has_are_refused(shell: Shell) -> None:
     _refused(shell, ["part1", "part2"], 1, "the ledger does not balance")
 
 
+def test_a_scan_that_no_shard_has_is_found(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    scans = json.loads(Path("part2/shard.json").read_text())["scans"]
+    _changed("part2", {"scans": scans[:-1]})
+    _refused(shell, ["part1", "part2"], 1, "expected the 7 scans", "found 6")
+
+
+def test_parts_that_cut_other_scans_are_refused(shell: Shell) -> None:
+    _shards(shell, CAPTURE, 2)
+    _changed("part2", {"figures": "0"})
+    _refused(shell, ["part1", "part2"], 1, "part2: expected the account of part1", "figures '0'")
+
+
 def test_a_renamed_shard_is_refused(shell: Shell) -> None:
     _shards(shell, CAPTURE, 2)
     shutil.copytree("part1", "renamed")
@@ -447,7 +460,7 @@ def test_an_output_that_another_run_writes_is_refused(
         raise ExportError(f"{path}: expected no other run that writes it, found one; wait")
 
     folders = _shards(shell, CAPTURE, 2)
-    monkeypatch.setattr(shard_merge.resume, "read_state", busy)
+    monkeypatch.setattr(resume, "read_state", busy)
     outcome = _merged(shell, folders)
     assert outcome.code == 1
     assert "found one; wait" in outcome.err
