@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mlbatch.batching.merge import ColumnMerge
+from mlbatch.batching.merge import ColumnMerge, joined
 from mlbatch.lidar.geometry import SECTORS
 from mlbatch.native.library import Part, address, library
 from mlbatch.types import ColumnFigures, Columns, WindowColumns, WindowFigures
@@ -14,6 +14,8 @@ from mlbatch.types import ColumnFigures, Columns, WindowColumns, WindowFigures
 _FIGURES = 7
 # As in `merge.c`.
 MOST_SENSORS = 256
+# Of a sensor; more, as of packets that come one by one, cost less when they are joined first.
+_MOST_PARTS = 3
 
 
 class NativeColumnMerge(ColumnMerge):
@@ -29,6 +31,9 @@ class NativeColumnMerge(ColumnMerge):
         """See `ColumnMerge`."""
         if len(waiting) > MOST_SENSORS:
             return super().take_until(waiting, until)
+        for own in waiting:
+            if len(own) > _MOST_PARTS:
+                own[:] = [joined(own)]
         parts = [(sensor, one) for sensor, own in enumerate(waiting) for one in own]
         structs = (Part * len(parts))()
         kept = []

@@ -17,10 +17,12 @@ class PacketArena:
     region is contiguous. A larger array replaces `data` where what is still needed leaves no room;
     the old one stays as it is for those who have it.
 
-    data: `capacity` bytes and spare ones; origin: a place that is byte 0 of `data`.
+    data: `capacity` bytes and spare ones; origin: a place that is byte 0 of `data`;
+    read_bytes: to read at a time, 0: as the reader likes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, read_bytes: int = 0) -> None:
+        self.read_bytes = read_bytes
         self.data: U8Array = np.zeros(_SPARE, np.uint8)
         self.capacity = 0
         self.origin = 0

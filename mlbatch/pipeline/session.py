@@ -23,6 +23,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, header_loops, new_ring
 from mlbatch.readers import merge, open_recordings
+from mlbatch.readers.source import BUFFER_BYTES
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
@@ -37,6 +38,9 @@ CLOUDS = "clouds"
 
 # Share of the bytes of a recording.
 _MOST = 0.5
+# Read at a time: each batch costs some calls a sensor, and memory grows with its size.
+_READ_BYTES_OF_SENSOR = 2 << 20
+_MOST_READ_BYTES = 16 << 20
 
 
 class Session:
@@ -67,7 +71,10 @@ class Session:
         # of others, which would be kept as long.
         kinds = {kind for found in self.setup.sensors for kind in found.kinds}
         is_mostly_lidar = self.setup.sampler.share_of(kinds) >= _MOST
-        self._arena = PacketArena() if self.engine == "native" and is_mostly_lidar else None
+        self._arena: PacketArena | None = None
+        if self.engine == "native" and is_mostly_lidar:
+            read_bytes = _READ_BYTES_OF_SENSOR * len(self.setup.sensors)
+            self._arena = PacketArena(min(max(read_bytes, BUFFER_BYTES), _MOST_READ_BYTES))
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
             self.sensors.append(self._sensor(found))

@@ -132,15 +132,16 @@ class _Pass:
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
         self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
-        self.front_bytes = recording.buffer_bytes + _FRONT_EXTRA_BYTES
         self.arena = recording.arena
+        read_bytes = 0 if self.arena is None else self.arena.read_bytes
+        self.buffer_bytes = read_bytes or recording.buffer_bytes
+        self.front_bytes = self.buffer_bytes + _FRONT_EXTRA_BYTES
         self.unknown_link: int | None = None
         self.has_known_link = False
 
     def batches(self, source: Source) -> Iterator[PacketBatch]:
         """All packets of the file."""
-        size = self.recording.buffer_bytes
-        window = Window(source, size, front=self.front_bytes, arena=self.arena)
+        window = Window(source, self.buffer_bytes, front=self.front_bytes, arena=self.arena)
         window.refill()
         while True:
             self.recording.position_bytes = source.position_bytes
