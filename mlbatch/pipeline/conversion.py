@@ -172,13 +172,19 @@ class Conversion:
                 if progress is not None:
                     scans = 0 if self.table is None else self.table.rows
                     progress(self.session.position_bytes, self.session.size_bytes, scans)
-                if self.batcher.past_end:
+                if self.batcher.past_end and not self._awaits_poses():
                     break
                 oldest_ring_indexes = self._oldest_ring_indexes()
                 self.session.keep_from(oldest_ring_indexes)
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)
+
+    def _awaits_poses(self) -> bool:
+        """Whether windows before `--end` need poses that are recorded after it."""
+        if self.deskew is None:
+            return False
+        return self.deskew.awaits(max(span[1] for span in self.batcher.spans_ns if span))
 
     def tasks(
         self, progress: Progress | None = None

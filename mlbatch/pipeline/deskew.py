@@ -47,6 +47,11 @@ class PoseSource(Protocol):
         """How long velocities were integrated, s."""
         ...
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether no poses will be added."""
+        ...
+
     def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
         """Add what a batch of the recording contains."""
         ...
@@ -60,6 +65,7 @@ class Trajectory:
     """Poses of a file, all known from the start."""
 
     gyro_bias: tuple[float, ...] = ()
+    is_complete = True
 
     def __init__(self, path: Path) -> None:
         track = read_tum(path)
@@ -99,6 +105,11 @@ class ImuPoses:
         if self._first_ns is None or self._newest_ns is None:
             return 0.0
         return max(0.0, (self._newest_ns - self._first_ns - STANDSTILL_NS) / NS_PER_S)
+
+    @property
+    def is_complete(self) -> bool:
+        """After a gap of the IMU."""
+        return self._integrator is not None and self._integrator.is_lost
 
     def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
         """Keep the samples of a batch."""
@@ -217,6 +228,13 @@ class Deskew:
         while self._waiting:
             yield from self._moved(self._waiting.popleft())
 
+    def awaits(self, newest_ns: int) -> bool:
+        """Whether windows wait for poses that may come; newest_ns: newest stamp of all sensors."""
+        if not self._waiting:
+            return False
+        self.source.advance(self._waiting[0].start_ns)
+        return not self._is_known(self._waiting[-1].end_ns, newest_ns)
+
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor in the windows that wait; None: none."""
         parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._waiting)
@@ -233,11 +251,14 @@ class Deskew:
         )
 
     def _is_due(self, newest_end_ns: int) -> bool:
-        end_ns = self._waiting[0].end_ns
+        return self._is_known(self._waiting[0].end_ns, newest_end_ns)
+
+    def _is_known(self, end_ns: int, now_ns: int) -> bool:
+        """Whether the poses of a window are known at a time, or are not waited for."""
         newest_ns = self.source.line.newest_ns
-        if newest_ns is not None and newest_ns >= end_ns:
+        if self.source.is_complete or (newest_ns is not None and newest_ns >= end_ns):
             return True
-        return self._max_wait_ns is not None and newest_end_ns - end_ns >= self._max_wait_ns
+        return self._max_wait_ns is not None and now_ns - end_ns >= self._max_wait_ns
 
     def _moved(self, window: Window) -> Iterator[Window]:
         columns = window.columns

@@ -86,6 +86,23 @@ def test_imu_poses_do_not_depend_on_engine_and_jobs(shell: Shell, tmp_path: Path
     assert one.read_bytes() == two.read_bytes()
 
 
+def test_the_end_of_a_selection_needs_later_samples_of_the_imu(
+    shell: Shell, tmp_path: Path
+) -> None:
+    """Windows of the first second have poses when it is complete, also with --end before that."""
+    text = scenario_text(SENSORS, scene=SCENE, motion=MOTION, duration=3.0, more=IMU)
+    drive = record(tmp_path, text, "mcap")
+    words = f"convert {drive.path} --rig {drive.rig} -q --deskew imu"
+    assert shell(f"{words} -o whole").code == 0
+    for end, count in (("+0.5", 5), ("+1.5", 15)):
+        assert shell(f"{words} -o part --overwrite --end {end}").code == 0
+        files = sorted(Path("part").glob("*.npz"))
+        assert len(files) == count
+        for file in files:
+            assert file.read_bytes() == (Path("whole") / file.name).read_bytes()
+        assert shell("verify part").code == 0
+
+
 def test_an_imu_integrated_for_long_is_a_warning(shell: Shell, tmp_path: Path) -> None:
     """Its velocity is that of an accelerometer with a bias."""
     motion = MOTION.replace("  sway:", "    - [12, 1.0, 3.0, 1.0, 200]\n  sway:")
