@@ -107,7 +107,7 @@ class Decoder:
             source.lidar.has_reflectivity for source in sources
         )
         choice = _ENGINES[engine]
-        columns = tile_columns(self._slots)
+        columns = tile_columns(sources)
         first_sensor = only or 0
         groups = _groups(sources, choice.joins_rotors)
         self._projectors = [

@@ -17,13 +17,16 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16
 from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, Labels
-from mlbatch.lidar.geometry import Projection, Tabled, Turning, blocks, read_rotor_words
+from mlbatch.lidar.geometry import Projection, Tabled, Turning, read_rotor_words
 from mlbatch.lidar.interface import Lidar
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import Pixels
 
-# Large enough to make calls cheap, small enough for the arrays to stay in the CPU caches.
-TILE_SLOTS = 3 << 15
+# Large enough to make calls cheap, small enough for the arrays to stay in the CPU caches; columns
+# with rotor words need three times as many calls.
+TILE_SLOTS = 1 << 15
+ROTOR_TILE_SLOTS = 3 * TILE_SLOTS
+_KEPT_VIEWS = 64
 _NO_RETURN_M = np.float32(0)
 # Return types, docs/sources/outputs.md section 3.
 _STRONGEST_FIRST = np.uint8(3)
@@ -56,9 +59,11 @@ class Source:
         return self.lidar.channels * self.lidar.returns
 
 
-def tile_columns(slots: int) -> int:
-    """Return the columns of a tile, for columns of up to `slots` slots."""
-    return max(16, TILE_SLOTS // slots)
+def tile_columns(sources: Sequence[Source]) -> int:
+    """Return the columns of a tile with columns of these sensors."""
+    has_rotors = any(source.lidar.beams.angle_rad is None for source in sources)
+    tile_slots = ROTOR_TILE_SLOTS if has_rotors else TILE_SLOTS
+    return max(16, tile_slots // max(source.slots for source in sources))
 
 
 class Tile:
@@ -75,9 +80,20 @@ class Tile:
         self.reflectivity = np.zeros(size, np.uint16)
         self.label = np.zeros(size, LABEL)
         self.keep = np.zeros(size, np.bool_)
+        self._views: dict[tuple[int, int, int], TileView] = {}
 
     def view(self, begin: int, count: int, slots: int) -> TileView:
         """Return `count` columns of `slots` slots each, from element `begin`."""
+        key = (begin, count, slots)
+        view = self._views.get(key)
+        if view is None:
+            # Most tiles are alike; those of several projectors need not be.
+            if len(self._views) == _KEPT_VIEWS:
+                self._views.clear()
+            view = self._views[key] = self._make_view(*key)
+        return view
+
+    def _make_view(self, begin: int, count: int, slots: int) -> TileView:
         elements = slice(begin, begin + count * slots)
         shape = (count, slots)
         return TileView(
@@ -106,7 +122,8 @@ class Projector:
     The sensors are its members. Slots of a column are beams in wire order times returns.
 
     counts: point counters by member; labels: (members * firing tables, slots) uint64, label words
-    without the time of the column; number: (slots,) output slot of each slot; order: (firing
+    without the time of the column; label_steps: (members,) uint64, to be added to the labels of
+    their columns, like the time; number: (slots,) output slot of each slot; order: (firing
     tables, slots), slots in firing order, None if that is wire order; limits_m: (members, 2)
     float32, minimum and maximum range.
     """
@@ -129,10 +146,12 @@ class Projector:
         self._tables = len(lidar.firing_ns)
         # Labels of members with equal firing tables differ by one number in all slots.
         steps = self.labels - self.labels[0]
-        self._label_steps = steps[:, 0].copy()
         self._repeated_labels: npt.NDArray[np.uint64] | None = None
+        self._labels_stay = False
+        self.label_steps = np.zeros(len(sources), np.uint64)
         if self._tables == 1 and bool((steps == steps[:, :1]).all()):
             self._repeated_labels = self.labels[:1].repeat(columns, axis=0)
+            self.label_steps = steps[:, 0].copy()
         self.order = _firing_order(lidar)
         self._elements = np.arange(columns * self.slots)
         if self.order is not None and self._tables == 1:
@@ -145,26 +164,24 @@ class Projector:
         self.is_limited = any(low > 0 or high < float("inf") for low, high in limits)
         self._needs_range = "range_m" in extras or self.is_limited
         self.drops_duplicates = lidar.sends_twice and not sources[0].keep_repeated
+        # Sensors whose rotor turns while beams fire are projected one by one.
+        self.is_sorted = len(sources) > 1 and not isinstance(self.projection, Tabled)
         self._records = np.empty((columns, lidar.records.size), np.uint8)
+        self._record = np.dtype((np.void, lidar.records.size))
+        self._of_member = np.empty_like(self._records if len(sources) > 1 else self._records[:0])
         self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
 
     def project(
-        self,
-        member: I64Array,
-        ring_index: I64Array,
-        encoder: I64Array,
-        offset_ns: I64Array,
-        view: TileView,
-    ) -> None:
+        self, member: I64Array, ring_index: I64Array, encoder: I64Array, view: TileView
+    ) -> Counts:
         """Decode the columns at `ring_index` into `view`; mark and count the points to keep.
 
-        member: (n,) member of each column, ascending; ring_index, encoder: (n,), as in `Columns`;
-        offset_ns: (n,) timestamp minus start of the scan.
+        member: (n,) member of each column, ascending if `is_sorted`; ring_index, encoder: (n,), as
+        in `Columns`. Labels have no `column_label` yet. Return the points of each column (n,).
         """
         lidar = self.lidar
-        own = blocks(member, len(self.sources))
-        records = self._gather(own, ring_index)
+        records = self._gather(member, ring_index)
         self.projection.prepare(member, encoder)
         for which in range(lidar.returns):
             slots = slice(which, None, lidar.returns)
@@ -179,24 +196,24 @@ class Projector:
                 view.range_m[:, slots] = range_m
         if not lidar.has_reflectivity:
             view.reflectivity[:] = 0
-        self._label(member, encoder, offset_ns, view)
+        self._label(member, encoder, view)
         if lidar.returns == 2:
             self._type_returns(view)
-        self._keep(own, view)
+        return self._keep(member, view)
 
-    def _label(
-        self, member: I64Array, encoder: I64Array, offset_ns: I64Array, view: TileView
-    ) -> None:
-        """Write the labels, times included."""
+    def _label(self, member: I64Array, encoder: I64Array, view: TileView) -> None:
+        """Write the labels but for what all slots of a column share."""
         words = view.label.view(np.uint64)
-        offset = offset_ns.astype(np.uint64)
         if self._repeated_labels is None:
             self.labels.take(self._label_row(member, encoder), axis=0, out=words, mode="clip")
-            words += offset[:, None]
-            return
-        # Adding whole arrays costs less than broadcasting a row.
-        np.copyto(words, (offset + self._label_steps[member])[:, None])
-        words += self._repeated_labels[: len(words)]
+        elif not self._labels_stay:
+            words[:] = self._repeated_labels[: len(words)]
+
+    def label_once(self, tile: Tile) -> None:
+        """Label a whole tile that no other projector uses; its labels stay from then on."""
+        if self._repeated_labels is not None:
+            tile.label.view(np.uint64)[:] = self._repeated_labels.reshape(-1)
+            self._labels_stay = True
 
     def in_firing_order(
         self, keep: BoolArray, encoder: I64Array
@@ -233,11 +250,18 @@ class Projector:
             return member
         return member * self._tables + read_rotor_words(encoder)[2]
 
-    def _gather(self, blocks: Sequence[slice], ring_index: I64Array) -> U8Array:
+    def _gather(self, member: I64Array, ring_index: I64Array) -> U8Array:
         """Return the records (n, records.size) of all columns, in their order."""
-        for source, own in zip(self.sources, blocks, strict=True):
-            source.ring.gather(ring_index[own], self._records[own])
-        return self._records[: len(ring_index)]
+        records = self._records[: len(ring_index)]
+        if len(self.sources) == 1:
+            self.sources[0].ring.gather(ring_index, records)
+            return records
+        for number, source in enumerate(self.sources):
+            own = (member == number).nonzero()[0]
+            of_member = self._of_member[: len(own)]
+            source.ring.gather(ring_index[own], of_member)
+            records.view(self._record)[own] = of_member.view(self._record)
+        return records
 
     def _type_returns(self, view: TileView) -> None:
         """Write the types of dual returns, by which is nearer and which is stronger.
@@ -263,56 +287,68 @@ class Projector:
         np.bitwise_or(kind, single, out=types[:, 0::2])
         np.bitwise_or(np.subtract(_SUM_OF_TYPES, kind, out=kind), single, out=types[:, 1::2])
 
-    def _keep(self, blocks: Sequence[slice], view: TileView) -> None:
-        """Mark the points to keep; count the other slots by reason."""
+    def _keep(self, member: I64Array, view: TileView) -> Counts:
+        """Mark the points to keep; count the other slots by reason; return points by column."""
         keep = view.keep
-        found, left = self._mark(blocks, view)
-        for counts, own, returns, distinct in zip(self.counts, blocks, found, left, strict=True):
-            slots = (own.stop - own.start) * self.slots
-            counts.slots += slots
-            counts.no_return += slots - returns
-            counts.repeated += returns - distinct
+        found, distinct = self._mark(view)
+        in_range = distinct
         if self.is_limited:
-            for own, (low, high) in zip(blocks, self.limits_m, strict=True):
-                keep[own] &= view.range_m[own] >= low
-                keep[own] &= view.range_m[own] <= high
-            now = _count_by_member(blocks, keep)
-            for counts, before, after in zip(self.counts, left, now, strict=True):
-                counts.range += before - after
-            left = now
+            low, high = self.limits_m.take(member, axis=0).T[:, :, None]
+            keep &= view.range_m >= low
+            keep &= view.range_m <= high
+            in_range = points_by_column(keep)
+        kept = in_range
         if len(self.boxes_m):
             self._cut_boxes(view.point[..., :3], keep)
-            now = _count_by_member(blocks, keep)
-            for counts, before, after in zip(self.counts, left, now, strict=True):
-                counts.box += before - after
-            left = now
-        for counts, points in zip(self.counts, left, strict=True):
-            counts.written += points
+            kept = points_by_column(keep)
+        self._count(member, found, distinct, in_range, kept)
+        return kept
 
-    def _mark(self, blocks: Sequence[slice], view: TileView) -> tuple[list[int], list[int]]:
-        """Mark the slots with a return that is no duplicate; count both by member.
+    def _mark(self, view: TileView) -> tuple[Counts, Counts]:
+        """Mark the slots with a return that is no duplicate.
 
-        A duplicate equals an earlier return of the same shot. Return the number of returns, and
-        the number without duplicates.
+        A duplicate equals an earlier return of the same shot. Return the number of returns by
+        column, and the number without duplicates.
         """
         keep = view.keep
         returns = self.lidar.returns
         if returns == 1:
             np.greater(view.range_m, _NO_RETURN_M, out=keep)
-            found = _count_by_member(blocks, keep)
+            found = points_by_column(keep)
             return found, found
         ranges_m = self._range_m[:, : len(keep)]
-        found = [0] * len(self.sources)
-        distinct = [0] * len(self.sources)
         for which, range_m in enumerate(ranges_m):
-            own = range_m > _NO_RETURN_M
-            found = list(map(int.__add__, found, _count_by_member(blocks, own)))
-            if self.drops_duplicates:
-                for earlier in ranges_m[:which]:
-                    own &= range_m != earlier
-            distinct = list(map(int.__add__, distinct, _count_by_member(blocks, own)))
-            keep[:, which::returns] = own
-        return found, distinct
+            np.greater(range_m, _NO_RETURN_M, out=keep[:, which::returns])
+        found = points_by_column(keep)
+        if not self.drops_duplicates:
+            return found, found
+        for which, range_m in enumerate(ranges_m):
+            for earlier in ranges_m[:which]:
+                keep[:, which::returns] &= range_m != earlier
+        return found, points_by_column(keep)
+
+    def _count(self, member: I64Array, *left: Counts) -> None:
+        """Count slots by reason and member; left: by column, slots left after each step."""
+        members = len(self.sources)
+        slots = np.bincount(member, minlength=members) * self.slots
+        sums: list[list[int]] = [slots.tolist()]
+        last: Counts | None = None
+        for by_column in left:
+            if by_column is not last:
+                total = np.bincount(member, by_column, members).astype(np.int64)
+                sums.append(total.tolist())
+                last = by_column
+            else:
+                sums.append(sums[-1])
+        for counts, all_slots, found, distinct, in_range, kept in zip(
+            self.counts, *sums, strict=True
+        ):
+            counts.slots += all_slots
+            counts.no_return += all_slots - found
+            counts.repeated += found - distinct
+            counts.range += distinct - in_range
+            counts.box += in_range - kept
+            counts.written += kept
 
     def _cut_boxes(self, xyz: F32Array, keep: BoolArray) -> None:
         for box in self.boxes_m:
@@ -331,11 +367,6 @@ def move(point: F32Array, moves: F32Array) -> None:
         moved += z * third
         moved += constant
         point[:, :, axis] = moved
-
-
-def _count_by_member(blocks: Sequence[slice], keep: BoolArray) -> list[int]:
-    """Return the number of marked slots by member."""
-    return [int(np.count_nonzero(keep[own])) for own in blocks]
 
 
 def points_by_column(keep: BoolArray) -> Counts:

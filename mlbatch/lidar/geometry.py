@@ -11,6 +11,7 @@ of its position (`Tabled`); else each beam is at the angle of the rotor when it 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -169,7 +170,7 @@ class Tabled:
 
     cosine, sine: (rows,), origin: (rows, 3, B or 1) float32, m, of all sensors in sequence;
     vectors: (sensors, 3 vectors, 3 axes, B); first_position: (sensors,), first row of each;
-    reaches_m: (sensors, B or 1).
+    reaches_m: (sensors, B or 1). Columns of `prepare` may be in any order.
     """
 
     def __init__(self, tables: Sequence[BeamTable], columns: int) -> None:
@@ -184,68 +185,70 @@ class Tabled:
         self.reaches_m = _reaches(tables)
         self._counts = counts
         self._columns = columns
-        self._direction: F32Array | None = None
-        self._runs: list[_Run] = []
+        self._tables: _AngleTables | None = None
 
     @property
     def direction(self) -> F32Array:
-        """Directions at all rotor positions, (rows, 3, B) float32; made when first asked for."""
-        if self._direction is None:
-            beams = self.vectors.shape[3]
-            self._direction = np.empty((len(self.cosine), 3, beams), np.float32)
-            self._taken = np.empty((self._columns, 3, beams), np.float32)
-            self._moved = np.empty_like(self._taken)
-            self._reached_m = np.empty((self._columns, beams), np.float32)
-            for first, count, vectors in zip(
-                self.first_position.tolist(), self._counts, self.vectors, strict=True
-            ):
-                rows = slice(first, first + count)
-                _combine(self.cosine[rows], self.sine[rows], vectors, self._direction[rows])
-        return self._direction
+        """Directions at all rotor positions, (3, rows, B) float32."""
+        return self._made().direction
 
     def prepare(self, member: I64Array, encoder: I64Array) -> None:
         """Look up directions and origins."""
-        table = self.direction
-        position = encoder + self.first_position[member]
-        is_next = position[1:] - position[:-1] == 1
-        is_next &= member[1:] == member[:-1]
-        starts = [0, *((~is_next).nonzero()[0] + 1).tolist()]
-        count = len(position)
-        if len(starts) * _COLUMNS_OF_A_RUN > count + _COLUMNS_OF_A_RUN * len(self.reaches_m):
-            direction = table.take(position, axis=0, out=self._taken[:count], mode="clip")
-            origin = self.origin.take(position, axis=0, mode="clip")
-            reach_m = self.reaches_m[member]
-            self._runs = [_Run(slice(0, count), direction, origin, reach_m)]
-            return
-        self._runs = []
-        for begin, end in zip(starts, [*starts[1:], count], strict=True):
-            first = int(position[begin])
-            rows = slice(first, first + end - begin)
-            reach_m = self.reaches_m[member[begin]]
-            run = _Run(slice(begin, end), table[rows], self.origin[rows], reach_m)
-            self._runs.append(run)
+        self._made().look_up(encoder + self.first_position.take(member), member)
 
     def project(self, range_m: F32Array, out: F32Array) -> None:
         """(r + reach) * direction + origin."""
-        for run in self._runs:
-            count = len(run.direction)
-            reached_m = np.add(range_m[run.columns], run.reach_m, out=self._reached_m[:count])
-            moved = np.multiply(reached_m[:, None, :], run.direction, out=self._moved[:count])
-            np.add(moved, run.origin, out=out[run.columns].transpose(0, 2, 1))
+        self._made().project(range_m, out)
+
+    def _made(self) -> _AngleTables:
+        """Return the tables, made when first asked for: compiled loops need none."""
+        if self._tables is None:
+            self._tables = _AngleTables(self, self._counts, self._columns)
+        return self._tables
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """Columns of a sensor and their rows of the tables of `Tabled`: (n, 3, B or 1), m."""
+class _AngleTables:
+    """Directions and origins at all rotor positions, and those of some columns; by axis.
 
-    columns: slice
-    direction: F32Array
-    origin: F32Array
-    reach_m: F32Array
+    Planes of one axis are contiguous, so that numpy multiplies them in one loop, and not in one a
+    column.
+    """
 
+    def __init__(self, tabled: Tabled, counts: Sequence[int], columns: int) -> None:
+        """counts: rotor positions of each sensor; columns: most in a call of `look_up`."""
+        beams = tabled.vectors.shape[3]
+        self.direction: F32Array = np.empty((3, len(tabled.cosine), beams), np.float32)
+        for first, count, vectors in zip(
+            tabled.first_position.tolist(), counts, tabled.vectors, strict=True
+        ):
+            rows = slice(first, first + count)
+            own = self.direction[:, rows].transpose(1, 0, 2)
+            _combine(tabled.cosine[rows], tabled.sine[rows], vectors, own)
+        self._origin = tabled.origin.transpose(1, 0, 2).copy()
+        self._reaches_m = tabled.reaches_m
+        # The same for all beams and sensors, as of most lidars: a number costs less than an array.
+        one = tabled.reaches_m[:1, :1]
+        self._reach_m: F32Array | None = one if bool((tabled.reaches_m == one).all()) else None
+        self._scratch = np.empty((2, columns * beams * 3), np.float32)
+        self._reached_m = np.empty((columns, beams), np.float32)
+        self._taken = (self.direction[:, :0], self._origin[:, :0], tabled.reaches_m[:1])
 
-# Runs of consecutive positions are views instead of lookups, if they are this long on average.
-_COLUMNS_OF_A_RUN = 32
+    def look_up(self, position: I64Array, member: I64Array) -> None:
+        """Look up the rows `position` (n,) of sensors `member` (n,), for `project`."""
+        shape = (3, len(position), self.direction.shape[2])
+        out = self._scratch[0, : math.prod(shape)].reshape(shape)
+        direction = self.direction.take(position, axis=1, out=out, mode="clip")
+        origin = self._origin.take(position, axis=1, mode="clip")
+        reach_m = self._reaches_m.take(member, axis=0) if self._reach_m is None else self._reach_m
+        self._taken = (direction, origin, reach_m)
+
+    def project(self, range_m: F32Array, out: F32Array) -> None:
+        """(r + reach) * direction + origin."""
+        direction, origin, reach_m = self._taken
+        reached_m = np.add(range_m, reach_m, out=self._reached_m[: len(range_m)])
+        moved = self._scratch[1, : direction.size].reshape(direction.shape)
+        np.multiply(reached_m, direction, out=moved)
+        np.add(moved, origin, out=out.transpose(2, 0, 1))
 
 
 class Turning:

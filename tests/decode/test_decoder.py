@@ -260,7 +260,8 @@ def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
-def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
+@pytest.mark.parametrize("other", ["flat", "dual"])
+def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str, other: str) -> None:
     """A scan of many tiles equals the scans of its columns, one after the other."""
     rng = np.random.default_rng(4)
     first, second = (
@@ -275,10 +276,10 @@ def test_scans_do_not_depend_on_tiles(tmp_path: Path, layout: str) -> None:
             },
             ring_base=base,
         )
-        for spec, base in ((FLAT, 0), (DUAL, 16))
+        for spec, base in ((FLAT, 0), ({"flat": FLAT, "dual": DUAL}[other], 16))
     )
     stored = [first, second]
-    count = 2 * tile_columns(32) + 100
+    count = 2 * tile_columns([one.source for one in stored]) + 100
     columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, COLUMNS], (count, 2))]
     whole = _scan(_decoder(*stored, layout=layout), stored, columns)
     decoder = _decoder(*stored, layout=layout)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, I32Array, U8Array, U32Array
+from mlbatch.arrays import I32Array, U8Array, U32Array
 from mlbatch.lidar.pixel_table import BitField, ChannelRun, PixelTable, ReturnLayout
 from mlbatch.sensors.ouster.profiles import Field, PacketLayout, Profile
 from mlbatch.types import Pixels
@@ -50,7 +50,7 @@ class _Return(NamedTuple):
 class PixelReader:
     """Decoder of the columns of one layout; owns its scratch arrays."""
 
-    __slots__ = ("_beams", "_first", "_floats", "_returns", "_step", "_words")
+    __slots__ = ("_beams", "_first", "_returns", "_step", "_words")
 
     def __init__(self, layout: PacketLayout) -> None:
         self._beams = layout.beams
@@ -61,17 +61,15 @@ class PixelReader:
         )
         width = layout.record_size // _WORD_BYTES if self._step == 1 else layout.beams
         self._words: U32Array = np.empty((0, width), np.uint32)
-        self._floats: F32Array = np.empty((0, layout.beams), np.float32)
 
     def read(self, records: U8Array, which: int, out: Pixels) -> None:
         """Decode return `which` of columns (n, record size), C-contiguous, into `out`."""
         words: U32Array = records.view("<u4")
         self._grow(len(records))
         fields = self._returns[which]
-        floats = self._floats[: len(records)]
-        np.copyto(floats, self._take(words, fields.range))
+        np.copyto(out.range_m, self._take(words, fields.range))
         # Integers below 2**24 are exact in float32, so only the division rounds.
-        np.divide(floats, fields.per_metre, out=out.range_m)
+        np.divide(out.range_m, fields.per_metre, out=out.range_m)
         reflectivity = self._whole(records, fields.reflectivity)
         if out.reflectivity is not None:
             np.copyto(out.reflectivity, reflectivity)
@@ -102,7 +100,6 @@ class PixelReader:
     def _grow(self, columns: int) -> None:
         if columns > len(self._words):
             self._words = np.empty((columns, self._words.shape[1]), np.uint32)
-            self._floats = np.empty((columns, self._beams), np.float32)
 
 
 def pixel_table(layout: PacketLayout) -> PixelTable:
