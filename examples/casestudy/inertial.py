@@ -70,16 +70,22 @@ class Odometry:
         if truth is not None:
             first = at_times(truth, np.array([begin_s])).poses[0]
         self._state = gtsam.NavState(gtsam.Pose3(first), np.zeros(3))
-        self._bias = gtsam.imuBias.ConstantBias(np.zeros(3), imu.rate[rest].mean(axis=0))
+        # At rest only the part along gravity can be told from a tilt.
+        felt = float(np.sqrt((up**2).sum()))
+        along = up * (1.0 - GRAVITY / felt)
+        self._bias = gtsam.imuBias.ConstantBias(along, imu.rate[rest].mean(axis=0))
         self._node = 0
+        # Nodes to which the IMU alone led: their scan has no Gaussian that the map has.
+        self.unmatched = 0
         self._map = ndt.LocalMap(LOCAL_MAP_S)
         self._isam = gtsam.ISAM2(gtsam.ISAM2Params())
         self._params = _imu_params()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        sigmas = np.array([1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6])
+        # A biased accelerometer tilts the first attitude.
+        sigmas = np.array([1e-2, 1e-2, 1e-6, 1e-6, 1e-6, 1e-6])
         graph.push_back(gtsam.PriorFactorPose3(X(0), self._state.pose(), _diagonal(sigmas)))
         graph.push_back(gtsam.PriorFactorVector(V(0), np.zeros(3), _diagonal([1e-3] * 3)))
-        spread = _diagonal([0.02] * 3 + [5e-4] * 3)
+        spread = _diagonal([0.1] * 3 + [5e-4] * 3)
         graph.push_back(gtsam.PriorFactorConstantBias(B(0), self._bias, spread))
         values.insert(X(0), self._state.pose())
         values.insert(V(0), np.zeros(3))
@@ -97,6 +103,7 @@ class Odometry:
         guess = at_times(poses, np.array([min(cloud.end_s, poses.stamp_s[-1])])).poses[0]
         points = _deskewed(cloud, np.linalg.inv(guess) @ columns)
         match = ndt.register(ndt.voxel_gaussians(points), self._map, guess, _prior())
+        self.unmatched += match.matched == 0
         self._update(imu_factor, predicted, match)
         self._stamp_s = cloud.end_s
         pose: Array = self._state.pose().matrix()

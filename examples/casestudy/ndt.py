@@ -60,7 +60,7 @@ def _moments(points: Array, keys: Indices) -> tuple[Indices, Array]:
     """Return distinct keys, and for each: number, sums and sums of products of its points."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    begins = np.flatnonzero(np.diff(ordered, prepend=ordered[0] - 1))
+    begins = np.flatnonzero(np.diff(ordered, prepend=np.iinfo(np.int64).min))
     x, y, z = points[order].T
     rows = np.stack([np.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
     return ordered[begins], np.add.reduceat(rows, begins, axis=0)
@@ -116,7 +116,8 @@ class LocalMap:
         """Return the slot of the nearest Gaussian in the voxel of each mean or next to it."""
         cells = np.floor(means / VOXEL_M).astype(np.int64)[:, None, :] + _NEIGHBOURS
         keys = self._keys(cells.reshape(-1, 3))
-        slots = np.where(keys >= 0, self._slot_of[keys], -1).reshape(len(means), -1)
+        slots = np.where(keys >= 0, self._slot_of[keys], -1)
+        slots = slots.reshape(len(means), len(_NEIGHBOURS))
         full = (slots >= 0) & (self._moments[slots, 0] >= _LEAST_POINTS)
         away = ((self.gaussians.mean[slots] - means[:, None]) ** 2).sum(axis=2)
         choice = np.argmin(np.where(full, away, np.inf), axis=1)

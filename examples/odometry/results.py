@@ -76,14 +76,19 @@ def table_lines(found: Mapping[str, Mapping[int, Errors]], base: str) -> list[st
             cells += [_cell(ratios, 2), _cell(turns, 2), f"{worse} of {len(ratios)}"]
         cells.append(_cell([1000.0 * one.offset_s for one in errors], 0))
         lines.append(f"| {' | '.join(cells)} |")
-    counts = sorted({len(seeds) for seeds in found.values()})
-    coverage = median_interval([0.0] * counts[0])[-1]
-    lines += [
-        "",
-        f"Median over {' or '.join(map(str, counts))} seeds; in brackets its interval "
-        f"({100 * coverage:.1f} % confidence or more).",
-    ]
-    return lines
+    return [*lines, "", statement([len(seeds) for seeds in found.values()])]
+
+
+def statement(counts: Sequence[int]) -> str:
+    """Return what the cells of a table are, given the numbers of runs behind them."""
+    if max(counts) == 1:
+        return "One run: no intervals, and no evidence of a difference."
+    coverage = median_interval([0.0] * min(counts))[-1]
+    numbers = " or ".join(map(str, sorted(set(counts))))
+    return (
+        f"Median over {numbers} seeds; in brackets its interval "
+        f"({100 * coverage:.1f} % confidence or more)."
+    )
 
 
 def _cell(values: Sequence[float], digits: int) -> str:
