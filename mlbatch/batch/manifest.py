@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob as globbing
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url
@@ -48,7 +48,29 @@ def sessions_of(sources: Sequence[str], given: Common, kinds: OptionKinds) -> tu
         else:
             found += _of_pattern(source, "{stem}", given, source)
     check_unique(found)
-    return tuple(found)
+    formats = {rig: _format_of(rig) for rig in {one.rig for one in found}}
+    return tuple(_formatted(one, formats[one.rig]) for one in found)
+
+
+def _format_of(rig: str | None) -> str | None:
+    """The format in the options of a rig, which decides the name of the output."""
+    if rig is None or is_url(rig):
+        return None
+    from mlbatch.rig.rig import read_rig
+
+    try:
+        options = read_rig(Path(rig)).options
+    except RigError:
+        # `convert` names what is wrong with it.
+        return None
+    return next((one.values[-1] for one in options if one.name == "format"), None)
+
+
+def _formatted(session: Session, name: str | None) -> Session:
+    """The session with the format of its rig, unless it has one."""
+    if name is None or any(one.name == "--format" for one in session.options):
+        return session
+    return replace(session, options=(*session.options, Option("--format", (name,))))
 
 
 # -- patterns ---------------------------------------------------------------------------------
@@ -154,7 +176,10 @@ def _of_manifest(path: Path, given: Common, kinds: OptionKinds) -> Iterator[Sess
     options = _options(root.get("options"), kinds)
     rig = _path(root["rig"]) if "rig" in root else None
     mine = {option.name.removeprefix("--"): option for option in given.options}
-    for node in root["sessions"].elements("sessions"):
+    nodes = root["sessions"].elements("sessions")
+    if not nodes:
+        raise root["sessions"].error("a list of sessions", "an empty one", "add one")
+    for node in nodes:
         entries = node.fields(_SESSION_KEYS)
         own = _options(entries.get("options"), kinds)
         common = Common(

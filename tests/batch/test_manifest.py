@@ -207,3 +207,20 @@ def test_the_key_changes_with_the_trajectory(tmp_path: Path, place: str) -> None
         keys.append(session_key(session, tmp_path))
     assert keys[0] == keys[2]
     assert changed(keys[0], keys[1]) == "trajectory"
+
+
+def test_the_format_of_the_rig_names_the_output(tmp_path: Path) -> None:
+    """As the options of a manifest, which take precedence."""
+    touch(tmp_path, "a.pcap")
+    (tmp_path / "rig.yaml").write_text(
+        "sensors: [{name: left, stream: {port: 7502}}]\nconvert: {format: npz}\n", encoding="utf-8"
+    )
+    head = "rig: rig.yaml\nsessions: [{name: a, inputs: [a.pcap]}]\n"
+    assert read(tmp_path, head)["a"].output == "scans"
+    given = Common(options=(Option("--format", ("mcap",)),))
+    assert read(tmp_path, head, given)["a"].output == "scans.mcap"
+
+
+def test_a_manifest_without_sessions_is_a_mistake(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match="expected a list of sessions, found an empty one; add one"):
+        read(tmp_path, "sessions: []\n")
