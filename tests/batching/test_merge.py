@@ -36,7 +36,7 @@ def _waiting(sensors: list[list[list[int]]]) -> list[list[Columns]]:
 
 
 STAMPS = st.lists(st.integers(0, 30), max_size=8)
-PARTS = st.lists(STAMPS, max_size=4)
+PARTS = st.lists(STAMPS, max_size=6)
 
 
 @needs_native
