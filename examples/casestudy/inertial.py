@@ -70,7 +70,7 @@ class Odometry:
         if truth is not None:
             first = at_times(truth, np.array([begin_s])).poses[0]
         self._state = gtsam.NavState(gtsam.Pose3(first), np.zeros(3))
-        # At rest only the part along gravity can be told from a tilt.
+        # At rest only the part along gravity can be distinguished from a tilt.
         felt = float(np.sqrt((up**2).sum()))
         along = up * (1.0 - GRAVITY / felt)
         self._bias = gtsam.imuBias.ConstantBias(along, imu.rate[rest].mean(axis=0))
