@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _OUTPUT = ("-o", "--output")
 # Files that are written apart from the output.
-_LOCAL_ONLY = ("--report", "--html", "--shard")
+_LOCAL_ONLY = ("--report", "--html")
 
 
 def convert_remote(words: list[str]) -> None:

@@ -44,7 +44,6 @@ _CALIBRATED = (
     "firing_ns",
     "beams",
     "timestamp_mode",
-    "calibration",
 )
 _DIGITS = 12
 # In `_size_and_time`.
@@ -186,7 +185,9 @@ def _calibration(sensor: Sensor) -> str:
     lidar = sensor.lidar
     path = Path(lidar.calibration)
     content = _content([path], 0) if path.is_file() else ""
-    return _digest((content, *(getattr(lidar, name) for name in _CALIBRATED)))
+    # Copies in other folders are the same calibration.
+    name = path.name if content else lidar.calibration
+    return _digest((content, name, *(getattr(lidar, one) for one in _CALIBRATED)))
 
 
 def _digest(value: object) -> str:
@@ -205,6 +206,9 @@ def _pieces(value: object) -> Iterator[bytes]:
         for one in fields(value):
             yield one.name.encode()
             yield from _pieces(getattr(value, one.name))
+    elif isinstance(value, Path):
+        # The content of calibrations is part of the identity of their sensors.
+        yield value.name.encode("utf-8", "surrogateescape")
     elif isinstance(value, Mapping):
         for key in sorted(value, key=str):
             yield str(key).encode()

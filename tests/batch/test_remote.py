@@ -168,6 +168,28 @@ def test_convert_alone(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "--overwrite" in again.err
 
 
+def test_shards_of_a_copied_recording(
+    cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("s3://data/raw/a1/drive.pcap", "--rate", "20", "--format", "npz", "-o")
+    monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
+    assert cloud.run("convert", *words, tmp_path / "whole").code == 0
+    parts = [tmp_path / "part1", tmp_path / "part2"]
+    for number, part in enumerate(parts, 1):
+        # Each machine has a cache of its own.
+        monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / f"cache{number}"))
+        ended = cloud.run("convert", *words, part, "--shard", f"{number}/2")
+        assert ended.code == 0, ended.err
+    merged = cloud.run("merge", *parts, "-o", tmp_path / "merged")
+    assert merged.code == 0, merged.err
+    whole, found = (
+        {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "report.json"}
+        for folder in (tmp_path / "whole", tmp_path / "merged")
+    )
+    assert len(whole) > 2
+    assert found == whole
+
+
 def test_a_web_server(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without lists of files, calibrations are named."""
     monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
