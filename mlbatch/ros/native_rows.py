@@ -144,7 +144,7 @@ class RowPacker:
 
 
 def _is_usual(known: dict[str, Any]) -> bool:
-    """Whether the loops read all fields of rows; lidars that share messages are told apart."""
+    """Whether the loops read all fields of rows; of clouds of one lidar."""
     if "lidar_id" in known or not {*AXES, "ring", "time"} <= known.keys():
         return False
     return all(known[role][0].str[1:] in types for role, types in _TYPES.items() if role in known)

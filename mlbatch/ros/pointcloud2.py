@@ -156,6 +156,7 @@ def sample_cloud(message: Message, rules: Rules) -> CloudHead:
 
 
 def raw_cloud(message: Message, rules: Rules) -> RawCloud:
+    """The rows of a message, as they are stored; CloudError if they cannot be read."""
     try:
         return _READERS[message.topic.type](message, rules)
     except MessageError as err:

@@ -318,6 +318,8 @@ class CloudRecording(WrappedRecording):
         """Packets of the recording and of its clouds, in receive order."""
         if not packed:
             return batch
+        if len(packed) == 1 and not len(batch):
+            return self._alone(packed[0])
         # The bytes of the recording's own packets are copied only where there are any.
         data = [batch.data] if len(batch) else []
         end = len(batch.data) if len(batch) else 0
@@ -336,15 +338,22 @@ class CloudRecording(WrappedRecording):
             end += count * size
         columns = np.concatenate(parts, axis=1)
         columns = columns[:, np.argsort(columns[4], kind="stable")]
-        # A single cloud is not copied.
-        is_single = len(data) == 1
-        joined = data[0] if is_single else np.concatenate(data)
+        joined = np.concatenate(data)
         start, size, stream, host_ns, _ = columns
-        found = PacketBatch(joined, start, size, stream, host_ns)
-        if is_single:
-            found.place = packed[0].place
-            found.content_key = packed[0].content_key
-        return found
+        return PacketBatch(joined, start, size, stream, host_ns)
+
+    def _alone(self, one: _Packed) -> PacketBatch:
+        """The packets of a single cloud, where they are."""
+        count, size = one.packets.shape
+        return PacketBatch(
+            one.packets.reshape(-1),
+            np.arange(count) * size,
+            np.full(count, size),
+            np.full(count, self._number(one.stream)),
+            np.full(count, one.message.host_ns),
+            place=one.place,
+            content_key=one.content_key,
+        )
 
     def _number(self, stream: Stream) -> int:
         """Number of a stream; its packets have no receive time of their own."""
