@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
 from mlbatch.frames.transforms import inverse
-from mlbatch.motion.se3 import exp_rotation
+from mlbatch.motion.se3 import exp_rotation, rotated
 from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
 from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
 
@@ -142,7 +142,7 @@ class Integrator:
         for row in range(count):
             rotation[row + 1] = rotation[row] @ turns[row]
         gravity = np.array([0.0, 0.0, math.sqrt(float((rest.gravity**2).sum()))])
-        acceleration = np.matmul(rotation[1:], force[:count, :, None])[..., 0] - gravity
+        acceleration = rotated(rotation[1:], force[:count]) - gravity
         acceleration[stamp_ns[:count] - self._begin_ns <= STANDSTILL_NS] = 0.0
         felt = np.concatenate([state.acceleration[None], acceleration])
         velocity = _summed(state.velocity, felt, step_s)
@@ -153,9 +153,9 @@ class Integrator:
 
     def _track(self, stamp_ns: I64Array, rotation: F64Array, position_m: F64Array) -> PoseTrack:
         """Return poses of the body for poses of the IMU."""
-        arm = np.matmul(rotation, self._imu_from_body[:3, 3])
-        turned = np.matmul(rotation, self._imu_from_body[:3, :3])
-        return PoseTrack(stamp_ns, turned, position_m + arm, self._name)
+        arm = rotated(rotation, self._imu_from_body[None, :3, 3])
+        body = np.matmul(rotation, self._imu_from_body[:3, :3])
+        return PoseTrack(stamp_ns, body, position_m + arm, self._name)
 
 
 def integrated(

@@ -31,6 +31,16 @@ def exp_rotation(vectors: F64Array) -> F64Array:
     return np.eye(3) + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
 
 
+def rotated(rotations: F64Array, vectors: F64Array) -> F64Array:
+    """Return vectors (n, 3) or (1, 3), each turned by its rotation (n, 3, 3).
+
+    Sums of three products, as each vector alone would get: `matmul` of numpy 1.26 rounds vectors
+    differently by how many there are.
+    """
+    x, y, z = (rotations[..., axis] * vectors[:, axis, None] for axis in range(3))
+    return x + y + z
+
+
 def log_rotation(rotations: F64Array) -> F64Array:
     """Return rotation vectors, of angles up to pi."""
     quaternions = quaternions_of(rotations)

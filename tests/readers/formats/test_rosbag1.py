@@ -175,7 +175,7 @@ def test_messages_are_handed_over_in_file_order(tmp_path: Path) -> None:
     found = [(m.topic.name, m.topic.type, m.host_ns, m.data) for m in kept]
     assert found == [(m.topic, m.type, m.log_ns, m.data) for m in expected]
     metadata = next(message for message in kept if message.topic.type == "std_msgs/String")
-    assert '"122647000123"' in decode_string(metadata.topic, metadata.data)
+    assert '"122647000123"' in decode_string(metadata.topic, bytes(metadata.data))
     assert metadata.topic.latched
 
 

@@ -218,7 +218,7 @@ def test_kept_messages_are_handed_over(tmp_path: Path) -> None:
     recording.keep = frozenset({"/tf_static"})
     _, kept = read(recording)
     assert [m.data for m in kept] == [m.data for m in messages if m.topic == "/tf_static"]
-    edges = [decode_transforms(m.topic, m.data)[0] for m in kept]
+    edges = [decode_transforms(m.topic, bytes(m.data))[0] for m in kept]
     assert [edge[1] for edge in edges] == ["left/os_sensor", "right/os_sensor"]
     assert edges[0][2] == (0.3, 0.95, 2.45)
 
