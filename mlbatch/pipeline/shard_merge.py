@@ -234,7 +234,8 @@ def _take(source: Path, size: int | None, path: Path) -> None:
         )
     with export_errors(path):
         with contextlib.suppress(OSError):
-            os.link(source, path)
+            # A link to what a symbolic link names: the output is whole without the part.
+            os.link(source.resolve(), path)
             return
         shutil.copyfile(source, path)
 

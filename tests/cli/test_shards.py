@@ -165,6 +165,24 @@ def test_another_file_system_gets_copies(shell: Shell, monkeypatch: pytest.Monke
     _assert_as_one_run(shell, CAPTURE, 2)
 
 
+@pytest.mark.parametrize("base", [Path(), Path("..")])
+def test_symbolic_links_of_a_part_are_not_taken_over(shell: Shell, base: Path) -> None:
+    """The output has the files themselves, also where links are relative to the part."""
+    folders = _shards(shell, CAPTURE, 2)
+    files = {path.name: path.read_bytes() for path in Path().glob("part*/*.npz")}
+    Path("linked").mkdir()
+    for path in Path("part1").iterdir():
+        target = base / path if base.parts else path.absolute()
+        (Path("linked") / path.name).symlink_to(target)
+    merged = _merged(shell, ["linked", folders[1]])
+    assert merged.code == 0, merged.err
+    shutil.rmtree("linked")
+    shutil.rmtree("part1")
+    found = list(Path("merged/out").glob("*.npz"))
+    assert not any(path.is_symlink() for path in found)
+    assert {path.name: path.read_bytes() for path in found} == files
+
+
 def test_copies_of_a_recording_are_the_same_recording(shell: Shell) -> None:
     for name in ("one", "two"):
         Path(name).mkdir()
