@@ -79,9 +79,9 @@ def input_identity(run: Conversion) -> dict[str, str]:
         content = _content(files, total)
         found[f"recording {number}"] = f"{path.name} ({size_and_time}, content {content})"
     for path in run.job.selection.metadata:
-        found[f"metadata {path.name}"] = _content([path], 0)
+        found[f"metadata {path.name}"] = _whole_content(path)
     if run.job.deskew and Path(run.job.deskew).is_file():
-        found["trajectory"] = _content([Path(run.job.deskew)], 0)
+        found["trajectory"] = _whole_content(Path(run.job.deskew))
     for sensor in run.sensors:
         found[f"calibration of {sensor.name}"] = _calibration(sensor)
         pose = (sensor.body_from_sensor, sensor.clock.offset_ns)
@@ -151,6 +151,20 @@ def _content(files: Sequence[Path], session_bytes: int) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
+def _whole_content(file: Path) -> str:
+    """Digest of a file that is read as a whole anyway: any byte of it may change points."""
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:_DIGITS]
+    except OSError as err:
+        raise _unreadable(file, err) from err
+
+
+def _unreadable(file: Path, err: OSError) -> RecordingError:
+    return RecordingError(
+        f"{file}: expected an input, could not read it ({err.strerror}); check the disk"
+    )
+
+
 def _samples(file: Path, session_bytes: int) -> Iterator[bytes]:
     """Samples of the content of a file."""
     try:
@@ -160,9 +174,7 @@ def _samples(file: Path, session_bytes: int) -> Iterator[bytes]:
             for begin, count in _sampled(size, session_bytes):
                 yield os.pread(descriptor, count, begin)
     except OSError as err:
-        raise RecordingError(
-            f"{file}: expected an input, could not read it ({err.strerror}); check the disk"
-        ) from err
+        raise _unreadable(file, err) from err
 
 
 def _sampled(size: int, session_bytes: int) -> Iterator[tuple[int, int]]:
@@ -184,7 +196,7 @@ def _calibration(sensor: Sensor) -> str:
     """Digest of a sensor's calibration: its file, if there is one, and what is made of it."""
     lidar = sensor.lidar
     path = Path(lidar.calibration)
-    content = _content([path], 0) if path.is_file() else ""
+    content = _whole_content(path) if path.is_file() else ""
     # Copies in other folders are the same calibration.
     name = path.name if content else lidar.calibration
     return _digest((content, name, *(getattr(lidar, one) for one in _CALIBRATED)))

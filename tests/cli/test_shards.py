@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
@@ -355,6 +356,22 @@ def test_parts_of_other_recordings_are_refused(shell: Shell) -> None:
     assert shell(f"convert session/drive.pcap {words} --shard 1/2 -o part1").code == 0
     assert shell(f"convert other/drive.pcap {words} --shard 2/2 -o part2").code == 0
     _refused(shell, ["part1", "part2"], 2, "part2: expected the job of part1", "drive.pcap")
+
+
+def test_parts_of_other_poses_in_a_long_trajectory_are_refused(shell: Shell) -> None:
+    """One pose of a file of 8 MB differs: 5 m instead of 0 m at 4 s after the first scan."""
+    assert shell(f"convert {CAPTURE} -o usual -q").code == 0
+    with np.load("usual/000000.npz") as scan:
+        begin_s = int(scan["start_ns"]) // 10**9 - 1
+    comments = f"# {'-' * 97}\n" * 40_000
+    still = "0 0 0 0 0 0 1"
+    poses = [f"{begin_s + n // 20}.{n % 20 * 5:02d} {still}\n" for n in range(101)]
+    for number, last in enumerate((poses[-1], poses[-1].replace(f" {still}", " 5" + still[1:])), 1):
+        text = comments + "".join(poses[:-1]) + last + comments
+        Path("drive.tum").write_text(text, encoding="utf-8")
+        words = f"{CAPTURE} --deskew drive.tum --shard {number}/2 -o part{number} -q"
+        assert shell(f"convert {words}").code == 0
+    _refused(shell, ["part1", "part2"], 2, "part2: expected the job of part1, found trajectory")
 
 
 def test_parts_that_read_other_packets_are_refused(shell: Shell) -> None:
