@@ -38,6 +38,8 @@ from mlbatch.types import Summary
 from mlbatch.writers import (
     REPORT_JSON,
     WriterOptions,
+    check_name,
+    choose_format,
     discard,
     export_errors,
     open_writer,
@@ -150,6 +152,8 @@ def merge(
     """
     began_s = time.perf_counter(), time.process_time()
     _check_apart(parts, target)
+    check_name(target)
+    choose_format(target, parts[0].account.format)
     # A run that writes this output is an error; what an interrupted one left is replaced.
     resume.find(target)
     resume.forget(target)

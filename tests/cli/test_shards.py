@@ -479,6 +479,23 @@ def test_an_output_among_the_parts_is_refused(shell: Shell, target: str) -> None
     assert sorted(Path().glob("**/*")) == before
 
 
+@pytest.mark.parametrize(
+    ("target", "code", "words"),
+    [
+        ("out.mcap", 2, "expected a folder for --format npz, found the name of a mcap file"),
+        ("none/out", 1, "expected an output in an existing folder, found no folder none"),
+    ],
+)
+def test_names_that_no_run_gives_are_refused(
+    shell: Shell, target: str, code: int, words: str
+) -> None:
+    folders = _shards(shell, CAPTURE, 2)
+    outcome = shell(f"merge {' '.join(folders)} -o {target} -q")
+    assert outcome.code == code
+    assert words in outcome.err
+    assert sorted(os.listdir()) == folders
+
+
 def test_an_existing_output_stays(shell: Shell) -> None:
     whole, _ = _whole(shell, CAPTURE)
     folders = _shards(shell, CAPTURE, 2)
