@@ -300,7 +300,7 @@ def _truncate(batch: PacketBatch, rows: I64Array, drawn: U64Array) -> PacketBatc
     """Cut the payloads at `rows` to a length from 1 byte to one byte less."""
     size = batch.size.copy()
     size[rows] = 1 + (drawn % (size[rows] - 1).astype(np.uint64)).astype(np.int64)
-    return replace(batch, size=size)
+    return replace(batch, size=size, content_key=None)
 
 
 def _flip_bit(batch: PacketBatch, rows: I64Array, drawn: U64Array) -> PacketBatch:
@@ -313,7 +313,7 @@ def _flip_bit(batch: PacketBatch, rows: I64Array, drawn: U64Array) -> PacketBatc
     data: U8Array = np.concatenate([batch.data[first:last], flipped.data])
     start = batch.start - first
     start[rows] = last - first + flipped.start
-    return replace(batch, data=data, start=start, place=None)
+    return replace(batch, data=data, start=start, place=None, content_key=None)
 
 
 # By kind, in the order of application: function, and smallest payload that can be damaged.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -160,6 +161,13 @@ def test_one_bit_flips(each: int) -> None:
         difference = int.from_bytes(payload, "big") ^ int.from_bytes(before, "big")
         assert difference.bit_count() == (1 if sensor == 0 else 0)
     assert faults.counts == (FaultCount("bitflip:left:100%", 4),)
+
+
+@pytest.mark.parametrize("fault", ["bitflip", "truncate"])
+def test_hashes_of_damaged_payloads_are_not_known(fault: str) -> None:
+    hashed = (replace(one, content_key=np.arange(len(one))) for one in batches(FEED, 3))
+    faults = FaultReplay([parse_fault(f"{fault}:left:100%")], 0, NAMES)
+    assert [one.content_key for one in faults.batches(hashed, owner)] == [None] * 3
 
 
 def test_two_faults_may_damage_the_same_packet() -> None:
