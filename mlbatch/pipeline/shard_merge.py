@@ -178,7 +178,10 @@ def merge(
         report = _merged_report(parts, table, command)
         broken = imbalances(report) or _unequal_points(report)
         if broken:
-            raise RecordingError(f"the ledger does not balance, please report: {broken[0]}")
+            raise RecordingError(
+                f"the ledger does not balance: {broken[0]}; a shard.json was changed: convert all "
+                "shards again, and report it if this remains"
+            )
         summary = Summary(
             report.t_init_ns,
             report_text(report, machine=False),

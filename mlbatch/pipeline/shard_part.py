@@ -355,7 +355,11 @@ def read_account(part: Path) -> Account:
         raise _damaged(path, str(err)) from err
     schema = content.pop("schema", None)
     version = content.pop("version", None)
-    if (schema, version) != (SCHEMA, mlbatch.__version__):
+    if schema != SCHEMA:
+        raise UsageError(
+            f"{path}: expected schema {SCHEMA}, found {schema!r}; name what convert --shard wrote"
+        )
+    if version != mlbatch.__version__:
         raise UsageError(
             f"{path}: expected a shard of mlbatch {mlbatch.__version__}, found one of "
             f"{version}; merge with that version, or convert again"
