@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from mlbatch.errors import UsageError, one_line
+from mlbatch.cli.summary import say
+from mlbatch.errors import UsageError
 
 if TYPE_CHECKING:
     from mlbatch.batch.cache import Cache
@@ -46,7 +47,7 @@ def convert_remote(words: list[str]) -> None:
     _check_target(target, words)
     with interruptible(), cache.staged(urls) as copies:
         for url, path in copies.items():
-            _say(f"{url}: copied to {path} ({path.stat().st_size} bytes)")
+            say(f"{url}: copied to {path} ({path.stat().st_size} bytes)")
         local = {url: str(path) for url, path in copies.items()}
         folder = cache.output(target)
         if target:
@@ -100,9 +101,5 @@ def _upload(folder: Path, target: str, cache: Cache) -> None:
     for path in sorted(files, key=lambda path: path.name == name):
         url = f"{root}/{path.relative_to(folder).as_posix()}"
         upload(path, url)
-        _say(f"uploaded {url} ({path.stat().st_size} bytes)")
+        say(f"uploaded {url} ({path.stat().st_size} bytes)")
     shutil.rmtree(folder)
-
-
-def _say(text: str) -> None:
-    typer.echo(one_line(f"mlbatch: {text}"), err=True)

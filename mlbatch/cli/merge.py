@@ -33,13 +33,13 @@ def merge(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
 ) -> None:
     """Join the shards of a conversion to the output of one run."""
-    from mlbatch.cli import EXIT_LIMIT
+    from mlbatch.cli.summary import exit_beyond, print_summary, say
     from mlbatch.errors import one_line
     from mlbatch.pipeline.interrupts import interruptible
     from mlbatch.pipeline.shard_merge import merge as merge_parts
     from mlbatch.pipeline.shard_merge import read_parts
     from mlbatch.report.limits import exceeded, parse_limits
-    from mlbatch.report.report import build_report, summary_lines
+    from mlbatch.report.report import build_report
 
     limits = parse_limits(fail_on or ())
     command = shlex.join(["mlbatch", *sys.argv[1:]])
@@ -48,14 +48,8 @@ def merge(
             read_parts(parts), output, command=command, overwrite=overwrite, fsync=not no_fsync
         )
     for item in report.warnings:
-        typer.echo(one_line(f"mlbatch: warning: {item.code}: {item.message}"), err=True)
+        say(f"warning: {item.code}: {item.message}")
     if not quiet:
-        for line in summary_lines(report):
-            if not line.startswith("warning "):
-                typer.echo(one_line(line))
+        print_summary(report)
         typer.echo(one_line(f"wrote {output}, {len(parts)} shards merged"))
-    beyond = exceeded(limits, build_report(report))
-    for line in beyond:
-        typer.echo(one_line(f"mlbatch: limit exceeded: {line}"), err=True)
-    if beyond:
-        raise typer.Exit(EXIT_LIMIT)
+    exit_beyond(exceeded(limits, build_report(report)))

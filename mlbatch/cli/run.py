@@ -13,9 +13,8 @@ from pathlib import Path
 
 import typer
 
-from mlbatch.cli import EXIT_LIMIT
 from mlbatch.cli.progress import progress_bar
-from mlbatch.cli.tables import paragraph, table_lines, terminal_width
+from mlbatch.cli.summary import exit_beyond, print_summary, say
 from mlbatch.errors import (
     ClockJump,
     ExportError,
@@ -34,7 +33,7 @@ from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
 from mlbatch.pipeline.shard_part import ShardOutput, check_format
 from mlbatch.report.limits import Limit, exceeded
-from mlbatch.report.report import RunReport, build_report, report_text, summary_lines, summary_rows
+from mlbatch.report.report import RunReport, build_report, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
@@ -89,15 +88,7 @@ def run(job: Job, target: Target) -> None:
     """
     with interruptible():
         beyond = _run_segments(job, target) if target.split_jumps else _run_one(job, target)
-    for line in beyond:
-        _say(f"limit exceeded: {line}")
-    if beyond:
-        raise typer.Exit(EXIT_LIMIT)
-
-
-def _say(text: str) -> None:
-    """Print a line to stderr."""
-    typer.echo(one_line(f"mlbatch: {text}"), err=True)
+    exit_beyond(beyond)
 
 
 # -- one output -------------------------------------------------------------------------------
@@ -136,7 +127,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         if options.kept_bytes is None:
             check_target(name, output, options, job.layout)
             if warning := preflight.check_disk(job, output):
-                _say(f"warning: {warning}")
+                say(f"warning: {warning}")
         if job.shard is not None:
             shard_output = ShardOutput(job.shard, name, options, resume_log)
         open_output = _opener(name, output, options, shard_output)
@@ -152,7 +143,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         )
     inputs = replace(inputs, command=_command())
     for note in conversion.notes:
-        _say(f"warning: {note.code}: {note.message}")
+        say(f"warning: {note.code}: {note.message}")
     if shard_output is not None:
         _print_shard(shard_output, inputs, target)
         return []
@@ -172,14 +163,7 @@ def _print_summary(
 ) -> None:
     if target.verbose:
         _print_sensors(conversion)
-    lines = [line for line in summary_lines(inputs) if not line.startswith("warning ")]
-    if terminal_width() is not None:
-        rows = summary_rows(inputs)
-        lines = [*table_lines(rows), *map(paragraph, lines[len(rows) :])]
-    else:
-        lines = [one_line(line) for line in lines]
-    for line in lines:
-        typer.echo(line)
+    print_summary(inputs)
     if target.written is not None:
         typer.echo(f"wrote {target.written}, report {report_path}")
 
@@ -382,7 +366,7 @@ def _run_segments(job: Job, target: Target) -> list[str]:
         except ClockJump as jump:
             if jump.host_ns <= (segment.begin_ns or 0):
                 raise
-            _say(f"segment {number} ends where {jump}")
+            say(f"segment {number} ends where {jump}")
             segment = TimeSegment(segment.begin_ns, jump.host_ns)
             if own_target.written is not None and (is_whole or not target.resume):
                 # Outputs of segments have other names.
@@ -391,7 +375,7 @@ def _run_segments(job: Job, target: Target) -> list[str]:
         except NoScanError as err:
             if is_whole:
                 raise
-            _say(f"warning: segment {number}: {err}")
+            say(f"warning: segment {number}: {err}")
         if segment.end_ns is None:
             break
         number += 1
@@ -437,7 +421,7 @@ def _is_complete(output: Path, *, overwrite: bool) -> bool:
     if not earlier.is_complete or (overwrite and not earlier.was_published):
         return False
     resume.forget(output)
-    _say(f"{output}: is complete; there is nothing to resume")
+    say(f"{output}: is complete; there is nothing to resume")
     return True
 
 
@@ -448,9 +432,9 @@ def _resume_log(
     earlier = resume.find(output)
     state = earlier.state
     if earlier.damage and resumes:
-        _say(earlier.damage)
+        say(earlier.damage)
     if state is not None and not resumes:
-        _say(
+        say(
             f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
             "discarded; --resume would continue after them"
         )
@@ -458,7 +442,7 @@ def _resume_log(
     if log.kept_bytes is None:
         resume.forget(output)
         if resumes:
-            _say(f"{output}: nothing to resume; started over")
+            say(f"{output}: nothing to resume; started over")
     else:
-        _say(f"{output}: resumed after {log.done} scans")
+        say(f"{output}: resumed after {log.done} scans")
     return log

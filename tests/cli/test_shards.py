@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline import resume, state_file
+from mlbatch.pipeline import resume
 from mlbatch.types import Scan
-from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
-from tests.builders.sessions import FIXTURE, Outcome, Shell
+from tests.builders.sessions import FIXTURE, Outcome, Shell, recording_shell
 from tests.resume_storm import contents, write_recordings
 
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
@@ -32,11 +31,7 @@ def shell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Shell:
     """The command line, in an empty folder; every scan gets a line of the state file."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
-    for module in (state_file, atomic):
-        monkeypatch.setattr(module, "sync_to_disk", lambda path: None)
-    return Shell(monkeypatch, capsys)
+    return recording_shell(monkeypatch, capsys, tmp_path)
 
 
 def _shards(shell: Shell, words: str, count: int, mixed: bool = False) -> list[str]:
@@ -396,7 +391,7 @@ def test_points_that_no_scan_has_are_refused(shell: Shell) -> None:
     counts["written"] += 1
     counts["slots"] += 1
     _changed("part2", {"report": report})
-    _refused(shell, ["part1", "part2"], 1, "the ledger does not balance")
+    _refused(shell, ["part1", "part2"], 1, "the ledger does not balance", "shard.json was changed")
 
 
 def test_a_scan_that_no_shard_has_is_found(shell: Shell) -> None:
@@ -446,6 +441,14 @@ def test_a_field_of_another_kind_is_named(shell: Shell) -> None:
     _shards(shell, CAPTURE, 2)
     _changed("part2", {"content": "7"})
     _refused(shell, ["part1", "part2"], 1, "part2/shard.json", "damaged content", "'7'")
+
+
+@pytest.mark.parametrize("content", [{"schema": 3}, {}])
+def test_json_of_others_is_refused(shell: Shell, content: dict[str, int]) -> None:
+    _shards(shell, CAPTURE, 2)
+    Path("part2/shard.json").write_text(json.dumps(content))
+    found = f"expected schema mlbatch.shard/1, found {content.get('schema')}"
+    _refused(shell, ["part1", "part2"], 2, "part2/shard.json", found)
 
 
 def test_a_shard_of_another_version_is_refused(shell: Shell) -> None:

@@ -22,10 +22,9 @@ from mlbatch.errors import ExportError, RecordingError
 from mlbatch.pipeline import job_identity, resume, state_file, workers
 from mlbatch.readers import source
 from mlbatch.types import Scan
-from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
-from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
+from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, recording_shell, write_session
 from tests.resume_storm import contents, write_recordings
 
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
@@ -39,11 +38,7 @@ def shell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Shell:
     """The command line, in an empty folder; every scan gets a line of the state file."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
-    for module in (state_file, atomic):
-        monkeypatch.setattr(module, "sync_to_disk", lambda path: None)
-    return Shell(monkeypatch, capsys)
+    return recording_shell(monkeypatch, capsys, tmp_path)
 
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:
