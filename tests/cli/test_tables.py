@@ -26,7 +26,7 @@ COMMANDS = (
 
 def _at(monkeypatch: pytest.MonkeyPatch, width: int | None) -> None:
     monkeypatch.setattr(tables, "terminal_width", lambda: width)
-    monkeypatch.setattr("mlbatch.cli.run.terminal_width", lambda: width)
+    monkeypatch.setattr("mlbatch.cli.summary.terminal_width", lambda: width)
 
 
 def _lines(rows: tables.Rows, *, transposable: bool = False) -> list[str]:
