@@ -25,6 +25,8 @@ from mlbatch.rig.keys import (
 from mlbatch.rig.yaml_tree import Node
 
 _TEXT = re.compile(r"\S(.*\S)?")
+# Values of `deskew` that are no files.
+POSE_MODELS = ("imu", "constant-velocity")
 _MOST_JOBS = 64
 _MOST_SLICES = 10_000
 _FULL_PERCENT = 100
@@ -43,6 +45,12 @@ class RigOption:
 
 def _text(node: Node) -> Values:
     return (node.word("text", _TEXT),)
+
+
+def _poses(node: Node) -> Values:
+    """Where poses come from; files relative to the rig file, as all paths in it."""
+    text = node.word("text", _TEXT)
+    return (text if text in POSE_MODELS else str(node.file.parent / text),)
 
 
 def _texts(node: Node) -> Values:
@@ -121,7 +129,10 @@ CONVERT: tuple[Key[Values], ...] = (
         *("batching", "windows, or a policy of frame-level fusion"),
         *("window", "latest", "approximate", "collate"),
     ),
-    _text_key("deskew", "where poses come from: imu, or a trajectory"),
+    Key(
+        *("deskew", _poses, (), TEXT),
+        about="where poses come from: imu, or a trajectory (relative to the rig file)",
+    ),
     _choice_key("deskew_to", "instant to move points to", "start", "middle", "end"),
     _choice_key("batching_times", "times of points in fused sweeps", "common", "own"),
     Key(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
-from mlbatch.rig.convert_keys import RigOption
+from mlbatch.rig.convert_keys import POSE_MODELS, RigOption
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, Sweeps, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
@@ -49,14 +49,16 @@ def write_rig(rig: Rig, folder: Path, notes: Mapping[str, str] | None = None) ->
         lines += [f"  - {_floats(box)}" for box in rig.exclude_boxes_m]
     if rig.options:
         lines.append("convert:")
-        lines += [f"  {option.name}: {_option_text(option)}" for option in rig.options]
+        lines += [f"  {option.name}: {_option_text(option, folder)}" for option in rig.options]
     return _HEADER + "\n".join(lines) + "\n"
 
 
-def _option_text(option: RigOption) -> str:
+def _option_text(option: RigOption, folder: Path) -> str:
     if option.name == "decode":
         pairs = (value.partition("=") for value in option.values)
         return _braces({_text(key): _text(value) for key, _, value in pairs})
+    if option.name == "deskew" and option.values[0] not in POSE_MODELS:
+        return _text(_path_from(folder, Path(option.values[0])))
     texts = [value if _SCALAR.fullmatch(value) else _text(value) for value in option.values]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.sessions import FIXTURE, Shell, names, report_of
+from tests.builders.sessions import FIXTURE, Shell, arrays, names, report_of
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 
@@ -37,6 +37,29 @@ def test_options_of_the_rig_are_those_of_the_command_line(shell: Shell, rig: Pat
     assert any("-1" in name for name in files)
     for name in files:
         assert Path("by_rig", name).read_bytes() == Path("by_words", name).read_bytes()
+
+
+def test_a_trajectory_is_found_next_to_the_rig(shell: Shell, tmp_path: Path) -> None:
+    """The rig is in a folder above the current one, and named from there."""
+    folder = tmp_path / "rigs"
+    folder.mkdir()
+    for name in ("left.json", "right.json"):
+        (folder / name).symlink_to(FIXTURE / name)
+    text = (FIXTURE / "rig.yaml").read_text(encoding="utf-8")
+    (folder / "rig.yaml").write_text(f"{text}\nconvert: {{deskew: poses.tum}}\n")
+    assert shell(f"convert {CAPTURE} -r {FIXTURE / 'rig.yaml'} -o usual -q").code == 0
+    begin_s = int(arrays("usual/000000.npz")["start_ns"]) // 10**9 - 1
+    times_s = [begin_s + tenths / 10 for tenths in range(50)]
+    (folder / "poses.tum").write_text(
+        "".join(f"{time_s:.1f} 0 0 0 0 0 0 1\n" for time_s in times_s)
+    )
+    outcome = shell(f"convert {CAPTURE} -r {folder / 'rig.yaml'} -o out")
+    assert outcome.code == 0, outcome.err
+    assert report_of("out/report.json")["deskew"]["source"] == "poses.tum"
+    (folder / "poses.tum").unlink()
+    outcome = shell(f"convert {CAPTURE} -r {folder / 'rig.yaml'} -o again")
+    assert outcome.code == 1
+    assert "convert.deskew: --deskew: expected imu or the file of a trajectory" in outcome.err
 
 
 def test_the_command_line_wins(shell: Shell, rig: Path) -> None:

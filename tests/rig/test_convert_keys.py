@@ -61,6 +61,29 @@ convert:
     assert places["jobs"] == f"{tmp_path / 'rig.yaml'}:7: convert.jobs"
 
 
+def test_a_trajectory_is_relative_to_the_rig_file_as_all_paths_in_it(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "poses.tum"
+    for text, value in (
+        ("drive/poses.tum", str(tmp_path / "drive" / "poses.tum")),
+        (str(elsewhere), str(elsewhere)),
+        ("imu", "imu"),
+        ("constant-velocity", "constant-velocity"),
+    ):
+        (found,) = _read(tmp_path, f"convert: {{deskew: {text}}}\n").options
+        assert found.values == (value,)
+
+
+def test_a_written_trajectory_is_relative_to_the_new_rig_file(tmp_path: Path) -> None:
+    rig = _read(tmp_path, "convert: {deskew: drive/poses.tum}\n")
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    (folder / "rig.yaml").write_text(write_rig(rig, folder))
+    assert "deskew: " in (folder / "rig.yaml").read_text()
+    assert str(tmp_path) not in (folder / "rig.yaml").read_text()
+    (found,) = read_rig(folder / "rig.yaml").options
+    assert Path(found.values[0]).resolve() == (tmp_path / "drive" / "poses.tum").resolve()
+
+
 @pytest.mark.parametrize(
     ("section", "message"),
     [
@@ -105,6 +128,7 @@ def test_written_options_are_read_back(tmp_path: Path) -> None:
         RigOption("max_range", ("80",)),
         RigOption("only", ("left", "001234")),
         RigOption("decode", ("firing_azimuth=off", "crc=check")),
+        RigOption("deskew", ("imu",)),
         RigOption("fail_on", ("loss>0.1%,underfilled>0",)),
     )
     file = tmp_path / "rig.yaml"
