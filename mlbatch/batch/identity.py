@@ -123,7 +123,7 @@ def _values(session: Session, name: str) -> list[str]:
 
 
 def _trajectories(rig: str | None) -> list[str]:
-    """Values of --deskew in the options of a rig; paths are those of the command line."""
+    """Values of --deskew in the options of a rig; files by their paths."""
     if rig is None or is_url(rig):
         return []
     from mlbatch.rig.rig import read_rig
