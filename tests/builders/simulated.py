@@ -43,6 +43,10 @@ scene:
   rectangles:
     - {corner_m: [5, -4, 0], along_m: [1, 0, 1], across_m: [0, 3, 0], reflectivity: 60}
 """
+
+# Distances of stems up to which they are computed, m; far above every tolerance.
+NEAR_M = 1.0
+
 HEAD = """\
 schema: mlbatch.scenario/1
 seed: 7
@@ -116,14 +120,19 @@ def at_true_poses(points_m: F64Array, time_ns: F64Array, truth: Path) -> F64Arra
 
 
 def distance_to_scene(scene: Scene, points_m: F64Array, time_s: F64Array) -> F64Array:
-    """Distances (n,) of points (n, 3) from the nearest surface at times (n,)."""
+    """Distances (n,) of points (n, 3) from the nearest surface at times (n,).
+
+    Stems that are farther than NEAR_M do not count: a forest has thousands.
+    """
     found = [np.full(len(points_m), np.inf)]
+    stems = [kind for kind in scene.kinds if isinstance(kind, Stems)]
+    found += [_to_stems(kind, points_m) for kind in stems]
     for kind in scene.kinds:
         for row in range(len(kind.reflectivity)):
             if isinstance(kind, Boxes):
                 found.append(_to_box(kind, row, points_m, time_s))
             elif isinstance(kind, Stems):
-                found.append(_to_stem(kind, row, points_m))
+                continue
             else:
                 found.append(_to_rectangle(kind, row, points_m))
     if scene.terrain is not None:
@@ -156,6 +165,22 @@ def _to_box(kind: Boxes, row: int, points_m: F64Array, time_s: F64Array) -> F64A
     past = np.abs(turned) - kind.size_m[row] / 2
     outside = np.linalg.norm(np.maximum(past, 0), axis=1)
     return np.asarray(np.where(outside > 0, outside, -past.max(axis=1)))
+
+
+def _to_stems(kind: Stems, points_m: F64Array) -> F64Array:
+    """Distances (n,) from the nearest stem within NEAR_M; infinite where there is none."""
+    order = np.argsort(points_m[:, 0])
+    ordered = points_m[order]
+    reach = NEAR_M + np.maximum(kind.radius_m, kind.top_radius_m)
+    begins = np.searchsorted(ordered[:, 0], kind.base_m[:, 0] - reach)
+    ends = np.searchsorted(ordered[:, 0], kind.base_m[:, 0] + reach)
+    nearest = np.full(len(points_m), np.inf)
+    for row, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+        own = nearest[begin:end]
+        np.minimum(own, _to_stem(kind, row, ordered[begin:end]), out=own)
+    found = np.empty_like(nearest)
+    found[order] = nearest
+    return found
 
 
 def _to_stem(kind: Stems, row: int, points_m: F64Array) -> F64Array:
