@@ -111,7 +111,7 @@ def rounds(spec: RobosenseSpec, columns: I64Array) -> I64Array:
     """(n,) number of the round that each column is; outside the view nothing is sent."""
     begin, end = spec.view_deg
     width = (end - begin) % 360.0 or 360.0
-    if width == 360.0:
+    if width == 360.0 or not len(columns):
         return columns
     needed = int((columns.max() + 1) * 360.0 / width) + round(2 * 360 / _step_deg(spec))
     number = np.arange(needed)
@@ -277,11 +277,15 @@ def _sent(spec: RobosenseSpec, payloads: U8Array) -> list[tuple[int, bytes]]:
     """Add the headers; a packet arrives after the round of its last block."""
     row = spec.row
     sent = []
-    step = spec.columns_per_packet
-    for number, payload in enumerate(payloads):
-        first = int(number * step)
-        after = int(np.ceil((number + 1) * step))
-        first_round, last_round = rounds(spec, np.array([first, after - 1])).tolist()
+    numbers = np.arange(len(payloads))
+    first_columns = np.floor(numbers * spec.columns_per_packet).astype(np.int64)
+    last_columns = np.ceil((numbers + 1) * spec.columns_per_packet).astype(np.int64) - 1
+    first_rounds = rounds(spec, first_columns).tolist()
+    last_rounds = rounds(spec, last_columns).tolist()
+    spans = zip(first_rounds, last_rounds, strict=True)
+    for number, (payload, (first_round, last_round)) in enumerate(
+        zip(payloads, spans, strict=True)
+    ):
         fields = {
             **row.marks,
             row.time_at: _time(spec, spec.start_ns + first_round * spec.round_ns),
