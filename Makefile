@@ -23,6 +23,8 @@ LOWEST := .venv-lowest
 CONSUMERS := .venv-consumers
 ODOMETRY := .venv-odometry
 BIN := $(VENV)/bin
+# Modules are compiled when they are imported; of most tools few are.
+INSTALL := install --quiet --disable-pip-version-check --no-compile
 RIG := fixtures/two_lidars
 # Of the compiled engine, which an installation builds.
 SOURCES := $(wildcard mlbatch/native/*.[ch])
@@ -112,17 +114,17 @@ $(VENV)/bin/python:
 
 $(VENV)/core.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@$(BIN)/python -m pip $(INSTALL) --editable .
 	@touch $@
 
 $(VENV)/dev.stamp: pyproject.toml $(SOURCES) | $(VENV)/bin/python
 	@echo "installing mlbatch and its tools into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(BIN)/python -m pip $(INSTALL) --editable '.[dev]'
 	@touch $@ $(VENV)/core.stamp
 
 $(VENV)/docs.stamp: $(VENV)/dev.stamp
 	@echo "installing the tools of the site into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(BIN)/python -m pip $(INSTALL) --editable '.[docs]'
 	@touch $@
 
 $(ODOMETRY)/odometry.stamp: examples/odometry/requirements.txt pyproject.toml $(SOURCES)
@@ -131,12 +133,12 @@ $(ODOMETRY)/odometry.stamp: examples/odometry/requirements.txt pyproject.toml $(
 			"$$($(PYTHON) --version 2>&1); choose another: make PYTHON=python3.12 odometry"; exit 1; }
 	@echo "installing mlbatch, KISS-ICP and evo into $(ODOMETRY)"
 	@$(PYTHON) -m venv $(ODOMETRY)
-	@$(ODOMETRY)/bin/python -m pip install --quiet --disable-pip-version-check \
+	@$(ODOMETRY)/bin/python -m pip $(INSTALL) \
 		--requirement examples/odometry/requirements.txt --editable .
 	@touch $@
 
 $(ODOMETRY)/casestudy.stamp: examples/casestudy/requirements.txt $(ODOMETRY)/odometry.stamp
-	@$(ODOMETRY)/bin/python -m pip install --quiet --disable-pip-version-check \
+	@$(ODOMETRY)/bin/python -m pip $(INSTALL) \
 		--requirement examples/casestudy/requirements.txt
 	@touch $@
 
@@ -146,6 +148,6 @@ $(LOWEST)/dev.stamp: pyproject.toml .ci/lowest.txt
 			"choose another: make LOWEST_PYTHON=python3.11 test-lowest"; exit 1; }
 	@echo "installing the oldest dependencies into $(LOWEST)"
 	@$(LOWEST_PYTHON) -m venv --clear $(LOWEST)
-	@$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+	@$(LOWEST)/bin/python -m pip $(INSTALL) \
 		--constraint .ci/lowest.txt --editable '.[dev]'
 	@touch $@
