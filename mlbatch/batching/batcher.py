@@ -453,7 +453,8 @@ class Batcher:
                 is_partial=self._schedule.is_partial(window, last_of_all),
             )
         for track in self._tracks:
-            track.gaps = [gap for gap in track.gaps if gap[1] > until]
+            if track.gaps:
+                track.gaps = [gap for gap in track.gaps if gap[1] > until]
 
     def _take_until(self, until: int) -> WindowColumns:
         """Take the waiting columns before `until`, merged."""
@@ -475,11 +476,15 @@ class Batcher:
 
     def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:
         """True if every sensor began by the start, reached the end, and no stall overlaps."""
-        return bool((progress.newest[:, at] >= end).all()) and not any(
-            track.first_ns > start
-            or any(before < end and after > start for before, after in track.gaps)
-            for track in self._tracks
-        )
+        # As a list, since there are few sensors.
+        if min(progress.newest[:, at].tolist()) < end:
+            return False
+        for track in self._tracks:
+            if track.first_ns > start:
+                return False
+            if any(before < end and after > start for before, after in track.gaps):
+                return False
+        return True
 
     def _drop(self, figures: WindowFigures, reason: str) -> None:
         for track, own in zip(self._tracks, figures, strict=True):

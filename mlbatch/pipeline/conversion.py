@@ -69,12 +69,15 @@ class Stages:
 
     def each(self, stage: str, items: Iterator[Item]) -> Iterator[Item]:
         """Yield the items; the time to make them is added to a stage."""
+        # `timed` costs more than the rest of the loop.
         while True:
-            with self.timed(stage):
-                try:
-                    item = next(items)
-                except StopIteration:
-                    return
+            began_s = time.perf_counter()
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+            finally:
+                setattr(self, stage, getattr(self, stage) + time.perf_counter() - began_s)
             yield item
 
 

@@ -53,7 +53,7 @@ class DecodeTask:
 
 
 class Decoded(NamedTuple):
-    """A scan, and the counts of its points, one list a sensor."""
+    """A scan, and the counts of its points, one list a sensor; none if they were not asked for."""
 
     scan: Scan
     outcomes: list[list[int]]
@@ -78,10 +78,13 @@ class DecodeWorker:
         else:
             self._decoders = [new(sources, None)]
 
-    def decode(self, task: DecodeTask) -> Decoded:
-        """Decode a task; the arrays are valid as long as the decoder's buffers last."""
+    def decode(self, task: DecodeTask, *, counts_points: bool = False) -> Decoded:
+        """Decode a task; the arrays are valid as long as the decoder's buffers last.
+
+        counts_points: give the outcomes.
+        """
         decoder = self._decoders[task.only or 0]
-        before = [counts.counters for counts in decoder.counts]
+        before = [counts.counters for counts in decoder.counts] if counts_points else []
         scan = decoder.scan(task.columns, task.label, task.outcomes)
         task.is_decoded = True
         # A scan that the output already contains has no points, but their counts.
@@ -89,6 +92,8 @@ class DecodeWorker:
             clipped = clipped_points(scan)
             for number, counts in enumerate(decoder.counts, start=task.only or 0):
                 counts.clipped += clipped[number]
+        if not counts_points:
+            return Decoded(scan, [])
         after = [counts.counters for counts in decoder.counts]
         outcomes = [
             [late - early for late, early in zip(now, was, strict=True)]

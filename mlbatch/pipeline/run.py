@@ -108,7 +108,8 @@ class _Output:
         """The task of a scan with the messages before it; many messages are tasks of their own."""
         task = None if isinstance(item, SkippedWindow) else item
         before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
-        while rest := self._run.passed_through(item.end_ns, _PORTION_BYTES):
+        # After nothing there is no more.
+        while before and (rest := self._run.passed_through(item.end_ns, _PORTION_BYTES)):
             yield self._scan_task(None, before)
             before = rest
         if task is not None or before:

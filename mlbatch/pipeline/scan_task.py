@@ -49,7 +49,7 @@ class ScanTask:
         if self._task is None:
             return
         began_s = time.perf_counter()
-        self._decoded = worker.decode(self._task)
+        self._decoded = worker.decode(self._task, counts_points=self._resume_log is not None)
         self._decode_s += time.perf_counter() - began_s
 
     def decode(self) -> None:
@@ -57,8 +57,9 @@ class ScanTask:
         if self._decoded is None and self._task is not None:
             self._worker = self._idle.pop()
             self.decode_with(self._worker)
-        self._job = self._writer_job()
-        self._timed(self._job.pack)
+        if self._writer is not None:
+            self._job = self._writer_job(self._writer)
+            self._timed(self._job.pack)
 
     def append(self) -> None:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
@@ -83,15 +84,15 @@ class ScanTask:
             # Only now, since its arrays were read until here.
             self._idle.append(self._worker)
 
-    def _writer_job(self) -> ScanJob:
-        if self._writer is None:
-            return ScanJob()
+    def _writer_job(self, writer: ScanWriter) -> ScanJob:
         if self._task is None or self._decoded is None:
-            return self._writer.flush()
-        write = self._writer.skip if self._is_kept else self._writer.write
+            return writer.flush()
+        write = writer.skip if self._is_kept else writer.write
         return write(self._decoded.scan, self._task.only)
 
     def _timed(self, stage: Callable[[], None]) -> None:
+        if self._writer is None:
+            return
         began_s = time.perf_counter()
         stage()
         self._write_s += time.perf_counter() - began_s
