@@ -122,8 +122,9 @@ def convert(
     deskew: Annotated[
         str | None,
         typer.Option(
-            help="Move points to one instant of their window by poses: imu, or a trajectory "
-            "(FILE.tum: time x y z qx qy qz qw of the body).",
+            help="Move points to one instant of their window by poses: imu, a trajectory "
+            "(FILE.tum: time x y z qx qy qz qw of the body), or constant-velocity, estimated from "
+            "the points.",
             metavar="SOURCE",
         ),
     ] = None,

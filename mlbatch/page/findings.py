@@ -45,6 +45,7 @@ REMEDIES = {
     "other_ros": "write an output of the same ROS version (--format rosbag1, mcap or rosbag2)",
     "imu_clock": "set IMU and lidars to one time source, or give the topic with --pass",
     "no_pose": "give a trajectory of the whole recording (--deskew FILE.tum)",
+    "no_velocity": "give a trajectory (--deskew FILE.tum); exclude the machine (--exclude-box)",
     "deskew_drift": "give a trajectory of the drive (--deskew FILE.tum)",
     "clock_epoch": "correct the offset in the rig (clock.offset_s), or use --clock host",
     "clocks": "synchronise the sensors (PTP or GPS), or use --align-clocks or --clock host",

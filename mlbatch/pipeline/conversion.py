@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -22,7 +22,8 @@ from mlbatch.decode.decoder import Decoder, Source
 from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes
+from mlbatch.pipeline.constant_velocity import CONSTANT_VELOCITY, ConstantVelocity
+from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes, with_own_lidars
 from mlbatch.pipeline.deskew import IMU as IMU_POSES
 from mlbatch.pipeline.deskew import Deskew, ImuPoses, PoseSource, Trajectory
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
@@ -137,17 +138,29 @@ class Conversion:
         for note in self.session.setup.notes:
             self.warn(note)
 
-    def _deskew(self) -> Deskew | None:
+    def _deskew(self) -> Deskew | ConstantVelocity | None:
         """What moves columns, by `--deskew`; None without."""
         job = self.job
         if not job.deskew:
             return None
+        if job.deskew == CONSTANT_VELOCITY:
+            slots = [sensor.source().slots for sensor in self.sensors]
+            return ConstantVelocity(job.deskew_to, self.grid, slots, self._plain_decoder)
         source: PoseSource
         if job.deskew == IMU_POSES:
             source = ImuPoses(self.sensors, self.session.setup.frames())
         else:
             source = Trajectory(Path(job.deskew))
         return Deskew(source, job.deskew_to, job.max_wait_ns, len(self.sensors))
+
+    def _plain_decoder(self) -> Decoder:
+        """A decoder for the thread that batches: dense scans of all sensors, with columns."""
+        # There is a window, so that the clocks are known.
+        info = replace(self._run_info(), layout="dense", sort="columns")
+        sources = with_own_lidars([sensor.source() for sensor in self.sensors])
+        boxes_m = self.session.boxes_m
+        extras = frozenset({"column"})
+        return Decoder(info, sources, boxes_m, extras, engine=self.session.engine)
 
     # -- the loop -----------------------------------------------------------------------------
 
@@ -167,7 +180,7 @@ class Conversion:
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
                 ingested = self.session.ingest.columns(batch, oldest_ring_indexes)
                 if self.deskew is not None:
-                    self.deskew.source.add(ingested.imu, batch.messages)
+                    self.deskew.add(ingested.imu, batch.messages)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -266,8 +279,7 @@ class Conversion:
         self._check_dates(shared)
         self._check_limits()
         self._check_passed()
-        forwards = self.passthrough.messages.is_asked(self.session.recordings)
-        info = self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
+        info = self._run_info()
         self.info = info
         self.table = ScanTable(info, [sensor.columns_per_s for sensor in self.sensors])
         boxes_m = self.session.boxes_m
@@ -297,6 +309,12 @@ class Conversion:
             slices=job.slices,
         )
         return self._pool
+
+    def _run_info(self) -> RunInfo:
+        """Properties of the run, once there is a window."""
+        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        shared = common_timescale(self._timescales())
+        return self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
 
     @property
     def pool(self) -> DecodePool:

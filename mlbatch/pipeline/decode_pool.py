@@ -140,7 +140,7 @@ class DecodePool:
         self._open: list[DecodeTask] = []
         self.workers = [
             DecodeWorker(
-                _with_own_lidars(sources) if workers > 1 else sources, split, new, counts_clipped
+                with_own_lidars(sources) if workers > 1 else sources, split, new, counts_clipped
             )
             for _ in range(workers)
         ]
@@ -235,6 +235,6 @@ def _last(sensors: I64Array, sensor: int) -> int | None:
     return None
 
 
-def _with_own_lidars(sources: Sequence[Source]) -> list[Source]:
+def with_own_lidars(sources: Sequence[Source]) -> list[Source]:
     """The same sources with copies of their lidars; rings are shared."""
     return [replace(source, lidar=deepcopy(source.lidar)) for source in sources]

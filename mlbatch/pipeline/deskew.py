@@ -214,6 +214,15 @@ class Deskew:
         # Columns of each sensor in windows that were left out.
         self.dropped = [0] * sensors
 
+    @property
+    def integrated_s(self) -> float:
+        """How long velocities of an IMU were integrated, s."""
+        return self.source.integrated_s
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Add what a batch of the recording contains."""
+        self.source.add(imu, messages)
+
     def push(self, window: Window) -> Iterator[Window]:
         """Add the next window; yield those whose poses are known."""
         self._waiting.append(window)

@@ -126,11 +126,8 @@ def check_deskew(job: Job, is_given: bool) -> Job:
             "--deskew FILE.tum, or leave it out"
         )
     if job.deskew == "constant-velocity":
-        raise UsageError(
-            "--deskew constant-velocity: expected a source of poses, found a model without one: "
-            "the velocity needs odometry; run it on the scans, and give its trajectory "
-            "(--deskew FILE.tum)"
-        )
+        _check_velocity(job)
+        return job
     if job.deskew == "imu" and job.selection.host_clock:
         raise UsageError(
             "--deskew imu: expected the clocks of the sensors, which IMU samples have, found "
@@ -138,10 +135,25 @@ def check_deskew(job: Job, is_given: bool) -> Job:
         )
     if job.deskew and job.deskew != "imu" and not Path(job.deskew).is_file():
         raise UsageError(
-            f"--deskew: expected imu or the file of a trajectory (TUM), found {job.deskew!r}; "
-            "check the path"
+            "--deskew: expected imu, constant-velocity or the file of a trajectory (TUM), found "
+            f"{job.deskew!r}; check the path"
         )
     return job
+
+
+def _check_velocity(job: Job) -> None:
+    """Refuse what would give other velocities than the whole recording, or none."""
+    if job.is_fused:
+        raise UsageError(
+            "--deskew constant-velocity: expected windows, which follow each other, found "
+            f"--batching {job.batching}; leave one of them out"
+        )
+    if job.start is not None:
+        raise UsageError(
+            "--deskew constant-velocity: expected the recording from its beginning, since each "
+            "window needs those before it, found --start; leave it out, or give poses "
+            "(--deskew FILE.tum)"
+        )
 
 
 def check_batching(job: Job) -> Job:

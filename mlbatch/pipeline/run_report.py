@@ -182,12 +182,22 @@ def _motion_notes(run: Conversion) -> Iterator[Note]:
             f"{motion.no_pose} of {motion.columns} columns, which were left out; give a trajectory "
             "of the whole recording",
         )
-    seconds = run.deskew.source.integrated_s
+    velocity = motion.velocity
+    # Nothing is known before the first two windows.
+    if velocity is not None and sum(velocity.windows.values()) > velocity.windows.get("first", 0):
+        yield Note(
+            "no_velocity",
+            "",
+            f"{velocity.unmoved} of {motion.columns} columns were not moved "
+            f"(windows: {velocity.describe()}); look at scene and motion, or give a trajectory "
+            "(--deskew FILE.tum)",
+        )
+    seconds = run.deskew.integrated_s
     if seconds > DRIFT_S:
         yield Note(
             "deskew_drift",
             "",
-            f"{run.deskew.source.name} was integrated for {seconds:.0f} s after the standstill: an "
+            f"{motion.source} was integrated for {seconds:.0f} s after the standstill: an "
             f"error of its accelerometer of {_USUAL_ERROR} m/s2 is then a velocity of "
             f"{_USUAL_ERROR * seconds:.2g} m/s; give a trajectory (--deskew FILE.tum)",
         )

@@ -143,7 +143,7 @@ class ScanOptions:
     stamp: str = "start"
     batching: str = "window"
     batching_times: str = "common"
-    # "imu", or the path of a trajectory.
+    # "imu", "constant-velocity", or the path of a trajectory.
     deskew: AnyPath | None = None
     deskew_to: str | None = None
 

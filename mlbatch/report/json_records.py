@@ -44,6 +44,8 @@ def _reader(kind: Any) -> Read:
         return _array
     if origin is tuple:
         return _tuple(get_args(kind))
+    if origin is list:
+        return _list(get_args(kind)[0])
     if origin is dict:
         return _dict(get_args(kind)[1])
     if kind in (bool, int, float, str):
@@ -83,6 +85,11 @@ def _tuple(kinds: tuple[Any, ...]) -> Read:
         return tuple([each(one) for each, one in zip(readers, _items(found), strict=True)])
 
     return read
+
+
+def _list(kind: Any) -> Read:
+    inside = _reader(kind)
+    return lambda found: [inside(one) for one in _items(found)]
 
 
 def _dict(kind: Any) -> Read:

@@ -131,7 +131,8 @@ CONVERT: tuple[Key[Values], ...] = (
     ),
     Key(
         *("deskew", _poses, (), TEXT),
-        about="where poses come from: imu, or a trajectory (relative to the rig file)",
+        about="where poses come from: imu, constant-velocity, or a trajectory (relative to the rig "
+        "file)",
     ),
     _choice_key("deskew_to", "instant to move points to", "start", "middle", "end"),
     _choice_key("batching_times", "times of points in fused sweeps", "common", "own"),

@@ -430,9 +430,12 @@ def check_ledgers(report: Document) -> None:
 
 
 def _check_motion(report: Document) -> None:
-    """Every column of --deskew is moved and written, or has no pose."""
+    """Every column of --deskew is moved and written, written as it is, or has no pose."""
     no_pose = report.number("deskew", "no_pose") or 0
-    _check_sum(report, ("deskew", "columns"), ("deskew", "moved"), {"no_pose": no_pose})
+    others = {"no_pose": no_pose}
+    if report.at("deskew", "unmoved") is not None:
+        others["unmoved"] = report.number("deskew", "unmoved") or 0
+    _check_sum(report, ("deskew", "columns"), ("deskew", "moved"), others)
     sensors = range(report.length("sensors"))
     dropped = [report.counts("sensors", i, "columns", "dropped") for i in sensors]
     counted = sum(counts.get("no_pose", 0) for counts in dropped)

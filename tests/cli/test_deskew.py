@@ -230,9 +230,10 @@ def test_every_format_can_be_checked_and_read(shell: Shell, output: str) -> None
     ("words", "message"),
     [
         ("--deskew-to end", "--deskew-to: expected --deskew, which moves points"),
-        ("--deskew constant-velocity", "needs odometry"),
+        ("--deskew constant-velocity --start +1", "expected the recording from its beginning"),
+        ("--deskew constant-velocity --batching latest", "expected windows, which follow"),
         ("--deskew imu --clock host", "--deskew imu: expected the clocks of the sensors"),
-        ("--deskew none.tum", "--deskew: expected imu or the file of a trajectory"),
+        ("--deskew none.tum", "--deskew: expected imu, constant-velocity or the file"),
         ("--deskew imu --deskew-to now", "--deskew-to: expected start or middle or end"),
     ],
 )

@@ -68,7 +68,7 @@ def _option(name: str) -> str:
 @pytest.mark.parametrize(
     "options",
     [
-        {"deskew": "constant-velocity"},
+        {"deskew": "constant-velocity", "start": "+1"},
         {"deskew": "missing.tum"},
         {"deskew_to": "end"},
         {"deskew": "imu", "deskew_to": "later"},

@@ -1,0 +1,173 @@
+"""`--deskew constant-velocity`: windows are moved by the velocity that their own points give.
+
+The thread that batches decodes some columns of each window and registers them with the windows
+before (`motion/estimate.py`), before the window goes to the decode workers. So the result depends
+on no worker, and shards and resumed runs, which batch everything, get the same velocities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.batching.grid import Grid
+from mlbatch.batching.windows import Window
+from mlbatch.decode.decoder import Decoder, ScanHeader
+from mlbatch.motion.estimate import Estimate, VelocityEstimator
+from mlbatch.motion.moves import PoseLine
+from mlbatch.motion.registration import ORIGIN, Cloud
+from mlbatch.motion.track import PoseTrack
+from mlbatch.report.motion import MotionLedger, VelocityCounts
+from mlbatch.types import ImuSamples, Message, instant_ns
+from mlbatch.units import NS_PER_S
+
+CONSTANT_VELOCITY = "constant-velocity"
+# Of a window; of more, every second column is read, or every third.
+_SLOTS = 1 << 16
+
+
+class ConstantVelocity:
+    """Takes windows, yields them with the transforms of their columns, or without."""
+
+    # No window is left out, and nothing is integrated.
+    integrated_s = 0.0
+
+    def __init__(
+        self, to: str, grid: Grid, slots: list[int], new_decoder: Callable[[], Decoder]
+    ) -> None:
+        """to: a word of INSTANTS; slots: of a column of each sensor.
+
+        new_decoder: called with the first window; its scans are dense, with `column`.
+        """
+        self._to = to
+        self._grid = grid
+        self._slots = slots
+        self._new_decoder = new_decoder
+        self._decoder: Decoder | None = None
+        self._estimator = VelocityEstimator()
+        # Slices of the window that is not complete, and their points.
+        self._slices: list[Window] = []
+        self._clouds: list[Cloud] = []
+        self._counts = MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts())
+        self.dropped = [0] * len(slots)
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Nothing: only points are used."""
+
+    def push(self, window: Window) -> Iterator[Window]:
+        """Add the next window or slice; yield all slices of those that are complete."""
+        if self._slices and self._slices[-1].index != window.index:
+            yield from self._release()
+        self._slices.append(window)
+        self._clouds.append(self._points(window))
+        if window.slice == self._grid.slices - 1:
+            yield from self._release()
+
+    def finish(self) -> Iterator[Window]:
+        """End of input."""
+        yield from self._release()
+
+    def awaits(self, newest_ns: int) -> bool:
+        """False: a window needs nothing that is recorded after it."""
+        return False
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the slices that wait; None: none."""
+        parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._slices)
+        return min((int(part.min()) for part in parts if len(part)), default=None)
+
+    @property
+    def ledger(self) -> MotionLedger:
+        """Counts so far."""
+        return self._counts
+
+    def _span_ns(self, window: Window) -> tuple[int, int]:
+        """Start and end of the whole window that a slice belongs to."""
+        slices = self._grid.slices
+        number = self._grid.index_of(window.start_ns) // slices
+        return self._grid.bound(number * slices), self._grid.bound((number + 1) * slices)
+
+    def _points(self, window: Window) -> Cloud:
+        """Points of some columns; columns of each sensor are taken at equal steps."""
+        columns = window.columns
+        counts = [int(np.count_nonzero(columns.sensor == one)) for one in range(len(self._slots))]
+        total = sum(count * slots for count, slots in zip(counts, self._slots, strict=True))
+        step = max(1, -(-total * self._grid.slices // _SLOTS))
+        taken: list[I64Array] = [
+            np.flatnonzero(columns.sensor == sensor)[::step] for sensor in range(len(self._slots))
+        ]
+        some = columns.take(np.sort(np.concatenate(taken)))
+        start_ns, end_ns = self._span_ns(window)
+        time_s: F64Array = (some.stamp_ns - (start_ns + end_ns) // 2) / NS_PER_S
+        if self._decoder is None:
+            self._decoder = self._new_decoder()
+        header = ScanHeader(
+            window.index, window.slice, window.start_ns, window.end_ns, window.complete, 0
+        )
+        scan = self._decoder.scan(some, header)
+        if scan.column is None:
+            raise TypeError("expected scans with columns")
+        return Cloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
+
+    def _release(self) -> Iterator[Window]:
+        if not self._slices:
+            return
+        slices, clouds = self._slices, self._clouds
+        self._slices, self._clouds = [], []
+        start_ns, end_ns = self._span_ns(slices[0])
+        middle_ns = (start_ns + end_ns) // 2
+        estimate = self._estimator.add(_joined(clouds), middle_ns, end_ns - start_ns)
+        self._count(estimate, slices)
+        if estimate.velocity is None:
+            yield from slices
+            return
+        line = _line(estimate.velocity, start_ns, end_ns)
+        for window in slices:
+            columns = window.columns
+            to_ns = instant_ns(self._to, window.start_ns, window.end_ns)
+            moves = line.moves(columns.stamp_ns, to_ns)
+            yield replace(window, columns=replace(columns, moves=moves))
+
+    def _count(self, estimate: Estimate, slices: list[Window]) -> None:
+        counts = self._counts
+        columns = sum(len(window.columns) for window in slices)
+        counts.columns += columns
+        velocity = counts.velocity
+        if velocity is None:
+            return
+        if estimate.residual_m is not None:
+            counts.poses += 1
+            velocity.residual_m.append(estimate.residual_m)
+        if estimate.velocity is not None:
+            counts.moved += columns
+            return
+        velocity.unmoved += columns
+        velocity.add_window(estimate.reason, slices[0].index)
+
+
+def _joined(clouds: list[Cloud]) -> Cloud:
+    """The points of all slices of a window."""
+    if len(clouds) == 1:
+        return clouds[0]
+    before = np.cumsum([0, *(len(one.time_s) for one in clouds[:-1])])
+    return Cloud(
+        np.concatenate([one.points_m for one in clouds]),
+        np.concatenate([one.column + base for one, base in zip(clouds, before, strict=True)]),
+        np.concatenate([one.time_s for one in clouds]),
+    )
+
+
+def _line(velocity: F64Array, start_ns: int, end_ns: int) -> PoseLine:
+    """The poses of a motion with a constant twist, from the start to the end of a window."""
+    end = ORIGIN.then(velocity * ((end_ns - start_ns) / NS_PER_S))
+    return PoseLine(
+        PoseTrack(
+            np.array([start_ns, end_ns], np.int64),
+            np.stack([ORIGIN.rotation, end.rotation]),
+            np.stack([ORIGIN.position_m, end.position_m]),
+            CONSTANT_VELOCITY,
+        )
+    )
