@@ -287,7 +287,7 @@ class Batcher:
             return None
         # The largest distance possible in this batch; the usual case ends here.
         before_ns = min(track.newest_ns for track in self._tracks)
-        if before_ns > NEVER and int(newest[:, -1].max()) - before_ns <= wait_ns:
+        if before_ns > NEVER and max(newest[:, -1].tolist()) - before_ns <= wait_ns:
             return None
         leading = newest.max(axis=0)
         present = newest > NEVER
@@ -325,8 +325,10 @@ class Batcher:
         headers = arrival.headers
         if arrival.is_rising and len(headers.stamp_ns):
             low = headers.stamp_ns[:, 0]
-            if self._is_ahead(track, int(low[0]), int(headers.stamp_ns[-1, -1])) and bool(
-                (low >= published).all()
+            first_ns = int(low[0])
+            if self._is_ahead(track, first_ns, int(headers.stamp_ns[-1, -1])) and (
+                # Neither array falls.
+                first_ns >= int(published[-1]) or bool((low >= published).all())
             ):
                 track.decoded += headers.valid.size
                 self._wait(track, self._columns(arrival))

@@ -85,6 +85,13 @@ def extremes(headers: ColumnHeaders) -> tuple[I64Array, I64Array]:
     return low, high
 
 
+def _extent(low: I64Array, high: I64Array, *, is_rising: bool) -> tuple[int, int]:
+    """Smallest of `low`, largest of `high`, both (n,); is_rising: both rise."""
+    if is_rising and len(low):
+        return int(low[0]), int(high[-1])
+    return int(low.min(initial=FOREVER)), int(high.max(initial=NEVER))
+
+
 class Intake:
     """Filter of the packets of one sensor; `rejected` counts rejected packets by reason."""
 
@@ -130,8 +137,9 @@ class Intake:
             high = headers.stamp_ns[:, -1].copy()
         else:
             low, high = extremes(headers)
-        if self._held is None and len(high) and self._has_no_step(int(low.min()), int(high.max())):
-            self._newest = max(self._newest, int(high.max()))
+        lowest, highest = _extent(low, high, is_rising=arrival.is_rising)
+        if self._held is None and len(high) and self._has_no_step(lowest, highest):
+            self._newest = max(self._newest, highest)
         else:
             arrival, low, high = self._check_stamps(arrival, low, high)
         self.loss.add(arrival.key, arrival.headers, arrival.host_ns)
@@ -367,7 +375,9 @@ class JumpGuard:
             return
         stamp_ns = accepted.newest_ns
         host_ns = accepted.packets.host_ns
-        if len(stamp_ns) and int(stamp_ns.min()) <= NEVER:
+        is_rising = accepted.packets.is_rising
+        lowest_ns, highest_ns = _extent(stamp_ns, stamp_ns, is_rising=is_rising)
+        if len(stamp_ns) and lowest_ns <= NEVER:
             measured = stamp_ns > NEVER
             stamp_ns = stamp_ns[measured]
             host_ns = host_ns[measured]
@@ -376,7 +386,7 @@ class JumpGuard:
         if self._newest_ns == NEVER:
             self._newest_ns = int(stamp_ns[0])
             self._host_ns = int(host_ns[0])
-        newest_ns = max(self._newest_ns, int(stamp_ns.max()))
+        newest_ns = max(self._newest_ns, highest_ns)
         if newest_ns - self._newest_ns > STEP_NS:
             self._refuse_jump(stamp_ns, host_ns)
         self._newest_ns = newest_ns

@@ -30,6 +30,8 @@ class ArenaRing:
         self._headers: U8Array = np.zeros((0, packet_size), np.uint8)
         self._loops = CaptureLoops()
         self._view = self._viewed()
+        # Of the last call.
+        self._offsets: I64Array = np.zeros(0, np.int64)
         # Of all packets, and up to each one that is still needed, by place; where asked for.
         self._has_sums = False
         self._sum = np.uint64(0)
@@ -43,8 +45,11 @@ class ArenaRing:
 
     def column_offsets(self, columns: int) -> I64Array:
         """See `PacketRing`."""
-        row, place = np.divmod(np.arange(columns), self._records.per_row)
-        return np.asarray(row * self._records.stride + place * self._records.step)
+        if columns != len(self._offsets):
+            row, place = np.divmod(np.arange(columns), self._records.per_row)
+            self._offsets = np.asarray(row * self._records.stride + place * self._records.step)
+            self._offsets.flags.writeable = False
+        return self._offsets
 
     @property
     def view(self) -> tuple[npt.NDArray[np.void], int]:

@@ -62,6 +62,7 @@ class Driver:
         """Push a batch, decode the windows it completes; returns the number of scans."""
         batcher = self.run.batcher
         oldest = [batcher.oldest_ring_index(sensor.index) for sensor in self.run.sensors]
+        self.run.session.keep_from(oldest)
         ingested = self.run.session.ingest.columns(batch, oldest)
         scans = 0
         for window in batcher.push(ingested.arrivals, batch.host_ns):
