@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
+from mlbatch.types import Scan
+from mlbatch.writers.formats import npz
+from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import Shell, arrays, names, report_of
 from tests.builders.simulated import Recorded, record, scenario_text
 from tests.motion.test_wall import SCENE
@@ -150,6 +153,29 @@ def test_shards_give_the_same_bytes(shell: Shell, drive: Recorded) -> None:
     assert shell("merge part1 part2 -o merged -q").code == 0
     assert report_of("merged/report.json")["deskew"] == report_of("whole/report.json")["deskew"]
     assert shell("verify merged").code == 0
+
+
+def test_a_resumed_run_gives_the_same_bytes(
+    shell: Shell, drive: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first scans are not decoded again, but registered."""
+    line = f"{words(drive)} --deskew constant-velocity --end +2.5"
+    assert shell(f"{line} -o whole").code == 0
+    encode = npz.NpzEncoder.encode
+
+    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
+        if scan.index == 20:
+            raise KeyboardInterrupt
+        return encode(encoder, scan)
+
+    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
+    assert shell(f"{line} -o part").code == 130
+    monkeypatch.setattr(npz.NpzEncoder, "encode", encode)
+    assert "resumed after" in shell(f"{line.replace(' -q', '')} -o part --resume").err
+    assert names("part") == names("whole")
+    for name in names("part"):
+        assert Path("part", name).read_bytes() == Path("whole", name).read_bytes()
+    assert report_of("part/report.json")["deskew"] == report_of("whole/report.json")["deskew"]
 
 
 def test_slices_have_the_motion_of_their_window(shell: Shell, drive: Recorded) -> None:
