@@ -1,7 +1,5 @@
 """`mlbatch convert`: the main job."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

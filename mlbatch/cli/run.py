@@ -10,6 +10,7 @@ import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -24,14 +25,12 @@ from mlbatch.errors import (
     UsageError,
     one_line,
 )
-from mlbatch.pipeline import preflight, resume
+from mlbatch.pipeline import preflight
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.interrupts import interruptible
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import Last, OpenWriter, convert
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.pipeline.shard_part import ShardOutput, check_format
 from mlbatch.report.limits import Limit, exceeded
 from mlbatch.report.report import RunReport, build_report, report_text
 from mlbatch.types import RunInfo
@@ -51,6 +50,11 @@ from mlbatch.writers import (
     sync_entries,
     write_text,
 )
+
+# `--resume` and `--shard` are loaded where they are needed: a dry run needs neither.
+if TYPE_CHECKING:
+    from mlbatch.pipeline.resume import ResumeLog
+    from mlbatch.pipeline.shard_part import ShardOutput
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,6 +133,8 @@ def _run_one(job: Job, target: Target) -> list[str]:
             if warning := preflight.check_disk(job, output):
                 say(f"warning: {warning}")
         if job.shard is not None:
+            from mlbatch.pipeline.shard_part import ShardOutput
+
             shard_output = ShardOutput(job.shard, name, options, resume_log)
         open_output = _opener(name, output, options, shard_output)
         if shard_output is None:
@@ -209,6 +215,8 @@ def _converted(
 
 def _check_shard(target: Target, name: str) -> None:
     """Refuse options that have no meaning for a shard; name: of the format."""
+    from mlbatch.pipeline.shard_part import check_format
+
     given = {
         "--dry-run": target.dry_run,
         "--report": target.report is not None or target.prints_report,
@@ -370,6 +378,8 @@ def _run_segments(job: Job, target: Target) -> list[str]:
             segment = TimeSegment(segment.begin_ns, jump.host_ns)
             if own_target.written is not None and (is_whole or not target.resume):
                 # Outputs of segments have other names.
+                from mlbatch.pipeline import resume
+
                 resume.abandon(own_target.written)
             continue
         except NoScanError as err:
@@ -389,6 +399,8 @@ def _run_segments(job: Job, target: Target) -> list[str]:
 
 
 def _refuse_jump(job: Job) -> None:
+    from mlbatch.pipeline import resume
+
     jump = resume.find_jump(job)
     if jump is not None:
         raise jump
@@ -416,6 +428,8 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 
 def _is_complete(output: Path, *, overwrite: bool) -> bool:
     """True if an earlier run completed the output, so that there is nothing to resume."""
+    from mlbatch.pipeline import resume
+
     earlier = resume.find(output)
     # With --overwrite an older output is replaced, but not the one of the interrupted run.
     if not earlier.is_complete or (overwrite and not earlier.was_published):
@@ -429,6 +443,8 @@ def _resume_log(
     job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
 ) -> ResumeLog:
     """Progress of an output: that of the interrupted run, or from the start."""
+    from mlbatch.pipeline import resume
+
     earlier = resume.find(output)
     state = earlier.state
     if earlier.damage and resumes:
@@ -438,7 +454,7 @@ def _resume_log(
             f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
             "discarded; --resume would continue after them"
         )
-    log = ResumeLog(output, job, name, options, state if resumes else None)
+    log = resume.ResumeLog(output, job, name, options, state if resumes else None)
     if log.kept_bytes is None:
         resume.forget(output)
         if resumes:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.fusion import OWN, SweepFusion
@@ -22,10 +22,7 @@ from mlbatch.decode.decoder import Decoder, Source
 from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.constant_velocity import CONSTANT_VELOCITY, ConstantVelocity
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes, with_own_lidars
-from mlbatch.pipeline.deskew import IMU as IMU_POSES
-from mlbatch.pipeline.deskew import Deskew, ImuPoses, PoseSource, Trajectory
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
@@ -35,6 +32,10 @@ from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
 from mlbatch.units import NS_PER_S, rate_text
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.constant_velocity import ConstantVelocity
+    from mlbatch.pipeline.deskew import Deskew, PoseSource
 
 # Called with the bytes read so far, those of all recordings, and the number of scans so far.
 Progress = Callable[[int, int, int], None]
@@ -143,11 +144,15 @@ class Conversion:
         job = self.job
         if not job.deskew:
             return None
+        from mlbatch.pipeline.constant_velocity import CONSTANT_VELOCITY, ConstantVelocity
+
         if job.deskew == CONSTANT_VELOCITY:
             slots = [sensor.source().slots for sensor in self.sensors]
             return ConstantVelocity(job.deskew_to, self.grid, slots, self._plain_decoder)
+        from mlbatch.pipeline.deskew import IMU, Deskew, ImuPoses, Trajectory
+
         source: PoseSource
-        if job.deskew == IMU_POSES:
+        if job.deskew == IMU:
             source = ImuPoses(self.sensors, self.session.setup.frames())
         else:
             source = Trajectory(Path(job.deskew))

@@ -11,18 +11,21 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mlbatch.errors import NoScanError, RecordingError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
 from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
 from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.writers import ScanJob, ScanWriter
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.resume import ResumeLog
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Called with the content of the report and the complete output, before that gets its final name.

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
-from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.types import ImuSamples, Message
 from mlbatch.writers import ScanJob, ScanWriter
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.resume import ResumeLog
 
 
 class ScanTask:

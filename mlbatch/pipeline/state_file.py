@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import io
 import json
 from collections.abc import Iterator, Mapping
@@ -131,6 +130,9 @@ class StateFile:
 
 def _checksum(before: str, text: bytes) -> str:
     """Checksum of a record; before: that of the record before, "" for the first."""
+    # OpenSSL takes a while to load; a dry run has no state file.
+    import hashlib
+
     return hashlib.sha256(before.encode() + text).hexdigest()[:_CHECKSUM_DIGITS]
 
 

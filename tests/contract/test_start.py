@@ -56,6 +56,7 @@ NEEDLESS = (
     *("mlbatch.sensors.ouster.simulate", "mlbatch.lidar.simulated"),
     *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
     *("mlbatch.cli.digest", "mlbatch.digest.golden"),
+    *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.shard_part"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
 )
 
