@@ -340,7 +340,9 @@ def _side_files(scenario: Scenario, streams: list[LidarStream], target: Path) ->
             found[path] = files.content
             lines.append(f"    metadata: {path.name}")
         translation = ", ".join(f"{value:.9g}" for value in plan.body_from_sensor[:3, 3])
-        rotation = ", ".join(f"{value:.9g}" for value in rpy_deg(plan.body_from_sensor))
+        # Angles of 1e-16 degrees come from the matrix.
+        angles = (round(value, 9) + 0.0 for value in rpy_deg(plan.body_from_sensor))
+        rotation = ", ".join(f"{value:.9g}" for value in angles)
         lines.append(
             f"    extrinsics: {{translation_m: [{translation}], rotation_rpy_deg: [{rotation}]}}"
         )

@@ -14,7 +14,12 @@ import mlbatch
 from mlbatch.digest import golden_text
 from tests.builders.run import ROOT, command
 
-FIXTURES = ("two_lidars", "four_makers")
+# Recording, rig, and options of each.
+FIXTURES = {
+    "two_lidars": ("two_lidars.pcap", "rig.yaml"),
+    "four_makers": ("four_makers.pcap", "rig.yaml"),
+    "moving": ("moving.mcap", "moving.rig.yaml", "--deskew", "imu"),
+}
 
 
 def expected(fixture: str) -> Path:
@@ -25,8 +30,16 @@ def expected(fixture: str) -> Path:
 def converted(fixture: str, folder: Path) -> Path:
     """The fixture as npz, with its partial scans."""
     source = ROOT / "fixtures" / fixture
-    words = ("--rig", source / "rig.yaml", "--keep-partial", "--quiet", "--overwrite")
-    done = command("convert", source / f"{fixture}.pcap", "-o", folder / fixture, *words)
+    recording, rig, *options = FIXTURES[fixture]
+    words: tuple[str | Path, ...] = (
+        "--rig",
+        source / rig,
+        "--keep-partial",
+        "--quiet",
+        "--overwrite",
+        *options,
+    )
+    done = command("convert", source / recording, "-o", folder / fixture, *words)
     assert done.code == 0, done.err
     return folder / fixture
 
