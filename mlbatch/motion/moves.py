@@ -30,6 +30,8 @@ class PoseLine:
 
     def __init__(self, track: PoseTrack) -> None:
         self._track = track
+        # Of each pair of poses, when it is added: a pair is in two windows or more.
+        self._terms, self._angle = _pair_terms(track.rotation, track.position_m)
         self.poses = len(track.stamp_ns)
 
     @property
@@ -43,6 +45,13 @@ class PoseLine:
         own = self._track
         first = max(0, int(own.stamp_ns.searchsorted(keep_ns, "right")) - 1)
         self.poses += len(track.stamp_ns)
+        before = slice(len(own.stamp_ns) - 1, None) if len(own.stamp_ns) else slice(0)
+        terms, angle = _pair_terms(
+            np.concatenate([own.rotation[before], track.rotation]),
+            np.concatenate([own.position_m[before], track.position_m]),
+        )
+        self._terms = np.concatenate([self._terms[first:], terms])
+        self._angle = np.concatenate([self._angle[first:], angle])
         self._track = PoseTrack(
             np.concatenate([own.stamp_ns[first:], track.stamp_ns]),
             np.concatenate([own.rotation[first:], track.rotation]),
@@ -71,14 +80,18 @@ class PoseLine:
         begin_ns, end_ns = self._span(stamp_ns, to_ns)
         around = self._around(begin_ns, end_ns)
         poses = self._track.stamp_ns[around]
-        terms, angle = _pair_terms(self._track.rotation[around], self._track.position_m[around])
+        pairs = slice(around.start, around.stop - 1)
+        terms, angle = self._terms[pairs].reshape(-1, 5, 3, 4).copy(), self._angle[pairs]
+        # Relative to the first pose: far from the origin little would be left of a difference.
+        position_m = self._track.position_m[around]
+        terms[:, 0, :, 3] += position_m[:-1] - position_m[0]
         # The instant as a column more.
         times = np.append(stamp_ns, to_ns)
         pair = np.clip(poses.searchsorted(times, "right") - 1, 0, len(poses) - 2)
         shares: F64Array = (times - poses[pair]) / (poses[1:] - poses[:-1])[pair]
         weights = _weights(shares, angle[pair])
-        target = (weights[-1] @ terms[pair[-1]]).reshape(3, 4)
-        terms = np.matmul(target[:, :3].T, terms.reshape(-1, 5, 3, 4))
+        target = (weights[-1] @ terms[pair[-1]].reshape(5, 12)).reshape(3, 4)
+        terms = np.matmul(target[:, :3].T, terms)
         terms[:, 0, :, 3] -= target[:, 3] @ target[:, :3]
         # Columns between two poses follow each other.
         terms = terms.reshape(-1, 5, 12)
@@ -114,9 +127,10 @@ def _weights(shares: F64Array, angle: F64Array) -> F64Array:
 
 
 def _pair_terms(rotation: F64Array, position_m: F64Array) -> tuple[F64Array, F64Array]:
-    """Return the five matrices (k, 5, 12) of k pairs of poses in the world, and their angles (k,).
+    """Return the five matrices (k, 5, 12) of k pairs of poses, and their angles (k,).
 
-    rotation, position_m: of k + 1 poses world_from_body.
+    They are in the world, but from the first pose of each pair. rotation, position_m: of k + 1
+    poses world_from_body, or of none.
     """
     begin = rotation[:-1]
     back = begin.transpose(0, 2, 1)
@@ -132,6 +146,4 @@ def _pair_terms(rotation: F64Array, position_m: F64Array) -> tuple[F64Array, F64
     terms[:, 3, :, 3] = np.matmul(cross, part[..., None])[..., 0]
     terms[:, 4, :, 3] = np.matmul(square, part[..., None])[..., 0]
     in_world: F64Array = np.matmul(begin[:, None], terms)
-    # Relative to the first pose: far from the origin little would be left of a difference.
-    in_world[:, 0, :, 3] += position_m[:-1] - position_m[0]
     return in_world.reshape(len(part), 5, 12), np.sqrt((vector**2).sum(axis=1))

@@ -5,6 +5,7 @@ Source: the TUM RGB-D benchmark, "File formats". Times are read as decimal text,
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -70,12 +71,12 @@ def _values(place: str, words: list[str]) -> tuple[int, list[float]]:
     except ValueError:
         row = [float("nan")]
     stamp_ns = _stamp_ns(words[0])
-    if stamp_ns is None or not np.isfinite(row).all():
+    if stamp_ns is None or not all(map(math.isfinite, row)):
         raise RigError(
             f"{place}: expected 8 finite numbers, the first a time in s since 1970, found "
             f"{' '.join(words)[:60]!r}; correct the line"
         )
-    norm = float(np.sqrt(np.square(row[3:]).sum()))
+    norm = math.hypot(*row[3:])
     if abs(norm - 1.0) > _NORM_TOLERANCE:
         raise RigError(
             f"{place}: expected a unit quaternion x, y, z, w, found norm {norm:.4g}; check the "
