@@ -151,7 +151,8 @@ def discover(
     refused = {} if clouds is None else clouds.refused
     if to_convert:
         _refuse_clouds_of_rig(rig, refused, selection)
-    sampler, collector = probe(recordings, table)
+    # `inspect` also counts these packets.
+    sampler, collector = probe(recordings, table, clouds if to_convert else None)
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
     examined: list[Path] = []

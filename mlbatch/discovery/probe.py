@@ -114,14 +114,25 @@ def is_without_packets(recording: Recording) -> bool:
     return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
 
 
-def probe(recordings: Sequence[Recording], table: StreamTable) -> tuple[Sampler, MetadataCollector]:
-    """Read the first 10 s of a session: samples of its packets, and its metadata messages."""
+def probe(
+    recordings: Sequence[Recording], table: StreamTable, cut: CloudTopics | None = None
+) -> tuple[Sampler, MetadataCollector]:
+    """Read the first 10 s of a session: samples of its packets, and its metadata messages.
+
+    cut: clouds of which the first points are enough; counts of their packets are then too small.
+    """
     sampler = Sampler(table)
     collector = MetadataCollector()
     subscribe(recordings)
-    for batch in first_seconds(recordings):
-        sampler.add(batch)
-        collector.add(batch)
+    if cut is not None:
+        cut.first_points_only = True
+    try:
+        for batch in first_seconds(recordings):
+            sampler.add(batch)
+            collector.add(batch)
+    finally:
+        if cut is not None:
+            cut.first_points_only = False
     for recording in recordings:
         recording.keep = frozenset()
     return sampler, collector

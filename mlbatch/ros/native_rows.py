@@ -8,6 +8,7 @@ read all other clouds.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -50,6 +51,25 @@ class PackedRows(NamedTuple):
     points: int
 
 
+class _Form:
+    """Fields of rows of one dtype, for the loops; the arrays at `fields_at` and `types_at`.
+
+    is_usual: whether the loops read them; the others are only set if they do.
+    """
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        known = dict(dtype.fields or {})
+        self.dtype = dtype
+        self.is_usual = _is_usual(known)
+        if not self.is_usual:
+            return
+        fields = np.array([field_of(known, role) for role in _ROLES], np.int64)
+        self._arrays = fields.T.copy()
+        self.fields_at, self.types_at = map(address, self._arrays)
+        self.time_at, self.time_type = field_of(known, "time")
+        self.time_kind = known["time"][0]
+
+
 class RowPacker:
     """Packs the rows of messages; its scratch arrays are used again."""
 
@@ -67,6 +87,7 @@ class RowPacker:
         self._scratch_at = [address(one) for one in self._scratch]
         self._times_at = address(self._times)
         self._number_at = 0
+        self._form = _Form(np.dtype([]))
 
     def pack(
         self,
@@ -81,26 +102,27 @@ class RowPacker:
 
         factors: (layout.size // 8,) of their words in content keys, or None.
         """
-        known = dict(rows.dtype.fields or {})
-        if not layout.by_ring or not _is_usual(known) or not len(rows):
+        if not layout.by_ring or not len(rows):
+            return None
+        if rows.dtype is not self._form.dtype:
+            self._form = _Form(rows.dtype)
+        form = self._form
+        if not form.is_usual:
             return None
         loops = library()
         if len(rows) > len(self._number):
             self._number = np.empty(len(rows), np.int32)
             self._number_at = address(self._number)
-        fields = np.array([field_of(known, role) for role in _ROLES], np.int64)
-        fields_at, types = fields.T.copy()
-        axes_at = address(fields_at)
-        time_at, time_type = field_of(known, "time")
-        time_kind = known["time"][0]
-        rows_at = rows.__array_interface__["data"][0]
+        # Not by `__array_interface__`, which describes all fields.
+        rows_at = rows.ctypes.data
+        axes_at = form.fields_at
         columns = loops.mlbatch_cloud_times(
             len(rows),
             rows_at,
             rows.strides[0],
             axes_at,
-            time_at,
-            time_type,
+            form.time_at,
+            form.time_type,
             _MOST_TIMES,
             self._times_at,
             self._number_at,
@@ -110,20 +132,20 @@ class RowPacker:
         # One time for all points is an error elsewhere.
         if columns < 2:
             return None
-        stamp_ns, meaning = stamps(self._times.view(time_kind)[:columns])
+        stamp_ns, meaning = stamps(self._times.view(form.time_kind)[:columns])
         # Times in s may be the same in ns.
         if not bool((stamp_ns[1:] > stamp_ns[:-1]).all()):
             return None
         check_columns(columns, points, layout, message_bytes)
         packets = room(columns, layout.size)
         content_key = np.empty(columns, np.int64)
-        head = layout.begin
+        head = _head_of(layout)
         _, _, ranks_at, begins_at, _ = self._scratch_at
         is_packed = loops.mlbatch_cloud_fill(
             rows_at,
             rows.strides[0],
             axes_at,
-            address(types),
+            form.types_at,
             runs,
             begins_at,
             self._number_at,
@@ -141,6 +163,11 @@ class RowPacker:
             return None
         known_key = None if factors is None else content_key
         return PackedRows(packets, known_key, meaning, placed, points)
+
+
+@lru_cache(maxsize=16)
+def _head_of(layout: Layout) -> npt.NDArray[np.void]:
+    return layout.begin
 
 
 def _is_usual(known: dict[str, Any]) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -26,6 +27,8 @@ _Whole = TypeVar("_Whole", np.uint8, np.uint16)
 # sensor_msgs/PointField: datatype by its number.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_FIELDS = 256
+# Of the numbers in the fields.
+_ALIGN = 4
 # Names of a field by its role; the first that a cloud has counts.
 _ROLES: Mapping[str, tuple[str, ...]] = {
     "time": TIME_NAMES,
@@ -139,10 +142,10 @@ class CloudHead:
     sample: CloudSample
 
 
-def sample_cloud(message: Message, rules: Rules) -> CloudHead:
+def sample_cloud(message: Message, rules: Rules, take: Take = take_rows) -> CloudHead:
     """Frame, lidars and times of a message as they are stored; CloudError as in `read_cloud`."""
     raw = raw_cloud(message, rules)
-    fields = take_rows(raw.rows).fields
+    fields = take(raw.rows).fields
     time = fields["time"]
     _ring(fields, rules(raw.frame))
     ids = _whole(fields, "lidar_id", np.uint16)
@@ -237,7 +240,7 @@ def _cloud2(message: Message, rules: Rules) -> RawCloud:
     stamp_ns, frame = cursor.header()
     height = cursor.number("I")
     width = cursor.number("I")
-    fields = _fields(cursor)
+    fields = _field_list(cursor)
     if cursor.number("B"):
         raise CloudError(
             "expected a cloud in little endian, found is_bigendian; convert the recording"
@@ -252,11 +255,42 @@ def _cloud2(message: Message, rules: Rules) -> RawCloud:
             f"expected {height} x {width} points of {step} bytes in rows of {row_step}, found "
             f"{size} bytes of data; the cloud was cut off, or written wrongly"
         )
-    layout, time = _layout(fields, step, rules(frame))
+    layout, time, type_name = _layout(fields, step, rules(frame))
     rows: Rows = np.ndarray((height, width), layout, message.data, at, (row_step, step))
-    type_name = np.dtype(_TYPES[time.type]).name
     zero = Zero(f"{time.name} ({type_name})", stamp_ns, "the header's stamp")
     return RawCloud(rows.reshape(-1), zero, stamp_ns, frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FieldList:
+    """The fields of a PointCloud2 by name; content: their bytes in the message."""
+
+    content: bytes
+    fields: Mapping[str, _Field]
+
+
+# Field lists of recent messages by encoding and the remainder of their first byte, newest last.
+_known_lists: dict[tuple[bool, int], list[_FieldList]] = {}
+_MOST_LISTS = 8
+
+
+def _field_list(cursor: Cursor) -> _FieldList:
+    """The next fields of a message; mostly those of the message before, which are not read again.
+
+    A list says itself where it ends: equal bytes are an equal list.
+    """
+    begin = cursor.at
+    known = _known_lists.setdefault((cursor.is_cdr, (begin - cursor.origin) % _ALIGN), [])
+    for one in known:
+        end = begin + len(one.content)
+        if end <= cursor.end and cursor.data[begin:end] == one.content:
+            cursor.at = end
+            return one
+    fields = _fields(cursor)
+    found = _FieldList(bytes(cursor.data[begin : cursor.at]), fields)
+    known.append(found)
+    del known[:-_MOST_LISTS]
+    return found
 
 
 def _fields(cursor: Cursor) -> dict[str, _Field]:
@@ -276,10 +310,13 @@ def _fields(cursor: Cursor) -> dict[str, _Field]:
     return fields
 
 
+# A message has the layout of the one before; the places of a rule are only for errors.
+@lru_cache(maxsize=4 * _MOST_LISTS)
 def _layout(
-    fields: Mapping[str, _Field], step: int, rule: PointRule
-) -> tuple[np.dtype[np.void], _Field]:
-    """The dtype of points, with fields named by role; and the time field."""
+    known: _FieldList, step: int, rule: PointRule
+) -> tuple[np.dtype[np.void], _Field, str]:
+    """The dtype of points, with fields named by role; the time field; and the name of its type."""
+    fields = known.fields
     chosen = {axis: fields[axis] for axis in AXES if axis in fields}
     given = {"time": rule.time, "ring": rule.ring}
     for role, names in _ROLES.items():
@@ -306,7 +343,8 @@ def _layout(
     layout = np.dtype(
         {"names": list(chosen), "formats": formats, "offsets": offsets, "itemsize": step}
     )
-    return layout, chosen["time"]
+    time = chosen["time"]
+    return layout, time, np.dtype(_TYPES[time.type]).name
 
 
 def _check(role: str, field: _Field, step: int) -> None:

@@ -16,6 +16,7 @@ from mlbatch.readers.merge import merge
 from mlbatch.rig.rig import RigSensor
 from mlbatch.ros.encoding import ENCODINGS
 from mlbatch.ros.point_packets import CloudError, Layout
+from mlbatch.ros.point_rows import Take, take_rows
 from mlbatch.ros.point_times import CONVENTION, CloudSample, PointRule, ahead_ns, checked_rule
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, FieldError, read_cloud, sample_cloud
 from mlbatch.types import Message, Recording, Stream, Topic
@@ -36,6 +37,16 @@ def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
     return tuple(
         topic for topic in topics if topic.type in CLOUD_TYPES and topic.encoding in ENCODINGS
     )
+
+
+def take_of(engine: str) -> Take:
+    """What takes the points of a message."""
+    if engine != "native":
+        return take_rows
+    # Imported on demand: the library may be missing.
+    from mlbatch.ros.native_points import take_rows_compiled
+
+    return take_rows_compiled
 
 
 @dataclass(slots=True)
@@ -66,7 +77,8 @@ class CloudTopics:
     """The clouds of a session, shared by its recordings, since a topic may be spread over several.
 
     rules: by topic and frame_id; lidars: by topic; layouts: of the packets of each stream; frames:
-    frame_id of each stream; refused: why topics cannot be used; ahead_ns: by topic
+    frame_id of each stream; first_points_only: whether all but the first cloud of a stream may be
+    cut after their first points; refused: why topics cannot be used; ahead_ns: by topic
     and frame_id, the last points minus the log times; warnings: topic and text.
     """
 
@@ -76,6 +88,8 @@ class CloudTopics:
     lidars: dict[str, TopicLidars] = field(default_factory=dict)
     layouts: dict[Stream, Layout] = field(default_factory=dict)
     frames: dict[Stream, str] = field(default_factory=dict)
+    # Set for a pass that only looks for sensors.
+    first_points_only: bool = False
     refused: dict[str, str] = field(default_factory=dict)
     ahead_ns: dict[tuple[str, str], int | None] = field(default_factory=dict)
     warnings: list[tuple[str, str]] = field(default_factory=list)
@@ -116,6 +130,7 @@ class CloudTopics:
     def examine(self, recordings: Sequence[Recording]) -> None:
         """Find lidars and rules by the first messages; topics that cannot be used are removed."""
         found = {topic.name: _Examined() for topic in self.topics}
+        take = take_of(recordings[0].engine) if recordings else take_rows
         for recording in recordings:
             recording.keep = frozenset(found)
         end_ns: int | None = None
@@ -125,7 +140,7 @@ class CloudTopics:
                     end_ns = message.host_ns + _EXAMINED_NS if end_ns is None else end_ns
                     one = found[message.topic.name]
                     if one.messages < _EXAMINED:
-                        self._examine(message, one)
+                        self._examine(message, one, take)
                 last_ns = max((m.host_ns for m in batch.messages), default=0)
                 last_ns = max(last_ns, int(batch.host_ns[-1]) if len(batch) else 0)
                 is_over = end_ns is not None and last_ns > end_ns
@@ -137,11 +152,11 @@ class CloudTopics:
             self._decide(name, one)
         self.topics = tuple(topic for topic in self.topics if topic.name not in self.refused)
 
-    def _examine(self, message: Message, examined: _Examined) -> None:
+    def _examine(self, message: Message, examined: _Examined, take: Take) -> None:
         name = message.topic.name
         examined.messages += 1
         try:
-            head = sample_cloud(message, lambda frame: self._given(name, frame))
+            head = sample_cloud(message, lambda frame: self._given(name, frame), take)
         except FieldError as err:
             raise RigError(str(err)) from err
         except CloudError as err:

@@ -18,7 +18,7 @@ import numpy as np
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.lidar.content_keys import hash_factors
 from mlbatch.native.arena import PacketArena
-from mlbatch.readers.bag.cloud_topics import CloudTopics
+from mlbatch.readers.bag.cloud_topics import CloudTopics, take_of
 from mlbatch.ros.point_packets import CloudError, Pack, Points, layout_of, pack
 from mlbatch.ros.point_rows import Take, take_rows
 from mlbatch.ros.point_times import stamps
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 # A batch ends when this many bytes of packets have been made.
 _BATCH_BYTES = 8 << 20
+# Points of a cloud that show its sensor; two columns and more.
+_FIRST_POINTS = 512
 
 
 @dataclass(slots=True)
@@ -95,12 +97,12 @@ class _TopicCounts:
 def _loops(engine: str) -> tuple[Take, Pack, RowPacker | None]:
     """What takes the points of a message, what packs them, and what does both at once."""
     if engine != "native":
-        return take_rows, pack, None
+        return take_of(engine), pack, None
     # Imported on demand: the library may be missing.
-    from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
+    from mlbatch.ros.native_points import pack_compiled
     from mlbatch.ros.native_rows import RowPacker
 
-    return take_rows_compiled, pack_compiled, RowPacker()
+    return take_of(engine), pack_compiled, RowPacker()
 
 
 class _Room:
@@ -264,8 +266,9 @@ class CloudRecording(WrappedRecording):
             return None
         rule = self.clouds.rule(name, raw.frame)
         room = _Room(self._arena)
+        rows = raw.rows[:_FIRST_POINTS] if self.clouds.first_points_only else raw.rows
         packed = self._pack_rows.pack(
-            raw.rows,
+            rows,
             lambda times: stamps(times, raw.zero, rule, raw.rows["time"]),
             layout,
             len(message.data),
@@ -274,7 +277,7 @@ class CloudRecording(WrappedRecording):
         )
         if packed is None:
             return None
-        self._counts[name].add_packed(len(raw.rows), packed)
+        self._counts[name].add_packed(len(rows), packed)
         self.clouds.frames.setdefault(stream, raw.frame)
         self.inner.counts.frames += len(packed.packets)
         self.inner.counts.datagrams += len(packed.packets)
