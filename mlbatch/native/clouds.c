@@ -387,6 +387,8 @@ EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t
 /* Clouds of a spinning lidar with a ring for each point, from the rows of a message to packets
    without planes in between; what is unusual is left to the functions above. */
 
+/* Bytes of rows that are fetched ahead, over the ends of pages. */
+enum { FETCHED = 2048 };
 /* Times are inserted at most so often a point, counted in times that are moved. */
 enum { MOST_MOVED = 4 };
 
@@ -424,9 +426,9 @@ static inline float real_at(const uint8_t *from)
     return value;
 }
 
-/* Number the times of all points: most are the last one, or the one after it. Shots without a place
-   say which times there are, too: most are then known after the first run. Return 0 for an unusual
-   cloud. */
+/* Number the times of all points: most are the last one, or the one after it, also of shots without
+   a place; these say which times there are, too: most are known after the first run. Return 0 for an
+   unusual cloud. */
 #define FOLLOW(name, type, IS_FINITE) \
     static int name(Times *all) \
     { \
@@ -441,6 +443,7 @@ static inline float real_at(const uint8_t *from)
         int32_t *restrict number = all->number; \
         int64_t placed = 0, found = 0; \
         for (int64_t point = 0; point < count; point++, row += step) { \
+            __builtin_prefetch(row + FETCHED); \
             const float x = real_at(row + x_at); \
             const float y = real_at(row + y_at); \
             const float z = real_at(row + z_at); \
@@ -449,6 +452,22 @@ static inline float real_at(const uint8_t *from)
             memcpy(&time, row + time_at, sizeof time); \
             const int is_placed = (squared > 0.0f) & (squared < INFINITY); \
             placed += is_placed; \
+            const int is_same = own >= 0 && time == last; \
+            if (is_same || (has_after && time == after)) { \
+                /* No branch on places: shots without a return are scattered. */ \
+                if (!is_same) { \
+                    at++; \
+                    last = time; \
+                    own = all->by_order[at]; \
+                    has_after = at + 1 < all->known; \
+                    if (has_after) \
+                        after = times[at + 1]; \
+                } \
+                found += is_placed; \
+                all->is_used[own] |= (uint8_t)is_placed; \
+                number[point] = own | (is_placed - 1); \
+                continue; \
+            } \
             if (!is_placed || !(IS_FINITE)) { \
                 number[point] = -1; \
                 if ((IS_FINITE) && all->known < all->room \
@@ -461,34 +480,26 @@ static inline float real_at(const uint8_t *from)
                 continue; \
             } \
             found++; \
-            if (own >= 0 && time == last) { \
-                number[point] = own; \
-                continue; \
+            int64_t low = own >= 0 && time > last ? at + 1 : 0, high = all->known; \
+            if (own < 0 || time < last) { \
+                if (all->runs == MOST_RUNS) \
+                    return 0; \
+                all->begins[all->runs++] = point; \
             } \
-            if (has_after && time == after) { \
-                at++; \
-            } else { \
-                int64_t low = own >= 0 && time > last ? at + 1 : 0, high = all->known; \
-                if (own < 0 || time < last) { \
-                    if (all->runs == MOST_RUNS) \
-                        return 0; \
-                    all->begins[all->runs++] = point; \
-                } \
-                while (low < high) { \
-                    const int64_t middle = (low + high) / 2; \
-                    if (times[middle] < time) \
-                        low = middle + 1; \
-                    else \
-                        high = middle; \
-                } \
-                at = low; \
-                if (at == all->known || times[at] != time) { \
-                    const size_t later = (size_t)(all->known - at); \
-                    if (!insert_number(all, at)) \
-                        return 0; \
-                    memmove(times + at + 1, times + at, later * sizeof *times); \
-                    times[at] = time; \
-                } \
+            while (low < high) { \
+                const int64_t middle = (low + high) / 2; \
+                if (times[middle] < time) \
+                    low = middle + 1; \
+                else \
+                    high = middle; \
+            } \
+            at = low; \
+            if (at == all->known || times[at] != time) { \
+                const size_t later = (size_t)(all->known - at); \
+                if (!insert_number(all, at)) \
+                    return 0; \
+                memmove(times + at + 1, times + at, later * sizeof *times); \
+                times[at] = time; \
             } \
             last = time; \
             own = all->by_order[at]; \

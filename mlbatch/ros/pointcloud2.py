@@ -312,9 +312,7 @@ def _fields(cursor: Cursor) -> dict[str, _Field]:
 
 # A message has the layout of the one before; the places of a rule are only for errors.
 @lru_cache(maxsize=4 * _MOST_LISTS)
-def _layout(
-    known: _FieldList, step: int, rule: PointRule
-) -> tuple[np.dtype[np.void], _Field, str]:
+def _layout(known: _FieldList, step: int, rule: PointRule) -> tuple[np.dtype[np.void], _Field, str]:
     """The dtype of points, with fields named by role; the time field; and the name of its type."""
     fields = known.fields
     chosen = {axis: fields[axis] for axis in AXES if axis in fields}

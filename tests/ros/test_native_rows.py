@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,13 @@ def packed(rows: Rows, slots: int) -> PackedRows | None:
     layout = Layout(0, slots, by_ring=True)
     factors = hash_factors(layout.size // 8)
     return RowPacker().pack(rows, stamps, layout, BIG, room, factors)
+
+
+def packed_bytes(rows: Rows, slots: int) -> U8Array:
+    """Packets of rows that are usual."""
+    found = packed(rows, slots)
+    assert found is not None
+    return found.packets
 
 
 def assert_as_by_numpy(rows: Rows, slots: int) -> None:
@@ -124,7 +132,7 @@ def test_clouds_of_a_spinning_lidar_are_packed_as_by_numpy(
     assert_as_by_numpy(rows, 256 if size[0] > 64 else 64)
 
 
-def simple(points: list[tuple[float, int, int]]) -> Rows:
+def simple(points: Sequence[tuple[float, int, int]]) -> Rows:
     """Rows of x, time and ring."""
     kinds = {**KINDS, "time": "<u4", "ring": "<u2"}
     rows = np.zeros(len(points), np.dtype(list(kinds.items())))
@@ -149,6 +157,16 @@ def test_times_of_shots_without_a_place_are_no_columns() -> None:
     assert_as_by_numpy(rows, 16)
     # Times that are wrong where there is no place.
     assert_as_by_numpy(simple([(1, 10, 0), (0, 0, 0), (2, 20, 0), (0, 7, 0), (3, 30, 1)]), 16)
+
+
+def test_shots_without_a_place_do_not_end_a_run() -> None:
+    """By hand: in the second run the shot at 30 has no place, and 20 comes behind it."""
+    points = [(1, 10, 0), (2, 20, 0), (3, 30, 0), (4, 10, 1), (0, 30, 1), (5, 20, 1), (6, 30, 1)]
+    assert_as_by_numpy(simple(points), 16)
+    # A time that only shots without a place have comes between those of points.
+    points = [(1, 10, 0), (0, 20, 0), (3, 30, 0), (4, 10, 1), (0, 20, 1), (6, 30, 1)]
+    assert_as_by_numpy(simple(points), 16)
+    assert [one.count for one in read_packets(packed_bytes(simple(points), 16))] == [2, 2]
 
 
 def test_times_without_a_value_are_left_out_and_counted() -> None:

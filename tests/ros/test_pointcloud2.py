@@ -92,6 +92,27 @@ def test_times_of_drivers(driver: str, encoding: str) -> None:
     assert ring.tolist() == [4, 5]
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_fields_are_those_of_each_message(encoding: str) -> None:
+    """Lists of equal length that differ by order or place, at any byte of a message."""
+    swapped = [OUSTER[1], OUSTER[0], *OUSTER[2:]]
+    for frame in ("lidar", "l", "lid", "li", "lidar_1"):
+        for fields, first in ((OUSTER, [1, 2]), (swapped, [2, 1]), (OUSTER, [1, 2])):
+            form = Form(encoding, frame=frame)
+            points = [(1, 2, 3, 9, 0, 4), (1, 2, 3, 9, 1000, 5)]
+            cloud = _read(cloud_message(fields, points, form=form), encoding=encoding)
+            assert cloud.points.reals[:2, 0].tolist() == first
+            assert cloud.frame == frame
+
+
+def test_more_lists_of_fields_than_are_kept_are_read() -> None:
+    for _ in range(2):
+        for spare in range(40):
+            fields = [*OUSTER, (f"spare_{spare}", OUSTER[0][1])]
+            cloud = _read(cloud_message(fields, [(1, 2, 3, 9, 0, 4, 7), (1, 2, 3, 9, 9, 5, 7)]))
+            assert cloud.points.stamp_ns.tolist() == [STAMP_NS, STAMP_NS + 9]
+
+
 def test_return_types_and_tags_are_kept() -> None:
     autoware = _read(cloud_message(AUTOWARE, DRIVERS["autoware"][1]))
     assert autoware.points.return_type.tolist() == [1, 1]

@@ -16,6 +16,7 @@ from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.report.ledger import check_capture
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
+from tests.builders.engines import needs_native
 from tests.builders.points import (
     CLOUD,
     CUSTOM2,
@@ -134,6 +135,36 @@ def test_each_pass_starts_anew(tmp_path: Path) -> None:
     packets.close()
     assert len(_payloads(recording.packets())) == 15
     assert (recording.counts.frames, recording.counts.datagrams) == (15, 15)
+
+
+@needs_native
+def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path) -> None:
+    """By hand: 256 columns of 16 rings, by column; 512 points are 32 columns."""
+    points = [(1, 1, ring, 9, 1000 * column, ring) for column in range(256) for ring in range(16)]
+    clouds = [cloud_message(OUSTER, points, STAMP_NS + n * 100_000_000) for n in range(3)]
+    recording, _ = _open(_bag(tmp_path, write_points("/points", clouds)))
+    recording.use_engine("native")
+    recording.clouds.first_points_only = True
+    # The first cloud decides the layout.
+    searched = _payloads(recording.packets())
+    assert len(searched) == 256 + 2 * 32
+    recording.clouds.first_points_only = False
+    run = _payloads(recording.packets())
+    assert len(run) == 3 * 256
+    assert searched == run[: 256 + 32] + run[512 : 512 + 32]
+    assert recording.counts.frames == 3 * 256
+
+
+@needs_native
+def test_clouds_without_a_place_at_first_are_searched_whole(tmp_path: Path) -> None:
+    points = [
+        (ring > 1, 0, 0, 9, 1000 * column, ring) for ring in range(16) for column in range(256)
+    ]
+    clouds = [cloud_message(OUSTER, points, STAMP_NS + n * 100_000_000) for n in range(2)]
+    recording, _ = _open(_bag(tmp_path, write_points("/points", clouds)))
+    recording.use_engine("native")
+    recording.clouds.first_points_only = True
+    assert len(_payloads(recording.packets())) == 2 * 256
 
 
 def test_messages_are_handed_over_where_they_are_asked_for(tmp_path: Path) -> None:
