@@ -101,7 +101,8 @@ class PoseLine:
             if begin < end:
                 np.matmul(weights[begin:end], matrices, out=moves[begin:end])
         moves = moves.reshape(-1, 3, 4)
-        if np.abs(moves - np.eye(3, 4)).max() < _NOTHING:
+        # The ends first: a body that moves is seen there.
+        if not _are_moved(moves[[0, -1]]) and not _are_moved(moves):
             return None
         return np.ascontiguousarray(moves, np.float32)
 
@@ -116,6 +117,10 @@ class PoseLine:
     @staticmethod
     def _span(stamp_ns: I64Array, to_ns: int) -> tuple[int, int]:
         return min(int(stamp_ns[0]), to_ns), max(int(stamp_ns[-1]), to_ns)
+
+
+def _are_moved(moves: F64Array) -> bool:
+    return bool(np.abs(moves - np.eye(3, 4)).max() >= _NOTHING)
 
 
 def _weights(shares: F64Array, angle: F64Array) -> F64Array:
