@@ -675,6 +675,7 @@ static inline int64_t decode_places(const Scan *scan, const Group *group, const 
     int64_t own_counts[COUNTS] = {0};
     const int64_t first_row = row;
     _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
+    /* cppcheck-suppress ctuuninitvar ; decode_fused() sets it, field by field */
     gather_at(record + own->distance_byte, group->places, group->slots, near);
     if (own->level_word)
         gather_at(record + own->level_byte, group->places, group->slots, levels);
@@ -1147,8 +1148,8 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
                 || column == scan->columns - 1))
             mlbatch_pack_rows(scan, column - column % scan->near_columns, column + 1);
         if (scan->column)
-            for (int64_t place = first; place < row; place++)
-                scan->column[place] = (uint32_t)(scan->first_number + column);
+            for (int64_t point = first; point < row; point++)
+                scan->column[point] = (uint32_t)(scan->first_number + column);
     }
     return row;
 }

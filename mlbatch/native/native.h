@@ -267,14 +267,14 @@ static inline int64_t mlbatch_content_key(const uint8_t *packet, int64_t bytes,
     enum { WORD = 8 };
     const uint64_t golden = UINT64_C(0x9E3779B97F4A7C15);
     const int64_t words = bytes / WORD;
-    uint64_t key = 0, word;
+    uint64_t key = 0, part;
     for (int64_t number = 0; number < words; number++) {
-        memcpy(&word, packet + WORD * number, WORD);
-        key += word * odd[number];
+        memcpy(&part, packet + WORD * number, WORD);
+        key += part * odd[number];
     }
     if (bytes % WORD) {
-        memcpy(&word, packet + bytes - WORD, WORD);
-        key = key * golden + word;
+        memcpy(&part, packet + bytes - WORD, WORD);
+        key = key * golden + part;
     }
     key ^= key >> 29;
     return (int64_t)(key * golden >> 1);
