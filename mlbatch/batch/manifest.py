@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import glob as globbing
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url
-from mlbatch.errors import RigError, UsageError
+from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
 SCHEMA = "mlbatch.batch/1"
@@ -21,6 +21,10 @@ _TEMPLATE_WORDS = ("folder", "stem", "name")
 # Files of a folder that are recordings; gzip and zstd of them, too.
 _RECORDINGS = re.compile(r".*\.(pcap|pcapng|cap|mcap|bag|db3)(\.gz|\.zst|\.zstd)?", re.IGNORECASE)
 _BAG_METADATA = "metadata.yaml"
+# Not looked into before they are fetched: objects with these names are no recordings.
+_DOCUMENTS = re.compile(r".*\.(json|ya?ml|csv|dat|tum|txt|md|log|html)", re.IGNORECASE)
+# Names that a message shows.
+_SHOWN = 5
 _WILD = re.compile(r"[*?\[]")
 
 # Options of `convert` by name without dashes: flag, value or list.
@@ -35,18 +39,27 @@ class Common:
     options: tuple[Option, ...] = ()
 
 
-def sessions_of(sources: Sequence[str], given: Common, kinds: OptionKinds) -> tuple[Session, ...]:
+def _nothing(text: str) -> None: ...
+
+
+def sessions_of(
+    sources: Sequence[str],
+    given: Common,
+    kinds: OptionKinds,
+    say: Callable[[str], None] = _nothing,
+) -> tuple[Session, ...]:
     """The sessions of manifests and patterns in their order.
 
-    given: by the command line; its options replace those of a manifest. Raises UsageError and
+    given: by the command line; its options replace those of a manifest. say: gets a line for each
+    pattern that matches files that are no recordings, which are left out. Raises UsageError and
     RigError for mistakes, also where a pattern matches nothing.
     """
     found: list[Session] = []
     for source in sources:
         if source.lower().endswith((".yaml", ".yml")) and not is_url(source):
-            found += _of_manifest(Path(source), given, kinds)
+            found += _of_manifest(Path(source), given, kinds, say)
         else:
-            found += _of_pattern(source, "{stem}", given, source)
+            found += _of_pattern(source, "{stem}", given, source, say)
     check_unique(found)
     formats = {rig: _format_of(rig) for rig in {one.rig for one in found}}
     return tuple(_formatted(one, formats[one.rig]) for one in found)
@@ -76,9 +89,18 @@ def _formatted(session: Session, name: str | None) -> Session:
 # -- patterns ---------------------------------------------------------------------------------
 
 
-def _of_pattern(pattern: str, template: str, common: Common, where: str) -> Iterator[Session]:
-    """A session for each file or folder that matches."""
+def _of_pattern(
+    pattern: str, template: str, common: Common, where: str, say: Callable[[str], None]
+) -> Iterator[Session]:
+    """A session for each file or folder that matches, but files that are no recordings."""
     matches = _matches(pattern)
+    if _WILD.search(pattern):
+        others = [match for match in matches if not _may_be_recording(match)]
+        matches = [match for match in matches if match not in others]
+        if others and matches:
+            names = ", ".join(PurePosixPath(match).name for match in others[:_SHOWN])
+            more = ", ..." if len(others) > _SHOWN else ""
+            say(f"{where}: left out {len(others)} files that are no recordings: {names}{more}")
     if not matches:
         raise UsageError(
             f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
@@ -128,6 +150,26 @@ def _matches(pattern: str) -> list[str]:
     return sorted(path.rstrip("/") for path in globbing.glob(pattern, recursive=True))
 
 
+def _may_be_recording(match: str) -> bool:
+    """False for files that have neither the name nor the content of a recording."""
+    if _RECORDINGS.fullmatch(match) or match.endswith("/"):
+        return True
+    if is_url(match):
+        return not _DOCUMENTS.fullmatch(match)
+    path = Path(match)
+    if not path.is_file():
+        return True
+    from mlbatch.readers import readers
+    from mlbatch.readers.source import read_head
+
+    try:
+        head = read_head(path)
+    except RecordingError:
+        # Empty, or not readable.
+        return False
+    return any(one.recognises(head) for one in readers())
+
+
 def _inputs(match: str) -> tuple[str, ...]:
     """The recordings of a match: itself, or those of a folder; none: it has none."""
     if is_url(match):
@@ -170,7 +212,9 @@ def _named(template: str, match: str) -> str:
 # -- manifests --------------------------------------------------------------------------------
 
 
-def _of_manifest(path: Path, given: Common, kinds: OptionKinds) -> Iterator[Session]:
+def _of_manifest(
+    path: Path, given: Common, kinds: OptionKinds, say: Callable[[str], None]
+) -> Iterator[Session]:
     root = read_yaml(path).fields(_KEYS, ("schema", "sessions"))
     root["schema"].choice((SCHEMA,))
     options = _options(root.get("options"), kinds)
@@ -186,10 +230,12 @@ def _of_manifest(path: Path, given: Common, kinds: OptionKinds) -> Iterator[Sess
             given.rig or (_path(entries["rig"]) if "rig" in entries else rig),
             _joined(options, own, mine),
         )
-        yield from _of_entry(node, entries, common)
+        yield from _of_entry(node, entries, common, say)
 
 
-def _of_entry(node: Node, entries: Mapping[str, Node], common: Common) -> Iterator[Session]:
+def _of_entry(
+    node: Node, entries: Mapping[str, Node], common: Common, say: Callable[[str], None]
+) -> Iterator[Session]:
     if ("glob" in entries) == ("inputs" in entries):
         found = "both" if "glob" in entries else "none"
         raise node.error("one of the keys glob and inputs", found, "give one of them")
@@ -207,7 +253,7 @@ def _of_entry(node: Node, entries: Mapping[str, Node], common: Common) -> Iterat
             known = ", ".join(f"{{{one}}}" for one in _TEMPLATE_WORDS)
             place = name or node
             raise place.error(known, f"{{{word}}}", "use one of them")
-    yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place)
+    yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place, say)
 
 
 def _text(node: Node) -> str:

@@ -89,6 +89,7 @@ def batch(
     from mlbatch.batch.session import is_url
     from mlbatch.batch.store import tasks_of
     from mlbatch.cli import EXIT_LIMIT
+    from mlbatch.cli.summary import say
     from mlbatch.pipeline.interrupts import interruptible
     from mlbatch.rig.rig import read_rig
 
@@ -99,7 +100,7 @@ def batch(
     if rig is not None and not is_url(rig):
         # A mistake in it would fail every session.
         read_rig(Path(rig))
-    sessions = chosen(sessions_of(sources, given, _kinds()), only or (), numbers)
+    sessions = chosen(sessions_of(sources, given, _kinds(), say), only or (), numbers)
     copies = Cache.of(cache, cache_gb)
     with interruptible():
         tasks = tasks_of(sessions, output, copies, retries=retries, pages=not no_pages)

@@ -52,6 +52,37 @@ def test_names_are_made_of_files_and_folders(tmp_path: Path) -> None:
     assert [(one.name, one.rig) for one in found] == [("a", "r.yaml"), ("b", "r.yaml")]
 
 
+def test_files_that_are_no_recordings_are_left_out_with_a_line(tmp_path: Path) -> None:
+    touch(tmp_path, "raw/b.mcap", "raw/empty.txt")
+    (tmp_path / "raw" / "left.json").write_text("{}")
+    # Recordings are known by their content, too: the first bytes of a ROS 1 bag.
+    (tmp_path / "raw" / "drive7").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    lines: list[str] = []
+    pattern = f"{tmp_path}/raw/*"
+    found = sessions_of([pattern], Common(), KINDS, lines.append)
+    assert [one.name for one in found] == ["b", "drive7"]
+    expected = "left out 2 files that are no recordings: empty.txt, left.json"
+    assert lines == [f"{pattern}: {expected}"]
+    text = 'schema: mlbatch.batch/1\nsessions: [{glob: "raw/*"}]\n'
+    (tmp_path / "manifest.yaml").write_text(text)
+    found = sessions_of([str(tmp_path / "manifest.yaml")], Common(), KINDS, lines.append)
+    assert [one.name for one in found] == ["b", "drive7"]
+    assert lines[1].endswith(f"manifest.yaml:2: sessions[0].glob: {expected}")
+
+
+def test_a_pattern_of_no_recording_is_an_error(tmp_path: Path) -> None:
+    touch(tmp_path, "raw/left.json")
+    with pytest.raises(UsageError, match="expected recordings or folders, found none for "):
+        sessions_of([f"{tmp_path}/raw/*"], Common(), KINDS)
+
+
+def test_a_file_that_is_named_is_a_session_whatever_it_is(tmp_path: Path) -> None:
+    """`convert` then says what is wrong with it."""
+    touch(tmp_path, "left.json")
+    (one,) = sessions_of([f"{tmp_path}/left.json"], Common(), KINDS)
+    assert one.inputs == (f"{tmp_path}/left.json",)
+
+
 def test_a_session_may_name_its_inputs(tmp_path: Path) -> None:
     found = read(tmp_path, "sessions: [{name: b7, inputs: [s3://bucket/b7.pcap, tf.bag]}]\n")
     assert found["b7"].inputs == ("s3://bucket/b7.pcap", str(tmp_path / "tf.bag"))
