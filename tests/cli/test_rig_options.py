@@ -59,7 +59,7 @@ def test_a_trajectory_is_found_next_to_the_rig(shell: Shell, tmp_path: Path) -> 
     (folder / "poses.tum").unlink()
     outcome = shell(f"convert {CAPTURE} -r {folder / 'rig.yaml'} -o again")
     assert outcome.code == 1
-    assert "convert.deskew: --deskew: expected imu or the file of a trajectory" in outcome.err
+    assert "convert.deskew: --deskew: expected imu, constant-velocity or the file" in outcome.err
 
 
 def test_the_command_line_wins(shell: Shell, rig: Path) -> None:
