@@ -342,6 +342,7 @@ class RunInfo:
     frames: tuple[tuple[str, F64Array], ...] = ()
     # Options of VARIANTS, where they differ from the default: name and value, as in outputs.
     variants: tuple[tuple[str, str], ...] = ()
+    t_init_ns: int | None = None  # start of the window of index 0; None: not known
 
     def variant(self, name: str, default: str) -> str:
         """Value of one of `variants`."""

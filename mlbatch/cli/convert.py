@@ -98,6 +98,15 @@ def convert(
             metavar="NAME",
         ),
     ] = "standard",
+    max_bag_duration: Annotated[
+        float,
+        typer.Option(
+            help="rosbag2: a new file of the bag every so many s of recording.  [default: one "
+            "file]",
+            metavar="S",
+            show_default=False,
+        ),
+    ] = 0.0,
     batching: Annotated[
         str,
         one_of(
@@ -322,7 +331,13 @@ def convert(
     from mlbatch.cli import options
     from mlbatch.cli.run import Target, run
     from mlbatch.discovery.discover import SensorSelection
-    from mlbatch.pipeline.job import Job, check_batching, check_deskew, check_sort
+    from mlbatch.pipeline.job import (
+        Job,
+        check_batching,
+        check_deskew,
+        check_max_bag_s,
+        check_sort,
+    )
     from mlbatch.pipeline.shards import parse_shard
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
@@ -378,6 +393,7 @@ def convert(
         fault_seed=options.seed(fault_seed),
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
+        max_bag_s=check_max_bag_s("--max-bag-duration", max_bag_duration),
         shard=None if shard is None else parse_shard(shard),
         engine=engine,
     )

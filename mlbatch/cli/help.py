@@ -39,6 +39,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
             "point_layout",
             "stamp",
             "ply_style",
+            "max_bag_duration",
             "compression",
             "report",
             "html",

@@ -109,11 +109,13 @@ def _run_one(job: Job, target: Target) -> list[str]:
         compression=target.compression,
         ply_style=target.ply_style,
         fsync=target.fsync,
+        max_bag_s=job.max_bag_s,
+        share=(1, 1) if job.shard is None else (job.shard.number, job.shard.count),
     )
     check_options(name, options)
     check_variants(name, job.variants)
     if job.shard is not None:
-        _check_shard(target, name)
+        _check_shard(target, name, job.max_bag_s)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
     job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report
@@ -213,7 +215,7 @@ def _converted(
         ) from err
 
 
-def _check_shard(target: Target, name: str) -> None:
+def _check_shard(target: Target, name: str, max_bag_s: float) -> None:
     """Refuse options that have no meaning for a shard; name: of the format."""
     from mlbatch.pipeline.shard_part import check_format
 
@@ -230,7 +232,7 @@ def _check_shard(target: Target, name: str) -> None:
                 f"--shard: expected no {option}, since a shard has a part of the points and no "
                 f"report, found both; leave {option} out, see mlbatch merge"
             )
-    check_format(name, plugin(name).SUFFIX)
+    check_format(name, plugin(name).SUFFIX, max_bag_s)
 
 
 def _print_shard(output: ShardOutput, inputs: RunReport, target: Target) -> None:

@@ -310,7 +310,7 @@ class Conversion:
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
             own_times=job.batching_times == OWN,
-            shard=job.shard,
+            shard=job.shard and job.shard.of_bag(job.max_bag_s, self.grid.rate),
             slices=job.slices,
         )
         return self._pool
@@ -319,7 +319,9 @@ class Conversion:
         """Properties of the run, once there is a window."""
         forwards = self.passthrough.messages.is_asked(self.session.recordings)
         shared = common_timescale(self._timescales())
-        return self.session.run_info(rate_text(self.grid.rate), shared, forwards=forwards)
+        return self.session.run_info(
+            rate_text(self.grid.rate), shared, self.batcher.t_init_ns, forwards=forwards
+        )
 
     @property
     def pool(self) -> DecodePool:

@@ -64,6 +64,7 @@ class Job:
     batching_times: str = COMMON  # or own
     deskew: str = ""  # where poses come from: imu, or the path of a trajectory; "": no motion
     deskew_to: str = INSTANTS[0]  # instant of a window that its points are moved to
+    max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     shard: Shard | None = None  # the only scans to make; None: all
     jobs: int = 1  # scans made at the same time
     engine: str = "auto"  # one of `native.ENGINES`
@@ -94,6 +95,16 @@ def wait_ns(option: str, seconds: float, given: object) -> int | None:
         raise UsageError(f"{option}: expected seconds above 0, or inf, found {given!r}; write 1.0")
     # Rounds less than a nanosecond up, since it is above 0.
     return None if seconds > MOST_S else max(1, round(seconds * NS_PER_S))
+
+
+def check_max_bag_s(option: str, seconds: float) -> float:
+    """`max_bag_s` of a job: 0 if not given, else above 0."""
+    if not 0 <= seconds <= MOST_S:
+        raise UsageError(
+            f"{option}: expected seconds above 0, found {seconds}; write 60, or leave it out for "
+            "one file"
+        )
+    return seconds
 
 
 def check_slices(option: str, count: object) -> int:

@@ -113,14 +113,18 @@ class _Output:
         before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
         # After nothing there is no more.
         while before and (rest := self._run.passed_through(item.end_ns, _PORTION_BYTES)):
-            yield self._scan_task(None, before)
+            yield self._scan_task(None, before, task)
             before = rest
         if task is not None or before:
-            yield self._scan_task(task, before)
+            yield self._scan_task(task, before, task)
 
     def _scan_task(
-        self, task: DecodeTask | None, before: Sequence[ImuSamples | Message]
+        self,
+        task: DecodeTask | None,
+        before: Sequence[ImuSamples | Message],
+        following: DecodeTask | None,
     ) -> ScanTask:
+        """following: of the scan that the messages precede, None if it is left out."""
         self._begin()
         is_kept = self._resume_log is not None and self._resume_log.take(before, task)
         return ScanTask(
@@ -131,6 +135,7 @@ class _Output:
             self._idle,
             self._resume_log,
             is_kept=is_kept,
+            index=None if following is None else following.label.index,
         )
 
     def _begin(self) -> None:

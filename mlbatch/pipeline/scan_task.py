@@ -28,11 +28,13 @@ class ScanTask:
         resume_log: ResumeLog | None,
         *,
         is_kept: bool,
+        index: int | None,
     ) -> None:
         """task: None where messages are to be written without a scan; before: what to write first.
 
         writer: None in a dry run; idle: decode workers, of which one is taken while in use;
-        is_kept: a resumed output already contains the scan.
+        is_kept: a resumed output already contains the scan; index: of its window, None where no
+        scan follows the messages.
         """
         self._run = run
         self._task = task
@@ -41,6 +43,7 @@ class ScanTask:
         self._idle = idle
         self._resume_log = resume_log
         self._is_kept = is_kept
+        self._index = index
         self._worker: DecodeWorker | None = None
         self._decoded: Decoded | None = None
         self._decode_s = 0.0
@@ -68,6 +71,8 @@ class ScanTask:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
             self._run.account(self._decoded.scan)
+        if self._index is not None:
+            self._job.start(self._index)
         for item in self._before:
             forward(item, self._writer)
         self._timed(self._job.append)

@@ -219,7 +219,14 @@ class Session:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
         return excluded_boxes_m(self.job, self.setup.rig)
 
-    def run_info(self, rate_hz: str, timescale: str, *, forwards: bool = False) -> RunInfo:
+    def run_info(
+        self,
+        rate_hz: str,
+        timescale: str,
+        t_init_ns: int | None = None,
+        *,
+        forwards: bool = False,
+    ) -> RunInfo:
         """What is the same for all scans.
 
         rate_hz: exact rate as text; forwards: recorded messages are written, too.
@@ -249,6 +256,7 @@ class Session:
             job.sort,
             frames,
             job.variants,
+            t_init_ns,
         )
 
     # -- checks and warnings ------------------------------------------------------------------

@@ -37,6 +37,7 @@ from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import Summary
 from mlbatch.writers import (
     REPORT_JSON,
+    ScanWriter,
     WriterOptions,
     check_name,
     choose_format,
@@ -159,22 +160,22 @@ def merge(
     resume.forget(target)
     account = parts[0].account
     options = WriterOptions(
-        overwrite=overwrite, split=account.is_split, ply_style=account.ply_style, fsync=fsync
+        overwrite=overwrite,
+        split=account.is_split,
+        ply_style=account.ply_style,
+        fsync=fsync,
+        max_bag_s=account.max_bag_s,
     )
     lock = StateFile(state_path(target), State({}, ""), is_new=True)
     try:
         writer = open_writer(account.format, target, account.info, options)
-        if not isinstance(writer, FolderWriter):
-            raise UsageError(f"{account.format}: expected a format with a file for each scan")
+        if isinstance(writer, FolderWriter):
+            _take_scans(parts, writer)
+        else:
+            _take_bag(parts, writer)
         table = ScanTable(account.info, account.columns_per_s)
-        for owner, figures in _merged_scans(parts):
-            scan = figures.scan(account.info)
-            for suffix, path in writer.files(scan, figures.only).items():
-                size = figures.sizes.get(suffix)
-                _take(owner.folder / path.relative_to(writer.folder), size, path)
-            job = writer.skip(scan, figures.only)
-            job.commit()
-            table.add(scan)
+        for _, figures in _merged_scans(parts):
+            table.add(figures.scan(account.info))
         report = _merged_report(parts, table, command)
         broken = imbalances(report) or _unequal_points(report)
         if broken:
@@ -223,6 +224,40 @@ def _merged_scans(parts: Sequence[Part]) -> Iterator[tuple[Part, ShardScan]]:
     )
     for _, number, scan in heapq.merge(*scans, key=lambda one: one[:2]):
         yield parts[number], scan
+
+
+def _take_scans(parts: Sequence[Part], writer: FolderWriter) -> None:
+    """Have the files of all scans in the output."""
+    info = parts[0].account.info
+    for owner, figures in _merged_scans(parts):
+        scan = figures.scan(info)
+        for path in writer.files(scan, figures.only).values():
+            name = path.relative_to(writer.folder)
+            _take(owner.folder / name, owner.account.files.get(name.as_posix()), path)
+        writer.skip(scan, figures.only).commit()
+
+
+def _take_bag(parts: Sequence[Part], writer: ScanWriter) -> None:
+    """Have the files of a bag in the output; RecordingError unless each is in one part."""
+    from mlbatch.writers.bag_writer import BagWriter, number_of_file
+
+    account = parts[0].account
+    if not isinstance(writer, BagWriter):
+        raise UsageError(f"{account.format}: expected a format with several files, found another")
+    owners = [
+        (number_of_file(name), part.folder / name, size)
+        for part in parts
+        for name, size in part.account.files.items()
+    ]
+    numbers = sorted(-1 if number is None else number for number, _, _ in owners)
+    if numbers != list(range(account.bag_files)):
+        raise RecordingError(
+            f"expected the {account.bag_files} files of the bag in {len(parts)} shards, found "
+            f"{len(numbers)}; convert all shards again"
+        )
+    for number, source, size in owners:
+        _take(source, size, writer.path_of_file(number or 0))
+    writer.adopt_files(account.bag_files)
 
 
 def _take(source: Path, size: int | None, path: Path) -> None:

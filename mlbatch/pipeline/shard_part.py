@@ -1,5 +1,7 @@
 """The folder that a shard writes: its scans and shard.json, neither report.json nor scans.csv.
 
+Scans are in files of their own, or in files of a bag.
+
 shard.json has the account of the whole recording, which every shard makes, with the points of the
 shard's own scans alone. From those of all shards the report and the table of scans follow.
 """
@@ -10,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +29,15 @@ from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers import (
     SHARD_JSON,
     Checkpoint,
+    PartWriter,
     ScanJob,
     ScanWriter,
     WriterOptions,
     partial_path,
     write_text,
 )
-from mlbatch.writers.scan_folder import FolderWriter
 
-SCHEMA = "mlbatch.shard/1"
+SCHEMA = "mlbatch.shard/2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +45,7 @@ class ShardScan:
     """A scan of a shard; the fields are those of `Scan`, but these.
 
     number: among all scans of the recording; only: with `--split` the index of its sensor;
-    stamps_ns: of the first and the last column, none without a column; sizes: bytes of its files,
-    by suffix.
+    stamps_ns: of the first and the last column, none without a column.
     """
 
     number: int
@@ -62,7 +64,6 @@ class ShardScan:
     overlap: tuple[float, ...]
     fill: tuple[float, ...]
     is_partial: bool
-    sizes: dict[str, int]
 
     def scan(self, info: RunInfo) -> Scan:
         """The scan without its points."""
@@ -117,7 +118,6 @@ def _figures(scan: Scan, number: int, only: int | None) -> ShardScan:
         tuple(map(float, scan.overlap)),
         tuple(scan.fill.tolist()),
         bool(scan.is_partial),
-        {},
     )
 
 
@@ -126,8 +126,10 @@ class Account:
     """Content of shard.json.
 
     identity: what all shards share, see `identity_of_parts`; content: checksum of what was read;
-    notes_before_points: warnings of the report that precede those about points; total: number of
-    scans of all shards; figures: digest of all of them, without points; scans: of this shard.
+    max_bag_s: as of `Job`; notes_before_points: warnings of the report that precede those about
+    points; total: number of scans of all shards; bag_files: of the files of a bag, 0 where scans
+    have files of their own; figures: digest of all scans, without points; scans: of this shard;
+    files: of this shard, bytes by path in the folder.
     """
 
     shard: Shard
@@ -137,19 +139,22 @@ class Account:
     ply_style: str
     is_split: bool
     is_strict: bool
+    max_bag_s: float
     columns_per_s: tuple[float | None, ...]
     notes_before_points: int
     info: RunInfo
     report: RunReport
     total: int
+    bag_files: int
     figures: str
     scans: tuple[ShardScan, ...]
+    files: dict[str, int]
 
     def shared(self) -> dict[str, Any]:
         """What must be the same in the accounts of all shards, as JSON values."""
         found = _fields(to_json(replace(self, scans=())))
-        del found["shard"]
-        del found["scans"]
+        for name in ("shard", "scans", "files"):
+            del found[name]
         report = found["report"]
         for name in ("timing", "command"):
             del report[name]
@@ -172,7 +177,7 @@ class ShardWriter:
     info: of the run; total: number of scans of all shards; scans: of this one.
     """
 
-    inner: FolderWriter
+    inner: PartWriter
     shard: Shard
     info: RunInfo
     total: int = 0
@@ -215,10 +220,12 @@ class ShardWriter:
         return self.inner.checkpoint()
 
     def write_imu(self, samples: ImuSamples) -> None:
-        """Ignore IMU samples, as all folders of scans do."""
+        """Write IMU samples if they are in a file of this shard."""
+        self.inner.write_imu(samples)
 
     def write_message(self, message: Message) -> None:
-        """Ignore messages, as all folders of scans do."""
+        """Forward a recorded message if it is in a file of this shard."""
+        self.inner.write_message(message)
 
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Move the folder to its final path, without a table of scans."""
@@ -227,15 +234,6 @@ class ShardWriter:
     def abandon(self) -> None:
         """Close what is open."""
         self.inner.abandon()
-
-    def sized_scans(self) -> tuple[ShardScan, ...]:
-        """The scans of this shard with the sizes of their files."""
-        sized = []
-        for figures in self.scans:
-            files = self.inner.files(figures.scan(self.info), figures.only)
-            sizes = {suffix: path.stat().st_size for suffix, path in files.items()}
-            sized.append(replace(figures, sizes=sizes))
-        return tuple(sized)
 
 
 Start = Callable[[Scan, int | None], ScanJob]
@@ -248,11 +246,14 @@ class _NotedJob(ScanJob):
         self._writer = writer
         self._scan = scan
         self._sensor = sensor
-        self._is_own = writer.has(scan)
-        self._job = start(scan, sensor) if self._is_own else ScanJob()
+        is_own = writer.has(scan)
+        self._job = start(scan, sensor) if is_own else writer.inner.pass_over(scan)
 
     def pack(self) -> None:
         self._job.pack()
+
+    def start(self, index: int) -> None:
+        self._job.start(index)
 
     def append(self) -> None:
         self._writer.note(self._scan, self._sensor)
@@ -262,23 +263,25 @@ class _NotedJob(ScanJob):
         self._job.compress()
 
     def commit(self) -> None:
-        if self._is_own:
-            self._job.commit()
-        else:
-            self._writer.inner.count({})
+        self._job.commit()
 
 
 def _not_a_folder(name: str) -> str:
+    if name == "rosbag2":
+        return (
+            "--shard: expected --max-bag-duration for rosbag2, since a shard writes whole files of "
+            "the bag, found none; give --max-bag-duration 60"
+        )
     return (
-        f"--shard: expected a format with a file for each scan (npz, ply, pcd, las, laz, kitti, "
-        f"nuscenes), found {name}, one file for all scans; give --format npz and a folder"
+        f"--shard: expected a format with several files (npz, ply, pcd, las, laz, kitti, nuscenes; "
+        f"rosbag2 with --max-bag-duration), found {name}, one file for all scans; give --format "
+        "npz and a folder, or --format rosbag2 --max-bag-duration 60"
     )
 
 
-def check_format(name: str, suffix: str | None) -> None:
+def check_format(name: str, suffix: str | None, max_bag_s: float) -> None:
     """Raise UsageError for a format whose scans are in one file; suffix: of that file."""
-    # The folder of a ROS 2 bag has one file with all scans, too.
-    if suffix is not None or name == "rosbag2":
+    if suffix is not None or (name == "rosbag2" and not max_bag_s):
         raise UsageError(_not_a_folder(name))
 
 
@@ -298,11 +301,12 @@ class ShardOutput:
         self._writer: ShardWriter | None = None
 
     def around(self, writer: ScanWriter, info: RunInfo) -> ShardWriter:
-        """Return the writer of this shard; UsageError for a format that is no folder of scans."""
-        if not isinstance(writer, FolderWriter):
+        """Return the writer of this shard; UsageError for a format that shards cannot write."""
+        if not isinstance(writer, PartWriter):
             writer.abandon()
             raise UsageError(_not_a_folder(self._name))
-        self._writer = ShardWriter(writer, self._shard, info)
+        shard = self._shard.of_bag(self._options.max_bag_s, Fraction(info.rate_hz))
+        self._writer = ShardWriter(writer, shard, info)
         return self._writer
 
     def complete(self, report: RunReport, folder: Path) -> None:
@@ -313,24 +317,33 @@ class ShardOutput:
             return
         options = self._options
         self.account = Account(
-            shard=self._shard,
+            shard=writer.shard,
             identity=identity_of_parts(self._log.identity),
             content=self._log.content,
             format=self._name,
             ply_style=options.ply_style,
             is_split=options.split,
             is_strict=run.job.strict,
+            max_bag_s=options.max_bag_s,
             columns_per_s=tuple(sensor.columns_per_s for sensor in run.sensors),
             notes_before_points=run.notes_before_points,
             info=writer.info,
             report=report,
             total=writer.total,
+            bag_files=writer.inner.bag_files,
             figures=writer.figures,
-            scans=writer.sized_scans(),
+            scans=tuple(writer.scans),
+            files=_sizes(folder),
         )
         head = {"schema": SCHEMA, "version": mlbatch.__version__}
         text = json.dumps(head | _fields(to_json(self.account)), separators=(",", ":"))
         write_text(folder / SHARD_JSON, text + "\n", options.fsync)
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of all files in a folder, by their paths in it."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
 
 
 # -- reading ----------------------------------------------------------------------------------

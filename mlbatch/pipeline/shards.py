@@ -1,5 +1,7 @@
 """Time shards: each of N runs makes every Nth scan of one recording (`--shard K/N`).
 
+Of a ROS 2 bag of several files (`--max-bag-duration`) it makes every Nth file.
+
 Every shard reads and batches the whole recording, since the first look, the first window, losses
 and clocks depend on all of it. It decodes and writes its own scans only, which is what costs most.
 """
@@ -7,9 +9,11 @@ and clocks depend on all of it. It decodes and writes its own scans only, which 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 
 from mlbatch.errors import UsageError
+from mlbatch.writers.base import windows_per_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +22,11 @@ class Shard:
 
     number: int  # from 1
     count: int
+    windows: int = 0  # in a file of a bag; 0: every scan has files of its own
+
+    def of_bag(self, max_bag_s: float, rate: Fraction) -> Shard:
+        """The shard of an output; max_bag_s: as of `Job`; rate: Hz."""
+        return replace(self, windows=windows_per_file(max_bag_s, rate)) if max_bag_s else self
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
@@ -27,7 +36,9 @@ class Shard:
 
         It depends on time alone: on neither the engine nor how packets are read.
         """
-        return (index * slices + slice_) % self.count == self.number - 1
+        # The head is in the first file of a bag.
+        unit = max(index, 0) // self.windows if self.windows else index * slices + slice_
+        return unit % self.count == self.number - 1
 
 
 def parse_shard(text: str) -> Shard:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from mlbatch.pipeline import preflight, resume
-from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import convert
 from mlbatch.report.ledger import SensorLedger
@@ -119,6 +119,7 @@ class OutputOptions:
     point_layout: str = "standard"
     compression: str = "none"
     ply_style: str = "standard"
+    max_bag_duration: float = 0.0  # s of recording in a file of a bag; 0: all in one file
     overwrite: bool = False
     fsync: bool = True  # wait until the output is on the disk
     report: Path | None = None
@@ -129,6 +130,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     """Convert to `output` (None: a dry run); the report is written as by the command."""
     asked = parse_jobs("jobs", str(options.jobs))
     name = choose_format(output or Path("scans.mcap"), options.format)
+    job = replace(job, max_bag_s=check_max_bag_s("max_bag_duration", options.max_bag_duration))
     writer_options = WriterOptions(
         options.point_layout,
         options.overwrite,
@@ -136,6 +138,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         compression=options.compression,
         ply_style=options.ply_style,
         fsync=options.fsync,
+        max_bag_s=job.max_bag_s,
     )
     check_options(name, writer_options)
     check_variants(name, job.variants)

@@ -76,6 +76,12 @@ def _range_m(node: Node) -> Values:
     return (node.text,)
 
 
+def _duration_s(node: Node) -> Values:
+    if node.number() < 0:
+        raise node.error("a duration above 0 s", node.shown, "give seconds")
+    return (node.text,)
+
+
 def _percent(node: Node) -> Values:
     if not 0 <= node.number() <= _FULL_PERCENT:
         raise node.error("a share from 0 to 100 %", node.shown, "correct it")
@@ -121,6 +127,10 @@ CONVERT: tuple[Key[Values], ...] = (
     _text_key("point_layout", "fields of a PointCloud2 point (preset)"),
     _text_key("ply_style", "properties of PLY files"),
     _text_key("compression", "of MCAP chunks"),
+    Key(
+        *("max_bag_duration", _duration_s, (), {"type": "number", "minimum": 0}),
+        "recording in a file of a ROS 2 bag, s; 0: all in one file",
+    ),
     _choice_key(
         *("stamp", "instant of the window that messages are stamped with"),
         *("start", "middle", "end"),

@@ -26,6 +26,7 @@ from mlbatch.writers.base import (
     NO_COMPRESSION,
     PLY_STYLES,
     Checkpoint,
+    PartWriter,
     ScanJob,
     ScanWriter,
     WriterModule,
@@ -52,6 +53,7 @@ __all__ = [
     "REPORT_JSON",
     "SHARD_JSON",
     "Checkpoint",
+    "PartWriter",
     "ReportPaths",
     "ScanJob",
     "ScanWriter",
@@ -196,6 +198,11 @@ def check_options(name: str, options: WriterOptions) -> None:
         raise UsageError(
             f"--ply-style: expected {PLY_STYLES[0]} for {name}, found {style!r}; leave it out, or "
             "give --format ply"
+        )
+    if options.max_bag_s and name != "rosbag2":
+        raise UsageError(
+            f"--max-bag-duration: expected --format rosbag2, a folder of several files, found "
+            f"{name}; leave it out, or give --format rosbag2 and a folder"
         )
 
 

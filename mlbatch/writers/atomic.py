@@ -32,7 +32,7 @@ _SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.([\w.]+)")
 _UNMARKED = ("npz", "ply")
 # The same for a ROS 2 bag and for lists of times. Other programs write such files too, and scans
 # of other formats: scans.csv marks an own output.
-_SHARED_FILE = re.compile(r".+_0\.mcap|metadata\.yaml|times\.txt")
+_SHARED_FILE = re.compile(r".+_\d+\.mcap|metadata\.yaml|times\.txt")
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
 _HEAD_BYTES = 64

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from fractions import Fraction
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +30,9 @@ class WriterOptions:
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
     ply_style: str = PLY_STYLES[0]  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
+    max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
+    # Number and count of shards: the only files of a bag to write are the Kth, (K + N)th, ...
+    share: tuple[int, int] = (1, 1)
 
 
 class Checkpoint(NamedTuple):
@@ -45,6 +49,12 @@ class ScanJob:
     the same time as stages of other jobs. `append` and `commit` run in the order of the scans,
     each after the same stage of all earlier jobs.
     """
+
+    def start(self, index: int) -> None:
+        """Prepare for the window of the scan: the messages before it follow, then `append`.
+
+        Runs in order, as `append` does; also for messages of the window that are written apart.
+        """
 
     def pack(self) -> None:
         """Convert the points to the bytes of a message or file. Any thread."""
@@ -107,6 +117,33 @@ class ScanWriter(Protocol):
     def abandon(self) -> None:
         """Close all files after an error; the `.partial` stays."""
         ...
+
+
+@runtime_checkable
+class PartWriter(ScanWriter, Protocol):
+    """A writer whose files depend on no other scans: each can be written by a shard of a run."""
+
+    @property
+    def bag_files(self) -> int:
+        """Number of files that all shards have begun; 0 where every scan has files of its own."""
+        ...
+
+    def pass_over(self, scan: Scan) -> ScanJob:
+        """Return the job of a scan that another shard writes; call it in the order of the scans."""
+        ...
+
+    def finish_part(self, last: Callable[[Path], None] | None = None) -> None:
+        """Complete the files of the shard, and move their folder to its final path.
+
+        last: as in `finish`.
+        """
+        ...
+
+
+def windows_per_file(max_bag_s: float, rate: Fraction) -> int:
+    """Return the number of windows in a file of a bag, 1 at least; rate: Hz."""
+    # As it was written: 0.3 s at 10 Hz are three windows.
+    return max(1, int(Fraction(str(max_bag_s)) * rate))
 
 
 class WriterModule(Protocol):

@@ -287,6 +287,10 @@ class McapContainer:
         )
         self._waiting_ends.append(self._file.position_bytes)
 
+    def end_chunk(self) -> None:
+        """Complete the chunk under construction: no message follows."""
+        self._end_chunk(b"")
+
     def _end_chunk(self, tail: bytes | memoryview) -> None:
         """Complete the chunk under construction; tail: its last bytes."""
         if not self._index:
@@ -330,6 +334,19 @@ class McapContainer:
         self._write_metadata("mlbatch.report", {"json": summary.report_json})
         log_ns = summary.t_init_ns or 0
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)
+        self._complete()
+
+    def finish_piece(self, grid: dict[str, str]) -> int:
+        """Complete and close one of several files of a run; returns its size in bytes.
+
+        Report and scans.csv are of the whole run: they are not in it.
+        """
+        self._write_all_chunks()
+        self._write_metadata("mlbatch.grid", grid)
+        self._complete()
+        return self._file.position_bytes
+
+    def _complete(self) -> None:
         self._write_summary()
         self._file.complete()
         if self._on_finish is not None:

@@ -41,7 +41,8 @@ WAITING_SAMPLES = 65536
 WAITING_BYTES = 16 << 20
 # Memory of a message in addition to its bytes.
 _MESSAGE_BYTES = 400
-_TF_STATIC = "/tf_static"
+TF_STATIC = "/tf_static"
+TF_TYPE = "tf2_msgs/TFMessage"
 
 # sensor_msgs/Imu: -1 in the covariance means no orientation; a covariance of zeros is unknown.
 _NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
@@ -157,7 +158,7 @@ class MessageWriter:
             for number, sensor in enumerate(info.sensors):
                 self._topics[number] = f"/{sensor.name}/points"
         imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
-        self._own = frozenset({_TF_STATIC, *self._topics.values(), *imu})
+        self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
         with export_errors(self._output.partial):
             self._file = opener(self._output.partial, options.kept_bytes)
 
@@ -171,7 +172,7 @@ class MessageWriter:
 
     def flush(self) -> ScanJob:
         """Return the job that writes complete chunks."""
-        return _ChunkJob(self._file, self._output.partial)
+        return ChunkJob(self._file, self._output.partial)
 
     def checkpoint(self) -> Checkpoint:
         """Return the scans in written chunks."""
@@ -200,7 +201,7 @@ class MessageWriter:
         output = self._output
         with export_errors(output.partial):
             self._begin(summary.t_init_ns)
-            self._file.finish(summary, self._grid(summary))
+            self._file.finish(summary, self._grid(summary.t_init_ns))
         output.sync()
         if last is not None:
             last(output.partial)
@@ -233,11 +234,16 @@ class MessageWriter:
 
     def send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
         """Add the message of a scan to its chunk. In order."""
+        self.place_scan(scan)
+        with export_errors(self._output.partial):
+            topic = self._topics[sensor]
+            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message)
+
+    def place_scan(self, scan: Scan) -> None:
+        """Write what precedes a scan, note the chunk that it is in. In order."""
         with export_errors(self._output.partial):
             self._begin(stamp_ns(scan))
             self._chunk_of_scan.append(self._file.complete_chunks)
-            topic = self._topics[sensor]
-            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message)
 
     # -- messages -----------------------------------------------------------------------------
 
@@ -270,7 +276,7 @@ class MessageWriter:
                 stamps += item.stamp_ns.tolist()
         stamp_ns = min(stamps, default=0)
         transforms = static_transforms(self._info, stamp_ns, self._wire)
-        self._file.send(_TF_STATIC, "tf2_msgs/TFMessage", stamp_ns, transforms, latched=True)
+        self._file.send(TF_STATIC, TF_TYPE, stamp_ns, transforms, latched=True)
         for item in self._waiting:
             self._send(item)
         self._waiting.clear()
@@ -284,11 +290,11 @@ class MessageWriter:
             message = imu_message(item, row, imu_frame(name), self._wire)
             self._file.send(f"/{name}/imu", "sensor_msgs/Imu", int(item.stamp_ns[row]), message)
 
-    def _grid(self, summary: Summary) -> dict[str, str]:
+    def _grid(self, t_init_ns: int | None) -> dict[str, str]:
         info = self._info
         return {
             "rate_hz": info.rate_hz,
-            "t_init_ns": "" if summary.t_init_ns is None else str(summary.t_init_ns),
+            "t_init_ns": "" if t_init_ns is None else str(t_init_ns),
             "slices": str(info.slices),
             "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
             "timescale": info.timescale,
@@ -303,7 +309,7 @@ def stamp_ns(scan: Scan) -> int:
     return instant_ns(scan.info.variant("stamp", INSTANTS[0]), scan.start_ns, scan.end_ns)
 
 
-class _ChunkJob(ScanJob):
+class ChunkJob(ScanJob):
     """Writes the chunks that are complete at its `append`."""
 
     def __init__(self, file: MessageFile, partial: Path) -> None:
@@ -339,6 +345,9 @@ class _CloudJob(ScanJob):
 
     def pack(self) -> None:
         self._cloud, self._message = self._writer.pack_scan(self._scan, self._is_kept)
+
+    def start(self, index: int) -> None:
+        self._chunks.start(index)
 
     def append(self) -> None:
         self._writer.send_scan(self._scan, self._sensor, self._message)

@@ -92,6 +92,10 @@ class FolderWriter:
         """Return the job that keeps the file of a scan."""
         return _KeepJob(self, self._paths(scan, sensor))
 
+    def pass_over(self, scan: Scan) -> ScanJob:
+        """Return the job of a scan that another shard writes: it has no file here."""
+        return _KeepJob(self, {})
+
     def flush(self) -> ScanJob:
         """Return a job without work: only scans are written."""
         return ScanJob()
@@ -154,6 +158,11 @@ class FolderWriter:
             key = (scan.index < 0, scan.index, scan.slice)
             self._entries.setdefault(sensor, []).append(Entry(key, scan.start_ns))
         return self.files(scan, sensor)
+
+    @property
+    def bag_files(self) -> int:
+        """Return 0: every scan has files of its own."""
+        return 0
 
     @property
     def folder(self) -> Path:

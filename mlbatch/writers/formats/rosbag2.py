@@ -1,17 +1,17 @@
-"""A ROS 2 bag: a folder with one MCAP file and metadata.yaml (docs/sources/outputs.md).
+"""A ROS 2 bag: a folder with MCAP files and metadata.yaml (docs/sources/outputs.md).
 
-metadata.yaml has version 5 (Humble), which later players read as well.
+There is one file, or with `--max-bag-duration` one for each so many windows (`bag_writer.py`).
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Cdr
 from mlbatch.types import RecordLayout, RunInfo, Topic
+from mlbatch.writers.bag_metadata import METADATA, file_of_container, metadata_text
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 FORMAT = "rosbag2"
 SUFFIX: str | None = None
 COMPRESSES = True
-
-METADATA = "metadata.yaml"
 
 
 def extras(options: WriterOptions) -> frozenset[str]:
@@ -37,6 +35,10 @@ def record_layout(options: WriterOptions) -> RecordLayout | None:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start the folder of a ROS 2 bag."""
+    if options.max_bag_s:
+        from mlbatch.writers.bag_writer import BagWriter
+
+        return BagWriter(target, info, options, check_topic)
 
     def open_file(folder: Path, kept_bytes: int | None) -> MessageFile:
         # Imported here, so that naming the format does not load the library.
@@ -45,50 +47,18 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         path = folder / f"{target.name}_0.mcap"
 
         def write_metadata(container: McapContainer) -> None:
-            text = _metadata(container, path.name)
+            text = metadata_text([file_of_container(container, path.name)])
             (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
 
-        return McapContainer(path, kept_bytes, options.compression, _check_topic, write_metadata)
+        return McapContainer(path, kept_bytes, options.compression, check_topic, write_metadata)
 
     return MessageWriter(target, info, options, Cdr, open_file, folder=True)
 
 
-def _check_topic(topic: Topic) -> None:
+def check_topic(topic: Topic) -> None:
     """Refuse messages of ROS 1: a player of ROS 2 bags cannot read them."""
     if topic.encoding != "cdr":
         raise ExportError(
             f"{topic.name}: expected messages of ROS 2 (cdr) for a ROS 2 bag, found "
             f"{topic.encoding!r}; do not pass the topic, or write a .mcap, which takes both"
         )
-
-
-def _metadata(container: McapContainer, name: str) -> str:
-    """Return the text of metadata.yaml; JSON strings are valid YAML strings."""
-    first_ns, last_ns = container.span_ns
-    contents = container.contents()
-    count = sum(sent for _, _, sent in contents)
-    topics = "".join(
-        f"    - topic_metadata:\n"
-        f"        name: {json.dumps(channel.topic)}\n"
-        f"        type: {json.dumps(schema)}\n"
-        f"        serialization_format: {channel.message_encoding}\n"
-        f"        offered_qos_profiles: {json.dumps(channel.metadata['offered_qos_profiles'])}\n"
-        f"      message_count: {sent}\n"
-        for channel, schema, sent in contents
-    )
-    return (
-        "rosbag2_bagfile_information:\n"
-        "  version: 5\n"
-        "  storage_identifier: mcap\n"
-        f"  duration:\n    nanoseconds: {last_ns - first_ns}\n"
-        f"  starting_time:\n    nanoseconds_since_epoch: {first_ns}\n"
-        f"  message_count: {count}\n"
-        f"  topics_with_message_count:\n{topics}"
-        '  compression_format: ""\n'
-        '  compression_mode: ""\n'
-        f"  relative_file_paths:\n    - {json.dumps(name)}\n"
-        f"  files:\n    - path: {json.dumps(name)}\n"
-        f"      starting_time:\n        nanoseconds_since_epoch: {first_ns}\n"
-        f"      duration:\n        nanoseconds: {last_ns - first_ns}\n"
-        f"      message_count: {count}\n"
-    )
