@@ -41,6 +41,7 @@ TURN_NS = 100 * NS_PER_MS
 SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)
 TWO = ("--identity-extrinsics", "--keep-partial")
 ZSTD = ("--compression", "zstd:1")
+FILES = ("--format", "rosbag2", "--max-bag-duration", "0.2", "--pass", "/chatter")
 TOUCHES = frozenset(
     {
         *("write", "writev", "flush", "truncate", "fsync"),
@@ -75,6 +76,9 @@ _ONE_JOB = {
     "rosbag1": Case("session/drive.pcap", "out.bag", (*TWO, "--slices", "3")),
     "rosbag2": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", "--pass", "/chatter")),
     "rosbag2 zstd": Case("bag/drive.mcap", "out", (*TWO, "--format", "rosbag2", *ZSTD)),
+    "bag files": Case("bag/drive.mcap", "out", (*TWO, *FILES)),
+    "bag files split": Case("bag/drive.mcap", "out", (*TWO, *FILES, "--split", *ZSTD)),
+    "bag files shard": Case("bag/drive.mcap", "out", (*TWO, *FILES, "--shard", "2/3")),
     "npz": Case("session/drive.pcap", "out", TWO),
     "npz shard": Case("session/drive.pcap", "out", (*TWO, "--shard", "2/3")),
     "npz split": Case("session/drive.pcap", "out", (*TWO, "--split", "--slices", "2")),

@@ -6,10 +6,11 @@ is an error here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
@@ -28,6 +29,9 @@ from mlbatch.verify.pcd import PcdReader
 from mlbatch.verify.ply import PlyReader
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 from mlbatch.writers.atomic import PARTIAL_SUFFIX
+
+if TYPE_CHECKING:
+    from mlbatch.verify.mcap_file import McapFile
 
 _METADATA = "metadata.yaml"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -66,7 +70,7 @@ def _scans(path: Path) -> Iterator[Scan]:
             "name"
         ) from err
     if head.startswith(_MCAP_MAGIC):
-        return _scans_of_mcap(path, path.name)
+        return _scans_of_mcap(path, {path.name: path})
     if head.startswith(_BAG_MAGIC):
         return _scans_of_bag(path)
     suffix = next((one for one in _FILE_READERS if path.name.endswith(one)), None)
@@ -93,9 +97,9 @@ def _scans_of_folder(path: Path) -> Iterator[Scan]:
         from mlbatch.verify.rosbag2 import open_bag
 
         log = CheckLog()
-        file, _ = open_bag(log, path)
+        bag, _ = open_bag(log, path)
         _refuse_damage(log, path)
-        return _scans_of_mcap(file, f"{path.name}/{file.name}")
+        return _scans_of_mcap(path, {f"{path.name}/{file.name}": file for file in bag})
     for suffix in _FILE_READERS:
         log = CheckLog()
         files = scan_files(log, path, suffix)
@@ -120,23 +124,38 @@ def _refuse_damage(log: CheckLog, path: Path) -> None:
 # -- messages -------------------------------------------------------------------------------------
 
 
-def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
-    import json
-
+def _scans_of_mcap(output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
+    """The scans of an output of MCAP files; paths: of all, by their names for errors."""
     from mlbatch.verify.mcap_file import McapFile
 
     log = CheckLog()
-    file = McapFile(log, path, where)
+    clouds: _Clouds | None = None
+    for where, path in paths.items():
+        file = McapFile(log, path, where)
+        if clouds is None:
+            clouds = _Clouds(_run_of_mcap(output, path, file))
+        for message in file.messages():
+            _refuse_damage(log, path)
+            if message.type == _CLOUD:
+                yield from clouds.scan(message.topic, message.data, message.encoding)
+        _refuse_damage(log, path)
+
+
+def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
+    """The constants of a run in its first file; report and table may be in the folder."""
+    import json
+
     grid = file.metadata.get("mlbatch.grid")
-    report = file.metadata.get("mlbatch.report", {}).get("json", "")
-    table = file.attachments.get("scans.csv", b"")
     if grid is None:
         raise RecordingError(
             f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
             "another; name the output of `mlbatch convert`"
         )
+    report = file.metadata.get("mlbatch.report", {}).get("json", "")
+    table = file.attachments.get("scans.csv", b"").decode("utf-8", "replace")
+    own = RunFiles(str(path), report, table)
     try:
-        about = RunOfOutput(
+        return RunOfOutput(
             str(path),
             tuple(map(str, json.loads(grid["sensors"]))),
             grid["rate_hz"],
@@ -144,7 +163,7 @@ def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
             grid["timescale"],
             int(grid["t_init_ns"]),
             grid.get("sort", "columns"),
-            RunFiles(str(path), report, table.decode("utf-8", "replace")),
+            RunFiles.of(output) if "windows_per_file" in grid else own,
             variants_of(grid),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as err:
@@ -152,12 +171,6 @@ def _scans_of_mcap(path: Path, where: str) -> Iterator[Scan]:
             f"{path}: expected rate, slices and sensors in mlbatch.grid, found "
             f"{type(err).__name__}: {err}; convert again"
         ) from err
-    clouds = _Clouds(about)
-    for message in file.messages():
-        _refuse_damage(log, path)
-        if message.type == _CLOUD:
-            yield from clouds.scan(message.topic, message.data, message.encoding)
-    _refuse_damage(log, path)
 
 
 def _scans_of_bag(path: Path) -> Iterator[Scan]:

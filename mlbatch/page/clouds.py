@@ -103,12 +103,11 @@ def read_clouds(output: Path, places: list[Place], sensors: tuple[str, ...]) -> 
 # -- containers -------------------------------------------------------------------------------
 
 
-def mcap_of(path: Path) -> Path | None:
-    """The MCAP file of an output: itself, or that in a bag folder; None in other outputs."""
+def mcaps_of(path: Path) -> list[Path]:
+    """The MCAP files of an output: itself, or those in a bag folder; none in other outputs."""
     if path.is_dir():
-        files = [entry for entry in entries(path) if entry.suffix == ".mcap"]
-        return files[0] if len(files) == 1 else None
-    return path if _begins_with(path, _MCAP_MAGIC) else None
+        return [entry for entry in entries(path) if entry.suffix == ".mcap"]
+    return [path] if _begins_with(path, _MCAP_MAGIC) else []
 
 
 def _begins_with(path: Path, magic: bytes) -> bool:
@@ -120,11 +119,13 @@ def _begins_with(path: Path, magic: bytes) -> bool:
 
 
 def _scans(output: Path, places: list[Place], sensors: tuple[str, ...]) -> Iterator[StoredScan]:
-    file = mcap_of(output)
+    files = mcaps_of(output)
     topics = {"/points": None} | {f"/{name}/points": i for i, name in enumerate(sensors)}
-    if file is not None:
+    for file in files:
         yield from _of_messages(_mcap_messages(file, places, list(topics)), topics)
-    elif output.is_dir():
+    if files:
+        return
+    if output.is_dir():
         yield from _of_files(output, places)
     elif _begins_with(output, _BAG_MAGIC):
         yield from _of_messages(_bag_messages(output, places, list(topics)), topics)

@@ -114,10 +114,11 @@ def _of_output(path: Path, report: Path | None) -> Source:
 
 def _inside(path: Path) -> tuple[str | None, str | None]:
     """Report and table in an MCAP file; None in other outputs."""
-    from mlbatch.page.clouds import mcap_of
+    from mlbatch.page.clouds import mcaps_of
 
-    file = mcap_of(path)
-    if file is None:
+    files = mcaps_of(path)
+    # Several files have neither.
+    if len(files) != 1:
         return None, None
     from mcap.reader import make_reader
 
@@ -127,7 +128,7 @@ def _inside(path: Path) -> tuple[str | None, str | None]:
     report = None
     table = None
     try:
-        with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:
+        with library_errors("an MCAP file with an index"), BoundedFile(files[0]) as stream:
             reader = make_reader(stream)
             for metadata in reader.iter_metadata():
                 if metadata.name == "mlbatch.report":

@@ -274,8 +274,10 @@ class TopicChecks:
     # Of the first cloud.
     layout: str = ""
     organized: bool = False
-    # Messages by topic.
+    # Messages by topic, in all files; files that were begun.
     counts: Counter[str] = field(default_factory=Counter)
+    files: int = 0
+    _is_first: bool = True
     _split: bool | None = None
     _last_ns: dict[str, int] = field(default_factory=dict)
     # Frames in /tf_static.
@@ -289,9 +291,15 @@ class TopicChecks:
         """Whether every sensor has its own topic."""
         return bool(self._split)
 
+    def begin_file(self) -> None:
+        """Call before the messages of a file."""
+        self.files += 1
+        self._is_first = True
+
     def check(self, message: Message) -> None:
-        """Check one message, in the order of the file."""
-        is_first = not self.counts
+        """Check one message, in the order of the files."""
+        is_first = self._is_first
+        self._is_first = False
         self.counts[message.topic] += 1
         sensors = self.metadata.sensors or ()
         # `/<sensor>/points` or `/<sensor>/imu`
@@ -492,7 +500,7 @@ class TopicChecks:
     def finish(self, where: str) -> None:
         """Check the counts of messages, and the sums of scans."""
         log = self.log
-        log.equal("tf_static", f"{where} messages", 1, self.counts[TF_STATIC])
+        log.equal("tf_static", f"{where} messages", self.files, self.counts[TF_STATIC])
         self._check_frames(where)
         self.examination.finish(split=self.split)
         report = self.report

@@ -5,10 +5,11 @@ Libraries of a format are loaded only for outputs of that format.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mlbatch.verify import messages, npz
 from mlbatch.verify.examination import Examination, Progress
@@ -25,7 +26,12 @@ from mlbatch.verify.report_checks import (
 )
 from mlbatch.verify.verdict import CheckLog, DamageError, Verdict, VerifyError
 
+if TYPE_CHECKING:
+    from mlbatch.verify.rosbag2 import BagFile
+
 _METADATA = "metadata.yaml"
+# In mlbatch.grid of each of several files; their report and table are in the folder.
+_PIECES = "windows_per_file"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG V2.0\n"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
@@ -76,7 +82,7 @@ def check_output(output: Output) -> Verdict:
     except OSError as err:
         raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
     if head.startswith(_MCAP_MAGIC):
-        return _check_mcap(output, path, "mcap")
+        return _check_mcap(output, [path], "mcap")
     if head.startswith(_BAG_MAGIC):
         return _check_bag(output)
     kind = "an empty file" if not head else "a file of another kind"
@@ -130,43 +136,62 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
 def _check_rosbag2(output: Output) -> Verdict:
     from mlbatch.verify.rosbag2 import check_metadata, open_bag
 
-    path, about = open_bag(output.log, output.path)
+    paths, about = open_bag(output.log, output.path)
 
-    def check_yaml(topics: TopicChecks, span_ns: tuple[int, int]) -> None:
-        check_metadata(output.log, about, path.name, topics.counts, span_ns)
+    def check_yaml(topics: TopicChecks, files: Sequence[BagFile]) -> None:
+        check_metadata(output.log, about, files, topics.counts)
 
-    return _check_mcap(output, path, "rosbag2", check_yaml)
+    return _check_mcap(output, paths, "rosbag2", check_yaml)
 
 
 def _check_mcap(
     output: Output,
-    path: Path,
+    paths: Sequence[Path],
     name: str,
-    check_yaml: Callable[[TopicChecks, tuple[int, int]], None] | None = None,
+    check_yaml: Callable[[TopicChecks, Sequence[BagFile]], None] | None = None,
 ) -> Verdict:
     from mlbatch.verify.mcap_file import McapFile
+    from mlbatch.verify.rosbag2 import BagFile
 
     log = output.log
-    where = path.name
-    file = McapFile(log, path, where)
-    grid = file.metadata.get("mlbatch.grid")
-    if grid is None:
-        raise VerifyError(
-            f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
-            f"one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
-        )
-    log.equal("metadata", f"{where} profile", "ros2", file.profile)
-    attachment = file.attachments.get(TABLE)
-    files = ReportFiles.inside(log, path, file.metadata.get("mlbatch.report"), attachment)
-    files.check_copies(log, attachment, output.places)
-    metadata = files.metadata(log, metadata_of_grid(log, where, grid))
-    examination = Examination(log, str(path), metadata, files, output.progress)
+    grids = []
+    mcaps = []
+    for path in paths:
+        file = McapFile(log, path, path.name)
+        grid = file.metadata.get("mlbatch.grid")
+        if grid is None:
+            raise VerifyError(
+                f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, "
+                f"found one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
+            )
+        log.equal("metadata", f"{path.name} profile", "ros2", file.profile)
+        grids.append(grid)
+        mcaps.append(file)
+    where = paths[0].name
+    for path, grid in zip(paths[1:], grids[1:], strict=True):
+        log.equal("metadata", f"{path.name} mlbatch.grid", grids[0], grid)
+    if _PIECES in grids[0] or len(paths) > 1:
+        files = ReportFiles.read(log, output.places)
+        if not output.places.table.exists():
+            log.fail("table", TABLE, "the table of scans", "none")
+    else:
+        attachment = mcaps[0].attachments.get(TABLE)
+        report = mcaps[0].metadata.get("mlbatch.report")
+        files = ReportFiles.inside(log, paths[0], report, attachment)
+        files.check_copies(log, attachment, output.places)
+    metadata = files.metadata(log, metadata_of_grid(log, where, grids[0]))
+    examination = Examination(log, str(output.path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
-    for message in file.messages():
-        topics.check(message)
-    topics.finish(where)
+    found = []
+    for path, file in zip(paths, mcaps, strict=True):
+        before = topics.counts.total()
+        topics.begin_file()
+        for message in file.messages():
+            topics.check(message)
+        found.append(BagFile(path.name, topics.counts.total() - before, file.span_ns))
+    topics.finish(where if len(paths) == 1 else output.path.name)
     if check_yaml is not None:
-        check_yaml(topics, file.span_ns)
+        check_yaml(topics, found)
     return output.verdict(_format(name, topics), examination, _limits(topics), files)
 
 
@@ -179,6 +204,7 @@ def _check_bag(output: Output) -> Verdict:
     metadata = files.metadata(log, RunMetadata())
     examination = Examination(log, str(path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
+    topics.begin_file()
     for message in BagFile(log, path, path.name).messages():
         topics.check(message)
     topics.finish(path.name)

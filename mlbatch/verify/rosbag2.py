@@ -1,4 +1,4 @@
-"""ROS 2 bags: metadata.yaml, checked against the MCAP file of the bag.
+"""ROS 2 bags: metadata.yaml, checked against the MCAP files of the bag.
 
 Source: docs/sources/outputs.md section 4.
 """
@@ -6,8 +6,9 @@ Source: docs/sources/outputs.md section 4.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import yaml
 
@@ -29,8 +30,16 @@ class PlainLoader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def open_bag(log: CheckLog, folder: Path) -> tuple[Path, Yaml]:
-    """The MCAP file of a bag, and the content of metadata.yaml."""
+class BagFile(NamedTuple):
+    """What was found in one MCAP file: messages, first and last log time."""
+
+    name: str
+    messages: int
+    span_ns: tuple[int, int]
+
+
+def open_bag(log: CheckLog, folder: Path) -> tuple[list[Path], Yaml]:
+    """The MCAP files of a bag by their numbers, one at least, and the content of metadata.yaml."""
     path = folder / METADATA
     try:
         if path.stat().st_size > _LARGEST_BYTES:
@@ -40,33 +49,30 @@ def open_bag(log: CheckLog, folder: Path) -> tuple[Path, Yaml]:
         text = " ".join(str(err).split())
         raise VerifyError(f"{path}: expected YAML, found {text}; restore it") from err
     about = _value_at(root, "rosbag2_bagfile_information")
-    files = sorted(found for found in folder.iterdir() if found.suffix == ".mcap")
+    files = sorted(
+        (found for found in folder.iterdir() if found.suffix == ".mcap"),
+        # Numbers have no leading zeros.
+        key=lambda found: (len(found.name), found.name),
+    )
     names = [found.name for found in files]
     said = _value_at(about, "relative_file_paths")
     log.equal("names", f"{METADATA} relative_file_paths", names, said)
-    if len(files) != 1:
-        raise VerifyError(
-            f"{folder}: expected a bag with one MCAP file, found {len(files)}; convert again"
-        )
-    return files[0], about
+    if not files:
+        raise VerifyError(f"{folder}: expected a bag with MCAP files, found none; convert again")
+    return files, about
 
 
 def check_metadata(
-    log: CheckLog, about: Yaml, name: str, counts: Counter[str], span_ns: tuple[int, int]
+    log: CheckLog, about: Yaml, files: Sequence[BagFile], counts: Counter[str]
 ) -> None:
-    """Check the content of metadata.yaml against the messages of the file `name`."""
-    first_ns, last_ns = span_ns
-    total = counts.total()
-    times: dict[str, Yaml] = {
-        "starting_time": {"nanoseconds_since_epoch": first_ns},
-        "duration": {"nanoseconds": last_ns - first_ns},
-        "message_count": total,
-    }
+    """Check the content of metadata.yaml against files; counts: of their messages by topic."""
+    first_ns = min(file.span_ns[0] for file in files)
+    last_ns = max(file.span_ns[1] for file in files)
     expected: dict[str, Yaml] = {
         "version": _VERSION,
         "storage_identifier": "mcap",
-        **times,
-        "files": [{"path": name, **times}],
+        **_times((first_ns, last_ns), counts.total()),
+        "files": [{"path": file.name, **_times(file.span_ns, file.messages)} for file in files],
     }
     for key, value in expected.items():
         log.equal("metadata", f"{METADATA} {key}", value, _value_at(about, key))
@@ -76,6 +82,15 @@ def check_metadata(
         name_of = _value_at(_value_at(topic, "topic_metadata"), "name")
         said[str(name_of)] = _value_at(topic, "message_count")
     log.equal("metadata", f"{METADATA} topics", dict(counts), said)
+
+
+def _times(span_ns: tuple[int, int], messages: int) -> dict[str, Yaml]:
+    first_ns, last_ns = span_ns
+    return {
+        "starting_time": {"nanoseconds_since_epoch": first_ns},
+        "duration": {"nanoseconds": last_ns - first_ns},
+        "message_count": messages,
+    }
 
 
 def _value_at(value: Yaml, key: str) -> Yaml:

@@ -60,7 +60,9 @@ class BagWriter(MessageWriter):
             container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
 
         def end_file(container: McapContainer) -> int:
-            return container.finish_piece(self._grid(info.t_init_ns))
+            # By this readers know that report and table are not in the file.
+            grid = self._grid(info.t_init_ns) | {"windows_per_file": str(windows)}
+            return container.finish_piece(grid)
 
         def open_files(folder: Path, kept_bytes: int | None) -> MessageFile:
             stages = FileStages(new_file, begin_file, end_file)

@@ -102,6 +102,10 @@ def test_every_shard_has_its_scans_and_no_report(shell: Shell) -> None:
         "--fault stall:left:0.3s-0.5s --max-wait 0.05 --keep-partial",
         "--exclude-box=-1000,-1000,-1000,1000,1000,1000",
         "--start +0.2 --end +0.5",
+        "--format rosbag2 --max-bag-duration 0.1",
+        "--format rosbag2 --max-bag-duration 0.2 --keep-partial --compression zstd:1",
+        "--format rosbag2 --max-bag-duration 0.3 --split --slices 2 --point-layout ouster",
+        "--format rosbag2 --max-bag-duration 5 --layout organized --start +0.2",
     ],
 )
 def test_options_give_the_bytes_of_one_run(shell: Shell, options: str) -> None:
@@ -115,6 +119,53 @@ def test_engines_and_jobs_may_differ_between_shards(shell: Shell) -> None:
 def test_a_bag_with_messages_gives_the_bytes_of_one_run(shell: Shell) -> None:
     write_recordings(Path(), turns=6)
     _assert_as_one_run(shell, "bag/drive.mcap --identity-extrinsics --pass /chatter", 2)
+
+
+@pytest.mark.parametrize("jobs", ["", "--jobs 3"])
+@pytest.mark.parametrize("seconds", [0.1, 0.25, 9])
+def test_files_of_a_bag_with_messages_are_those_of_one_run(
+    shell: Shell, seconds: float, jobs: str
+) -> None:
+    """Messages are in the file of the scan that follows them, whatever shard writes it."""
+    write_recordings(Path(), turns=9)
+    options = f"--pass /chatter --format rosbag2 --max-bag-duration {seconds} {jobs}"
+    _assert_as_one_run(shell, f"bag/drive.mcap --identity-extrinsics {options}", 3)
+
+
+def test_every_shard_has_its_files_of_a_bag(shell: Shell) -> None:
+    """Seven windows, two a file: four files."""
+    _shards(shell, f"{CAPTURE} --format rosbag2 --max-bag-duration 0.2", 3)
+    names = [sorted(os.listdir(f"part{number}")) for number in (1, 2, 3)]
+    assert names == [
+        ["part1_0.mcap", "part1_3.mcap", "shard.json"],
+        ["part2_1.mcap", "shard.json"],
+        ["part3_2.mcap", "shard.json"],
+    ]
+
+
+def test_a_renamed_part_of_a_bag_is_merged(shell: Shell) -> None:
+    words = f"{CAPTURE} --format rosbag2 --max-bag-duration 0.2"
+    whole, _ = _whole(shell, words)
+    _shards(shell, words, 2)
+    Path("part1").rename("other")
+    assert _merged(shell, ["other", "part2"]).code == 0
+    assert contents(Path("merged")) == whole
+
+
+@pytest.mark.parametrize("damage", ["lost", "short", "unlisted"])
+def test_a_damaged_part_of_a_bag_is_named(shell: Shell, damage: str) -> None:
+    folders = _shards(shell, f"{CAPTURE} --format rosbag2 --max-bag-duration 0.2", 2)
+    file = Path("part2/part2_3.mcap")
+    size = file.stat().st_size
+    if damage == "lost":
+        file.unlink()
+        _refused(shell, folders, 1, "part2/part2_3.mcap", "No such file")
+    elif damage == "short":
+        os.truncate(file, size - 1)
+        _refused(shell, folders, 1, f"expected {size} bytes, found {size - 1}")
+    else:
+        _changed("part2", {"files": {"part2_1.mcap": 5}})
+        _refused(shell, folders, 1, "expected the 4 files of the bag", "found 3")
 
 
 def test_a_clock_step_is_the_error_of_one_run(shell: Shell) -> None:
@@ -410,7 +461,7 @@ def test_parts_that_cut_other_scans_are_refused(shell: Shell) -> None:
 def test_a_renamed_shard_is_refused(shell: Shell) -> None:
     _shards(shell, CAPTURE, 2)
     shutil.copytree("part1", "renamed")
-    _changed("renamed", {"shard": {"number": 2, "count": 2}})
+    _changed("renamed", {"shard": {"number": 2, "count": 2, "windows": 0}})
     _refused(shell, ["part1", "renamed"], 1, "renamed: expected the scans of shard 2/2")
 
 
@@ -427,7 +478,7 @@ def test_a_damaged_part_is_named(shell: Shell, damage: str) -> None:
         _refused(shell, ["part1", "part2"], 1, f"expected {size} bytes, found {size - 1}")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"schema": "mlbatch.shard/1"}', "\xff"])
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"schema": "mlbatch.shard/2"}', "\xff"])
 def test_a_damaged_account_is_named(shell: Shell, text: str) -> None:
     _shards(shell, CAPTURE, 2)
     Path("part2/shard.json").write_text(text, encoding="latin-1")
@@ -447,7 +498,7 @@ def test_a_field_of_another_kind_is_named(shell: Shell) -> None:
 def test_json_of_others_is_refused(shell: Shell, content: dict[str, int]) -> None:
     _shards(shell, CAPTURE, 2)
     Path("part2/shard.json").write_text(json.dumps(content))
-    found = f"expected schema mlbatch.shard/1, found {content.get('schema')}"
+    found = f"expected schema mlbatch.shard/2, found {content.get('schema')}"
     _refused(shell, ["part1", "part2"], 2, "part2/shard.json", found)
 
 
@@ -537,7 +588,7 @@ def test_a_shard_is_not_taken_for_a_whole_output(shell: Shell, command: str) -> 
     [
         ("-o out.mcap", "found mcap, one file for all scans; give --format npz"),
         ("-o out.bag", "found rosbag1"),
-        ("-o out --format rosbag2", "found rosbag2"),
+        ("-o out --format rosbag2", "--max-bag-duration for rosbag2"),
         ("--dry-run", "expected no --dry-run"),
         ("-o out --report report.json", "expected no --report"),
         ("-o out --report -", "expected no --report"),

@@ -28,6 +28,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--batching-times": "set.*own sweep",
         "--point-layout": "preset",
         "--ply-style": "standard, cloudcompare, float",
+        "--max-bag-duration": r"rosbag2.*file.*\bs\b",
         "--slices": "window",
         "--split": "sensor",
         "--keep-partial": "first and last",

@@ -63,7 +63,7 @@ NOTHING: dict[str, tuple[str, Edit, str]] = {
         text("metadata.yaml", "  version", "  a: &a [1]\n  b: [*a, *a]\n  version"),
         "an alias",
     ),
-    "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with one MCAP file"),
+    "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with MCAP files, found none"),
     "other file of a bag": ("bag2", raw("bag2_0.mcap", flipped(0)), "an MCAP file, found another"),
     "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "expected YAML"),
 }
