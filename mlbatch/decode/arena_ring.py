@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array, U64Array
-from mlbatch.decode.packet_ring import KeptPackets, packet_sums
+from mlbatch.decode.packet_ring import KeptPackets
 from mlbatch.lidar.interface import Records
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
@@ -81,7 +81,7 @@ class ArenaRing:
             data, place, start = self._copied(data, start)
         kept = KeptPackets(data, start, start + (place + self._records.start))
         if self._has_sums and len(start):
-            self._add_sums(self.packets(kept), kept.ring_index, oldest_ring_index)
+            self._add_sums(kept, oldest_ring_index)
         return kept
 
     def packets(self, kept: KeptPackets) -> U8Array:
@@ -94,9 +94,8 @@ class ArenaRing:
         return headers
 
     def keep_sums(self) -> None:
-        """See `PacketRing`; from now on packets are gathered as a whole."""
+        """See `PacketRing`."""
         self._has_sums = True
-        self._header_bytes = np.array([[0, self._size]])
 
     def sum_until(self, ring_index: int) -> int:
         """See `PacketRing`."""
@@ -114,8 +113,10 @@ class ArenaRing:
         self._loops.copy_runs(data, start, np.full(len(start), self._size), region, target)
         return region, place, target
 
-    def _add_sums(self, packets: U8Array, places: I64Array, oldest: int | None) -> None:
-        sums = np.cumsum(packet_sums(packets), dtype=np.uint64) + self._sum
+    def _add_sums(self, kept: KeptPackets, oldest: int | None) -> None:
+        places = kept.ring_index
+        each = self._loops.sums(kept.data, kept.start, self._size)
+        sums = np.cumsum(each, dtype=np.uint64) + self._sum
         self._sum = sums[-1]
         is_needed = self._places >= (places.min() if oldest is None else oldest - self._size)
         known = np.concatenate([self._places[is_needed], places])

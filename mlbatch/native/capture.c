@@ -158,6 +158,32 @@ EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *
     }
 }
 
+static uint64_t word8(const uint8_t *at)
+{
+    uint64_t word;
+    memcpy(&word, at, sizeof word);
+    return word;
+}
+
+/* Sums of the 64-bit words of packets, modulo 2^64; the last word overlaps the one before where
+   the bytes are no whole words. Packets of less than a word: sums of bytes. */
+EXPORT void mlbatch_sums(int64_t packets, const uint8_t *data, const int64_t *start, int64_t bytes,
+                         uint64_t *sums)
+{
+    for (int64_t packet = 0; packet < packets; packet++) {
+        const uint8_t *from = data + start[packet];
+        uint64_t sum = 0;
+        for (int64_t at = 0; at + 8 <= bytes; at += 8)
+            sum += word8(from + at);
+        if (bytes < 8)
+            for (int64_t at = 0; at < bytes; at++)
+                sum += from[at];
+        else if (bytes % 8)
+            sum += word8(from + bytes - 8);
+        sums[packet] = sum;
+    }
+}
+
 EXPORT int64_t mlbatch_abi(void)
 {
     return MLBATCH_ABI;

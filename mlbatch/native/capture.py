@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.arrays import BoolArray, I64Array, U8Array, U64Array
 from mlbatch.native.library import address, library
 
 # Why a walk ended: no room for more frames, no whole record, a frame that is too long.
@@ -114,6 +114,17 @@ class CaptureLoops:
             size,
             address(out),
         )
+
+    def sums(self, data: U8Array, start: I64Array, size: int) -> U64Array:
+        """Return the checksums (n,) of packets of a size; as `packet_ring.packet_sums`."""
+        found = np.empty(len(start), np.uint64)
+        if not len(start):
+            return found
+        start = np.ascontiguousarray(start)
+        if int(start.min()) < 0 or int(start.max()) + size > len(data):
+            raise IndexError("packets outside of their array")
+        self._library.mlbatch_sums(len(start), address(data), address(start), size, address(found))
+        return found
 
 
 def _is_outside(data: U8Array, start: I64Array, size: I64Array) -> BoolArray:

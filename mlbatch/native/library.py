@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 7
+_ABI = 8
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -29,6 +29,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
+    "mlbatch_sums": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_cloud_points": (
         *(_WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS, _WORD),
         *(_WORD, _ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 3),
@@ -50,7 +51,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
         *(_WORD, *[_ADDRESS] * 4, *[_WORD] * 3, _ADDRESS, _ADDRESS),
     ),
 }
-_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather", "mlbatch_cloud_pack")
+_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather", "mlbatch_sums", "mlbatch_cloud_pack")
 
 
 class Ring(ctypes.Structure):

@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 7
+#define MLBATCH_ABI 8
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -311,6 +311,8 @@ EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *sou
 EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
                            int64_t range_count, const int64_t *ranges, int64_t row_bytes,
                            uint8_t *out);
+EXPORT void mlbatch_sums(int64_t packets, const uint8_t *data, const int64_t *start, int64_t bytes,
+                         uint64_t *sums);
 EXPORT int64_t mlbatch_cloud_points(int64_t count, const uint8_t *rows, int64_t step,
                               const int64_t *real_at, const int64_t *real_type, int64_t time_type,
                               int64_t fields, const int64_t *field_at, const int64_t *field_bytes,

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from mlbatch.decode.packet_ring import packet_sums
 from mlbatch.errors import RecordingError
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import copy_runs
@@ -110,3 +113,21 @@ def test_runs_beyond_their_arrays_are_refused(start: int, size: int, place: int)
 def test_bytes_beyond_the_buffer_are_not_walked(begin: int, end: int) -> None:
     with pytest.raises(IndexError):
         CaptureLoops().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)
+
+
+@given(size=st.integers(1, 70), seed=st.integers(0, 2**32), data=st.data())
+def test_sums_of_packets_are_those_of_numpy(size: int, seed: int, data: st.DataObject) -> None:
+    content = np.random.default_rng(seed).integers(0, 256, 200, np.uint8)
+    # The last packet may end with the array.
+    begins = data.draw(st.lists(st.integers(0, len(content) - size), max_size=9))
+    start = np.array([*begins, len(content) - size])
+    packets = np.stack([content[begin : begin + size] for begin in start])
+    found = CaptureLoops().sums(content, start, size)
+    assert found.tolist() == packet_sums(packets).tolist()
+    assert CaptureLoops().sums(content, start[:0], size).tolist() == []
+
+
+@pytest.mark.parametrize("begin", [-1, 91, 2**40])
+def test_sums_beyond_the_array_are_refused(begin: int) -> None:
+    with pytest.raises(IndexError):
+        CaptureLoops().sums(np.zeros(100, np.uint8), np.array([0, begin]), 10)
