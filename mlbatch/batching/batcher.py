@@ -426,11 +426,10 @@ class Batcher:
         self._until = until
         merged = self._take_until(until)
         cuts = self._cuts(merged.stamp_ns)
-        figures = self._merge.figures(merged, [stop for _, stop in cuts])
+        figures = self._merge.figures(merged, [stop for _, stop, _ in cuts])
         begin = 0
-        for (window, stop), own in zip(cuts, figures, strict=True):
+        for (window, stop, end), own in zip(cuts, figures, strict=True):
             start = self._grid.bound(window)
-            end = self._grid.bound(window + 1)
             closed_by = int(progress.watermark.searchsorted(end))
             columns = merged.take(slice(begin, stop))
             begin = stop
@@ -466,14 +465,18 @@ class Batcher:
             track.oldest_ring_index = min(oldest, default=FOREVER)
         return merged
 
-    def _cuts(self, stamp_ns: I64Array) -> list[tuple[int, int]]:
-        """Windows of columns (n,): number, column after its last; windows without are left out."""
+    def _cuts(self, stamp_ns: I64Array) -> list[tuple[int, int, int]]:
+        """Windows of columns (n,): number, column after the last, end; those without are left out.
+
+        end: ns, of the window.
+        """
         cuts = []
         done = 0
         while done < len(stamp_ns):
             window = self._grid.index_of(int(stamp_ns[done]))
-            done = int(stamp_ns.searchsorted(self._grid.bound(window + 1)))
-            cuts.append((window, done))
+            end = self._grid.bound(window + 1)
+            done = int(stamp_ns.searchsorted(end))
+            cuts.append((window, done, end))
         return cuts
 
     def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:

@@ -6,7 +6,7 @@ whole period in ns) and do not overflow (a product of an int64 stamp and a rate 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 from mlbatch.errors import UsageError
@@ -23,6 +23,9 @@ class Grid:
 
     rate: Fraction
     slices: int = 1
+    # Slices in `_per_ns` nanoseconds: of the rate, which gives its parts slowly.
+    _count: int = field(init=False, repr=False, compare=False)
+    _per_ns: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the values; UsageError where there would be no windows."""
@@ -30,16 +33,17 @@ class Grid:
             raise UsageError(f"rate: expected a positive number of Hz, found {self.rate}")
         if self.slices < 1:
             raise UsageError(f"slices: expected 1 or more a window, found {self.slices}")
+        object.__setattr__(self, "_count", self.rate.numerator * self.slices)
+        object.__setattr__(self, "_per_ns", NS_PER_S * self.rate.denominator)
 
     def bound(self, q: int) -> int:
         """First nanosecond of slice `q`: ceil(q * 1e9 / (rate * slices))."""
-        return -(-q * NS_PER_S * self.rate.denominator // (self.rate.numerator * self.slices))
+        return -(-q * self._per_ns // self._count)
 
     def index_of(self, stamp_ns: int) -> int:
         """The slice q with bound(q) <= stamp_ns < bound(q + 1)."""
         # For an integer n, n >= ceil(x) is the same as n >= x, so the floor is exact.
-        scaled = int(stamp_ns) * self.rate.numerator * self.slices
-        return scaled // (NS_PER_S * self.rate.denominator)
+        return int(stamp_ns) * self._count // self._per_ns
 
     def floor_bound(self, stamp_ns: int) -> int:
         """First nanosecond of the slice that contains `stamp_ns`."""

@@ -150,8 +150,13 @@ class ScanTable:
         if row is None:
             return
         self._open = None
-        cells = [*row.cells(), *self._missing(row), *map(_fill_cell, row.fill), row.ready_host_ns]
-        self._append(",".join(map(str, cells)) + "\n")
+        length_ns = row.end_ns - row.start_ns
+        shares = _share_cells(
+            *(row.coverage, row.overlap, row.columns, self._columns_per_s, length_ns, row.fill)
+        )
+        counts = _count_cells(row.columns, row.complete)
+        line = f"{row.places()},{counts},{row.gaps()},{shares},{row.ready_host_ns}\n"
+        self._append(line)
         self._written += 1
         self._incomplete += not row.complete
         self._points += row.points
@@ -173,14 +178,6 @@ class ScanTable:
             one.add(columns, points, fill)
             is_underfilled |= fill < UNDERFILLED
         self._underfilled += is_underfilled
-
-    def _missing(self, row: _Row) -> list[int | str]:
-        """Missing columns of each sensor in a window, by its nominal rate; `UNKNOWN` if unknown."""
-        seconds = (row.end_ns - row.start_ns) / NS_PER_S
-        return [
-            UNKNOWN if rate is None else max(0, round(rate * seconds) - count)
-            for rate, count in zip(self._columns_per_s, row.columns, strict=True)
-        ]
 
     def _append(self, line: str) -> None:
         try:
@@ -280,24 +277,42 @@ class _Row:
             self.is_partial,
         )
 
-    def cells(self) -> list[int | str]:
-        """Values in the order of the header, without those that the table adds."""
-        total = sum(self.columns)
-        stamps = (self.first_stamp_ns, self.last_stamp_ns) if total else ("", "")
-        start = (*self.key, self.start_ns, self.end_ns, *stamps)
-        complete = str(self.complete).lower()
-        counts = (self.points, total, *self.columns, complete)
-        shares = map(_share_cell, (*self.coverage, *self.overlap))
-        return [*start, *counts, *self.max_gap_ns, *shares]
+    def places(self) -> str:
+        """The cells up to the number of points."""
+        index, part = self.key
+        stamps = f"{self.first_stamp_ns},{self.last_stamp_ns}" if any(self.columns) else ","
+        return f"{index},{part},{self.start_ns},{self.end_ns},{stamps},{self.points}"
+
+    def gaps(self) -> str:
+        """The cells of gaps."""
+        return ",".join(map(str, self.max_gap_ns))
 
 
-# Few of the values differ, and to format them costs more than to look them up.
+# Few of these cells differ from row to row, and to format them costs more than to look them up.
 @lru_cache(maxsize=1024)
-def _share_cell(share: float) -> str:
-    return f"{share:.3f}"
+def _count_cells(columns: tuple[int, ...], complete: bool) -> str:
+    return ",".join(map(str, (sum(columns), *columns, str(complete).lower())))
 
 
 @lru_cache(maxsize=1024)
+def _share_cells(
+    coverage: tuple[float, ...],
+    overlap: tuple[float, ...],
+    columns: tuple[int, ...],
+    columns_per_s: tuple[float | None, ...],
+    length_ns: int,
+    fill: tuple[float, ...],
+) -> str:
+    """The cells after the gaps, of each sensor; columns_per_s: nominal, None: unknown."""
+    seconds = length_ns / NS_PER_S
+    missing = (
+        UNKNOWN if rate is None else max(0, round(rate * seconds) - count)
+        for rate, count in zip(columns_per_s, columns, strict=True)
+    )
+    shares = (f"{share:.3f}" for share in (*coverage, *overlap))
+    return ",".join(map(str, (*shares, *missing, *map(_fill_cell, fill))))
+
+
 def _fill_cell(fill: float) -> str:
     # The shortest text of a float32.
     return UNKNOWN if math.isnan(fill) else str(np.float32(fill))
