@@ -36,7 +36,7 @@ __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ScanHeader:
     """Fields of a scan that do not depend on its points; see `Scan`."""
 
