@@ -46,6 +46,8 @@ _NEAR_COLUMNS = 16
 _SPARE_SLOTS = 4
 # Points beyond those of a column that the loops may overwrite.
 _SPARE_POINTS = 4
+# Bits of all vectors of directions; `Group.used`.
+_ALL_DIRECTIONS = 0o77
 # The return type in a label.
 _TYPE_BITS = np.uint64(0xFF << 48)
 
@@ -347,6 +349,7 @@ class _DecodedGroup:
         struct.sine = self._kept(projection.sine)
         struct.origin = self._kept(projection.origin)
         struct.first_row = self._kept(projection.first_position)
+        struct.used = self._kept(_used_by_table(projection))
         struct.rows = len(projection.cosine)
         reach_m = np.broadcast_to(projection.reaches_m, shape)
         struct.reach = self._kept(self._beams(projector, reach_m))
@@ -606,6 +609,17 @@ def _used_vectors(projection: Turning) -> int:
         bits |= _nonzero_axes(projection.origin[:2]) << 6
     bits |= _nonzero_axes(projection.origin[2:]) << 9
     return bits
+
+
+def _used_by_table(projection: Tabled) -> I64Array:
+    """Return bits of the vectors that the coordinates depend on, (sensors,); `Group.used`.
+
+    A term of zero changes a coordinate only from -0 to 0, which no origin other than -0 leaves.
+    """
+    if bool((np.signbit(projection.origin) & (projection.origin == 0)).any()):
+        return np.full(len(projection.vectors), _ALL_DIRECTIONS)
+    own = [_nonzero_axes(one[:2]) | _nonzero_axes(one[2:]) << 3 for one in projection.vectors]
+    return np.array(own, np.int64)
 
 
 def _nonzero_axes(vectors: F32Array) -> int:

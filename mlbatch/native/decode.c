@@ -19,6 +19,13 @@
 #define SPEED_BIT 32
 #define SPEED_SIGN (INT64_C(1) << 23)
 #define TABLE_BIT 56
+/* The usual case of TABLED, as a kind: the axis of the rotor is vertical, so that vector 3 is zero
+   for x and y, and vectors 1 and 2 are for z; with this many beams, so that vectors are constant
+   distances apart. Bits as in `Group.used`. */
+#define UPRIGHT (-1)
+#define UPRIGHT_BEAMS 128
+#define UPRIGHT_VECTORS 043
+#define ALL_VECTORS 077
 
 /* Planes of one column. */
 typedef struct {
@@ -399,35 +406,34 @@ static inline void put_point(float *point, const Planes *planes, int64_t element
 }
 
 #if defined(__SSE2__)
+/* Rows of lanes 1, 2, 3 after that of lane 0, by the bits of the lanes that are kept, and how many
+   are. */
+static const uint8_t NEXT[16][4] = {
+    {0, 0, 0, 0}, {1, 1, 1, 1}, {0, 1, 1, 1}, {1, 2, 2, 2}, {0, 0, 1, 1}, {1, 1, 2, 2},
+    {0, 1, 2, 2}, {1, 2, 3, 3}, {0, 0, 0, 1}, {1, 1, 1, 2}, {0, 1, 1, 2}, {1, 2, 2, 3},
+    {0, 0, 1, 2}, {1, 1, 2, 3}, {0, 1, 2, 3}, {1, 2, 3, 4},
+};
+
 /* Store the points and labels of the lanes in `kept` to rows from `row`; others are overwritten by
-   the next point. p0 to p3: x, y, z, level of four beams. Return the next row. */
+   the next point. No branch depends on `kept`, which processors would often predict wrongly. p0 to
+   p3: x, y, z, level of four beams. Return the next row. */
 static inline int64_t store_kept(float *point, int64_t *labels, int64_t row, int kept, __m128 p0,
                                  __m128 p1, __m128 p2, __m128 p3, __m128i low, __m128i high)
 {
     point += 4 * row;
     labels += row;
     _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
-    if (kept == 15) {
-        _mm_storeu_ps(point, p0);
-        _mm_storeu_ps(point + 4, p1);
-        _mm_storeu_ps(point + 8, p2);
-        _mm_storeu_ps(point + 12, p3);
-        _mm_storeu_si128((__m128i *)labels, low);
-        _mm_storeu_si128((__m128i *)(labels + 2), high);
-        return row + 4;
-    }
+    const uint8_t *next = NEXT[kept];
+    const int64_t second = next[0], third = next[1], fourth = next[2];
     _mm_storeu_ps(point, p0);
+    _mm_storeu_ps(point + 4 * second, p1);
+    _mm_storeu_ps(point + 4 * third, p2);
+    _mm_storeu_ps(point + 4 * fourth, p3);
     _mm_storel_epi64((__m128i *)labels, low);
-    int64_t next = kept & 1;
-    _mm_storeu_ps(point + 4 * next, p1);
-    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(low, low));
-    next += kept >> 1 & 1;
-    _mm_storeu_ps(point + 4 * next, p2);
-    _mm_storel_epi64((__m128i *)(labels + next), high);
-    next += kept >> 2 & 1;
-    _mm_storeu_ps(point + 4 * next, p3);
-    _mm_storel_epi64((__m128i *)(labels + next), _mm_unpackhi_epi64(high, high));
-    return row + next + (kept >> 3);
+    _mm_storeh_pi((__m64 *)(labels + second), _mm_castsi128_ps(low));
+    _mm_storel_epi64((__m128i *)(labels + third), high);
+    _mm_storeh_pi((__m64 *)(labels + fourth), _mm_castsi128_ps(high));
+    return row + next[3];
 }
 #endif
 
@@ -449,8 +455,6 @@ typedef struct {
     int64_t used, width, distance_byte, level_byte, reflectivity_byte;
     int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras, has_moves;
 } Column;
-
-static const uint8_t LANES[16] = {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4};
 
 static inline __m128i load_four(const uint8_t *from, int64_t step)
 {
@@ -479,15 +483,14 @@ static inline __m128 combine_four(const float *vectors, int64_t width, int64_t u
     return used >> 3 & 1 ? _mm_add_ps(turned, third) : turned;
 }
 
-static inline void place_tabled(const Column *own, int64_t width, int64_t beam, __m128 range_m,
-                                __m128 *xyz)
+/* used: bits of the vectors to add, as `Group.used`; a constant here. */
+static inline void place_tabled(const Column *own, int64_t width, int64_t used, int64_t beam,
+                                __m128 range_m, __m128 *xyz)
 {
     const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(own->reach + beam));
     for (int axis = 0; axis < 3; axis++) {
-        const float *vectors = own->direction + axis * width + beam;
-        const __m128 turned = multiply_add(own->cosine, _mm_loadu_ps(vectors), own->sine,
-                                           _mm_loadu_ps(vectors + 3 * width));
-        const __m128 direction = _mm_add_ps(turned, _mm_loadu_ps(vectors + 6 * width));
+        const __m128 direction = combine_four(own->direction + axis * width + beam, width,
+                                              used >> axis, own->cosine, own->sine);
         xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), own->origin[axis]);
     }
 }
@@ -577,7 +580,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     const __m128i first = is_read ? _mm_load_si128((const __m128i *)near)
                                   : load_four(from + own->distance_byte, step);
     __m128i value = _mm_srl_epi32(first, own->shift);
-    if (own->is_big) {
+    if ((!is_plain || kind == TURNING) && own->is_big) {
         const __m128i byte = _mm_set1_epi32(0xFF);
         value = _mm_or_si128(_mm_slli_epi32(_mm_and_si128(value, byte), 8),
                              _mm_and_si128(_mm_srli_epi32(value, 8), byte));
@@ -590,7 +593,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     const __m128 range_m = _mm_div_ps(
         _mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), own->factor), own->divisor);
     if (!is_plain && own->is_filtered)
-        counts[FOUND] += LANES[kept];
+        counts[FOUND] += NEXT[kept][3];
     if (!is_plain && own->is_limited) {
         kept &= _mm_movemask_ps(_mm_and_ps(_mm_cmpge_ps(range_m, own->low_m),
                                            _mm_cmple_ps(range_m, own->high_m)));
@@ -598,10 +601,12 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
             return row;
     }
     if (!is_plain && own->has_boxes)
-        counts[IN_RANGE] += LANES[kept];
+        counts[IN_RANGE] += NEXT[kept][3];
     __m128 xyz[3];
-    if (kind == TABLED)
-        place_tabled(own, own->width, beam, range_m, xyz);
+    if (kind == UPRIGHT)
+        place_tabled(own, UPRIGHT_BEAMS, UPRIGHT_VECTORS, beam, range_m, xyz);
+    else if (kind == TABLED)
+        place_tabled(own, own->width, ALL_VECTORS, beam, range_m, xyz);
     else
         place_turning(own, own->width, beam, range_m, xyz);
     if (!is_plain && own->has_boxes)
@@ -651,14 +656,14 @@ static inline int64_t decode_runs(const Scan *scan, const Group *group, const Co
         const uint8_t *from = record + run[0];
         const int64_t beams = run[2], first_beam = run[1];
         _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
-        if (kind == TABLED) {
+        if (kind != TURNING) {
             /* Reads the column as a whole, since the passes below would wait for each piece. */
             gather_every(from + own->distance_byte, step, beams, near);
             if (own->level_word)
                 gather_every(from + own->level_byte, step, beams, levels);
         }
         for (int64_t beam = 0; beam < beams; beam += 4)
-            row = decode_four(scan, group, own, kind, step, is_plain, has_moves, kind == TABLED,
+            row = decode_four(scan, group, own, kind, step, is_plain, has_moves, kind != TURNING,
                               from + beam * step, near + beam,
                               (own->level_word ? levels : near) + beam, first_beam + beam, row,
                               own_counts);
@@ -734,13 +739,21 @@ static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member
             own.origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
         if (group->places)
             return decode_places(scan, group, &own, TABLED, 0, record, row, counts);
-        if (is_plain && group->step == 4 && own.has_moves)
+        const int is_short = is_plain && !own.is_big && group->step == 4;
+        const int is_long = is_plain && !own.is_big && group->step == 12;
+        const int is_upright = width == UPRIGHT_BEAMS && !own.has_moves
+            && group->used[member] == UPRIGHT_VECTORS;
+        if (is_short && is_upright)
+            return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, record, row, counts);
+        if (is_long && is_upright)
+            return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, record, row, counts);
+        if (is_short && own.has_moves)
             return decode_runs(scan, group, &own, TABLED, 4, 1, 1, record, row, counts);
-        if (is_plain && group->step == 4)
+        if (is_short)
             return decode_runs(scan, group, &own, TABLED, 4, 1, 0, record, row, counts);
-        if (is_plain && group->step == 12 && own.has_moves)
+        if (is_long && own.has_moves)
             return decode_runs(scan, group, &own, TABLED, 12, 1, 1, record, row, counts);
-        if (is_plain && group->step == 12)
+        if (is_long)
             return decode_runs(scan, group, &own, TABLED, 12, 1, 0, record, row, counts);
         return decode_runs(scan, group, &own, TABLED, group->step, 0, own.has_moves, record, row,
                            counts);
@@ -804,7 +817,7 @@ static int64_t decode_placed(const Scan *scan, const Group *group, int64_t membe
         const __m128 range_m = _mm_sqrt_ps(_mm_add_ps(
             _mm_add_ps(_mm_mul_ps(x, x), _mm_mul_ps(y, y)), _mm_mul_ps(z, z)));
         __m128 keep = _mm_cmpgt_ps(range_m, _mm_setzero_ps());
-        found += LANES[_mm_movemask_ps(keep)];
+        found += NEXT[_mm_movemask_ps(keep)][3];
         if (limits_m)
             keep = _mm_and_ps(keep, _mm_and_ps(_mm_cmpge_ps(range_m, low_m),
                                                _mm_cmple_ps(range_m, high_m)));

@@ -83,9 +83,10 @@ typedef struct {
     Ring *rings; /* (members,) */
     /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
-       TURNING: cosine and sine (columns of the scan,); origin as direction; used (members,): bits
-       of the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from bit 3) of the direction
-       are not zero; from bit 6 the same of the origin.
+       TURNING: cosine and sine (columns of the scan,); origin as direction.
+       used (members,): bits of the axes in which vectors 1 and 2 (from bit 0) and vector 3 (from
+       bit 3) of the direction are not zero; TURNING: from bit 6 the same of the origin; TABLED: as
+       if no vector were zero where the sign of a zero coordinate depends on all of them.
        PLACED: pixels are planes of float32 from the byte of the first run: x, y, z, intensity;
        direction (members, 3, 3): rotation; origin (members, 3): translation, m. */
     const float *direction;

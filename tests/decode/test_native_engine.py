@@ -22,7 +22,7 @@ from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
 from mlbatch.frames.transforms import from_rpy_deg
-from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.geometry import BeamTable, rotor_words
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.library import library
 from mlbatch.pipeline.conversion import Conversion
@@ -38,11 +38,13 @@ pytestmark = needs_native
 
 START_NS = 1_800_000_000_000_000_000
 END_NS = 1_800_000_000_100_000_000
-# Tilted, level, and where the vehicle is: sensors that are decoded together differ in these.
+# Tilted, level, where the vehicle is, and upside down, with zeros of both signs: sensors that are
+# decoded together differ in these.
 POSES = (
     from_rpy_deg((0.3, -1.1, 1.7), (3.0, -7.0, 131.0)),
     from_rpy_deg((-1.0, 0.0, 1.8), (0.0, 0.0, 180.0)),
     np.eye(4),
+    np.array([[1, 0, 0, 0], [0, -1, 0, 0], [-0.0, -0.0, -1, 0], [0, 0, 0, 1]]),
 )
 NAMES = tuple(name for name in PROFILES if name != "OFF")
 GUARD_ROWS = 64
@@ -235,6 +237,24 @@ def check(lidars: list[Lidar], case: Case) -> None:
 @settings(max_examples=40)
 def test_any_pixels_of_any_profile(case: Case, profile: str, beams: int) -> None:
     check([ouster(profile, beams)], case)
+
+
+@pytest.mark.parametrize("pose", range(len(POSES)))
+@pytest.mark.parametrize("profile", ["RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"])
+@pytest.mark.parametrize("origin_m", [None, 0.0, -0.0])
+def test_upright_sensors_with_beams_at_elevation_0(
+    pose: int, profile: str, origin_m: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Terms of zero are left out: origins of -0 show their sign."""
+    altitude_deg = (5.0,) * 64 + (0.0,) * 64
+    spec = OusterSpec(profile, 128, 512, altitude_deg=altitude_deg, azimuth_deg=(0.0,) * 128)
+    found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
+    assert found is not None
+    if origin_m is not None:
+        rows = np.full((512, 3, 1), origin_m, np.float32)
+        monkeypatch.setattr(BeamTable, "origins", lambda self: rows)
+    case = Case(pose, 700, "dense", frozenset(), is_cut=False, keeps_repeated=True)
+    check([cast(Lidar, found.lidar({}, None))], case)
 
 
 @given(case=cases, chosen=st.lists(st.integers(0, len(OTHERS) + 1), min_size=1, max_size=4))
