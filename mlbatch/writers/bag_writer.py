@@ -27,6 +27,7 @@ from mlbatch.writers.message_writer import (
     MessageFile,
     MessageWriter,
     PendingChunk,
+    stamp_ns,
     static_transforms,
 )
 
@@ -89,6 +90,10 @@ class BagWriter(MessageWriter):
         if last is not None:
             last(self._output.partial)
         self._output.publish()
+
+    def begin_file(self, log_ns: int) -> None:
+        """Begin the file of the window, if no message has begun it; log_ns: of the first one."""
+        self._bag.begin(log_ns)
 
     def path_of_file(self, number: int) -> Path:
         """Return the path of a file, in the folder under construction."""
@@ -154,6 +159,10 @@ class BagFiles:
         if block != self._block:
             self._end_file()
             self._block = block
+
+    def begin(self, log_ns: int) -> None:
+        """Begin the file of the window, as a message of this log time would."""
+        self._file(log_ns)
 
     def adopt(self, count: int) -> None:
         """Continue after `count` complete files that are in the folder."""
@@ -310,6 +319,8 @@ class _PassedJob(ScanJob):
 
     def append(self) -> None:
         self._writer.place_scan(self._scan)
+        # Another shard sends its message, which begins the file.
+        self._writer.begin_file(stamp_ns(self._scan))
         self._chunks.append()
 
     def compress(self) -> None:

@@ -18,7 +18,15 @@ from mlbatch.pipeline import resume
 from mlbatch.types import Scan
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
-from tests.builders.sessions import FIXTURE, Outcome, Shell, recording_shell
+from tests.builders.captures import write_pcap
+from tests.builders.sessions import (
+    FIXTURE,
+    Outcome,
+    Shell,
+    Unit,
+    recording_shell,
+    write_metadata,
+)
 from tests.resume_storm import contents, write_recordings
 
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
@@ -106,6 +114,9 @@ def test_every_shard_has_its_scans_and_no_report(shell: Shell) -> None:
         "--format rosbag2 --max-bag-duration 0.2 --keep-partial --compression zstd:1",
         "--format rosbag2 --max-bag-duration 0.3 --split --slices 2 --point-layout ouster",
         "--format rosbag2 --max-bag-duration 5 --layout organized --start +0.2",
+        "--format rosbag2 --max-bag-duration 0.2 --batching latest",
+        "--format rosbag2 --max-bag-duration 0.2 --stamp end --drop-incomplete 70 "
+        "--fault drop:left:30% --fault-seed 5",
     ],
 )
 def test_options_give_the_bytes_of_one_run(shell: Shell, options: str) -> None:
@@ -130,6 +141,16 @@ def test_files_of_a_bag_with_messages_are_those_of_one_run(
     write_recordings(Path(), turns=9)
     options = f"--pass /chatter --format rosbag2 --max-bag-duration {seconds} {jobs}"
     _assert_as_one_run(shell, f"bag/drive.mcap --identity-extrinsics {options}", 3)
+
+
+@pytest.mark.parametrize("options", ["", "--split", "--slices 2 --keep-partial"])
+def test_files_of_a_bag_without_messages_are_those_of_one_run(shell: Shell, options: str) -> None:
+    """The packets of lidars alone: other shards' files begin without a message."""
+    Path("in").mkdir()
+    unit = Unit(turns=9)
+    write_metadata(Path("in/111.json"), unit.spec)
+    write_pcap(Path("in/drive.pcap"), unit.records)
+    _assert_as_one_run(shell, f"in/drive.pcap --format rosbag2 --max-bag-duration 0.2 {options}", 3)
 
 
 def test_every_shard_has_its_files_of_a_bag(shell: Shell) -> None:

@@ -226,8 +226,12 @@ def _numbers(folder: Path) -> Iterator[int]:
     return iter(sorted(int(path.stem.rpartition("_")[2]) for path in folder.glob("*.mcap")))
 
 
-def test_a_shard_writes_every_nth_file(tmp_path: Path) -> None:
-    """With one file in three: windows 2, 3 and 8, 9 of files 0 to 4."""
+@pytest.mark.parametrize("has_notes", [True, False])
+def test_a_shard_writes_every_nth_file(tmp_path: Path, has_notes: bool) -> None:
+    """With one file in three: windows 2, 3 and 8, 9 of files 0 to 4.
+
+    Without messages nothing of the other files is seen but scans without points.
+    """
     writer = open_writer(
         *("rosbag2", tmp_path / "out", dense_scan().info),
         WriterOptions(max_bag_s=0.2, share=(2, 3)),
@@ -237,9 +241,11 @@ def test_a_shard_writes_every_nth_file(tmp_path: Path) -> None:
         is_own = index // 2 % 3 == 1
         job = writer.write(_scan(index)) if is_own else writer.pass_over(_scan(index))  # type: ignore[attr-defined]
         job.start(index)
-        writer.write_message(note(ROS2_NOTE, str(index), index * PERIOD_NS))
+        if has_notes:
+            writer.write_message(note(ROS2_NOTE, str(index), index * PERIOD_NS))
         run_job(job)
     finish_part()
+    assert writer.bag_files == 5  # type: ignore[attr-defined]
     assert list(_numbers(tmp_path / "out")) == [1, 4]
     notes = [
         message[8:-1].decode()
@@ -247,7 +253,14 @@ def test_a_shard_writes_every_nth_file(tmp_path: Path) -> None:
         for topic, _, message in _messages(tmp_path / "out" / f"out_{number}.mcap")
         if topic == "/note"
     ]
-    assert notes == ["2", "3", "8", "9"]
+    assert notes == (["2", "3", "8", "9"] if has_notes else [])
+    starts = [
+        (log_ns - START_NS) // PERIOD_NS
+        for number in (1, 4)
+        for topic, log_ns, _ in _messages(tmp_path / "out" / f"out_{number}.mcap")
+        if topic == "/points"
+    ]
+    assert starts == [2, 3, 8, 9]
 
 
 def test_complete_files_survive_a_kill(tmp_path: Path) -> None:
