@@ -12,6 +12,7 @@ import random
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -19,10 +20,12 @@ import numpy as np
 import pytest
 
 from mlbatch import readers
+from mlbatch.discovery import discover
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.faults import Fault, parse_fault
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
+from mlbatch.rig.rig import read_rig
 from mlbatch.types import CaptureCounts, PacketBatch, Recording, Stream, StreamTable
 from tests.builders import livox
 from tests.builders.run import Values, csv_without_arrival, print_of
@@ -38,6 +41,9 @@ WAIT_NS = 40 * NS_PER_MS
 RATE = Fraction(50)
 LIVOX_IP = "10.0.0.5"
 LIVOX_PORT = 57000
+
+# The same rig in all conversions: to read it again would be a fifth of the time.
+_READ_RIG = lru_cache(maxsize=1)(read_rig)
 
 # Scans, scans.csv, ledgers, and what is the same for all scans.
 Print = tuple[list[Values], str, list[str], str]
@@ -100,7 +106,10 @@ class Session:
         def opened(path: Path, streams: StreamTable) -> Recording:
             return self.recording(order, rng, streams, is_timely=bool(faults))
 
-        with patch.object(readers, "open_recording", opened):
+        with (
+            patch.object(readers, "open_recording", opened),
+            patch.object(discover, "read_rig", _READ_RIG),
+        ):
             return printed(replace(self.job, faults=faults))
 
     @property
