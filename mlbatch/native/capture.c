@@ -164,9 +164,9 @@ EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *
 
 static uint64_t word8(const uint8_t *at)
 {
-    uint64_t word;
-    memcpy(&word, at, sizeof word);
-    return word;
+    uint64_t value;
+    memcpy(&value, at, sizeof value);
+    return value;
 }
 
 /* Ask for a line of 64 bytes. */
