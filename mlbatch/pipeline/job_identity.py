@@ -12,15 +12,18 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import mlbatch
 from mlbatch.errors import RecordingError
-from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.sensor import Sensor
 from mlbatch.writers import WriterOptions
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.conversion import Conversion
+    from mlbatch.pipeline.sensor import Sensor
 
 # Fields of a job that are not part of its identity: digests of files and sensors replace them, or
 # the output does not depend on them.

@@ -14,19 +14,21 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mlbatch.errors import ClockJump, UsageError
-from mlbatch.pipeline.conversion import Conversion
-from mlbatch.pipeline.decode_pool import DecodeTask, Outcomes
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.job_identity import difference, input_identity, job_identity
 from mlbatch.pipeline.state_file import FinishedScan, State, StateFile, read_state, state_path
 from mlbatch.types import ImuSamples, Message
 from mlbatch.writers import ScanWriter, WriterOptions, discard, discard_old, partial_path
 from mlbatch.writers.output_file import crc32
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.conversion import Conversion
+    from mlbatch.pipeline.decode_pool import DecodeTask, Outcomes
 
 # A kill costs no more than the work since the last record of the state file.
 INTERVAL_S = 0.5
@@ -73,6 +75,9 @@ def abandon(target: Path) -> None:
 
 def find_jump(job: Job) -> ClockJump | None:
     """First clock step in the session of a job, None without; nothing is decoded."""
+    # A merge of shards, which needs this module, converts nothing.
+    from mlbatch.pipeline.conversion import Conversion
+
     run = Conversion(job)
     try:
         for _ in run.windows():

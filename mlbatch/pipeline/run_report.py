@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,10 +16,11 @@ from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
+from mlbatch.pipeline.point_notes import point_notes
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
 from mlbatch.pipeline.time_limits import text_of_range, text_of_time
-from mlbatch.report.ledger import PointCounts, ordered
+from mlbatch.report.ledger import ordered
 from mlbatch.report.report import (
     ClockReport,
     FaultReport,
@@ -231,30 +232,6 @@ def notes_of_run(run: Conversion) -> Iterator[Note]:
     """Warnings about the points of a run."""
     points = [(sensor.name, sensor.ledger.points) for sensor in run.sensors]
     return point_notes(points, _NO_SCANS if run.table is None else run.table.statistics(0))
-
-
-def point_notes(points: Sequence[tuple[str, PointCounts]], scans: ScanStatistics) -> Iterator[Note]:
-    """Clipped intensities; scans with columns but no points: of a sensor, and of all.
-
-    points: name and counts of each sensor.
-    """
-    for name, counts in points:
-        if counts.clipped:
-            text = (
-                f"{name}: {counts.clipped} of {counts.written} points "
-                f"({counts.clipped / counts.written:.2%}) have an intensity outside 0 to 255, "
-                "which the point layout clips; choose one with a float32 intensity"
-            )
-            yield Note("clipped", name, text)
-    for name, count in scans.no_points.items():
-        text = (
-            f"{name}: {count} of {scans.written} scans have its columns but none of its points: no "
-            "returns, or all excluded; check its window, --min-range and --exclude-box"
-        )
-        yield Note("no_points", name, text)
-    if scans.empty_clouds:
-        text = f"{scans.empty_clouds} clouds without a point were written"
-        yield Note("empty_cloud", "", text)
 
 
 def unassigned_notes(run: Conversion) -> Iterator[Note]:

@@ -20,7 +20,7 @@ from typing import Any
 from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.pipeline import resume
 from mlbatch.pipeline.job_identity import difference
-from mlbatch.pipeline.run_report import point_notes
+from mlbatch.pipeline.point_notes import point_notes
 from mlbatch.pipeline.shard_part import Account, ShardScan, read_account
 from mlbatch.pipeline.state_file import State, StateFile, state_path
 from mlbatch.report.ledger import PointCounts

@@ -318,14 +318,17 @@ class ChunkJob(ScanJob):
         self._chunks: Sequence[PendingChunk] = ()
 
     def append(self) -> None:
+        """Take the chunks."""
         with export_errors(self._partial):
             self._chunks = self._file.take_chunks()
 
     def compress(self) -> None:
+        """Compress them."""
         for chunk in self._chunks:
             chunk.compress()
 
     def commit(self) -> None:
+        """Write them."""
         with export_errors(self._partial):
             for chunk in self._chunks:
                 chunk.write()
