@@ -151,6 +151,10 @@ def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
             f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
             "another; name the output of `mlbatch convert`"
         )
+    if "windows_per_file" in grid and not output.is_dir():
+        raise RecordingError(
+            f"{path}: expected a whole output, found one of the files of a bag; name its folder"
+        )
     report = file.metadata.get("mlbatch.report", {}).get("json", "")
     table = file.attachments.get("scans.csv", b"").decode("utf-8", "replace")
     own = RunFiles(str(path), report, table)

@@ -101,8 +101,8 @@ def check_max_bag_s(option: str, seconds: float) -> float:
     """`max_bag_s` of a job: 0 if not given, else above 0."""
     if not 0 <= seconds <= MOST_S:
         raise UsageError(
-            f"{option}: expected seconds above 0, found {seconds}; write 60, or leave it out for "
-            "one file"
+            f"{option}: expected seconds above 0 and at most {MOST_S}, found {seconds}; write 60, "
+            "or leave it out for one file"
         )
     return seconds
 

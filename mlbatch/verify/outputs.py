@@ -164,6 +164,10 @@ def _check_mcap(
                 f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, "
                 f"found one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
             )
+        if _PIECES in grid and not output.path.is_dir():
+            raise VerifyError(
+                f"{path}: expected a whole output, found one of the files of a bag; name its folder"
+            )
         log.equal("metadata", f"{path.name} profile", "ros2", file.profile)
         grids.append(grid)
         mcaps.append(file)

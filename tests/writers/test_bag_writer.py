@@ -290,9 +290,12 @@ def test_complete_files_survive_a_kill(tmp_path: Path) -> None:
     [
         ("-o out.mcap --max-bag-duration 5", "expected --format rosbag2, a folder of several"),
         ("-o out --max-bag-duration 5", "found npz"),
-        ("-o out --format rosbag2 --max-bag-duration=-1", "expected seconds above 0, found -1"),
-        ("-o out --format rosbag2 --max-bag-duration nan", "expected seconds above 0, found nan"),
-        ("-o out --format rosbag2 --max-bag-duration inf", "expected seconds above 0, found inf"),
+        (
+            "-o out --format rosbag2 --max-bag-duration=-1",
+            "expected seconds above 0 and at most 8589934592, found -1",
+        ),
+        ("-o out --format rosbag2 --max-bag-duration nan", "at most 8589934592, found nan"),
+        ("-o out --format rosbag2 --max-bag-duration inf", "at most 8589934592, found inf"),
         ("-o out --format rosbag2 --shard 1/2", "expected --max-bag-duration for rosbag2"),
     ],
 )
@@ -313,6 +316,18 @@ def test_a_lost_file_is_found(shell: Shell) -> None:
     violations = [one["where"] for one in json.loads(outcome.out)["violations"]]
     assert "metadata.yaml relative_file_paths" in violations
     assert shell("digest out").code == 1
+
+
+@pytest.mark.parametrize("command", ["verify", "digest"])
+def test_one_file_is_not_taken_for_the_output(shell: Shell, command: str) -> None:
+    words = f"convert {CAPTURE} --format rosbag2 --max-bag-duration 0.3 -o out -q"
+    assert shell(words).code == 0
+    outcome = shell(f"{command} out/out_1.mcap")
+    assert outcome.code == 1
+    assert outcome.err == (
+        "mlbatch: error: out/out_1.mcap: expected a whole output, found one of the files of a bag; "
+        "name its folder\n"
+    )
 
 
 def test_a_lost_file_is_not_resumed(tmp_path: Path) -> None:
