@@ -239,6 +239,7 @@ def _take_scans(parts: Sequence[Part], writer: FolderWriter) -> None:
 
 def _take_bag(parts: Sequence[Part], writer: ScanWriter) -> None:
     """Have the files of a bag in the output; RecordingError unless each is in one part."""
+    from mlbatch.writers.bag_metadata import read_file
     from mlbatch.writers.bag_writer import BagWriter, number_of_file
 
     account = parts[0].account
@@ -257,6 +258,8 @@ def _take_bag(parts: Sequence[Part], writer: ScanWriter) -> None:
         )
     for number, source, size in owners:
         _take(source, size, writer.path_of_file(number or 0))
+        # An error names the part, not the output.
+        read_file(source)
     writer.adopt_files(account.bag_files)
 
 

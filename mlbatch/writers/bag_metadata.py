@@ -66,9 +66,9 @@ def read_file(path: Path) -> BagFile:
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
     except McapError as err:
-        raise ExportError(f"{path}: expected a complete MCAP file, found {err}") from err
+        raise _incomplete(path, str(err) or type(err).__name__) from err
     if summary is None or summary.statistics is None:
-        raise ExportError(f"{path}: expected a complete MCAP file, found one without a summary")
+        raise _incomplete(path, "one without a summary")
     statistics = summary.statistics
     topics = (
         BagTopic(
@@ -84,15 +84,21 @@ def read_file(path: Path) -> BagFile:
     return BagFile(path.name, first_ns, last_ns, tuple(topics))
 
 
+def _incomplete(path: Path, found: str) -> ExportError:
+    return ExportError(
+        f"{path}: expected a complete MCAP file, found {found}; convert again with --overwrite"
+    )
+
+
 def metadata_text(files: Sequence[BagFile]) -> str:
-    """Return the text of metadata.yaml; JSON strings are valid YAML strings."""
-    names = "".join(f"    - {json.dumps(file.name)}\n" for file in files)
+    """Return the text of metadata.yaml."""
+    names = "".join(f"    - {_quoted(file.name)}\n" for file in files)
     topics = "".join(
         f"    - topic_metadata:\n"
-        f"        name: {json.dumps(topic.name)}\n"
-        f"        type: {json.dumps(topic.type)}\n"
+        f"        name: {_quoted(topic.name)}\n"
+        f"        type: {_quoted(topic.type)}\n"
         f"        serialization_format: {topic.encoding}\n"
-        f"        offered_qos_profiles: {json.dumps(topic.qos)}\n"
+        f"        offered_qos_profiles: {_quoted(topic.qos)}\n"
         f"      message_count: {topic.messages}\n"
         for topic in _all_topics(files)
     )
@@ -113,6 +119,12 @@ def metadata_text(files: Sequence[BagFile]) -> str:
     )
 
 
+def _quoted(text: str) -> str:
+    """Return a YAML string: as in JSON, but pairs of escapes, which YAML does not join, are one."""
+    parts = (f"\\U{ord(one):08x}" if one > "\uffff" else json.dumps(one)[1:-1] for one in text)
+    return f'"{"".join(parts)}"'
+
+
 def _all_topics(files: Iterable[BagFile]) -> Iterable[BagTopic]:
     """Return each topic once, with its messages in all files, as they appear first."""
     found: dict[str, BagTopic] = {}
@@ -125,7 +137,7 @@ def _all_topics(files: Iterable[BagFile]) -> Iterable[BagTopic]:
 
 def _text_of_file(file: BagFile) -> str:
     return (
-        f"    - path: {json.dumps(file.name)}\n"
+        f"    - path: {_quoted(file.name)}\n"
         f"      starting_time:\n        nanoseconds_since_epoch: {file.first_ns}\n"
         f"      duration:\n        nanoseconds: {file.last_ns - file.first_ns}\n"
         f"      message_count: {file.messages}\n"

@@ -173,7 +173,7 @@ def test_a_renamed_part_of_a_bag_is_merged(shell: Shell) -> None:
     assert contents(Path("merged")) == whole
 
 
-@pytest.mark.parametrize("damage", ["lost", "short", "unlisted"])
+@pytest.mark.parametrize("damage", ["lost", "short", "unlisted", "zeros"])
 def test_a_damaged_part_of_a_bag_is_named(shell: Shell, damage: str) -> None:
     folders = _shards(shell, f"{CAPTURE} --format rosbag2 --max-bag-duration 0.2", 2)
     file = Path("part2/part2_3.mcap")
@@ -184,6 +184,12 @@ def test_a_damaged_part_of_a_bag_is_named(shell: Shell, damage: str) -> None:
     elif damage == "short":
         os.truncate(file, size - 1)
         _refused(shell, folders, 1, f"expected {size} bytes, found {size - 1}")
+    elif damage == "zeros":
+        with file.open("r+b") as opened:
+            opened.seek(-60, os.SEEK_END)
+            opened.write(bytes(60))
+        words = "part2/part2_3.mcap: expected a complete MCAP file, found EndOfFile; convert again"
+        _refused(shell, folders, 1, words)
     else:
         _changed("part2", {"files": {"part2_1.mcap": 5}})
         _refused(shell, folders, 1, "expected the 4 files of the bag", "found 3")

@@ -222,6 +222,18 @@ def test_metadata_by_hand(tmp_path: Path) -> None:
     assert counts == {"/tf_static": 2, "/note": 3, "/left/imu": 2, "/points": 3}
 
 
+@pytest.mark.parametrize("name", ["drive é", "run 😀", 'quo"ted\\', "tab\there"])
+@pytest.mark.parametrize("seconds", [0.0, 0.2])
+def test_any_name_can_be_read(tmp_path: Path, name: str, seconds: float) -> None:
+    scan = _scan(0)
+    writer = open_writer("rosbag2", tmp_path / name, scan.info, WriterOptions(max_bag_s=seconds))
+    run_job(writer.write(scan))
+    writer.finish(SUMMARY)
+    assert _about(tmp_path / name)["relative_file_paths"] == [f"{name}_0.mcap"]
+    with AnyReader([tmp_path / name]) as reader:
+        assert reader.message_count == 2
+
+
 def _numbers(folder: Path) -> Iterator[int]:
     return iter(sorted(int(path.stem.rpartition("_")[2]) for path in folder.glob("*.mcap")))
 
