@@ -58,15 +58,21 @@ def file_of_container(container: McapContainer, name: str) -> BagFile:
 
 
 def read_file(path: Path) -> BagFile:
-    """Describe a complete file by its summary; ExportError where there is none."""
-    from mcap.exceptions import McapError
+    """Describe a complete file by its summary; ExportError where it cannot be read."""
+    try:
+        return _file_of_summary(path)
+    except (ExportError, OSError):
+        raise
+    # Damaged bytes raise errors of many types in the library, and others in its versions.
+    except Exception as err:
+        raise _incomplete(path, str(err) or type(err).__name__) from err
+
+
+def _file_of_summary(path: Path) -> BagFile:
     from mcap.reader import make_reader
 
-    try:
-        with path.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
-    except McapError as err:
-        raise _incomplete(path, str(err) or type(err).__name__) from err
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
     if summary is None or summary.statistics is None:
         raise _incomplete(path, "one without a summary")
     statistics = summary.statistics

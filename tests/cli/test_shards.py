@@ -188,8 +188,9 @@ def test_a_damaged_part_of_a_bag_is_named(shell: Shell, damage: str) -> None:
         with file.open("r+b") as opened:
             opened.seek(-60, os.SEEK_END)
             opened.write(bytes(60))
-        words = "part2/part2_3.mcap: expected a complete MCAP file, found EndOfFile; convert again"
-        _refused(shell, folders, 1, words)
+        # What was found is named in the words of the mcap library, which differ by its version.
+        expected = "part2/part2_3.mcap: expected a complete MCAP file, found "
+        _refused(shell, folders, 1, expected, "; convert again")
     else:
         _changed("part2", {"files": {"part2_1.mcap": 5}})
         _refused(shell, folders, 1, "expected the 4 files of the bag", "found 3")
