@@ -427,10 +427,15 @@ class Batcher:
         merged = self._take_until(until)
         cuts = self._cuts(merged.stamp_ns)
         figures = self._merge.figures(merged, [stop for _, stop, _ in cuts])
+        # By window: the delivery that closed it, and up to where all sensors were by then.
+        closed_by = progress.watermark.searchsorted(np.array([end for *_, end in cuts], np.int64))
+        reached_ns = progress.newest[:, closed_by].min(axis=0).tolist()
+        ready_ns = progress.host_ns[closed_by - 1].tolist()
         begin = 0
-        for (window, stop, end), own in zip(cuts, figures, strict=True):
+        for (window, stop, end), own, reached, ready in zip(
+            cuts, figures, reached_ns, ready_ns, strict=True
+        ):
             start = self._grid.bound(window)
-            closed_by = int(progress.watermark.searchsorted(end))
             columns = merged.take(slice(begin, stop))
             begin = stop
             # Also of windows that are dropped: later ones must not depend on options.
@@ -445,8 +450,8 @@ class Batcher:
                 slice=window % self._grid.slices,
                 start_ns=start,
                 end_ns=end,
-                complete=self._complete(progress, closed_by, start, end),
-                ready_host_ns=int(progress.host_ns[closed_by - 1]),
+                complete=reached >= end and self._is_covered(start, end),
+                ready_host_ns=ready,
                 columns=columns,
                 figures=own,
                 edge_gap_ns=gaps_ns,
@@ -479,15 +484,13 @@ class Batcher:
             cuts.append((window, done, end))
         return cuts
 
-    def _complete(self, progress: Progress, at: int, start: int, end: int) -> bool:
-        """True if every sensor began by the start, reached the end, and no stall overlaps."""
-        # As a list, since there are few sensors.
-        if min(progress.newest[:, at].tolist()) < end:
-            return False
+    def _is_covered(self, start: int, end: int) -> bool:
+        """True if every sensor began by the start, and no stall overlaps."""
         for track in self._tracks:
             if track.first_ns > start:
                 return False
-            if any(before < end and after > start for before, after in track.gaps):
+            # Most sensors have none.
+            if track.gaps and any(before < end and after > start for before, after in track.gaps):
                 return False
         return True
 

@@ -56,16 +56,16 @@ class FillMeter:
     def measure(self, length_ns: int, figures: WindowFigures, columns: WindowColumns) -> F32Array:
         """Fill (s,) of a window of this length, from its columns; NaN: unknown."""
         fills = []
-        for number, one in enumerate(self._sensors):
-            count = figures[number].columns
+        for number, (one, own_figures) in enumerate(zip(self._sensors, figures, strict=True)):
+            count = own_figures.columns
             if one.learns and count:
                 own = np.flatnonzero(columns.sensor == number)
                 one.learn(columns.stamp_ns[own], columns.encoder[own])
-            fills.append(_share(count, one.columns(length_ns)))
+            fills.append(_fill(count, one.columns(length_ns)))
         return np.array(fills, np.float32)
 
 
-def _share(count: int, expected: float) -> float:
+def _fill(count: int, expected: float) -> float:
     """The fill; expected: NaN if the rate of the sensor is unknown."""
     if math.isnan(expected):
         # Whatever the rate is, there should be columns.
@@ -83,22 +83,25 @@ class _Expectation:
     _seen: BoolArray = field(default_factory=lambda: np.zeros(SECTORS, np.bool_))
     _lit_share: float = 0.0
     _revolution_ns: float = 0.0
+    # False once all is known: at once, or after a revolution, except with dark sectors.
+    learns: bool = field(init=False)
+    # `columns` by length of the window, of which there are two at most: its bounds are rounded.
+    _columns: dict[int, float] = field(default_factory=dict)
 
-    @property
-    def learns(self) -> bool:
-        """False once all is known: at once, or after a revolution, except with dark sectors."""
-        return self.pace.columns_per_s > 0 and self._share < 1.0
-
-    @property
-    def _share(self) -> float:
-        known = self.pace.lit_share
-        return self._lit_share if known is None else known
+    def __post_init__(self) -> None:
+        """Find out whether there is something to learn."""
+        if self.pace.lit_share is not None:
+            self._lit_share = self.pace.lit_share
+        self.learns = self.pace.columns_per_s > 0 and self._lit_share < 1.0
 
     def learn(self, stamp_ns: I64Array, encoder: I64Array) -> None:
         """Update dark sectors and the speed of the rotor by columns (n,) of a window."""
         positions = self.pace.positions
         self._seen[np.clip(sectors(encoder, positions), 0, SECTORS - 1)] = True
-        self._lit_share = int(np.count_nonzero(self._seen)) / SECTORS
+        if self.pace.lit_share is None:
+            self._lit_share = int(np.count_nonzero(self._seen)) / SECTORS
+            self.learns = self._lit_share < 1.0
+        self._columns.clear()
         ticks = rotor_ticks(encoder) if positions is None else encoder
         turned = np.diff(ticks) / (_TICKS if positions is None else positions)
         turned -= np.rint(turned)
@@ -110,10 +113,16 @@ class _Expectation:
 
     def columns(self, length_ns: int) -> float:
         """Columns that any window of this length has at least, without loss; NaN: unknown."""
+        found = self._columns.get(length_ns)
+        if found is None:
+            found = self._columns[length_ns] = self._computed(length_ns)
+        return found
+
+    def _computed(self, length_ns: int) -> float:
         if not self.pace.columns_per_s:
             return UNKNOWN
         columns = self.pace.columns_per_s * length_ns / NS_PER_S
-        share = self._share
+        share = self._lit_share
         # Nothing is known of a sensor without a column so far, but that it should send.
         if share >= 1.0 or not self._seen.any():
             return columns

@@ -138,9 +138,11 @@ class Schedule:
         """True if window `index` begins in [--start, --end)."""
         if self.t_init_ns is None:
             return False
-        begin = self._grid.bound((index + self._first) * self._grid.slices)
         start = self._policy.start
         end = self._policy.end
+        if start is None and end is None:
+            return True
+        begin = self._grid.bound((index + self._first) * self._grid.slices)
         return (start is None or begin >= start.at(self.t_init_ns)) and (
             end is None or begin < end.at(self.t_init_ns)
         )

@@ -213,7 +213,8 @@ class Decoder:
         rows = slice(0, len(columns) if self._is_organized else points)
         buffer = self._buffer
         figures = header.figures or (NO_COLUMNS,) * len(self._info.sensors)
-        edge_gap_ns = header.edge_gap_ns or (0,) * len(figures)
+        counts, gaps_ns, coverage, overlap, _, _ = zip(*figures, strict=True)
+        edge_gap_ns = header.edge_gap_ns or (0,) * len(counts)
         has_column = "column" in self._extras and not self._is_organized
         return Scan(
             info=self._info,
@@ -235,11 +236,11 @@ class Decoder:
             column_stamp_ns=columns.stamp_ns,
             column_lidar_id=self._lidar_id(columns),
             points=points,
-            columns_per_sensor=tuple([one.columns for one in figures]),
+            columns_per_sensor=counts,
             points_per_sensor=tuple(map(sub, self._written(), before)),
-            max_gap_ns=tuple(map(max, [one.max_gap_ns for one in figures], edge_gap_ns)),
-            coverage=tuple([one.coverage for one in figures]),
-            overlap=tuple([one.overlap for one in figures]),
+            max_gap_ns=tuple(map(max, gaps_ns, edge_gap_ns)),
+            coverage=coverage,
+            overlap=overlap,
             fill=header.fill,
             is_partial=header.is_partial,
             packed=buffer.packed_points(

@@ -381,6 +381,8 @@ class Conversion:
 
         most_bytes: of messages, before the rest is left for the next call.
         """
+        if not self.passthrough.is_waiting:
+            return []
         return self.passthrough.drain_until(
             end_ns, self.batcher.limits_ns, self._clock_offset_ns(), most_bytes
         )

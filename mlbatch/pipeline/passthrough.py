@@ -86,6 +86,11 @@ class Passthrough:
             self.imu.drop_before(low_ns)
             self.messages.drop_before(low_ns)
 
+    @property
+    def is_waiting(self) -> bool:
+        """True if there are samples or messages in the queues."""
+        return self.imu.is_waiting or self.messages.is_waiting
+
     def drain_until(
         self,
         end_ns: int | None,
@@ -118,6 +123,11 @@ class ImuQueue:
         self._offsets_ns = list(offsets_ns)
         self._has_place = has_place
         self._waiting: list[ImuSamples] = []
+
+    @property
+    def is_waiting(self) -> bool:
+        """True if there are samples in the queue."""
+        return bool(self._waiting)
 
     def add(self, samples: ImuSamples) -> None:
         """Add samples of one sensor."""
@@ -262,6 +272,11 @@ class MessageQueue:
     def waiting(self) -> int:
         """Number of messages in the queue."""
         return len(self._near) + len(self._far)
+
+    @property
+    def is_waiting(self) -> bool:
+        """True if there are messages in the queue."""
+        return bool(self._near) or len(self._far) > 0
 
     @property
     def has_place(self) -> bool:
