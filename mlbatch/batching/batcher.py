@@ -412,17 +412,20 @@ class Batcher:
 
     # -- step 4: publish windows --------------------------------------------------------------
 
-    def _publish(self, progress: Progress, last_of_all: int | None = None) -> Iterator[Window]:
-        """Yield the windows that the watermark has passed; last_of_all: as in Schedule.enter."""
+    def _publish(self, progress: Progress, last_of_all: int | None = None) -> list[Window]:
+        """Return the windows that the watermark has passed; last_of_all: as in Schedule.enter.
+
+        All at once: between the decoding of two, none of this would still be in the cache.
+        """
         if self.t_init_ns is None:
-            return
+            return []
         until = FOREVER
         if last_of_all is None:
             if self._watermark <= 0:
-                return
+                return []
             until = self._grid.floor_bound(self._watermark)
         if until <= self._until:
-            return
+            return []
         self._until = until
         merged = self._take_until(until)
         cuts = self._cuts(merged.stamp_ns)
@@ -431,6 +434,7 @@ class Batcher:
         closed_by = progress.watermark.searchsorted(np.array([end for *_, end in cuts], np.int64))
         reached_ns = progress.newest[:, closed_by].min(axis=0).tolist()
         ready_ns = progress.host_ns[closed_by - 1].tolist()
+        windows = []
         begin = 0
         for (window, stop, end), own, reached, ready in zip(
             cuts, figures, reached_ns, ready_ns, strict=True
@@ -445,7 +449,7 @@ class Batcher:
             if reason:
                 self._drop(own, reason)
                 continue
-            yield Window(
+            one = Window(
                 index=self._schedule.index_of(window),
                 slice=window % self._grid.slices,
                 start_ns=start,
@@ -458,9 +462,11 @@ class Batcher:
                 fill=fill,
                 is_partial=self._schedule.is_partial(window, last_of_all),
             )
+            windows.append(one)
         for track in self._tracks:
             if track.gaps:
                 track.gaps = [gap for gap in track.gaps if gap[1] > until]
+        return windows
 
     def _take_until(self, until: int) -> WindowColumns:
         """Take the waiting columns before `until`, merged."""
