@@ -43,8 +43,7 @@ class Stream(NamedTuple):
         return frozenset({str(self), f"{address}:{self.port}"})
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
+class Topic(NamedTuple):
     """A topic of a bag as its recording describes it."""
 
     name: str
@@ -56,8 +55,7 @@ class Topic:
     latched: bool = False  # ROS 1 latching, or transient local durability
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """A message without lidar packets, as stored.
 
     data: a view that is valid until the next batch where the topic is in `Recording.lend`.
@@ -290,8 +288,7 @@ class ColumnHeaders:
     valid: BoolArray  # (P, C) True where the sensor reports the column as measured
 
 
-@dataclass(slots=True)
-class Pixels:
+class Pixels(NamedTuple):
     """Readings of n columns of one return: (n, channels) each."""
 
     range_m: F32Array  # 0: no return
@@ -327,8 +324,7 @@ def instant_ns(word: str, start_ns: int, end_ns: int) -> int:
 VARIANTS = ("batching", "batching_times", "stamp", "deskew", "deskew_to")
 
 
-@dataclass(frozen=True, slots=True)
-class RunInfo:
+class RunInfo(NamedTuple):
     """Properties that all scans of a run share."""
 
     sensors: tuple[SensorInfo, ...]  # in the order of `lidar_id`

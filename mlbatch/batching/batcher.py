@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,8 +62,7 @@ class Track:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 
 
-@dataclass(slots=True)
-class Progress:
+class Progress(NamedTuple):
     """State before the first delivery of a batch, and after each of its E deliveries."""
 
     newest: I64Array  # (S, E + 1) int64, newest stamp of each sensor

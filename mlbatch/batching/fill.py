@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ _TICKS = 2.0**32
 _ROUNDING = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
+class Pace(NamedTuple):
     """Columns that a sensor sends.
 
     columns_per_s: while it measures, 0: unknown; lit_share: share of a revolution in which it

@@ -7,7 +7,7 @@ accepted ones for forward jumps of the clock. Both raise ClockJump.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -59,8 +59,7 @@ class Arrival:
         )
 
 
-@dataclass(slots=True)
-class Accepted:
+class Accepted(NamedTuple):
     """Accepted packets of one sensor on the common clock, in order of delivery."""
 
     packets: Arrival

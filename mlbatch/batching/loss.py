@@ -8,6 +8,7 @@ sends nothing because its rotor passes a dark sector.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -349,8 +350,7 @@ def _speed(packets: _Packets, step_ns: F64Array, is_gap: BoolArray) -> float:
     return float(turned[~is_gap].sum()) / time_ns if time_ns else 0.0
 
 
-@dataclass(slots=True)
-class _Sectors:
+class _Sectors(NamedTuple):
     """Sectors of a revolution, (k,) each, in revolutions, in the direction of the rotor."""
 
     begin: F64Array

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -31,8 +30,7 @@ DEFAULT_TIMEOUT_NS = 100 * NS_PER_MS
 _MIN_FALL = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Sweep:
+class Sweep(NamedTuple):
     """Columns of one sensor that are published together.
 
     first_ns, last_ns: timestamps of its first and last column; ready_ns: time of publication.

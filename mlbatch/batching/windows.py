@@ -8,6 +8,7 @@ sensors, t_init is the first bound after t0max.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from mlbatch.arrays import F32Array
 from mlbatch.batching.grid import Grid
@@ -27,8 +28,7 @@ class Limit:
         return self.ns + t_init if self.from_t_init else self.ns
 
 
-@dataclass(frozen=True, slots=True)
-class Policy:
+class Policy(NamedTuple):
     """Options of batching."""
 
     max_wait_ns: int | None = NS_PER_S  # idle-source timeout; None: none, as in the paper

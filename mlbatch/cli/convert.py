@@ -338,7 +338,6 @@ def convert(
         check_max_bag_s,
         check_sort,
     )
-    from mlbatch.pipeline.shards import parse_shard
     from mlbatch.readers.inputs import expand
     from mlbatch.report.limits import parse_limits
     from mlbatch.writers import parse_jobs
@@ -394,7 +393,7 @@ def convert(
         align_clocks_to=align_to if align_clocks else "",
         passed=tuple(pass_ or ()),
         max_bag_s=check_max_bag_s("--max-bag-duration", max_bag_duration),
-        shard=None if shard is None else parse_shard(shard),
+        shard=options.shard(shard),
         engine=engine,
     )
     run(

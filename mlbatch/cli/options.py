@@ -20,6 +20,7 @@ from mlbatch.units import parse_rate
 
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
+    from mlbatch.pipeline.shards import Shard
 
 # Every job needs memory for a few scans.
 
@@ -117,6 +118,16 @@ def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
     from mlbatch.faults import parse_fault
 
     return tuple(parse_fault(text) for text in texts)
+
+
+def shard(text: str | None) -> Shard | None:
+    """`--shard K/N`."""
+    if text is None:
+        return None
+    # Not loaded for runs without shards.
+    from mlbatch.pipeline.shards import parse_shard
+
+    return parse_shard(text)
 
 
 def seed(number: int) -> int:

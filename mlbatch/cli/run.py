@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
@@ -57,8 +57,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.shard_part import ShardOutput
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
+class Target(NamedTuple):
     """Where the result goes, and how much is printed."""
 
     output: Path | None
@@ -129,7 +128,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         if target.resume and _is_complete(output, overwrite=target.overwrite):
             return _beyond_limits_before(target, name)
         resume_log = _resume_log(job, output, name, options, resumes=target.resume)
-        options = replace(options, kept_bytes=resume_log.kept_bytes)
+        options = options._replace(kept_bytes=resume_log.kept_bytes)
         if options.kept_bytes is None:
             check_target(name, output, options, job.layout)
             if warning := preflight.check_disk(job, output):
@@ -149,7 +148,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         conversion, inputs = _converted(
             job, open_output, progress, resume_log, _last(target, report_path, shard_output)
         )
-    inputs = replace(inputs, command=_command())
+    inputs = inputs._replace(command=_command())
     for note in conversion.notes:
         say(f"warning: {note.code}: {note.message}")
     if shard_output is not None:
@@ -255,7 +254,7 @@ def _last(target: Target, report_path: Path | None, shard_output: ShardOutput | 
     if shard_output is None:
         return _report_writer(target, report_path)
     complete = shard_output.complete
-    return lambda inputs, partial: complete(replace(inputs, command=_command()), partial)
+    return lambda inputs, partial: complete(inputs._replace(command=_command()), partial)
 
 
 def _report_writer(target: Target, report_path: Path | None) -> Last:
@@ -266,7 +265,7 @@ def _report_writer(target: Target, report_path: Path | None) -> Last:
             return
         is_inside = report_path.parent.absolute() == target.output.absolute()
         path = partial / report_path.name if is_inside else report_path
-        write_text(path, report_text(replace(inputs, command=_command())), target.fsync)
+        write_text(path, report_text(inputs._replace(command=_command())), target.fsync)
         if target.fsync and path.parent.absolute() != target.output.parent.absolute():
             sync_entries(path.parent)
 
@@ -410,8 +409,7 @@ def _refuse_jump(job: Job) -> None:
 
 def _numbered(target: Target, number: int) -> Target:
     """The target of a segment: scans.seg2.mcap, scans.seg2."""
-    return replace(
-        target,
+    return target._replace(
         output=_with_number(target.output, number, ".mcap", ".bag"),
         report=_with_number(target.report, number, ".json"),
         html=_with_number(target.html, number, ".html"),

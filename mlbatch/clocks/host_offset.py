@@ -7,7 +7,7 @@ wrong times for everything that was recorded with another clock.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from mlbatch.clocks.timescale import (
     EPOCH_NS,
@@ -40,8 +40,7 @@ _CAUSES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class HostOffset:
+class HostOffset(NamedTuple):
     """Clock of a sensor against the capture host's, in the middle of a recording."""
 
     sensor: str

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from mlbatch.arrays import I64Array
 from mlbatch.decode.projector import Extras, Projector
@@ -12,8 +11,7 @@ from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import RecordLayout, WindowColumns
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EngineSetup:
+class EngineSetup(NamedTuple):
     """The sensors that an engine decodes, and the layout of their scans.
 
     seat: (sensors, 2) int64, index of the projector of each sensor, and its member there; -1: the

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,7 +75,7 @@ class NativeEngine:
                 self._groups.append(_DecodedGroup(own, self._structs[number], is_dense=is_dense))
             else:
                 seat = np.stack([np.minimum(members, 0), members], axis=1)
-                engine = NumpyEngine(replace(setup, projectors=own, seat=seat))
+                engine = NumpyEngine(setup._replace(projectors=own, seat=seat))
                 if setup.organized_slots:
                     # numpy writes its rows itself.
                     self._organized_numpy.append(engine)

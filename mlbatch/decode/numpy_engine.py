@@ -8,9 +8,8 @@ copied out of the tile has the order of the scan.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +26,7 @@ _NO_POINT = np.full(4, np.nan, np.float32).view(np.complex128)
 _LIDAR_ID_BIT = np.uint64(56)
 
 
-@dataclass(slots=True)
-class _TilePart:
+class _TilePart(NamedTuple):
     """Columns of a tile that one projector decoded.
 
     rows: (n,) their positions in the tile's share of the scan; begin: first element in the arrays
@@ -272,8 +270,7 @@ class NumpyEngine:
         (projector,) = self._projectors
         scratch = self._tile.view(0, len(columns), self._slots)
         rows = slice(first_row, first_row + len(columns))
-        view = replace(
-            scratch,
+        view = scratch._replace(
             point=out.point[rows],
             range_m=out.range_m[rows],
             reflectivity=out.reflectivity[rows],

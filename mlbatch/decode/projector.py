@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -105,8 +105,7 @@ class Tile:
         )
 
 
-@dataclass(slots=True)
-class TileView:
+class TileView(NamedTuple):
     """Columns of one projector in a tile: (n, slots) views of its arrays, `point` (n, slots, 4)."""
 
     point: F32Array

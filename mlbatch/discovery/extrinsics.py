@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
@@ -39,8 +39,7 @@ MAX_APART_RAD = 0.1 * RAD_PER_DEG
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Extrinsics:
+class Extrinsics(NamedTuple):
     """Poses of all sensors of a session in one body frame, warnings, and all static frames."""
 
     body_frame: str
@@ -403,7 +402,7 @@ def _poses_by_source(
         except RigError:
             continue
         if chain is not None and any(edge.source == source for edge in chain.edges):
-            yield replace(_tree_pose(chain, candidate), source=source)
+            yield _tree_pose(chain, candidate)._replace(source=source)
 
 
 def _contradictions(name: str, used: Pose, others: Iterable[Pose]) -> Iterator[Note]:

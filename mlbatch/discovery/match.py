@@ -10,7 +10,7 @@ import ipaddress
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -28,13 +28,12 @@ from mlbatch.sensors.advice import with_advice
 from mlbatch.types import StreamTable
 
 
-@dataclass(frozen=True, slots=True)
-class Matched:
+class Matched(NamedTuple):
     """Sensors, kinds of no sensor, and why a matching calibration of a kind could not be used."""
 
     sensors: list[DetectedSensor]
     unknown: list[PacketKind]
-    failures: dict[PacketKind, str] = field(default_factory=dict)
+    failures: dict[PacketKind, str]
 
 
 # -- the scorer -----------------------------------------------------------------------------------
@@ -116,7 +115,7 @@ def _parts(
             continue
         own = lidar.sent_by_me(evidence.sample[:, : lidar.packet_size])
         if own.any():
-            part = replace(evidence, sample=evidence.sample[own], host_ns=evidence.host_ns[own])
+            part = evidence._replace(sample=evidence.sample[own], host_ns=evidence.host_ns[own])
             yield number, own, part
 
 
@@ -169,7 +168,7 @@ def match(
     every = [*calibrations, *sensors.built_in(senders(sampler))]
     # By index of the calibration, and by stream where it is shared.
     found: dict[tuple[int, int], DetectedSensor] = {}
-    matched = Matched([], [])
+    matched = Matched([], [], {})
     for kind in sampler.kinds:
         fits, failure = best_fits(sampler.evidence(kind), every, options)
         if failure:
@@ -262,13 +261,12 @@ def _number_equal_names(found: Sequence[DetectedSensor]) -> None:
 # -- with a rig -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedSensor:
+class ExpectedSensor(NamedTuple):
     """A sensor of the rig, and calibrations it may have."""
 
     rig: RigSensor
     calibrations: Sequence[Calibration]
-    options: Mapping[str, str] = field(default_factory=dict)  # of the command line
+    options: Mapping[str, str]  # of the command line
 
     @property
     def name(self) -> str:
@@ -315,7 +313,7 @@ def match_rig(sampler: Sampler, expected: Sequence[ExpectedSensor], origin: Path
         sensor or _silent(sampler, one, unknown, used, origin)
         for sensor, one in zip(detected, expected, strict=True)
     ]
-    return Matched(found, unknown)
+    return Matched(found, unknown, {})
 
 
 def is_model(expected: str, found: str) -> bool:

@@ -31,8 +31,7 @@ class Note(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pose:
+class Pose(NamedTuple):
     """Extrinsics of a sensor."""
 
     body_from_sensor: F64Array  # (4, 4) float64, m

@@ -6,15 +6,13 @@ Source: docs/sources/messages.md section 6.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.tree import clean
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class Candidate(NamedTuple):
     """A possible frame of a sensor; lower ranks are tried first.
 
     sensor_from_frame: (4, 4), m, if the frame is not that of the points; else None.

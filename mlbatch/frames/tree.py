@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +23,7 @@ MOST_FRAMES = 1000
 _REMEDY = "give the extrinsics in a rig file (--rig)"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Edge:
+class Edge(NamedTuple):
     """A transform of a source; matrix: (4, 4) float64 parent_from_child, m."""
 
     parent: str
@@ -37,8 +35,7 @@ class Edge:
         return f"{self.parent} -> {self.child}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Chain:
+class Chain(NamedTuple):
     """The transforms from frame a to frame b; matrix: (4, 4) float64 a_from_b, m.
 
     frames: all from a to b; edges: between them.

@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -350,8 +350,7 @@ class Turning:
         np.add(sine, half, out=sine)
 
 
-@dataclass(frozen=True, slots=True)
-class _Prepared:
+class _Prepared(NamedTuple):
     """Columns of a sensor, and the planes (n, B) of each axis that `Turning` made, m."""
 
     columns: slice

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -34,8 +33,7 @@ class SensorModel(NamedTuple):
     same_packets_as: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class NeighbourStream:
+class NeighbourStream(NamedTuple):
     """Packets of another stream with the same source IP or topic namespace; as `Evidence`.
 
     Position, device and IMU packets contain facts that the packets of a lidar lack.
@@ -47,8 +45,7 @@ class NeighbourStream:
     host_ns: I64Array
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
+class Evidence(NamedTuple):
     """A sample of the packets of one stream and size, from which the sensor is identified.
 
     size: bytes of a payload; sample: (k, size) uint8, the first packets, then some of each quarter

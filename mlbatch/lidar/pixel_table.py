@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class BitField:
+class BitField(NamedTuple):
     """An unsigned integer in a pixel: `(word >> shift) & mask` of the word at byte `first`.
 
     word: numpy type, "u1", "<u2", ">u2" or "<u4".
@@ -21,8 +20,7 @@ class BitField:
     mask: int = 0xFFFFFFFF
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelRun:
+class ChannelRun(NamedTuple):
     """Channels with evenly spaced pixels.
 
     first_byte: offset of the first pixel in a record; channel: its channel; channels: their number.
@@ -33,8 +31,7 @@ class ChannelRun:
     channels: int
 
 
-@dataclass(frozen=True, slots=True)
-class ReturnLayout:
+class ReturnLayout(NamedTuple):
     """The pixels of one return; reflectivity: None if the sensor has none besides intensity."""
 
     runs: tuple[ChannelRun, ...]
@@ -43,8 +40,7 @@ class ReturnLayout:
     reflectivity: BitField | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PixelTable:
+class PixelTable(NamedTuple):
     """The pixels of a record, `step` bytes from channel to channel.
 
     The range in m is `distance * factor / divisor`, each step rounded to float32; 0 (no return) if

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ NO_ROOM, CUT, TOO_LONG = range(3)
 _ROOM = 1 << 14
 
 
-@dataclass(slots=True)
-class Found:
+class Found(NamedTuple):
     """Rows of Ethernet frames: columns of datagrams (5, n) and fragments (8, n); other frames."""
 
     datagrams: I64Array

@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -161,7 +161,7 @@ class Conversion:
     def _plain_decoder(self) -> Decoder:
         """A decoder for the thread that batches: dense scans of all sensors, with columns."""
         # There is a window, so that the clocks are known.
-        info = replace(self._run_info(), layout="dense", sort="columns")
+        info = self._run_info()._replace(layout="dense", sort="columns")
         sources = with_own_lidars([sensor.source() for sensor in self.sensors])
         boxes_m = self.session.boxes_m
         extras = frozenset({"column"})

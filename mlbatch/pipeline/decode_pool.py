@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
-from mlbatch.pipeline.shards import Shard
 from mlbatch.report.ledger import POINT_COUNTERS, PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
+
+if TYPE_CHECKING:
+    from mlbatch.pipeline.shards import Shard
 
 # Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]

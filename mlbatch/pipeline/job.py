@@ -14,12 +14,12 @@ from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.pipeline.shards import Shard
 from mlbatch.types import EXTRAS, INSTANTS, RecordLayout
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
+    from mlbatch.pipeline.shards import Shard
 
 DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S

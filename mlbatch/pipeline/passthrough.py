@@ -15,7 +15,7 @@ import heapq
 import math
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -425,7 +425,7 @@ class MessageQueue:
             else:
                 counts.written += 1
                 size += len(message.data) + MESSAGE_BYTES
-                taken.append(replace(message, host_ns=stamp_ns))
+                taken.append(message._replace(host_ns=stamp_ns))
         if end_ns is not None:
             self._taken_ns = end_ns
         self._most_bytes = max(_MEMORY_BYTES, self._near_bytes)

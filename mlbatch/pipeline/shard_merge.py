@@ -192,7 +192,7 @@ def merge(
 
         def complete(partial: Path) -> None:
             nonlocal report
-            report = replace(report, timing=_timing(parts, report, began_s))
+            report = report._replace(timing=_timing(parts, report, began_s))
             write_text(partial / REPORT_JSON, report_text(report), fsync)
 
         writer.finish(summary, complete)
@@ -303,8 +303,7 @@ def _merged_report(parts: Sequence[Part], table: ScanTable, command: str) -> Run
     before = account.notes_before_points
     warnings = (*earlier.warnings[:before], *notes, *earlier.warnings[before:])
     commands = [part.account.report.command for part in parts]
-    return replace(
-        earlier,
+    return earlier._replace(
         sensors=sensors,
         scans=scans,
         warnings=warnings,

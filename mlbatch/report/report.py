@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from fractions import Fraction
 from typing import NamedTuple, TypeAlias
 
@@ -118,8 +118,7 @@ class Warned(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True, slots=True)
-class RunReport:
+class RunReport(NamedTuple):
     """Content of a report."""
 
     inputs: tuple[InputReport, ...]

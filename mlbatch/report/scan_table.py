@@ -220,8 +220,7 @@ class _SensorTotals:
         return round(self.fill / self.known, 6) if self.known else None
 
 
-@dataclass(slots=True)
-class _Row:
+class _Row(NamedTuple):
     """A row of scans.csv; timestamps are only valid if there are columns."""
 
     key: tuple[int, int]

@@ -11,9 +11,10 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import yaml
 
@@ -34,8 +35,7 @@ _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "o
 _NULLS = ("", "~", "null", "Null", "NULL")
 
 
-@dataclass(frozen=True, slots=True)
-class Node:
+class Node(NamedTuple):
     """A value of the file: a scalar (`text`), a list (`items`) or a mapping (`entries`).
 
     path: keys from the root, as `sensors[1].name`; line: counts from 1; kind: scalar, list or
@@ -50,7 +50,7 @@ class Node:
     text: str = ""
     plain: bool = False
     items: tuple[Node, ...] = ()
-    entries: Mapping[str, Node] = field(default_factory=dict)
+    entries: Mapping[str, Node] = MappingProxyType({})
 
     def error(self, expected: str, found: str, remedy: str) -> RigError:
         """Return the error for an unusable value."""

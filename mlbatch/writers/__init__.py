@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
@@ -244,5 +243,5 @@ def check_target(name: str, target: Path, options: WriterOptions, layout: str) -
     from mlbatch.types import RunInfo
 
     info = RunInfo((), "", "10", "unknown", layout=layout)
-    open_writer(name, target, info, replace(options, split=False)).abandon()
+    open_writer(name, target, info, options._replace(split=False)).abandon()
     discard(target)

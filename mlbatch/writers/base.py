@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
@@ -17,8 +16,7 @@ NO_COMPRESSION = "none"
 PLY_STYLES = ("standard", "cloudcompare", "float")
 
 
-@dataclass(frozen=True, slots=True)
-class WriterOptions:
+class WriterOptions(NamedTuple):
     """Options of an output."""
 
     point_layout: str = DEFAULT_POINT_LAYOUT  # preset of PointCloud2 fields

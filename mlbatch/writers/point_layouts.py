@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -151,8 +150,7 @@ def seconds_toward_zero(time_ns: U32Array) -> F64Array:
     return value
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(NamedTuple):
     """One field of a record."""
 
     name: str
@@ -477,7 +475,7 @@ CLOUD_LAYOUTS = {
 }
 PLY_LAYOUT = Layout("ply", 30, _PLY)
 # CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
-_SCALARS = tuple(replace(field, name=f"scalar_{field.name}") for field in _PLY[3:])
+_SCALARS = tuple(field._replace(name=f"scalar_{field.name}") for field in _PLY[3:])
 # small_gicp reads four floats a vertex, whatever the header says.
 _FLOATS = (*_XYZ, _time(12))
 # By the styles of `--ply-style`.

@@ -83,7 +83,7 @@ def _decoder(run: Conversion, wanted: Job, engine: str) -> Decoder:
     info = session.run_info(rate_text(run.grid.rate), run.info.timescale)
     sensors = [replace(one, limits=limits(wanted, one.rig)) for one in run.sensors]
     return Decoder(
-        replace(info, layout=wanted.layout),
+        info._replace(layout=wanted.layout),
         [sensor.source() for sensor in sensors],
         excluded_boxes_m(wanted, session.setup.rig),
         wanted.extras,

@@ -169,7 +169,7 @@ def test_with_strict_clipping_is_an_error(shell: Shell, tmp_path: Path) -> None:
 def test_a_mixed_rig_takes_what_each_sensor_has() -> None:
     scan = dense_scan(points=4)
     left, right = scan.info.sensors
-    info = replace(scan.info, sensors=(replace(left, has_reflectivity=True), right))
+    info = scan.info._replace(sensors=(replace(left, has_reflectivity=True), right))
     scan = replace(
         scan,
         info=info,

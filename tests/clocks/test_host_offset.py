@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -111,7 +109,7 @@ def test_sensors_that_agree_with_each_other_get_one_correction() -> None:
 
 def test_a_correction_in_the_rig_is_part_of_the_new_one() -> None:
     # The rig adds 2 s, which leaves 38 s: altogether 36 s are to be taken away.
-    left = replace(measured(TRUE), domain="unknown", offset_ns=38 * NS_PER_S)
+    left = measured(TRUE)._replace(domain="unknown", offset_ns=38 * NS_PER_S)
     assert "`clock: {offset_s: -36.000}`" in describe_off([left], 2 * NS_PER_S)
 
 

@@ -98,7 +98,9 @@ def _match(rig: Rig, path: Path) -> None:
     every = sensors.built_in()
     expected = [
         ExpectedSensor(
-            one, [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every
+            one,
+            [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
+            {},
         )
         for one in rig.sensors
     ]

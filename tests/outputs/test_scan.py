@@ -109,7 +109,7 @@ def test_what_is_not_stored_is_refused_not_zero() -> None:
 def test_an_unknown_pose_is_refused() -> None:
     scan = Scan.copied(point_scan())
     unknown = replace(scan.info.sensors[1], body_from_sensor=np.full((4, 4), math.nan))
-    info = replace(scan.info, sensors=(scan.info.sensors[0], unknown))
+    info = scan.info._replace(sensors=(scan.info.sensors[0], unknown))
     with pytest.raises(UsageError, match="expected the extrinsics of right, found no report"):
         _ = replace(scan, info=info).xyz_sensor
 

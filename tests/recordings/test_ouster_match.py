@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +95,7 @@ def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> 
     shared = calibration_at(SAME / "same_ports_nonlegacy.2.json")
     apart = calibration_at(SAME / "same_ports_nonlegacy.2.non_colliding_imu.json")
     assert shared.match_score(found) > apart.match_score(found) > 0
-    moved = replace(found, neighbours=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
+    moved = found._replace(neighbours=(beside(Stream(SOURCES[2], 7503), bytes(48)),))
     assert apart.match_score(moved) > shared.match_score(moved) > 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -69,9 +69,9 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
     one, result = recorded(name), reference(name)
     shift_ns = wrong_s * 1_000_000_000
     neighbours = tuple(
-        replace(other, host_ns=other.host_ns + shift_ns) for other in one.evidence.neighbours
+        other._replace(host_ns=other.host_ns + shift_ns) for other in one.evidence.neighbours
     )
-    moved = replace(one.evidence, host_ns=one.evidence.host_ns + shift_ns, neighbours=neighbours)
+    moved = one.evidence._replace(host_ns=one.evidence.host_ns + shift_ns, neighbours=neighbours)
     lidar = lidar_for(moved)
     assert lidar.timestamp_mode == pulse
     headers = lidar.column_headers(one.sent.payloads, one.sent.host_ns + shift_ns)

@@ -113,8 +113,8 @@ def test_every_counter_tips_its_ledger(part: str, name: str) -> None:
 
 def test_messages_that_nobody_accounts_for_are_found() -> None:
     passed = ForwardedMessages("/imu", 10, 6, {"no_place": 4})
-    assert imbalances(replace(run(), messages=(passed,))) == []
-    assert imbalances(replace(run(), messages=(passed, passed._replace(written=5)))) == [
+    assert imbalances(run()._replace(messages=(passed,))) == []
+    assert imbalances(run()._replace(messages=(passed, passed._replace(written=5)))) == [
         "messages of /imu: expected 10 accounted for, found 5 + 4"
     ]
 
@@ -122,9 +122,9 @@ def test_messages_that_nobody_accounts_for_are_found() -> None:
 @pytest.mark.parametrize("repeated", [0, 4, -3])
 def test_datagrams_that_reach_no_sensor_are_found(repeated: int) -> None:
     """110 lidar packets, 9 of an IMU and 2 of no sensor."""
-    counted = replace(run(), capture=CaptureCounts(121 - repeated, 121 - repeated))
-    assert imbalances(replace(counted, repeated=repeated)) == []
-    assert imbalances(replace(counted, repeated=repeated + 1)) == [
+    counted = run()._replace(capture=CaptureCounts(121 - repeated, 121 - repeated))
+    assert imbalances(counted._replace(repeated=repeated)) == []
+    assert imbalances(counted._replace(repeated=repeated + 1)) == [
         "datagrams: expected 122 accounted for, found 110 + 9 + 2"
     ]
 
@@ -273,14 +273,14 @@ def test_report_has_the_contract_s_form() -> None:
 
 
 def test_a_period_that_is_no_whole_number_is_a_fraction() -> None:
-    report = json.loads(report_text(replace(run(), rate_hz="15")))
+    report = json.loads(report_text(run()._replace(rate_hz="15")))
     assert report["grid"]["period_ns"] == "200000000/3"
 
 
 def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
     text = report_text(run(), machine=False)
     moved = (InputReport("/elsewhere/b.pcap", 1000, "pcap"),)
-    other = replace(run(), inputs=moved, timing=Timing(9, 8, 7, 6, 5, 4, 3, 2, 1, "native"))
+    other = run()._replace(inputs=moved, timing=Timing(9, 8, 7, 6, 5, 4, 3, 2, 1, "native"))
     assert report_text(other, machine=False) == text
     assert "timing" not in text
     assert "path" not in text
@@ -289,7 +289,7 @@ def test_without_machine_nothing_depends_on_timings_or_paths() -> None:
 def test_names_that_are_no_text_come_back() -> None:
     """A file name of two bytes that are not UTF-8."""
     name = os.fsdecode(b"/data/\xff\xfe.pcap")
-    text = report_text(replace(run(), inputs=(InputReport(name, 1000, "pcap"),)))
+    text = report_text(run()._replace(inputs=(InputReport(name, 1000, "pcap"),)))
     assert json.loads(text.encode("utf-8"))["inputs"][0]["path"] == name
 
 

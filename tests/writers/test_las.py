@@ -101,7 +101,7 @@ def test_no_reflectivity_without_a_sensor_that_has_it(tmp_path: Path) -> None:
 )
 def test_gps_time_of_other_clocks(timescale: str, shift_s: int, tmp_path: Path) -> None:
     scan = dense_scan()
-    scan = replace(scan, info=replace(scan.info, timescale=timescale))
+    scan = replace(scan, info=scan.info._replace(timescale=timescale))
     expected = [(START_NS + shift_s * 10**9 + int(time)) / 10**9 for time in scan.time_ns]
     np.testing.assert_allclose(gps_time_s(scan), expected, rtol=0, atol=3e-7)
     header = written(tmp_path / "out", scan).header

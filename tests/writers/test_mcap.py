@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -33,7 +32,7 @@ def test_one_message_by_hand(tmp_path: Path) -> None:
 
 
 def test_messages_of_ros_1_and_ros_2(tmp_path: Path) -> None:
-    messages = [note(ROS1_NOTE, "one", 1), note(replace(ROS2_NOTE, name="/two"), "two", 2)]
+    messages = [note(ROS1_NOTE, "one", 1), note(ROS2_NOTE._replace(name="/two"), "two", 2)]
     path = written("mcap", tmp_path / "out.mcap", [dense_scan()], messages)
     with path.open("rb") as file:
         found = list(make_reader(file, validate_crcs=True).iter_messages(["/note", "/two"]))

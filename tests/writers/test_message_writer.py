@@ -110,14 +110,14 @@ def test_static_transforms_are_the_poses(name: str, tmp_path: Path) -> None:
 def test_two_frames_of_one_name_are_refused(tmp_path: Path) -> None:
     info = run_info()
     left, right = info.sensors
-    same = replace(
-        info, sensors=(replace(left, sensor_from_imu=np.eye(4)), replace(right, name="left_imu"))
+    same = info._replace(
+        sensors=(replace(left, sensor_from_imu=np.eye(4)), replace(right, name="left_imu"))
     )
     with pytest.raises(ExportError, match="found left_imu for a sensor and for an IMU"):
         open_writer("mcap", tmp_path / "scans.mcap", same, WriterOptions("standard"))
     assert list(tmp_path.iterdir()) == []
     # A frame of the recording does not replace an own one.
-    recorded = replace(info, frames=(("gps", np.eye(4)), ("left", np.eye(4))))
+    recorded = info._replace(frames=(("gps", np.eye(4)), ("left", np.eye(4))))
     children = [child for _, child, _ in static_edges(recorded)]
     assert children == ["left", "right", "gps"]
 
@@ -176,7 +176,7 @@ def test_a_run_without_scans(name: str, tmp_path: Path) -> None:
 def test_topics_of_the_scans_are_not_shared(name: str, topic: str, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path / "out", run_info(), WriterOptions())
     with pytest.raises(ExportError, match=f"than those of the scans, found {topic}; do not pass"):
-        writer.write_message(note(replace(ROS2_NOTE, name=topic), "x", 0))
+        writer.write_message(note(ROS2_NOTE._replace(name=topic), "x", 0))
     writer.abandon()
 
 

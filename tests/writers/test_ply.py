@@ -60,7 +60,7 @@ def test_one_vertex_by_hand(tmp_path: Path) -> None:
 
 def test_a_frame_of_any_name_stays_in_its_line(tmp_path: Path) -> None:
     scan = point_scan()
-    scan = replace(scan, info=replace(scan.info, frame_id="map\nend_header\n\x1b"))
+    scan = replace(scan, info=scan.info._replace(frame_id="map\nend_header\n\x1b"))
     head, body = written(tmp_path / "out", scan).split(b"end_header\n")
     assert rb"comment frame_id map\nend_header\n\x1b" in head.splitlines()
     assert len(body) == 30

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,7 +88,7 @@ def test_connections_are_what_ros_1_expects(tmp_path: Path) -> None:
 
 def test_a_type_without_fields(tmp_path: Path) -> None:
     rosbag1 = pytest.importorskip("rosbags.rosbag1")
-    topic = replace(ROS1_NOTE, type="std_msgs/Empty", definition="")
+    topic = ROS1_NOTE._replace(type="std_msgs/Empty", definition="")
     message = Message(topic, START_NS, b"")
     path = written("rosbag1", tmp_path / "out.bag", SCANS[:1], [message])
     with rosbag1.Reader(path) as reader:
@@ -116,7 +115,7 @@ def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     writer = open_writer("rosbag1", tmp_path / "out.bag", run_info(), WriterOptions())
     run_job(writer.write(dense_scan()))
     for text in ("what ever this is !!", "other_msgs/Missing x\n"):
-        topic = replace(ROS1_NOTE, definition=text, type="my_msgs/Lost")
+        topic = ROS1_NOTE._replace(definition=text, type="my_msgs/Lost")
         with pytest.raises(ExportError, match=r"^/note: expected a definition of my_msgs/Lost"):
             writer.write_message(note(topic, "x", 0))
     writer.abandon()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -132,7 +131,7 @@ def test_a_definition_that_was_not_stored_is_ours(tmp_path: Path) -> None:
     topic = Topic("/imu", "sensor_msgs/Imu", "cdr")
     source = read_back(written("rosbag2", tmp_path / "first", SCANS[:1]))
     [raw, _] = [r.raw for r in source if r.topic == "/left/imu"]
-    message = replace(note(ROS2_NOTE, "", 5), topic=topic, data=raw)
+    message = note(ROS2_NOTE, "", 5)._replace(topic=topic, data=raw)
     found = read_back(written("rosbag2", tmp_path / "out", SCANS[:1], [message]))
     [imu] = [r.value for r in found if r.topic == "/imu"]
     assert imu.linear_acceleration.z == 3.0

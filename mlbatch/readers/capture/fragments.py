@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -153,8 +154,7 @@ class SetTable:
 # -- many at once ----------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class _Chains:
+class _Chains(NamedTuple):
     """Chains over the fragments sorted by set; chain c is `order[start[c] : stop[c]]`.
 
     whole: the chain is a complete datagram; new_set: it is the first chain of its set;
@@ -305,5 +305,5 @@ def _assemble(
     )
     # File order: sorting by set separated the datagrams of different sensors.
     by_frame = np.argsort(datagrams.frame, kind="stable")
-    sorted_columns = (getattr(datagrams, name)[by_frame] for name in Datagrams.__slots__)
+    sorted_columns = (getattr(datagrams, name)[by_frame] for name in Datagrams._fields)
     return Datagrams(*sorted_columns), int(total.sum())

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -94,8 +95,7 @@ class Frames:
         )
 
 
-@dataclass(slots=True)
-class Datagrams:
+class Datagrams(NamedTuple):
     """UDP payloads, all fields (n,) int64; frame: index of the (completing) frame.
 
     source: an address number of `Addresses`.
@@ -316,7 +316,7 @@ def in_order(first: Datagrams, *others: Datagrams) -> Datagrams:
     return Datagrams(
         *(
             np.concatenate([getattr(one, name) for one in every])[order]
-            for name in Datagrams.__slots__
+            for name in Datagrams._fields
         )
     )
 

@@ -12,7 +12,6 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -194,8 +193,7 @@ _DEFAULT_RETURN_ORDER = "STRONGEST_TO_WEAKEST"
 _U16 = 65535
 
 
-@dataclass(frozen=True, slots=True)
-class Metadata:
+class Metadata(NamedTuple):
     """A sensor as described by its metadata; lengths in metres, angles in rad, ids 0 if unknown.
 
     altitude_rad, azimuth_rad: (B,), beam 0 is the top one.

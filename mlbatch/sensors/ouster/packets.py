@@ -5,7 +5,7 @@ Source: docs/sources/ouster.md sections 2, 5 and 10.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -77,8 +77,7 @@ def column_bytes(packets: U8Array, layout: PacketLayout) -> U8Array:
     return packets[:, layout.record_start : end].reshape(len(packets), layout.columns, size)
 
 
-@dataclass(frozen=True, slots=True)
-class LegacyHeaders:
+class LegacyHeaders(NamedTuple):
     """LEGACY packets: no header, only columns; no serial number, no checksum."""
 
     layout: PacketLayout
@@ -144,7 +143,9 @@ class LegacyHeaders:
         """(P,) 0: packets carry none."""
         return np.zeros(len(packets), np.int64)
 
-    serials = init_ids
+    def serials(self, packets: U8Array) -> I64Array:
+        """(P,) 0: packets carry none."""
+        return np.zeros(len(packets), np.int64)
 
     def _columns(self, packets: U8Array) -> np.ndarray[tuple[int, ...], np.dtype[np.void]]:
         raw = column_bytes(packets, self.layout)[:, :, : LEGACY_COLUMN.itemsize]
@@ -156,8 +157,7 @@ class LegacyHeaders:
         return measured
 
 
-@dataclass(frozen=True, slots=True)
-class PacketHeaders:
+class PacketHeaders(NamedTuple):
     """Packets with a header of the layout `header`, according to the metadata.
 
     Manuals and firmware disagree on the layout of STANDARD: if the serial number is found at the

@@ -36,7 +36,7 @@ def reduced(product: str = "", mode: str = "1024x10", beams: int = 64) -> JsonOb
 
 
 def same(one: Metadata, other: Metadata) -> bool:
-    names = [name for name in Metadata.__slots__ if name != "timestamp_mode"]
+    names = [name for name in Metadata._fields if name != "timestamp_mode"]
     pairs = [(getattr(one, name), getattr(other, name)) for name in names]
     return all(np.all(left == right) for left, right in pairs)
 

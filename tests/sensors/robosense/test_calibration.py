@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +93,7 @@ def test_device_packets_between_point_packets() -> None:
     spec = RobosenseSpec("Helios 16", DUAL)
     sent = _sent(spec)
     mixed = [difop(spec, fan(spec)), *sent[:4], difop(spec, fan(spec)), *sent[4:]]
-    evidence = replace(evidence_of(mixed), stream=Stream(topic="/rslidar_packets"))
+    evidence = evidence_of(mixed)._replace(stream=Stream(topic="/rslidar_packets"))
     lidar = built_in(evidence).lidar({}, evidence)
     assert lidar.mode == "dual return"
     assert lidar.sent_by_me(evidence.sample).tolist() == [False, *[True] * 4, False, *[True] * 4]
@@ -129,8 +128,7 @@ def test_angles_are_asked_for(name: str) -> None:
     for evidence, found in (
         (_evidence(name, with_difop=False), "no DIFOP packet"),
         (
-            replace(
-                _evidence(name, with_difop=False),
+            _evidence(name, with_difop=False)._replace(
                 neighbours=(
                     NeighbourStream(
                         DIFOP, 1248, rows([filled(1248, {0: MAGIC, 1246: TAIL})]), np.zeros(1, int)
