@@ -20,7 +20,7 @@ STANDARD_GRAVITY = 9.80665
 MIN_RATE_HZ = Fraction(1, 4)
 MAX_RATE_HZ = Fraction(1_000_000)
 # `Fraction` alone accepts "1e999999999" and computes for hours.
-_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,2})?|\d+/\d+", re.ASCII)
+_NUMBER = r"(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,2})?|\d+/\d+"
 _MAX_CHARACTERS = 100
 _MAX_DECIMALS = 9
 
@@ -29,7 +29,7 @@ def parse_rate(text: str) -> Fraction:
     """Return the exact rate in Hz of text as `10`, `29.97`, `10/3` or `1e1`; UsageError if none."""
     cleaned = text.strip()
     shown = cleaned if len(cleaned) <= 40 else cleaned[:40] + "..."
-    if len(cleaned) > _MAX_CHARACTERS or _NUMBER.fullmatch(cleaned) is None:
+    if len(cleaned) > _MAX_CHARACTERS or re.fullmatch(_NUMBER, cleaned, re.ASCII) is None:
         raise UsageError(
             f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found {shown!r}; "
             "write a decimal number or a fraction"

@@ -28,18 +28,12 @@ from mlbatch.batching.windows import Window
 from mlbatch.types import ColumnFigures, Columns, WindowColumns
 from mlbatch.units import NS_PER_S
 
-# Words of `--batching`; windows are on the grid.
-WINDOW = "window"
+# By the words of `--batching`.
 POLICIES: Mapping[str, Callable[[int], JoinPolicy]] = {
     "latest": NewestSweeps,
     "approximate": lambda sensors: NearestSweeps(sensors, DEFAULT_TOLERANCE_NS),
     "collate": lambda sensors: CollectedSweeps(sensors, DEFAULT_TIMEOUT_NS),
 }
-BATCHINGS = (WINDOW, *POLICIES)
-# Words of `--batching-times`: times of points count from the start of the set, or of their sweep.
-COMMON = "common"
-OWN = "own"
-TIMES = (COMMON, OWN)
 # Older sweeps are in no set, so that raw packets are not kept for a sensor that is silent.
 MOST_AGE_NS = NS_PER_S
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.decode.engine import Engine, EngineSetup
-from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
 from mlbatch.report.ledger import PointCounts
@@ -64,6 +63,13 @@ class _EngineChoice(NamedTuple):
     joins_rotors: bool
 
 
+def _numpy_engine(setup: EngineSetup) -> Engine:
+    # Imported on demand: the other engine seldom needs it.
+    from mlbatch.decode.numpy_engine import NumpyEngine
+
+    return NumpyEngine(setup)
+
+
 def _native_engine(setup: EngineSetup) -> Engine:
     # Imported on demand: the library may be missing.
     from mlbatch.decode.native_engine import NativeEngine
@@ -72,7 +78,7 @@ def _native_engine(setup: EngineSetup) -> Engine:
 
 
 _ENGINES: Mapping[str, _EngineChoice] = {
-    "numpy": _EngineChoice(NumpyEngine, joins_rotors=True),
+    "numpy": _EngineChoice(_numpy_engine, joins_rotors=True),
     # Its groups join what its projectors do not; a compiled loop follows one rotor.
     "native": _EngineChoice(_native_engine, joins_rotors=False),
 }

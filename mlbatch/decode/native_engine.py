@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Hashable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, I64Array
 from mlbatch.decode.engine import EngineSetup
-from mlbatch.decode.numpy_engine import NumpyEngine
 from mlbatch.decode.projector import Projector
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.lidar.geometry import Tabled, Turning, rotor_angles
@@ -24,6 +23,9 @@ from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
 from mlbatch.lidar.placed import PlacedPoints
 from mlbatch.native.library import Field, Group, Piece, Ring, Scan, address, library
 from mlbatch.types import PACKED_ROOM, RECORD_KINDS, RecordLayout, WindowColumns
+
+if TYPE_CHECKING:
+    from mlbatch.decode.numpy_engine import NumpyEngine
 
 # As in `native.h`.
 _TABLED, _TURNING, _COPIED, _PLACED = range(4)
@@ -74,6 +76,8 @@ class NativeEngine:
                 is_dense = not setup.organized_slots
                 self._groups.append(_DecodedGroup(own, self._structs[number], is_dense=is_dense))
             else:
+                from mlbatch.decode.numpy_engine import NumpyEngine
+
                 seat = np.stack([np.minimum(members, 0), members], axis=1)
                 engine = NumpyEngine(setup._replace(projectors=own, seat=seat))
                 if setup.organized_slots:

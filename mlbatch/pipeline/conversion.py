@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import Batcher
-from mlbatch.batching.fusion import OWN, SweepFusion
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.merge import column_merge
-from mlbatch.batching.sweeps import SweepCutter
-from mlbatch.batching.windows import Policy, Window
+from mlbatch.batching.windows import OWN, Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
@@ -34,6 +32,8 @@ from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
 from mlbatch.units import NS_PER_S, rate_text
 
 if TYPE_CHECKING:
+    from mlbatch.batching.fusion import SweepFusion
+    from mlbatch.batching.sweeps import SweepCutter
     from mlbatch.pipeline.constant_velocity import ConstantVelocity
     from mlbatch.pipeline.deskew import Deskew, PoseSource
 
@@ -122,6 +122,9 @@ class Conversion:
         )
         self.fusion: SweepFusion | None = None
         if job.is_fused:
+            # Not loaded for windows.
+            from mlbatch.batching.fusion import SweepFusion
+
             cutters = [sweep_cutter(sensor) for sensor in self.sensors]
             self.fusion = SweepFusion(job.batching, cutters, merge)
         self.passthrough = Passthrough(self.sensors, job)
@@ -465,5 +468,7 @@ class Conversion:
 
 def sweep_cutter(sensor: Sensor) -> SweepCutter:
     """Return what cuts the columns of a sensor into sweeps."""
+    from mlbatch.batching.sweeps import SweepCutter
+
     angles = sensor.lidar.beams.angle_rad
     return SweepCutter(sensor.index, None if angles is None else len(angles))

@@ -9,8 +9,7 @@ from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
-from mlbatch.batching.fusion import BATCHINGS, COMMON, TIMES, WINDOW
-from mlbatch.batching.windows import Limit
+from mlbatch.batching.windows import BATCHINGS, COMMON, TIMES, WINDOW, Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.pipeline.segments import TimeSegment

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from mlbatch.errors import ExportError
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.state_file import state_path
 from mlbatch.rig.rig import read_rig
 from mlbatch.writers import (
     check_free_space,
@@ -53,6 +52,9 @@ def check_output(job: Job, output: Path, name: str) -> None:
 
 def _own_files(output: Path, name: str) -> list[Path]:
     """Files that a run creates or removes, apart from those in an output folder."""
+    # Not loaded for dry runs.
+    from mlbatch.pipeline.state_file import state_path
+
     files = [output, partial_path(output), old_path(output), state_path(output)]
     paths = report_paths(output, name)
     if paths.report.parent != output:

@@ -14,7 +14,7 @@ Amount: TypeAlias = tuple[int, int]
 # report.json as parsed or built.
 Report: TypeAlias = Mapping[str, object]
 
-_LIMIT = re.compile(r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", re.ASCII)
+_LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*"
 _EXAMPLE = "write loss>0.1%,underfilled>0"
 
 
@@ -49,7 +49,7 @@ def exceeded(limits: Sequence[Limit], report: Report) -> list[str]:
 
 
 def _parsed(text: str) -> Limit:
-    found = _LIMIT.fullmatch(text)
+    found = re.fullmatch(_LIMIT, text, re.ASCII)
     if found is None:
         raise UsageError(
             f"--fail-on: expected NAME>NUMBER or NAME>NUMBER%, found {text!r}; {_EXAMPLE}"

@@ -27,14 +27,14 @@ REPORT_JSON = "report.json"
 # In a folder with the scans of one shard, instead of both.
 SHARD_JSON = "shard.json"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
-_SCAN_FILE = re.compile(r"(\d{6,}|head)(-\d+)?\.([\w.]+)")
+_SCAN_FILE = r"(\d{6,}|head)(-\d+)?\.([\w.]+)"
 # Names that only mlbatch gives, or that its first versions wrote without a scans.csv.
 _UNMARKED = ("npz", "ply")
 # The same for a ROS 2 bag and for lists of times. Other programs write such files too, and scans
 # of other formats: scans.csv marks an own output.
-_SHARED_FILE = re.compile(r".+_\d+\.mcap|metadata\.yaml|times\.txt")
+_SHARED_FILE = r".+_\d+\.mcap|metadata\.yaml|times\.txt"
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
-_REPORT = re.compile(rb'\{\s*"schema":\s*"mlbatch\.report/')
+_REPORT = rb'\{\s*"schema":\s*"mlbatch\.report/'
 _HEAD_BYTES = 64
 _ADVICE = {
     errno.ENOSPC: "free space on this disk or choose another output",
@@ -125,9 +125,9 @@ def _is_own_file(name: str, *, marked: bool) -> bool:
     """marked: there is a scans.csv in the output, or a shard.json."""
     if name in (SCANS_CSV, REPORT_JSON, SHARD_JSON):
         return True
-    scan = _SCAN_FILE.fullmatch(name)
+    scan = re.fullmatch(_SCAN_FILE, name)
     if scan is None:
-        return marked and bool(_SHARED_FILE.fullmatch(name))
+        return marked and bool(re.fullmatch(_SHARED_FILE, name))
     return (marked or scan[3] in _UNMARKED) and format_of_files(scan[3]) is not None
 
 
@@ -136,7 +136,7 @@ def is_report(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return _REPORT.match(file.read(_HEAD_BYTES)) is not None
+        return re.match(_REPORT, file.read(_HEAD_BYTES)) is not None
 
 
 def check_name(target: Path) -> None:

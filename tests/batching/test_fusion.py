@@ -9,12 +9,16 @@ from mlbatch.arrays import I64Array
 from mlbatch.batching.fusion import POLICIES, SweepFusion
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.sweeps import SweepCutter
-from mlbatch.batching.windows import Window
+from mlbatch.batching.windows import BATCHINGS, WINDOW, Window
 from mlbatch.types import NO_COLUMNS, WindowColumns
 from mlbatch.units import NS_PER_MS
 
 TICKS = 10
 STEP_NS = 10 * NS_PER_MS
+
+
+def test_every_word_but_that_of_windows_is_a_policy() -> None:
+    assert (WINDOW, *POLICIES) == BATCHINGS
 
 
 def rotor(zero_ms: int, until_ms: int, period_ms: int = 100) -> tuple[I64Array, I64Array]:
