@@ -510,11 +510,14 @@ def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Arra
     events = [_NONE if one is None else one.packets.position for one in accepted]
     delivering = [number for number, event in enumerate(events) if len(event)]
     if len(delivering) == 1:
-        ranks: list[I64Array] = [np.arange(len(event)) for event in events]
-        return ranks, events[delivering[0]]
+        return [np.arange(len(event)) for event in events], events[delivering[0]]
     position = np.concatenate(events)
     order = position.argsort(kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
-    cuts = np.cumsum([len(event) for event in events])[:-1]
-    return np.split(rank, cuts), position[order]
+    ranks = []
+    begin = 0
+    for event in events:
+        ranks.append(rank[begin : begin + len(event)])
+        begin += len(event)
+    return ranks, position[order]
