@@ -146,7 +146,8 @@ class _Pass:
         while True:
             self.recording.position_bytes = source.position_bytes
             walk = self.walker.walk(window.data, window.begin, window.end)
-            for frames, is_last in self._portions(walk.frames):
+            spanned_bytes = walk.next - window.begin
+            for frames, is_last in self._portions(walk.frames, spanned_bytes):
                 # With a need the rest comes in another region.
                 batch = self._batch(window, frames, is_last=is_last and walk.need > 0)
                 if len(batch):
@@ -161,11 +162,15 @@ class _Pass:
                 self._end(window, walk, source)
                 return
 
-    def _portions(self, frames: Frames) -> Iterator[tuple[Frames, bool]]:
+    def _portions(self, frames: Frames, spanned_bytes: int) -> Iterator[tuple[Frames, bool]]:
         """Frames in portions whose datagrams fit into the front, whatever their fragments.
 
-        The second is True for the last portion.
+        The second is True for the last portion. spanned_bytes: of the records of all frames.
         """
+        if len(frames) and self.reassembler.sets.held_bytes + spanned_bytes <= self.front_bytes:
+            # The usual case.
+            yield frames, True
+            return
         fewest = self.front_bytes // MAX_DATAGRAM_BYTES
         end_bytes = np.cumsum(frames.captured)
         at = 0
