@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -14,7 +15,8 @@ _ABI = 8
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
-_BYTE = ctypes.c_char
+# Takes every buffer; types of numpy name the protocol from Python 3.12 on.
+_from_buffer: Callable[[Any], Any] = ctypes.c_char.from_buffer
 # Arguments of the functions; they return a number, except some.
 _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_abi": (),
@@ -245,7 +247,7 @@ def address(array: npt.NDArray[Any]) -> int:
     """Return the address of a C-contiguous array; the caller keeps the array."""
     try:
         # A third of the time of the other way, and a window needs many addresses.
-        return ctypes.addressof(_BYTE.from_buffer(array))
+        return ctypes.addressof(_from_buffer(array))
     except (TypeError, ValueError) as err:
         # Arrays without elements, or that are read only, have no such buffer.
         if not array.flags.c_contiguous:
